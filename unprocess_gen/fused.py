@@ -1,0 +1,290 @@
+"""The fast form of a pair: one pass over the photograph, one channel a site, no full-resolution RGB in between.
+
+Must give the DN of `pair.reference_pair` everywhere, on every machine. Hence Numba without fastmath (no reordering, no
+fused multiply-add), float64, only + - × ÷ √, comparisons, integers and table look-ups, and each formula in the
+reference's order of operations.
+
+How it is fast: a row is worked through in chunks of `CHUNK` pixels whose buffers stay in the first-level cache, and
+each stage is a loop of its own, so that it becomes vector code. Doubles are taken apart and put together through views
+of their bits: 2**52 | j is j as a double, and adding and subtracting 1.5·2**52 rounds half to even; both vectorise
+where the conversion instructions do not exist below AVX-512.
+
+Measured on a 2880x2160 photograph, AVX2, one thread: colour and gains 1.3 ns a pixel, Philox 0.8, normals 1.3, noise
+and rounding 1.3. Tried and slower: one loop for everything (scalar code), a [1024, 4] table instead of three columns
+for the quadratics (2.3 instead of 1.3), conversions instead of bit views (2.4 instead of 1.3).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from unprocess_gen.bayer import tile
+from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
+from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
+from unprocess_gen.tables import SEGMENTS
+
+CHUNK = 1024
+"""Pixels worked on at a time: six buffers of 8 kB."""
+
+SEGMENT_BITS = SEGMENTS.bit_length() - 1
+
+_M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
+_STEP0, _STEP1 = (np.uint64(step) for step in KEY_STEPS)
+_LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+_LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
+_1 = np.uint64(1)
+_TWO52_BITS, _TWO52 = np.uint64(0x4330000000000000), 2.0**52
+_ONE_BITS = np.uint64(0x3FF0000000000000)
+_POSITION_BITS = np.uint64(52 - SEGMENT_BITS)
+_POSITION_MASK = np.uint64(2 ** (52 - SEGMENT_BITS) - 1)
+_FIRST_ROW = np.uint64(1023 << SEGMENT_BITS)
+_ROUND = 1.5 * 2.0**52
+
+# The frozen options of `njit` for this room; `cache` keeps the machine code between processes.
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": False}
+
+
+def make_pair(
+    srgb: Srgb,
+    plan: Plan,
+    curve: Float,
+    quantiles: Float,
+    limits_dn: tuple[float, float],
+    origin: tuple[int, int] = (0, 0),
+) -> Pair:
+    """Make a pair; arguments as in `pair.make_pair`, with the curve of the source's codes, the normal table and the
+    lowest and highest DN of the noisy frame.
+    """
+    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
+    noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
+    gains = np.array(plan.inverse_gains)
+    ccm = np.array(plan.rgb2cam).reshape(3, 3)
+    black_dn = float(plan.black_level_dn)
+    counts = np.zeros(6, dtype=np.int64)
+    _pair(
+        np.ascontiguousarray(srgb),
+        ccm[:, :, None] * curve,
+        np.array(tile(plan.pattern, origin)),
+        gains,
+        # The highlight term, where it applies at all; "gray_mean" has a function of its own.
+        np.maximum(1 - gains, 0) if plan.highlight == "per_channel" else np.zeros(3),
+        plan.highlight == "gray_mean",
+        plan.highlight_threshold,
+        (black_dn, float(plan.white_level_dn - plan.black_level_dn), float(plan.white_level_dn)),
+        (plan.a_dn, plan.b_dn2),
+        limits_dn,
+        (np.uint64(plan.stream_key & 0xFFFFFFFF), np.uint64(plan.stream_key >> 32)),
+        np.uint64(purpose("heteroscedastic")),
+        origin,
+        (quantiles[:, 0].copy(), quantiles[:, 1].copy(), quantiles[:, 2].copy()),
+        clean,
+        noisy,
+        counts,
+    )
+    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+
+
+@njit(**_OPTIONS)
+def _pair(
+    srgb: Srgb,
+    products: Float,
+    sites: NDArray[np.int64],
+    gains: Float,
+    headroom: Float,
+    by_gray: bool,
+    threshold: float,
+    levels_dn: tuple[float, float, float],
+    noise: tuple[float, float],
+    limits_dn: tuple[float, float],
+    key: tuple[np.uint64, np.uint64],
+    purpose_word: np.uint64,
+    origin: tuple[int, int],
+    quantiles: tuple[Float, Float, Float],
+    clean: Raw,
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill ``clean``, ``noisy`` and ``counts``; ``products[c, k]`` is ccm[c, k] times the curve."""
+    height, width = clean.shape
+    signal = np.empty(CHUNK)
+    light = np.empty(CHUNK)
+    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    normals = np.empty(CHUNK + BLOCK)
+    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    site_gains = np.empty((2, CHUNK))
+    site_headroom = np.empty((2, CHUNK))
+    for y in range(2):
+        for x in range(CHUNK):
+            site_gains[y, x] = gains[sites[y, x & 1]]
+            site_headroom[y, x] = headroom[sites[y, x & 1]]
+
+    for start in range(0, width, CHUNK):
+        length = min(CHUNK, width - start)
+        first_block = (origin[1] + start) // BLOCK
+        offset = (origin[1] + start) % BLOCK
+        blocks = (offset + length + BLOCK - 1) // BLOCK
+        for y in range(height):
+            row = srgb[y, start : start + length]
+            site = sites[y & 1]
+            if by_gray:
+                _light_by_gray(row, products, site, gains, threshold, light)
+            else:
+                _camera(row, products[site[0]], products[site[1]], signal)
+                _light(signal[:length], site_gains[y & 1], site_headroom[y & 1], threshold, light)
+            _words(key, first_block, blocks, np.uint64(origin[0] + y), purpose_word, words)
+            _normals(words[: blocks * BLOCK], quantiles, bits, normals)
+            _frames(
+                light[:length],
+                normals[offset : offset + length],
+                levels_dn,
+                noise,
+                limits_dn,
+                signal,
+                clean[y, start : start + length],
+                noisy[y, start : start + length],
+                counts,
+            )
+
+
+@njit(**_OPTIONS)
+def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
+    """Linearise and apply the matrix, for the one channel that each site keeps."""
+    e0, e1, e2 = even[0], even[1], even[2]
+    o0, o1, o2 = odd[0], odd[1], odd[2]
+    length = row.shape[0]
+    for pair in range(length // 2):
+        x = 2 * pair
+        out[x] = (e0[row[x, 0]] + e1[row[x, 1]]) + e2[row[x, 2]]
+        out[x + 1] = (o0[row[x + 1, 0]] + o1[row[x + 1, 1]]) + o2[row[x + 1, 2]]
+    if length & 1:
+        x = length - 1
+        out[x] = (e0[row[x, 0]] + e1[row[x, 1]]) + e2[row[x, 2]]
+
+
+@njit(**_OPTIONS)
+def _light(signal: Float, gains: Float, headroom: Float, threshold: float, out: Float) -> None:
+    """Invert the gains, highlights kept by channel (or not at all, where ``headroom`` is 0)."""
+    for x in range(signal.shape[0]):
+        i = signal[x]
+        m = max(i - threshold, 0.0) / (1.0 - threshold)
+        out[x] = i * gains[x] + i * (m * m) * headroom[x]
+
+
+@njit(**_OPTIONS)
+def _light_by_gray(
+    row: Srgb, products: Float, site: NDArray[np.int64], gains: Float, threshold: float, out: Float
+) -> None:
+    """Linearise, apply the matrix and invert the gains, highlights kept by the mean of the three channels."""
+    for x in range(row.shape[0]):
+        r, g, b = row[x, 0], row[x, 1], row[x, 2]
+        red = (products[0, 0, r] + products[0, 1, g]) + products[0, 2, b]
+        green = (products[1, 0, r] + products[1, 1, g]) + products[1, 2, b]
+        blue = (products[2, 0, r] + products[2, 1, g]) + products[2, 2, b]
+        m = max(((red + green) + blue) / 3.0 - threshold, 0.0) / (1.0 - threshold)
+        mask = m * m
+        c = site[x & 1]
+        i = red if c == 0 else green if c == 1 else blue
+        out[x] = i * max(mask + (1.0 - mask) * gains[c], gains[c])
+
+
+@njit(**_OPTIONS)
+def _words(
+    key: tuple[np.uint64, np.uint64],
+    first_block: int,
+    blocks: int,
+    y: np.uint64,
+    purpose_word: np.uint64,
+    out: NDArray[np.uint64],
+) -> None:
+    """Philox4x32-10 in the layout of `streams`: one 32-bit word a pixel, whole blocks."""
+    for block in range(blocks):
+        counter = np.uint64((first_block + block) * LANES)
+        at = block * BLOCK
+        for lane in range(LANES):
+            c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word, np.uint64(0)
+            k0, k1 = key
+            for _ in range(ROUNDS):
+                p0 = _M0 * c0
+                p1 = _M1 * c2
+                c0 = (p1 >> _32) ^ c1 ^ k0
+                c1 = p1 & _LOW32
+                c2 = (p0 >> _32) ^ c3 ^ k1
+                c3 = p0 & _LOW32
+                k0 = (k0 + _STEP0) & _LOW32
+                k1 = (k1 + _STEP1) & _LOW32
+            out[at + lane] = c0
+            out[at + LANES + lane] = c1
+            out[at + 2 * LANES + lane] = c2
+            out[at + 3 * LANES + lane] = c3
+
+
+@njit(**_OPTIONS)
+def _normals(
+    words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
+) -> None:
+    """Normals by inverse CDF, as `effects.normals`; overwrites the low bits of ``words``."""
+    q0, q1, q2 = quantiles
+    count = words.shape[0]
+    doubles = bits.view(np.float64)
+    out_bits = out.view(np.uint64)
+    for n in range(count):
+        bits[n] = ((words[n] & _LOW31) << _1 | _1) | _TWO52_BITS
+    for n in range(count):
+        doubles[n] = doubles[n] - _TWO52
+    for n in range(count):
+        b = bits[n]
+        words[n] = (words[n] & _SIGN) | ((b >> _POSITION_BITS) - _FIRST_ROW)
+        bits[n] = (b & _POSITION_MASK) | _ONE_BITS
+    for n in range(count):
+        row = words[n] & _LOW31
+        t = doubles[n] - 1.0
+        out[n] = q0[row] + t * (q1[row] + t * q2[row])
+    for n in range(count):
+        out_bits[n] = out_bits[n] ^ ((words[n] & _SIGN) << _32)
+
+
+@njit(**_OPTIONS)
+def _frames(
+    light: Float,
+    normals: Float,
+    levels_dn: tuple[float, float, float],
+    noise: tuple[float, float],
+    limits_dn: tuple[float, float],
+    buffer: Float,
+    clean: Raw,
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Clip, go to DN, add the noise, round half to even, clip, cast; count what met a limit."""
+    black, span, white = levels_dn
+    a, b = noise
+    low, high = limits_dn
+    length = light.shape[0]
+    below, above, saturated = 0, 0, 0
+    for x in range(length):
+        below += light[x] < 0.0
+        above += light[x] > 1.0
+        dn = min(max(light[x], 0.0), 1.0) * span + black
+        rounded = (dn + _ROUND) - _ROUND
+        saturated += rounded == white
+        clean[x] = np.uint16(np.int32(rounded))
+        buffer[x] = dn
+    noisy_low, noisy_high, still = 0, 0, 0
+    for x in range(length):
+        dn = buffer[x]
+        variance = max(a * (dn - black) + b, 0.0)
+        still += variance == 0.0
+        rounded = (dn + np.sqrt(variance) * normals[x] + _ROUND) - _ROUND
+        noisy_low += rounded < low
+        noisy_high += rounded > high
+        noisy[x] = np.uint16(np.int32(min(max(rounded, low), high)))
+    counts[0] += below
+    counts[1] += above
+    counts[2] += noisy_low
+    counts[3] += noisy_high
+    counts[4] += saturated
+    counts[5] += still
