@@ -1,0 +1,384 @@
+"""The door: ``gen-dataset``. Verbs, composing and checking the settings, exit codes. The only room that names Hydra.
+
+Verbs are dispatched before Hydra, and ``--help`` is answered before it too (its own takes half a second). Hydra prints
+several lines for a mistake and always ends with 1; so it is told to raise, and every mistake becomes one line here. An
+exception that leaves a Hydra task costs a second line, so tasks hand over their outcome instead; that is also what lets
+a sweep go on. Everything heavy is imported where it is first used.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import os
+import re
+import signal
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from unprocess_gen import __version__
+from unprocess_gen.errors import ConfigError, UnprocessGenError
+
+if TYPE_CHECKING:
+    from unprocess_gen.config import Config
+    from unprocess_gen.runner import Summary
+
+HELP = """\
+gen-dataset: pairs of clean and noisy raw images from ordinary photographs
+
+  gen-dataset camera=convex noise=imx385_iso3200 source.root=photos out=ds     one dataset
+  gen-dataset                                  the same from the built-in scenes, into ds
+  gen-dataset -m camera=sony_a7r,nexus_6p noise=imx385_iso1600,imx385_iso3200 out=sweep
+                                               a sweep: one dataset folder each, and sweep/sweep.csv
+  gen-dataset plan [overrides] [--all]         what would be made; writes nothing
+  gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
+
+Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
+  source   root, include, recursive, limit, max_pixels, max_failed, icc
+  camera   convex choice sony_a7r olympus_em10 sony_rx100 nexus_6p identity custom
+  gains    brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
+  isp      smoothstep_gamma22 gamma22 srgb linear
+  sensor   imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit
+  noise    imx385_iso1600 … imx385_iso25600 imx385_iso3200_rvdd brooks2019 heteroscedastic none
+  output   webdataset
+and at the top: seed (0), out (ds), n_jobs (-1: all cores).
+
+  --cfg job           print the settings and stop      --config-dir DIR   add a folder of your own options
+  -m, --multirun      sweep over comma-separated values
+  -sc install=bash    tab completion: eval "$(gen-dataset -sc install=bash)"; zsh and fish too
+  --version, --help, --hydra-help
+
+Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 finished with failed images · 4 damage found
+            5 the machine failed (disk full) · 11 another run holds the output · 130, 143 stopped by a signal
+"""
+
+SEVERITY = (0, 3, 11, 4, 2, 5, 1)
+"""Exit codes from good to bad: a sweep ends with the worst of its jobs."""
+
+HYDRA_FLAGS = re.compile(
+    r"--hydra-help|--version|--(cfg|resolve|package|run|multirun|shell-completion|config-path|config-name|config-dir|info)(=.*)?"
+    r"|--experimental-rerun(=.*)?|-(c|p|r|m|sc|cp|cn|cd|i)(=.*)?"
+)
+SWEEP_FLAGS = ("-m", "--multirun")
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived."""
+
+
+def main() -> int:
+    """Run ``gen-dataset`` with the arguments of this process; return the exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        return run(sys.argv[1:])
+    except UnprocessGenError as error:
+        return _report(error)
+    except KeyboardInterrupt:
+        return 130
+    except Terminated:
+        return 143
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def _report(error: BaseException) -> int:
+    """Say what went wrong, in one line where it is not a bug; return the exit code."""
+    if isinstance(error, UnprocessGenError):
+        print(f"gen-dataset: {error}", file=sys.stderr)
+        return error.exit_code
+    traceback.print_exception(error)
+    return 1
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Dispatch the verb; return the exit code or raise what `main` knows."""
+    if {"-h", "--help"} & set(arguments):
+        print(HELP, end="")
+        return 0
+    if "--version" in arguments:
+        print(f"unprocess_gen {__version__}")
+        return 0
+    if arguments and re.fullmatch("[a-z]+", arguments[0]):
+        if arguments[0] not in VERBS:
+            raise ConfigError(f"{arguments[0]}: no such verb; expected one of {', '.join(VERBS)}, or settings key=value")
+        return VERBS[arguments[0]](list(arguments[1:]))
+    return generate(list(arguments))
+
+
+# ----------------------------------------------------------------------------------------------------------- verbs
+
+
+def generate(arguments: list[str]) -> int:
+    """``gen-dataset [overrides]``: make a dataset, or with ``-m`` one for every combination."""
+    return compose(arguments, _generate)
+
+
+def _generate(config: Config) -> tuple[int, Summary]:
+    from unprocess_gen import runner
+
+    summary = runner.generate(config)
+    print(_sentence(summary))
+    too_many = sum(summary.failed.values()) > config.source.max_failed
+    return 3 if too_many else 0, summary
+
+
+def _sentence(summary: Summary) -> str:
+    failed = ", ".join(f"{count} {reason}" for reason, count in summary.failed.items())
+    facts = f"{summary.pairs} pairs in {summary.shards} shards, {summary.bytes / 1e6:,.1f} MB, " + (
+        f"{sum(summary.failed.values())} failed ({failed}; see {summary.out}/manifest.csv)" if failed else "0 failed"
+    )
+    if not summary.made:
+        return f"{summary.out} is complete: {facts}; nothing to do"
+    return f"{summary.out}: {facts}; {summary.made} of {summary.rows} made now, {summary.seconds:.1f} s"
+
+
+def plan(arguments: list[str]) -> int:
+    """``gen-dataset plan [overrides] [--all]``: tell what would be made."""
+    read_all = "--all" in arguments
+    return compose([argument for argument in arguments if argument != "--all"], lambda config: _plan(config, read_all))
+
+
+def _plan(config: Config, read_all: bool) -> tuple[int, None]:
+    from unprocess_gen import forecast, runner
+
+    print(forecast.text(config, forecast.forecast(config, runner.effective_jobs(config.n_jobs, 10**6), read_all)))
+    return 0, None
+
+
+AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
+
+
+def again(arguments: list[str]) -> int:
+    """``gen-dataset again DIR source.root=… out=…``: make a dataset again from its ``config.yaml``."""
+    from unprocess_gen import config as settings
+
+    if not arguments or "=" in arguments[0]:
+        raise ConfigError("again: expected the folder of a dataset, then source.root=… and out=…")
+    folder, chosen = Path(arguments[0]), _again_values(arguments[1:])
+    config, kind = settings.read_dataset_yaml(folder / "config.yaml")
+    if "out" not in chosen:
+        raise ConfigError("again: out=… is missing: the folder to make it in")
+    if (kind == "folder") != ("source.root" in chosen):
+        wanted = "give source.root=…" if kind == "folder" else "leave source.root out"
+        raise ConfigError(f"again: {folder} was made from a source of kind {kind}: {wanted}")
+    config.out, config.source.root = chosen["out"], chosen.get("source.root")
+    config.n_jobs = chosen.get("n_jobs", config.n_jobs)
+    config.source.max_failed = chosen.get("source.max_failed", config.source.max_failed)
+    settings.check(config)
+    code, _ = _generate(config)
+    print(_compare(folder, Path(config.out)))
+    return code
+
+
+def _again_values(arguments: list[str]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key not in AGAIN_KEYS:
+            raise ConfigError(f"again: {argument}: expected only {', '.join(AGAIN_KEYS)}; all else is in config.yaml")
+        try:
+            values[key] = AGAIN_KEYS[key](value)
+        except ValueError:
+            raise ConfigError(f"{argument}: expected a whole number") from None
+    return values
+
+
+def _compare(old: Path, new: Path) -> str:
+    """Say whether two datasets have the same manifest, and with it the same arrays."""
+    try:
+        before, after = (hashlib.sha256((folder / "manifest.csv").read_bytes()).hexdigest() for folder in (old, new))
+    except OSError:
+        return f"{old} has no manifest.csv to compare with"
+    return f"manifest.csv {'is the same as' if before == after else 'DIFFERS from'} that of {old}"
+
+
+VERBS: dict[str, Callable[[list[str]], int]] = {"plan": plan, "again": again}
+
+# ------------------------------------------------------------------------------------------------- Hydra, and sweeps
+
+Outcome = tuple[int, Any]
+Task = Callable[["Config"], Outcome]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One dataset of a sweep, as ``sweep.csv`` tells it."""
+
+    folder: str
+    overrides: str
+    rows: int | None
+    failed: int | None
+    exit: int
+
+
+def conf_dir() -> Path:
+    """Return the folder of the options: inside the installed package, or beside it in a source tree."""
+    here = Path(__file__).resolve().parent
+    for folder in (here / "conf", here.parent / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise ConfigError(f"no conf/config.yaml in or beside {here}: the installation is not whole")
+
+
+def compose(arguments: list[str], task: Task) -> int:
+    """Let Hydra compose the settings and run ``task`` on each; return its exit code, of a sweep the worst.
+
+    Raises ConfigError for settings that Hydra or `config.check` refuse; anything a single task raises.
+    """
+    _refuse_unknown_flags(arguments)
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra's switch for: raise, do not print
+    import hydra
+    from hydra.core.config_store import ConfigStore
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import HydraException
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
+
+    from unprocess_gen.config import Config, check
+
+    ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
+    outcomes: list[int | BaseException] = []
+    jobs: list[Job] = []
+
+    def on_config(node: DictConfig) -> None:
+        hydra_config = HydraConfig.get()
+        try:
+            config = OmegaConf.to_object(node)
+            assert isinstance(config, Config)
+            if hydra_config.mode == RunMode.MULTIRUN:
+                jobs.append(_sweep_job(config, hydra_config.job.override_dirname, task))
+                _write_sweep(Path(config.out).parent, jobs)
+                outcomes.append(jobs[-1].exit)
+            else:
+                check(config)
+                outcomes.append(task(config)[0])
+        except BaseException as error:
+            outcomes.append(error)
+            if isinstance(error, KeyboardInterrupt | Terminated):
+                raise
+
+    try:
+        with tempfile.TemporaryDirectory() as aside:  # Hydra writes a multirun.yaml; the datasets keep a config each
+            sys.argv = ["gen-dataset", *arguments]
+            if any(argument in SWEEP_FLAGS for argument in arguments):
+                sys.argv += [f"hydra.sweep.dir={aside}", "hydra.sweep.subdir=."]
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(on_config)()
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise ConfigError(_explain(error, arguments)) from error
+    for outcome in outcomes:
+        if isinstance(outcome, OmegaConfBaseException):
+            raise ConfigError(_explain(outcome, arguments)) from outcome
+        if isinstance(outcome, BaseException):
+            raise outcome
+    return max((code for code in outcomes if isinstance(code, int)), key=SEVERITY.index, default=0)
+
+
+def _sweep_job(config: Config, overrides: str, task: Task) -> Job:
+    """Make one dataset of a sweep below ``out``; whatever goes wrong becomes its exit code."""
+    from unprocess_gen.config import check
+
+    folder = _folder_name(overrides)
+    config.out = str(Path(config.out) / folder)
+    try:
+        check(config)
+        code, summary = task(config)
+    except Exception as error:
+        print(f"gen-dataset: in {folder}:", file=sys.stderr)
+        return Job(folder, overrides, None, None, _report(error))
+    if summary is None:
+        return Job(folder, overrides, None, None, code)
+    return Job(folder, overrides, summary.rows, sum(summary.failed.values()), code)
+
+
+def _folder_name(overrides: str) -> str:
+    """Return the overrides as a folder's name: slashes encoded, a long one cut and told apart by its digest."""
+    name = overrides.replace("%", "%25").replace("/", "%2F") or "default"
+    if len(os.fsencode(name)) <= 200:
+        return name
+    return name.encode()[:180].decode(errors="ignore") + "-" + hashlib.sha256(name.encode()).hexdigest()[:16]
+
+
+def _write_sweep(out: Path, jobs: Sequence[Job]) -> None:
+    """Write ``sweep.csv`` anew after every job, where the sweep's folder exists at all."""
+    if not out.is_dir():
+        return
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(Job.__slots__)
+    writer.writerows([getattr(job, name) for name in Job.__slots__] for job in jobs)
+    aside = out / "sweep.csv.part"
+    aside.write_text(stream.getvalue(), encoding="utf-8", newline="")
+    os.replace(aside, out / "sweep.csv")
+
+
+def _refuse_unknown_flags(arguments: Sequence[str]) -> None:
+    for argument in arguments:
+        if argument.startswith("-") and not HYDRA_FLAGS.fullmatch(argument):
+            raise ConfigError(f"{argument}: no such flag; see gen-dataset --help")
+
+
+# --------------------------------------------------------------------------------------- Hydra's errors, in one line
+
+
+def _explain(error: BaseException, arguments: Sequence[str]) -> str:
+    """Return one sentence with the key, the value and what is allowed."""
+    from omegaconf.errors import OmegaConfBaseException
+
+    from unprocess_gen.config import one_line
+
+    chain: list[BaseException] = []
+    link: BaseException | None = error
+    while link is not None and link not in chain:
+        chain.append(link)
+        link = link.__cause__ or link.__context__
+    text = " ".join(one_line(link) for link in chain)
+    option = re.search(r"Could not find '([^']+)/([^'/]+)'.*?Available options in '[^']+': ((?:[\w-]+ ?)+)", text)
+    if option:
+        return f"{option[1]}={option[2]}: no such option; expected one of {', '.join(option[3].split())}"
+    unknown = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([\w.@/]+)'", text)
+    if unknown:
+        return f"{_assignment(unknown[1], arguments)}: no such key; {_allowed(unknown[1])}"
+    for link in chain:
+        key = getattr(link, "full_key", None)
+        if isinstance(link, OmegaConfBaseException) and key:
+            return f"{_assignment(key, arguments)}: {_reason(link, key)}"
+    return one_line(error)
+
+
+def _reason(error: Any, key: str) -> str:
+    message = str(error.msg or error).splitlines()[0]
+    if re.search(r"Key '.*' not in", message):
+        return f"no such key; {_allowed(key)}"
+    return message
+
+
+def _assignment(key: str, arguments: Sequence[str]) -> str:
+    """Return ``key=value`` as the user wrote it, where the key stands on the command line."""
+    return next((argument.lstrip("+~") for argument in arguments if argument.lstrip("+~").split("=")[0] == key), key)
+
+
+def _allowed(key: str) -> str:
+    """Return what stands where an unknown key was looked for."""
+    import dataclasses
+
+    from unprocess_gen.config import Config
+
+    node: Any = Config()
+    path = key.split(".")[:-1]
+    for name in path:
+        node = getattr(node, name, None)
+    if not dataclasses.is_dataclass(node):
+        node, path = Config(), []
+    names = ", ".join(field.name for field in dataclasses.fields(node))
+    return f"{'.'.join(path)} has {names}" if path else f"expected one of {names}"

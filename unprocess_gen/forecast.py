@@ -1,0 +1,162 @@
+"""What a run would make, told before it: pairs, shards, bytes, time, effects and why. Writes nothing.
+
+Reads `SAMPLE` photographs spread over the listing, or all of them; the bytes of the shards are exact when all were
+read, since a pair's size depends on its width, height and name alone.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unprocess_gen.config import Config
+from unprocess_gen.errors import SourceError
+from unprocess_gen.manifest import json_size
+from unprocess_gen.pair import make_pair
+from unprocess_gen.photographs import list_photographs, load
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Plan, Source
+from unprocess_gen.shards import array_xxh3, pair_bytes, shard_bytes
+
+SAMPLE = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What one photograph would give: the bytes of its pair (0 where it fails), the time, its plan or the reason."""
+
+    source: Source
+    bytes: int
+    seconds: float
+    plan: Plan | None
+    reason: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What a run would make; ``exact`` where every photograph was read."""
+
+    sources: int
+    shards: int
+    bytes: int
+    exact: bool
+    seconds: float
+    n_jobs: int
+    free_bytes: int
+    looks: tuple[Look, ...]
+
+
+def forecast(config: Config, n_jobs: int, read_all: bool) -> Forecast:
+    """Look at the photographs of a run; ``n_jobs`` is what the time is divided by.
+
+    Raises ConfigError as `photographs.list_photographs` does.
+    """
+    sources = list_photographs(config.source).sources
+    chosen = sources if read_all else spread(sources, SAMPLE)
+    _warm_up(config)
+    looks = tuple(look(config, source) for source in chosen)
+    exact = len(chosen) == len(sources)
+    per_shard = config.output.pairs_per_shard
+    shards = -(-len(sources) // per_shard)
+    if exact:
+        sizes = [[one.bytes for one in looks[at : at + per_shard] if one.bytes] for at in range(0, len(looks), per_shard)]
+        total = sum(shard_bytes(pairs) for pairs in sizes)
+    else:
+        total = sum(one.bytes for one in looks) * len(sources) // len(looks) + shards * shard_bytes([0])
+    seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
+    free = shutil.disk_usage(_existing(Path(config.out))).free
+    return Forecast(len(sources), shards, total, exact, seconds, n_jobs, free, looks)
+
+
+def spread(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
+    """Return at most ``count`` sources, evenly spread over the listing."""
+    if len(sources) <= count:
+        return sources
+    return tuple(sources[i * len(sources) // count] for i in range(count))
+
+
+def look(config: Config, source: Source) -> Look:
+    """Make one pair and throw it away."""
+    started = time.perf_counter()
+    try:
+        sha256, photograph = load(config.source, source)
+    except SourceError as error:
+        return Look(source, 0, time.perf_counter() - started, None, error.reason)
+    plan = plan_image(config, sha256, source.occurrence)
+    pair = make_pair(photograph.srgb, plan)
+    array_xxh3(pair.clean), array_xxh3(pair.noisy)
+    height, width = pair.clean.shape
+    size = pair_bytes(width, height, json_size(source.name))
+    return Look(source, size, time.perf_counter() - started, plan, None)
+
+
+def _warm_up(config: Config) -> None:
+    """Have the machine code ready, so that its compilation is not taken for the price of an image."""
+    make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan_image(config, "0" * 64))
+
+
+def _existing(path: Path) -> Path:
+    path = Path(os.path.abspath(path))
+    return path if path.exists() else _existing(path.parent)
+
+
+# -------------------------------------------------------------------------------------------------------- for people
+
+
+def text(config: Config, told: Forecast) -> str:
+    """Return the forecast as lines for a terminal."""
+    about = "" if told.exact else "about "
+    lines = [
+        f"sources   {told.sources} ({config.source.root or 'built-in scenes'}), {len(told.looks)} of them read",
+        f"pairs     {told.sources} at the most, in {told.shards} shards of {config.output.pairs_per_shard}",
+        f"bytes     {about}{told.bytes:,} in shards" + ("" if told.exact else " (--all reads every source: exact)"),
+        f"disk      {told.free_bytes:,} bytes free" + ("" if told.free_bytes > told.bytes else ": NOT ENOUGH"),
+        f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}",
+        *_failures(told.looks),
+        *_noise(config, told.looks),
+    ]
+    return "\n".join(lines)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 90 else f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _failures(looks: tuple[Look, ...]) -> list[str]:
+    return [f"fails     {one.source.name}: {one.reason}" for one in looks if one.reason]
+
+
+def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
+    plans = [one.plan for one in looks if one.plan is not None]
+    if not plans:
+        return []
+    sensor, noise, first = config.sensor, config.noise, plans[0]
+    levels = f"black {noise.black_level_dn}, white {noise.white_level_dn}" if noise.units == "dn" else "black 0, white 1"
+    lines = [
+        f"noise     {noise.name}: a={noise.a}, b={noise.b} ({noise.units}, {levels}, black {noise.black})",
+        f"          on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}): "
+        f"a_dn {_span([plan.a_dn for plan in plans])}, b_dn2 {_span([plan.b_dn2 for plan in plans])}",
+    ]
+    if min(plan.b_dn2 for plan in plans) < 0:
+        zero = max(-plan.b_dn2 / plan.a_dn for plan in plans)
+        lines.append(f"          no noise up to {zero:.2f} DN above black, where the fitted variance is below 0")
+    lines += [f"effect    {name}: {EFFECT_REASONS[name]}" for name in first.effects]
+    lines += [f"skipped   {reason}" for reason in first.skipped]
+    return lines
+
+
+EFFECT_REASONS = {
+    "heteroscedastic": "on; shot and read noise as one Gaussian, variance = a_dn·(x - black) + b_dn2",
+    "quantise": "on; integer output is always rounded and clipped",
+}
+"""Why each effect of a two-parameter profile is simulated."""
+
+
+def _span(values: list[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"

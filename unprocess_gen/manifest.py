@@ -1,0 +1,280 @@
+"""The manifest: one row a pair, and a row is a plan. Its columns stand in one tuple.
+
+A row is built once, by `ok_row` or `failed_row`, as a mapping from column to typed value (None where not applicable).
+In CSV, floats are Python's shortest round-trip spelling, so that a row read back is the same plan bit for bit. In the
+shards each row also stands as JSON, padded with blanks to a size that depends on the source's name alone: the size of a
+shard can then be told before it is made.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from unprocess_gen.colour import matrix
+from unprocess_gen.errors import DamageError
+from unprocess_gen.records import Pair, Plan, Source
+from unprocess_gen.tables import gamma_text
+
+Value = str | int | float | None
+Row = Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: its name, its type and what it holds."""
+
+    name: str
+    type: type[str] | type[int] | type[float]
+    meaning: str
+
+
+COLUMNS = (
+    Column("key", str, "source index as eight digits; the pair's name in its shard"),
+    Column("source", str, "path below the source folder, percent-encoded where unsafe"),
+    Column("source_sha256", str, "SHA-256 of the source's bytes"),
+    Column("source_bytes", int, "size of the source"),
+    Column("status", str, "ok or failed"),
+    Column("reason", str, "why it failed"),
+    Column("width", int, "of the arrays"),
+    Column("height", int, "of the arrays"),
+    Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8"),
+    Column("shard", int, "number of the shard"),
+    Column("seed", int, "seed of the run"),
+    Column("stream_key", str, "key of the image's random streams, 16 hex digits"),
+    Column("camera", str, "convex, or the camera"),
+    Column("w_nexus_6p", float, "weight of this camera in the mix"),
+    Column("w_sony_a7r", float, "weight of this camera in the mix"),
+    Column("w_olympus_em10", float, "weight of this camera in the mix"),
+    Column("w_sony_rx100", float, "weight of this camera in the mix"),
+    *(Column(f"rgb2cam_{i}{j}", float, "linear sRGB to camera, row and column") for i in range(3) for j in range(3)),
+    Column("red_gain", float, "forward white-balance gain of red"),
+    Column("blue_gain", float, "forward white-balance gain of blue"),
+    Column("inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it"),
+    Column("tone", str, "tone curve that was inverted: smoothstep or none"),
+    Column("gamma", str, "gamma that was expanded: a number or srgb"),
+    Column("highlight", str, "per_channel, gray_mean or none"),
+    Column("highlight_threshold", float, "intensity above which highlights are kept"),
+    Column("pattern", str, "Bayer pattern of the top-left 2x2 sites"),
+    Column("bits", int, "of the sensor"),
+    Column("black_level_dn", int, "DN of no light"),
+    Column("white_level_dn", int, "DN of saturation"),
+    Column("sensor_clip", str, "how the noisy frame was clipped: sensor or black"),
+    Column("noise", str, "name of the noise profile"),
+    Column("a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2"),
+    Column("b_dn2", float, "noise variance at black, DN²"),
+    Column("effects", str, "what was simulated, in order, separated by ;"),
+    Column("skipped", str, "what was not, each with its reason, separated by ;"),
+    Column("accuracy", str, "the accuracy asked for"),
+    Column("methods", str, "how each stage was computed, separated by ;"),
+    Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes"),
+    Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes"),
+    Column("clean_clipped_low", int, "clean sites below black before clipping"),
+    Column("clean_clipped_high", int, "clean sites above white before clipping"),
+    Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping"),
+    Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping"),
+    Column("saturated", int, "clean sites at the white level"),
+    Column("zero_variance", int, "sites to which the noise law gives no variance"),
+)
+NAMES = tuple(column.name for column in COLUMNS)
+
+JSON_BYTES = 2560
+"""Room for a row without its source's name: the longest numbers in every column take 2,150 bytes."""
+
+
+def key_text(index: int) -> str:
+    """Return the key of a source: eight digits (more, should there be more than 10⁸ sources)."""
+    return f"{index:08d}"
+
+
+def ok_row(source: Source, sha256: str, orientation: int, shard: int, plan: Plan, pair: Pair, digests: tuple[str, str]) -> Row:
+    """Return the row of a pair; ``digests`` are the XXH3-128 of clean and noisy."""
+    height, width = pair.clean.shape
+    values: dict[str, Value] = {
+        "status": "ok",
+        "width": width,
+        "height": height,
+        "orientation": orientation,
+        "stream_key": f"{plan.stream_key:016x}",
+        "camera": plan.camera,
+        **dict(zip(_WEIGHTS, plan.weights, strict=True)),
+        **dict(zip(_MATRIX, plan.rgb2cam, strict=True)),
+        "red_gain": plan.red_gain,
+        "blue_gain": plan.blue_gain,
+        "inverse_rgb_gain": plan.inverse_rgb_gain,
+        "tone": plan.tone,
+        "gamma": gamma_text(plan.gamma),
+        "highlight": plan.highlight,
+        "highlight_threshold": plan.highlight_threshold,
+        "pattern": plan.pattern,
+        "bits": plan.bits,
+        "black_level_dn": plan.black_level_dn,
+        "white_level_dn": plan.white_level_dn,
+        "sensor_clip": plan.sensor_clip,
+        "noise": plan.noise,
+        "a_dn": plan.a_dn,
+        "b_dn2": plan.b_dn2,
+        "effects": ";".join(plan.effects),
+        "skipped": ";".join(plan.skipped),
+        "accuracy": plan.accuracy,
+        "methods": ";".join(plan.methods),
+        "clean_xxh3": digests[0],
+        "noisy_xxh3": digests[1],
+        "clean_clipped_low": pair.counts.clean_clipped_low,
+        "clean_clipped_high": pair.counts.clean_clipped_high,
+        "noisy_clipped_low": pair.counts.noisy_clipped_low,
+        "noisy_clipped_high": pair.counts.noisy_clipped_high,
+        "saturated": pair.counts.saturated,
+        "zero_variance": pair.counts.zero_variance,
+    }
+    return _row(source, sha256, shard, plan.seed, values)
+
+
+def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str) -> Row:
+    """Return the row of a photograph that could not be used; ``sha256`` is None where it could not even be read."""
+    return _row(source, sha256, shard, seed, {"status": "failed", "reason": reason})
+
+
+_WEIGHTS = tuple(name for name in NAMES if name.startswith("w_"))
+_MATRIX = tuple(name for name in NAMES if name.startswith("rgb2cam_"))
+
+
+def _row(source: Source, sha256: str | None, shard: int, seed: int, values: dict[str, Value]) -> Row:
+    known: dict[str, Value] = {
+        "key": key_text(source.index),
+        "source": source.name,
+        "source_sha256": sha256,
+        "source_bytes": source.size_bytes,
+        "shard": shard,
+        "seed": seed,
+    }
+    return {name: known.get(name, values.get(name)) for name in NAMES}
+
+
+def plan_of(row: Row) -> Plan:
+    """Return the plan that a row holds: replay needs the row and the source, nothing else.
+
+    Raises DamageError where a value is missing or of another type.
+    """
+    try:
+        w0, w1, w2, w3 = (_float(row, name) for name in _WEIGHTS)
+        return Plan(
+            seed=_int(row, "seed"),
+            stream_key=int(_str(row, "stream_key"), 16),
+            camera=_str(row, "camera"),
+            weights=(w0, w1, w2, w3),
+            rgb2cam=matrix([_float(row, name) for name in _MATRIX]),
+            red_gain=_float(row, "red_gain"),
+            blue_gain=_float(row, "blue_gain"),
+            inverse_rgb_gain=_float(row, "inverse_rgb_gain"),
+            tone=_str(row, "tone"),
+            gamma="srgb" if row["gamma"] == "srgb" else float(_str(row, "gamma")),
+            highlight=_str(row, "highlight"),
+            highlight_threshold=_float(row, "highlight_threshold"),
+            pattern=_str(row, "pattern"),
+            bits=_int(row, "bits"),
+            black_level_dn=_int(row, "black_level_dn"),
+            white_level_dn=_int(row, "white_level_dn"),
+            sensor_clip=_str(row, "sensor_clip"),
+            noise=_str(row, "noise"),
+            a_dn=_float(row, "a_dn"),
+            b_dn2=_float(row, "b_dn2"),
+            effects=_list(row, "effects"),
+            skipped=_list(row, "skipped"),
+            accuracy=_str(row, "accuracy"),
+            methods=_list(row, "methods"),
+        )
+    except (TypeError, ValueError) as error:
+        raise DamageError(f"row {row.get('key')}: not a plan ({error})") from error
+
+
+def _float(row: Row, name: str) -> float:
+    return float(_present(row, name))
+
+
+def _int(row: Row, name: str) -> int:
+    return int(_present(row, name))
+
+
+def _str(row: Row, name: str) -> str:
+    return str(_present(row, name))
+
+
+def _list(row: Row, name: str) -> tuple[str, ...]:
+    text = row.get(name)
+    return tuple(str(text).split(";")) if text else ()
+
+
+def _present(row: Row, name: str) -> str | int | float:
+    value = row.get(name)
+    if value is None:
+        raise ValueError(f"{name} is empty")
+    return value
+
+
+# ------------------------------------------------------------------------------------------------------------- CSV
+
+
+def write_rows(stream: TextIO, rows: Iterable[Row], header: bool = True) -> None:
+    """Write rows as CSV: ``\\n`` line ends, quotes only where needed, empty for None."""
+    writer = csv.writer(stream, lineterminator="\n")
+    if header:
+        writer.writerow(NAMES)
+    writer.writerows([_cell(row[name]) for name in NAMES] for row in rows)
+
+
+def csv_text(rows: Iterable[Row], header: bool = True) -> str:
+    """Return rows as CSV text."""
+    stream = io.StringIO(newline="")
+    write_rows(stream, rows, header)
+    return stream.getvalue()
+
+
+def _cell(value: Value) -> str:
+    return "" if value is None else repr(value) if isinstance(value, float) else str(value)
+
+
+def read_rows(path: Path) -> Iterator[Row]:
+    """Yield the typed rows of a manifest, one at a time; unknown columns are left out.
+
+    Raises DamageError where the file is not a manifest or a value does not fit its column.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            reader = csv.reader(stream, strict=True)
+            header = next(reader, [])
+            missing = [name for name in NAMES if name not in header]
+            if missing:
+                raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
+            for cells in reader:
+                yield _typed(dict(zip(header, cells, strict=True)))
+    except (csv.Error, ValueError, UnicodeDecodeError) as error:
+        raise DamageError(f"{path}: not a readable manifest ({error})") from error
+    except FileNotFoundError:
+        raise DamageError(f"{path}: no such manifest") from None
+
+
+def _typed(cells: Mapping[str, str]) -> Row:
+    return {column.name: column.type(cells[column.name]) if cells[column.name] else None for column in COLUMNS}
+
+
+# ------------------------------------------------------------------------------------------------------------ JSON
+
+
+def json_size(source_name: str) -> int:
+    """Return the bytes of a row's JSON in the shard, padding included: a function of the source's name alone."""
+    return -(-(JSON_BYTES + len(json.dumps(source_name))) // 512) * 512
+
+
+def row_json(row: Row) -> bytes:
+    """Return the row as typed JSON, padded with blanks to `json_size`."""
+    text = json.dumps(dict(row), separators=(",", ":")).encode("ascii")
+    size = json_size(str(row["source"]))
+    if len(text) >= size:
+        raise ValueError(f"row {row['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
+    return text.ljust(size - 1) + b"\n"

@@ -1,0 +1,43 @@
+"""The photographs of a run, wherever they come from: a folder, or the built-in scenes."""
+
+from __future__ import annotations
+
+import hashlib
+
+from unprocess_gen import decode, sources, synthetic
+from unprocess_gen.config import SourceConfig
+from unprocess_gen.errors import ConfigError, SourceError
+from unprocess_gen.records import Photograph, Source
+
+
+def list_photographs(config: SourceConfig) -> sources.Listing:
+    """Return every photograph of the run in source order, identical files numbered; reads no pixel.
+
+    Raises ConfigError where the folder is missing, cannot be read or holds nothing that ``include`` matches.
+    """
+    if config.root is None:
+        scenes = synthetic.listing(config.limit)
+        listed = tuple(Source(index, name, name, None) for index, name in enumerate(scenes))
+        return sources.Listing(listed, not_matched=0, skipped_links=0)
+    listing = sources.list_folder(config.root, config.include, config.recursive, config.limit)
+    numbered = sources.number_twins(config.root, listing.sources)
+    return sources.Listing(numbered, listing.not_matched, listing.skipped_links)
+
+
+def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
+    """Return the SHA-256 of a source's bytes (of a scene's pixels) and its decoded pixels.
+
+    Raises SourceError, with the digest as ``sha256`` where the bytes could be read; ConfigError where the file is not
+    the one that was listed.
+    """
+    if config.root is None:
+        pixels = synthetic.scene(source.path)
+        return hashlib.sha256(pixels).hexdigest(), Photograph(pixels, orientation=1)
+    content = sources.read_bytes(config.root, source)
+    digest = hashlib.sha256(content).hexdigest()
+    if source.sha256 not in (None, digest):
+        raise ConfigError(f"source {source.name} changed while the run was on; start again into another out")
+    try:
+        return digest, decode.decode(content, max_pixels=config.max_pixels, icc=config.icc)
+    except SourceError as error:
+        raise SourceError(error.reason, error.text, digest) from error

@@ -1,0 +1,60 @@
+"""A finished dataset, read back: `RawPairs`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from unprocess_gen.errors import DamageError
+from unprocess_gen.manifest import read_rows
+from unprocess_gen.records import Raw
+from unprocess_gen.shards import MEMBERS, Member, map_array, read_index, shard_name
+
+
+class Sample(NamedTuple):
+    """One pair of a dataset: uint16 mosaics ``[H, W]`` in DN, and its manifest row (column → value)."""
+
+    clean: Raw
+    noisy: Raw
+    row: dict[str, Any]
+
+
+class RawPairs:
+    """The pairs of a dataset, by number: a map-style dataset, for PyTorch's DataLoader as it is.
+
+    ``pairs[i]`` is a `Sample` with ``clean``, ``noisy`` and ``row``, in the order of the manifest, failed photographs
+    left out. Arrays are mapped from the shard (no copy, no unpacking); they are yours to write to, the file does not
+    change. Holds no open file, so it can be pickled, forked and shared between threads.
+
+    Raises DamageError where the dataset is not whole, IndexError for a number out of range.
+
+    >>> pairs = RawPairs("ds")                                      # doctest: +SKIP
+    >>> clean, noisy, row = pairs[0]                                # doctest: +SKIP
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.rows = [dict(row) for row in read_rows(self.path / "manifest.csv") if row["status"] == "ok"]
+        self._indexes: dict[int, dict[str, Member]] = {}
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Sample:
+        row = self.rows[number]
+        shard = int(row["shard"] or 0)
+        path = self.path / "shards" / shard_name(shard)
+        if shard not in self._indexes:
+            self._indexes[shard] = read_index(path)
+        clean, noisy = (self._array(path, shard, f"{row['key']}.{member}") for member in MEMBERS[:2])
+        return Sample(clean, noisy, dict(row))
+
+    def _array(self, path: Path, shard: int, name: str) -> Raw:
+        member = self._indexes[shard].get(name)
+        if member is None:
+            raise DamageError(f"{path}: member {name} is missing")
+        return map_array(path, member)

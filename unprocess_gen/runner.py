@@ -1,0 +1,261 @@
+"""Make a dataset: plan the shards, let workers make them, commit them in order, finish.
+
+A shard is the unit of work, retry and completion. Workers (loky processes, one shard a task) write aside and return
+rows; the coordinator commits in shard order, so the folder looks the same whatever finished first. Results come through
+joblib's ordered generator: at most two shards a worker wait for an earlier one. This is the only room that names
+joblib.
+
+A worker whose coordinator is gone ends within a second (`_end_with_parent`): otherwise loky would keep it, and its
+memory, for minutes. One that dies (out of memory, most likely) ends the run with exit code 5; committed shards stay.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, cpu_count, delayed
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+from tqdm import tqdm
+
+from unprocess_gen.config import Config, dataset_yaml, source_kind
+from unprocess_gen.errors import MachineError, SourceError
+from unprocess_gen.manifest import Row, failed_row, key_text, ok_row, row_json
+from unprocess_gen.pair import make_pair
+from unprocess_gen.photographs import list_photographs, load
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Source
+from unprocess_gen.shards import ShardWriter, array_xxh3, shard_name
+from unprocess_gen.workspace import Made, Workspace, machine_error
+
+PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "pillow", "xxhash")
+PARENT_POLL_S = 0.5
+PLAIN_LINE_S = 5.0
+"""Seconds between progress lines where there is no terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run came to: rows by status, how many were made just now, and where."""
+
+    out: Path
+    pairs: int
+    failed: dict[str, int]
+    shards: int
+    bytes: int
+    made: int
+    seconds: float
+
+    @property
+    def rows(self) -> int:
+        return self.pairs + sum(self.failed.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One shard's worth of work, as it travels to a worker."""
+
+    shard: int
+    sources: tuple[Source, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What every task of a run shares: the settings, where to write aside, and whose run it is."""
+
+    config: Config
+    tmp: str
+    coordinator_pid: int
+
+
+def generate(config: Config) -> Summary:
+    """Make, or go on making, the dataset that ``config`` describes; ``config`` has passed `config.check`.
+
+    Raises ConfigError, LockedError, DamageError and MachineError as `workspace.Workspace` does.
+    """
+    started = time.monotonic()
+    listing = list_photographs(config.source)
+    with Workspace(Path(config.out), dataset_yaml(config)) as workspace:
+        workspace.open()
+        if workspace.complete:
+            facts = workspace.check_complete(listing.sources)
+            return _summary(workspace.out, facts, made=0, started=started)
+        workspace.begin(listing.sources)
+        tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
+        done = set(workspace.committed(len(tasks)))
+        todo = [task for task in tasks if task.shard not in done]
+        n_jobs = effective_jobs(config.n_jobs, len(todo))
+        bench = Bench(config, str(workspace.tmp), os.getpid())
+        with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
+            for made in run_tasks(bench, todo, n_jobs):
+                workspace.commit(made)
+                progress.advance(made.rows)
+        seconds = time.monotonic() - started
+        failed = count_reasons(workspace.committed_rows(range(len(tasks))))
+        facts = workspace.finish(
+            len(tasks),
+            {
+                "pairs": len(listing.sources) - sum(failed.values()),
+                "failed": failed,
+                "not_matched": listing.not_matched,
+                "skipped_links": listing.skipped_links,
+                "source": {"kind": source_kind(config), "root": _absolute(config.source.root)},
+                "run": {"seconds": round(seconds, 3), "n_jobs": n_jobs, "shards_made": len(todo), **machine()},
+                "versions": {package: version(package) for package in PACKAGES},
+            },
+        )
+    return _summary(Path(config.out), facts, made=sum(len(task.sources) for task in todo), started=started)
+
+
+def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[Task]:
+    """Split the listing: shard s holds source indices [s·N, (s+1)·N)."""
+    starts = range(0, len(sources), pairs_per_shard)
+    return [Task(shard, tuple(sources[at : at + pairs_per_shard])) for shard, at in enumerate(starts)]
+
+
+def effective_jobs(n_jobs: int, tasks: int) -> int:
+    """Return how many workers to use: -1 stands for the cores this process may use, never more than tasks."""
+    return max(1, min(cpu_count() if n_jobs == -1 else n_jobs, tasks))
+
+
+def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
+    """Yield the shards in order as they are made; MachineError where a worker dies."""
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
+    try:
+        with closing(parallel(delayed(make_shard)(bench, task) for task in tasks)) as results:
+            yield from results
+    except TerminatedWorkerError as error:
+        raise MachineError(
+            "a worker process died, most likely out of memory; what is committed is kept, run again to go on, "
+            f"with fewer workers than n_jobs={n_jobs}"
+        ) from error
+
+
+# --------------------------------------------------------------------------------------------------- in the workers
+
+
+def make_shard(bench: Bench, task: Task) -> Made:
+    """Make one shard aside and return its rows; MachineError where the file cannot be written."""
+    _settle(bench.coordinator_pid)
+    path = Path(bench.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
+    try:
+        with ShardWriter(path) as writer:
+            rows = tuple(_make_row(bench.config, task.shard, source, writer) for source in task.sources)
+        if any(row["status"] == "ok" for row in rows):
+            return Made(task.shard, str(path), writer.bytes, writer.sha256, rows)
+        path.unlink()
+        return Made(task.shard, None, 0, None, rows)
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise machine_error(error, Path(bench.tmp)) from error
+
+
+def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -> Row:
+    try:
+        sha256, photograph = load(config.source, source)
+    except SourceError as error:
+        return failed_row(source, error.sha256, shard, config.seed, error.reason)
+    plan = plan_image(config, sha256, source.occurrence)
+    pair = make_pair(photograph.srgb, plan)
+    digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
+    row = ok_row(source, sha256, photograph.orientation, shard, plan, pair, digests)
+    writer.add(key_text(source.index), pair, row_json(row))
+    return row
+
+
+def _settle(coordinator_pid: int) -> None:
+    """Keep OpenCV to one thread, and a worker from outliving its coordinator."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
+        threading.Thread(target=_end_with_parent, args=(os.getppid(),), name=WATCHDOG, daemon=True).start()
+
+
+WATCHDOG = "unprocess_gen watchdog"
+
+
+def _end_with_parent(parent_pid: int) -> None:
+    while os.getppid() == parent_pid:
+        time.sleep(PARENT_POLL_S)
+    os._exit(1)
+
+
+# ------------------------------------------------------------------------------------------------------- reporting
+
+
+class Progress:
+    """A bar over pairs on a terminal, a plain line every few seconds elsewhere; both on stderr."""
+
+    def __init__(self, total: int, done: int) -> None:
+        self._failed = 0
+        self._total, self._done, self._first = total, done, done
+        self._started = self._last_line = time.monotonic()
+        terminal = sys.stderr.isatty()
+        self._bar = tqdm(total=total, initial=done, unit="pair", file=sys.stderr, disable=not terminal)
+        self._plain = not terminal
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def advance(self, rows: Iterable[Row]) -> None:
+        """Count the rows of a committed shard."""
+        statuses = [row["status"] for row in rows]
+        self._failed += statuses.count("failed")
+        self._done += len(statuses)
+        self._bar.set_postfix(failed=self._failed, refresh=False)
+        self._bar.update(len(statuses))
+        now = time.monotonic()
+        if self._plain and (now - self._last_line >= PLAIN_LINE_S or self._done == self._total):
+            self._last_line = now
+            rate = (self._done - self._first) / max(now - self._started, 1e-9)
+            left = (self._total - self._done) / rate
+            print(
+                f"gen-dataset: {self._done}/{self._total} pairs, {rate:.1f} pairs/s, {self._failed} failed, "
+                f"{left:.0f} s left",
+                file=sys.stderr,
+                flush=True,
+            )
+
+
+def count_reasons(rows: Iterable[Row]) -> dict[str, int]:
+    """Return how many rows failed, by reason."""
+    counts: dict[str, int] = {}
+    for row in rows:
+        if row["status"] != "ok":
+            reason = str(row["reason"])
+            counts[reason] = counts.get(reason, 0) + 1
+    return dict(sorted(counts.items()))
+
+
+def machine() -> dict[str, Any]:
+    """Return what this machine calls itself; for ``dataset.json``, which no byte of the data depends on."""
+    return {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
+
+
+def _absolute(root: str | None) -> str | None:
+    return None if root is None else os.path.abspath(root)
+
+
+def _summary(out: Path, facts: dict[str, Any], made: int, started: float) -> Summary:
+    return Summary(
+        out=out,
+        pairs=facts["pairs"],
+        failed=facts["failed"],
+        shards=len(facts["shards"]),
+        bytes=sum(entry["bytes"] for entry in facts["shards"]),
+        made=made,
+        seconds=time.monotonic() - started,
+    )

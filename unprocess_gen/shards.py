@@ -1,0 +1,164 @@
+"""Shards: uncompressed tar files in the WebDataset layout, whose bytes depend on nothing but their members.
+
+Members of one image stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 ``[H, W]``), ``KEY.json``. Headers
+are USTAR with time, owner and mode fixed. Writing goes straight from the arrays to the file while SHA-256 runs along
+(0.5 ns a byte together), reading maps just the bytes of one array into memory, found through an index of
+offsets that is read from the tar headers: nothing is ever unpacked.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import math
+import mmap
+import tarfile
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import xxhash
+
+from unprocess_gen.errors import DamageError
+from unprocess_gen.records import Pair, Raw
+
+RECORD = 512
+END = b"\0" * (2 * RECORD)
+MEMBERS = ("clean.npy", "noisy.npy", "json")
+
+
+def shard_name(number: int) -> str:
+    """Return a shard's file name."""
+    return f"shard-{number:05d}.tar"
+
+
+def array_xxh3(array: Raw) -> str:
+    """Return the XXH3-128 of an array's little-endian bytes, 32 hex digits."""
+    return xxhash.xxh3_128_hexdigest(_little_endian(array).data)
+
+
+def _little_endian(array: Raw) -> Raw:
+    return np.ascontiguousarray(array, dtype="<u2")
+
+
+def _npy_header(shape: tuple[int, ...]) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<u2", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def _padding(size: int) -> int:
+    return -size % RECORD
+
+
+def pair_bytes(width: int, height: int, json_bytes: int) -> int:
+    """Return the bytes that one pair takes in its shard, tar framing included."""
+    array = len(_npy_header((height, width))) + 2 * width * height
+    return sum(RECORD + size + _padding(size) for size in (array, array, json_bytes))
+
+
+def shard_bytes(pairs: list[int]) -> int:
+    """Return the size of a shard from those of its pairs; no pair, no file."""
+    return sum(pairs) + len(END) if pairs else 0
+
+
+class ShardWriter:
+    """Write one shard to ``path``, which must not exist; its size and SHA-256 are known on leaving.
+
+    Raises OSError as the file system does; the caller owns the file and what becomes of it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file: BinaryIO = path.open("xb", buffering=0)
+        self._hash = hashlib.sha256()
+        self.bytes = 0
+
+    def __enter__(self) -> ShardWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        try:
+            if kind is None:
+                self._write(END)
+        finally:
+            self._file.close()
+
+    @property
+    def sha256(self) -> str:
+        return self._hash.hexdigest()
+
+    def add(self, key: str, pair: Pair, row_json: bytes) -> None:
+        """Append the three members of one image."""
+        for name, array in zip(MEMBERS, (pair.clean, pair.noisy), strict=False):
+            header = _npy_header(array.shape)
+            self._member(f"{key}.{name}", len(header) + array.nbytes, header, _little_endian(array).data)
+        self._member(f"{key}.{MEMBERS[2]}", len(row_json), row_json)
+
+    def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
+        info = tarfile.TarInfo(name)
+        info.size = size
+        for part in (info.tobuf(format=tarfile.USTAR_FORMAT), *parts, b"\0" * _padding(size)):
+            self._write(part)
+
+    def _write(self, content: bytes | memoryview) -> None:
+        view = memoryview(content).cast("B")
+        self._hash.update(view)
+        self.bytes += len(view)
+        while view:
+            written = self._file.write(view)
+            if not written:
+                raise OSError(errno.EIO, "the file takes no more bytes", self._file.name)
+            view = view[written:]
+
+
+# --------------------------------------------------------------------------------------------------------- reading
+
+
+class Member(NamedTuple):
+    """Where the bytes of one tar member lie."""
+
+    offset: int
+    size: int
+
+
+def read_index(path: Path) -> dict[str, Member]:
+    """Return name → place of every member of a shard, from its headers; DamageError where it is not a whole tar."""
+    index: dict[str, Member] = {}
+    try:
+        with path.open("rb") as stream:
+            while (header := stream.read(RECORD)) != END[:RECORD]:
+                info = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
+                index[info.name] = Member(stream.tell(), info.size)
+                stream.seek(info.size + _padding(info.size), io.SEEK_CUR)
+    except (tarfile.HeaderError, FileNotFoundError) as error:
+        raise DamageError(f"{path}: not a whole shard ({error})") from error
+    return index
+
+
+def map_array(path: Path, member: Member) -> Raw:
+    """Return an array that lies in the file: mapped, not copied, and private, so that writing to it is harmless."""
+    start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
+    with path.open("rb") as stream:
+        end = member.offset + member.size
+        mapped = mmap.mmap(stream.fileno(), end - start, access=mmap.ACCESS_COPY, offset=start)
+    head = io.BytesIO(mapped[member.offset - start : member.offset - start + 128])
+    try:
+        version = np.lib.format.read_magic(head)
+        if version != (1, 0):
+            raise ValueError(f"version {version} of the npy format")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(head)
+        if dtype != np.dtype("<u2") or head.tell() + 2 * math.prod(shape) != member.size:
+            raise ValueError(f"{dtype} {shape} in {member.size} bytes")
+    except ValueError as error:
+        raise DamageError(f"{path}: the member at byte {member.offset} is not an array ({error})") from error
+    return np.ndarray(shape, dtype, mapped, member.offset - start + head.tell())
+
+
+def read_json(path: Path, member: Member) -> dict[str, Any]:
+    """Return the row that stands beside a pair."""
+    with path.open("rb") as stream:
+        stream.seek(member.offset)
+        return dict(json.loads(stream.read(member.size)))
