@@ -63,8 +63,8 @@ SEVERITY = (0, 3, 11, 4, 2, 5, 1)
 """Exit codes from good to bad: a sweep ends with the worst of its jobs."""
 
 HYDRA_FLAGS = re.compile(
-    r"--hydra-help|--version|--(cfg|resolve|package|run|multirun|shell-completion|config-path|config-name|config-dir|info)(=.*)?"
-    r"|--experimental-rerun(=.*)?|-(c|p|r|m|sc|cp|cn|cd|i)(=.*)?"
+    "--(hydra-help|resolve|run|multirun|shell-completion)|-(r|m|sc)"
+    "|(--(cfg|package|config-path|config-name|config-dir|info|experimental-rerun)|-(c|p|cp|cn|cd|i))(=.*)?"
 )
 SWEEP_FLAGS = ("-m", "--multirun")
 
@@ -90,10 +90,10 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-def _report(error: BaseException) -> int:
-    """Say what went wrong, in one line where it is not a bug; return the exit code."""
+def _report(error: BaseException, job: str = "") -> int:
+    """Say what went wrong (in which ``job`` of a sweep), in one line where it is not a bug; return the exit code."""
     if isinstance(error, UnprocessGenError):
-        print(f"gen-dataset: {error}", file=sys.stderr)
+        print(f"gen-dataset: {job}{error}", file=sys.stderr)
         return error.exit_code
     traceback.print_exception(error)
     return 1
@@ -109,7 +109,7 @@ def run(arguments: Sequence[str]) -> int:
         return 0
     if arguments and re.fullmatch("[a-z]+", arguments[0]):
         if arguments[0] not in VERBS:
-            raise ConfigError(f"{arguments[0]}: no such verb; expected one of {', '.join(VERBS)}, or settings key=value")
+            raise ConfigError(f"{arguments[0]}: no such verb; expected {', '.join(VERBS)} or settings key=value")
         return VERBS[arguments[0]](list(arguments[1:]))
     return generate(list(arguments))
 
@@ -254,7 +254,8 @@ def compose(arguments: list[str], task: Task) -> int:
     def on_config(node: DictConfig) -> None:
         hydra_config = HydraConfig.get()
         try:
-            config = OmegaConf.to_object(node)
+            settings = OmegaConf.to_container(node, resolve=True)
+            config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), settings))
             assert isinstance(config, Config)
             if hydra_config.mode == RunMode.MULTIRUN:
                 jobs.append(_sweep_job(config, hydra_config.job.override_dirname, task))
@@ -294,8 +295,7 @@ def _sweep_job(config: Config, overrides: str, task: Task) -> Job:
         check(config)
         code, summary = task(config)
     except Exception as error:
-        print(f"gen-dataset: in {folder}:", file=sys.stderr)
-        return Job(folder, overrides, None, None, _report(error))
+        return Job(folder, overrides, None, None, _report(error, f"{folder}: "))
     if summary is None:
         return Job(folder, overrides, None, None, code)
     return Job(folder, overrides, summary.rows, sum(summary.failed.values()), code)
@@ -326,6 +326,8 @@ def _refuse_unknown_flags(arguments: Sequence[str]) -> None:
     for argument in arguments:
         if argument.startswith("-") and not HYDRA_FLAGS.fullmatch(argument):
             raise ConfigError(f"{argument}: no such flag; see gen-dataset --help")
+        if argument.startswith("~"):
+            raise ConfigError(f"{argument}: a setting cannot be taken away; choose another value or option")
 
 
 # --------------------------------------------------------------------------------------- Hydra's errors, in one line
@@ -343,7 +345,7 @@ def _explain(error: BaseException, arguments: Sequence[str]) -> str:
         chain.append(link)
         link = link.__cause__ or link.__context__
     text = " ".join(one_line(link) for link in chain)
-    option = re.search(r"Could not find '([^']+)/([^'/]+)'.*?Available options in '[^']+': ((?:[\w-]+ ?)+)", text)
+    option = re.search(r"Could not find '([^']+)/([^'/]*)'\s+Available options in '[^']+':((?:\n\t\S+)+)", str(error))
     if option:
         return f"{option[1]}={option[2]}: no such option; expected one of {', '.join(option[3].split())}"
     unknown = re.search(r"Could not (?:override|append to config|delete from config)[^']*'([\w.@/]+)'", text)

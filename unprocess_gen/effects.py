@@ -30,12 +30,12 @@ def normals(uniforms: Words) -> Float:
     row = normal_table()[((exponent - 1) * SEGMENTS + segment.astype(np.int32))]
     t = (position - segment) / SEGMENTS
     z = row[..., 0] + t * (row[..., 1] + t * row[..., 2])
-    return np.where(uniforms >> np.uint32(31), -z, z)
+    return np.asarray(np.where(uniforms >> np.uint32(31), -z, z))
 
 
 def noise_variance(clean_dn: Float, plan: Plan) -> Float:
     """Return max(0, a·(x - black) + b) in DN², ``[H, W]``, of the unrounded clean frame x."""
-    return np.maximum(plan.a_dn * (clean_dn - plan.black_level_dn) + plan.b_dn2, 0)
+    return np.asarray(np.maximum(plan.a_dn * (clean_dn - plan.black_level_dn) + plan.b_dn2, 0))
 
 
 def heteroscedastic(clean_dn: Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:

@@ -20,11 +20,10 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     """Make the clean and the noisy frame of a photograph, as planned.
 
     Pure: the same pixels and plan give the same pair on any machine, worker, engine and in any order. ``srgb`` is uint8
-    or uint16 ``[H, W, 3]``. A cut-out whose top-left pixel is ``origin`` in the full frame gives the cut-out of the full
-    pair, single pixels included. Raises ValueError for other types and shapes.
+    or uint16 ``[H, W, 3]``. A cut-out whose top-left pixel is ``origin`` in the full frame gives the same cut-out of
+    the full pair, single pixels included. Raises ValueError for other types and shapes.
     """
-    if srgb.dtype not in (np.uint8, np.uint16) or srgb.ndim != 3 or srgb.shape[2] != 3:
-        raise ValueError(f"srgb is {srgb.dtype} {list(srgb.shape)}, expected uint8 or uint16 [H, W, 3]")
+    _check(srgb)
     curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
     return fused.make_pair(srgb, plan, curve, normal_table(), limits_dn, origin)
@@ -32,6 +31,7 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
 
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     """Make the same pair by the readable forms: Algorithm 1, the noise, the sensor's rounding."""
+    _check(srgb)
     light = unprocess(srgb, plan, origin)
     clean_dn = to_dn(light, plan.black_level_dn, plan.white_level_dn)
     noisy_dn = heteroscedastic(clean_dn, plan, origin)
@@ -49,3 +49,8 @@ def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> 
         zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
     )
     return Pair(clean, noisy, counts)
+
+
+def _check(srgb: Srgb) -> None:
+    if srgb.dtype not in (np.uint8, np.uint16) or srgb.ndim != 3 or srgb.shape[2] != 3:
+        raise ValueError(f"srgb is {srgb.dtype} {list(srgb.shape)}, expected uint8 or uint16 [H, W, 3]")

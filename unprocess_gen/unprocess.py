@@ -19,37 +19,31 @@ from unprocess_gen.records import Float, Plan, Srgb
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
     """Return the clean mosaic before clipping, ``[H, W]`` float64 with 0 at black and 1 at white.
 
-    ``srgb`` is uint8 or uint16 ``[H, W, 3]``; ``origin`` places a cut-out in the full frame, for the Bayer phase.
+    ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535; ``origin`` places a cut-out in the
+    full frame, for the Bayer phase.
     """
-    image = normalise(srgb)
-    image = TONES[plan.tone](image)
+    white = float(np.iinfo(srgb.dtype).max)
+    image = TONES[plan.tone](srgb / white, (white - srgb) / white)
     image = expand_gamma(image, plan.gamma)
     image = apply_ccm(image, plan.rgb2cam)
     image = invert_gains(image, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
     return mosaic(image, plan.pattern, origin)
 
 
-def normalise(srgb: Srgb) -> Float:
-    """Map codes to [0, 1]: k / 255 for uint8, k / 65535 for uint16. ValueError for any other type or shape."""
-    if srgb.dtype not in (np.uint8, np.uint16) or srgb.ndim != 3 or srgb.shape[2] != 3:
-        raise ValueError(f"srgb is {srgb.dtype} {list(srgb.shape)}, expected uint8 or uint16 [H, W, 3]")
-    return np.asarray(srgb / float(np.iinfo(srgb.dtype).max))
-
-
-def inverse_smoothstep(x: Float) -> Float:
-    """Invert the tone curve y ↦ 3y² - 2y³; x and the result in [0, 1], any shape.
+def inverse_smoothstep(x: Float, rest: Float) -> Float:
+    """Invert the tone curve y ↦ 3y² - 2y³; x, ``rest`` = 1 - x and the result in [0, 1], any shape.
 
     The article writes ½ - sin(asin(1 - 2x) / 3), which loses every digit near black. The same function without a
-    subtraction, for x up to ½, is sin t · (√3 cos t + sin t) with t = asin(√x) / 3; above ½ it is mirrored, and
-    1 - x is exact there. Within 5 units in the last place of the true value on the 8- and 16-bit grids.
+    subtraction, for x up to ½, is sin t · (√3 cos t + sin t) with t = asin(√x) / 3; above ½ it is mirrored. White is
+    steep, so the distance from it is passed in, computed from the integer codes: (N - k) / N has no rounding of k / N
+    in it. Within 5 units in the last place of the true value on the 8- and 16-bit grids.
     """
-    dark = np.minimum(x, 1 - x)
-    t = np.arcsin(np.sqrt(dark)) / 3
+    t = np.arcsin(np.sqrt(np.minimum(x, rest))) / 3
     y = np.sin(t) * (np.sqrt(3) * np.cos(t) + np.sin(t))
-    return np.where(x > 0.5, 1 - y, y)
+    return np.asarray(np.where(x > 0.5, 1 - y, y))
 
 
-def no_tone(x: Float) -> Float:
+def no_tone(x: Float, rest: Float) -> Float:
     """Leave the image as it is: no tone curve was applied."""
     return x
 
@@ -81,7 +75,8 @@ def invert_gains(
     ``highlight`` says what happens to intensities above ``threshold`` (in [0, 1)) where the gain is below 1; see
     `HIGHLIGHTS`.
     """
-    return HIGHLIGHTS[highlight](camera_rgb, np.array(inverse_gains), threshold)
+    invert = HIGHLIGHTS[highlight]
+    return invert(camera_rgb, np.array(inverse_gains), threshold)
 
 
 def invert_gains_per_channel(i: Float, k: Float, threshold: float) -> Float:

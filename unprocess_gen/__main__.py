@@ -1,0 +1,7 @@
+"""``python -m unprocess_gen`` is ``gen-dataset``."""
+
+import sys
+
+from unprocess_gen.cli import main
+
+sys.exit(main())
