@@ -15,6 +15,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Optional
 
@@ -29,6 +30,8 @@ from unprocess_gen.records import Law
 
 @dataclass
 class SourceConfig:
+    """Where the photographs come from; ``root`` null stands for the built-in scenes."""
+
     root: Optional[str] = None
     include: list[str] = field(default_factory=list)
     recursive: bool = True
@@ -40,6 +43,8 @@ class SourceConfig:
 
 @dataclass
 class CameraConfig:
+    """Which camera saw the scene: ``law`` is one of `CAMERA_LAWS`; ``xyz2cam`` row by row, for ``custom`` alone."""
+
     name: str = "convex"
     law: str = "convex"
     xyz2cam: Optional[list[float]] = None
@@ -47,6 +52,8 @@ class CameraConfig:
 
 @dataclass
 class GainsConfig:
+    """Forward gains of red and blue, the inverse brightening gain (numbers or laws), and what highlights do."""
+
     red: Any = None
     blue: Any = None
     inverse_rgb: Any = None
@@ -56,12 +63,16 @@ class GainsConfig:
 
 @dataclass
 class IspConfig:
+    """The tone curve and gamma (a power, or srgb) that the camera's processing applied after the matrix."""
+
     tone: str = "smoothstep"
     gamma: Any = 2.2
 
 
 @dataclass
 class SensorConfig:
+    """Bits, levels (DN), Bayer pattern, and how noisy frames are clipped."""
+
     bits: int = 12
     black_level_dn: int = 240
     white_level_dn: int = 4095
@@ -71,6 +82,8 @@ class SensorConfig:
 
 @dataclass
 class NoiseConfig:
+    """Variance a·x + b (numbers or laws) in ``units``, with the levels (DN) it was calibrated at."""
+
     name: str = "none"
     units: Optional[str] = None
     black: Optional[str] = None
@@ -84,6 +97,8 @@ class NoiseConfig:
 
 @dataclass
 class OutputConfig:
+    """What the dataset is written as."""
+
     layout: str = "webdataset"
     pairs_per_shard: int = 8
 
@@ -234,6 +249,8 @@ def _check_source(source: SourceConfig) -> None:
     _in_range("source.max_pixels", source.max_pixels, 1, 2**40)
     _in_range("source.max_failed", source.max_failed, 0, 10**9)
     _one_of("source.icc", source.icc, ("ignore", "refuse"))
+    if source.icc == "refuse" and find_spec("PIL") is None:
+        raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install 'unprocess_gen[icc]'")
 
 
 def _check_camera(camera: CameraConfig) -> None:

@@ -32,7 +32,7 @@ def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
     """
     if config.root is None:
         pixels = synthetic.scene(source.path)
-        return hashlib.sha256(pixels).hexdigest(), Photograph(pixels, orientation=1)
+        return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)
     content = sources.read_bytes(config.root, source)
     digest = hashlib.sha256(content).hexdigest()
     if source.sha256 not in (None, digest):

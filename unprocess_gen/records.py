@@ -46,8 +46,8 @@ class Plan:
 
     Drawn once (`plan.plan_image`) or read back from a row (`manifest.plan_of`). ``weights`` are those of the mixed
     cameras in the order of `colour.CAMERAS`; ``rgb2cam`` is row-major and its rows sum to 1; ``red_gain`` and
-    ``blue_gain`` are forward gains, ``inverse_rgb_gain`` an inverse one; ``a_dn`` and ``b_dn2`` are the noise variance's
-    slope (DN) and intercept (DN²) above black; ``stream_key`` is the key of the image's random streams.
+    ``blue_gain`` are forward gains, ``inverse_rgb_gain`` an inverse one; ``a_dn`` (DN) and ``b_dn2`` (DN²) are slope
+    and intercept of the noise variance above black; ``stream_key`` is the key of the image's random streams.
     """
 
     seed: int

@@ -37,7 +37,7 @@ from unprocess_gen.records import Source
 from unprocess_gen.shards import ShardWriter, array_xxh3, shard_name
 from unprocess_gen.workspace import Made, Workspace, machine_error
 
-PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "pillow", "xxhash")
+PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
 PARENT_POLL_S = 0.5
 PLAIN_LINE_S = 5.0
 """Seconds between progress lines where there is no terminal."""
@@ -57,6 +57,7 @@ class Summary:
 
     @property
     def rows(self) -> int:
+        """Pairs and failures together."""
         return self.pairs + sum(self.failed.values())
 
 

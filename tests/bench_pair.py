@@ -1,0 +1,96 @@
+"""How fast a pair is made, as a ratio: the fast form and a yardstick in turns, in one process, one thread.
+
+    python tests/bench_pair.py PHOTO [PHOTO ...] [--yardstick naive.py] [--rounds 5]
+
+Prints, for each photograph, nanoseconds a pixel of both (medians) and the median of the ratios round by round. The
+yardstick is `algorithm1` beside this file, or any module with the functions unprocess(rgb, dtype), add_noise(raw) and
+to_dn(raw).
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import algorithm1
+
+from unprocess_gen.config import Config, GainsConfig, NoiseConfig
+from unprocess_gen.decode import decode
+from unprocess_gen.manifest import ok_row
+from unprocess_gen.pair import make_pair
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Plan, Source
+
+
+def fixed_plan() -> Plan:
+    noise = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
+    return plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise), "0" * 64)
+
+
+def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
+    tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
+    values = ok_row(Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""))
+    row = {name: str(value) for name, value in values.items()}
+    rng = np.random.default_rng(0)
+
+    def pair(rgb: np.ndarray) -> object:
+        raw = algorithm1.unprocess(rgb, row)
+        return algorithm1.to_dn(raw, 4095), algorithm1.to_dn(algorithm1.add_noise(raw, row, rng), 4095)
+
+    return pair
+
+
+def other_yardstick(path: str) -> Callable[[np.ndarray], object]:
+    spec = importlib.util.spec_from_file_location("yardstick", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def pair(rgb: np.ndarray) -> object:
+        raw = module.unprocess(rgb, np.float64)
+        return module.to_dn(raw), module.to_dn(module.add_noise(raw))
+
+    return pair
+
+
+def seconds(call: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    call()
+    return time.perf_counter() - started
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", nargs="+")
+    parser.add_argument("--yardstick")
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    cv2.setNumThreads(1)
+    plan = fixed_plan()
+    naive = other_yardstick(options.yardstick) if options.yardstick else own_yardstick(plan)
+    ratios = []
+    for photo in options.photos:
+        rgb = decode(Path(photo).read_bytes(), max_pixels=2**26, icc="ignore").srgb
+        make_pair(rgb, plan)
+        rounds = [
+            (seconds(lambda: naive(rgb)), seconds(lambda: make_pair(rgb, plan)))  # noqa: B023
+            for _ in range(options.rounds)
+        ]
+        ours, theirs = (statistics.median(column) for column in zip(*((b, a) for a, b in rounds), strict=True))
+        ratios.append(statistics.median(a / b for a, b in rounds))
+        scale = 1e9 / (rgb.shape[0] * rgb.shape[1])
+        print(f"{Path(photo).name}: {theirs * scale:.0f} and {ours * scale:.2f} ns a pixel, ratio {ratios[-1]:.1f}")
+    print(f"median ratio {statistics.median(ratios):.1f}, lowest {min(ratios):.1f}")
+
+
+if __name__ == "__main__":
+    main()

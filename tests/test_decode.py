@@ -1,0 +1,661 @@
+"""Decoding and its policy: exact pixels where a photograph is taken, a reason where it is not, and nothing in between.
+
+Every file is made here, by Pillow, tifffile, OpenCV or by hand; Pillow's reading of a header is a second opinion.
+"""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+import time
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image, ImageCms
+
+from unprocess_gen.decode import CV2_MAX_PIXELS, Header, decode, probe
+from unprocess_gen.errors import SourceError
+
+SIZES = [(1, 1), (1, 9), (9, 1), (2, 2), (7, 13), (40, 61)]
+
+
+def smooth(height: int = 40, width: int = 61, seed: int = 0) -> np.ndarray:
+    """A soft, asymmetric picture, uint8 [H, W, 3]: what JPEG can hold."""
+    rows, columns = np.mgrid[:height, :width]
+    wave = np.stack([3 * rows + columns, 2 * columns + rows + 40, rows * columns // 16 + seed], -1)
+    return (np.abs(wave % 400 - 200) + 30).astype(np.uint8)
+
+
+def noise(height: int, width: int, dtype: Any = np.uint8, channels: int = 3) -> np.ndarray:
+    generator = np.random.default_rng(height * 1000 + width)
+    return generator.integers(0, np.iinfo(dtype).max, (height, width, channels), dtype, endpoint=True)
+
+
+def pillow(pixels: np.ndarray | Image.Image, kind: str, **options: Any) -> bytes:
+    file = io.BytesIO()
+    image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
+    image.save(file, kind, **options)
+    return file.getvalue()
+
+
+def tiff(pixels: np.ndarray, photometric: str = "rgb", **options: Any) -> bytes:
+    file = io.BytesIO()
+    tifffile.imwrite(file, pixels, photometric=photometric, **options)
+    return file.getvalue()
+
+
+def retagged(data: bytes, values: dict[int, int]) -> bytes:
+    """A little-endian TIFF with other numbers in tags that hold one number."""
+    edited = bytearray(data)
+    (first,) = struct.unpack_from("<I", data, 4)
+    (entries,) = struct.unpack_from("<H", data, first)
+    for at in range(first + 2, first + 2 + 12 * entries, 12):
+        (tag,) = struct.unpack_from("<H", data, at)
+        if tag in values:
+            struct.pack_into("<HII", edited, at + 2, 4, 1, values[tag])
+    return bytes(edited)
+
+
+def chunk(kind: bytes, payload: bytes = b"") -> bytes:
+    return struct.pack(">I", len(payload)) + kind + payload + struct.pack(">I", zlib.crc32(kind + payload))
+
+
+def png(
+    width: int, bits: int, colour: int, row: bytes, before: bytes = b"", after: bytes = b"", height: int = 1
+) -> bytes:
+    """A PNG of equal rows, with chunks before and after the pixels."""
+    head = chunk(b"IHDR", struct.pack(">IIBB3x", width, height, bits, colour))
+    pixels = chunk(b"IDAT", zlib.compress((b"\0" + row) * height))
+    return b"\x89PNG\r\n\x1a\n" + head + before + pixels + after + chunk(b"IEND")
+
+
+def bmp(width: int, height: int, bits: int, pixels: bytes, masks: tuple[int, ...] = (), palette: bytes = b"") -> bytes:
+    """A BMP with the 108-byte header where there are masks, and the 40-byte one where there are none."""
+    size = 108 if masks else 40
+    extra = struct.pack(f"<{len(masks)}I", *masks).ljust(size - 40, b"\0") + palette
+    offset = 54 + len(extra)
+    compression = 3 if masks else 0
+    info = struct.pack(
+        "<IiiHHIIiiII", size, width, height, 1, bits, compression, len(pixels), 0, 0, len(palette) // 4, 0
+    )
+    return struct.pack("<2sIHHI", b"BM", offset + len(pixels), 0, 0, offset) + info + extra + pixels
+
+
+def exif(orientation: int, order: str = "<", kind: int = 3) -> bytes:
+    """An EXIF block with the orientation only."""
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    value = struct.pack(order + ("H2x" if kind == 3 else "I"), orientation)
+    return b"Exif\0\0" + mark + struct.pack(order + "IHHHI", 8, 1, 274, kind, 1) + value + bytes(4)
+
+
+def pixels_of(data: bytes, *, max_pixels: int = 2**26, icc: str = "ignore") -> np.ndarray:
+    return decode(data, max_pixels=max_pixels, icc=icc).srgb
+
+
+def reason_of(data: bytes, *, max_pixels: int = 2**26, icc: str = "ignore") -> str:
+    with pytest.raises(SourceError) as caught:
+        decode(data, max_pixels=max_pixels, icc=icc)
+    return caught.value.reason
+
+
+# Pixels are exact -----------------------------------------------------------------------------------------------------
+
+LOSSLESS: dict[str, Callable[[np.ndarray], bytes]] = {
+    "png": lambda pixels: pillow(pixels, "PNG"),
+    "webp": lambda pixels: pillow(pixels, "WEBP", lossless=True),
+    "bmp": lambda pixels: pillow(pixels, "BMP"),
+    "tiff": lambda pixels: tiff(pixels),
+    "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
+    "tiff, BigTIFF": lambda pixels: tiff(pixels, bigtiff=True),
+    "tiff, deflated": lambda pixels: tiff(pixels, compression="zlib", predictor=True),
+    "tiff, LZW": lambda pixels: pillow(pixels, "TIFF", compression="tiff_lzw"),
+    "tiff, PackBits": lambda pixels: pillow(pixels, "TIFF", compression="packbits"),
+    "tiff, tiles": lambda pixels: tiff(pixels, tile=(32, 32)),
+    "tiff, strips": lambda pixels: tiff(pixels, rowsperstrip=2),
+    "tiff, planes": lambda pixels: tiff(np.moveaxis(pixels, -1, 0).copy(), planarconfig="separate"),
+}
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("kind", LOSSLESS)
+def test_lossless_pixels_are_exact(kind: str, size: tuple[int, int]) -> None:
+    stored = noise(*size)
+    np.testing.assert_array_equal(pixels_of(LOSSLESS[kind](stored)), stored, strict=True)
+
+
+DEEP: dict[str, Callable[[np.ndarray], bytes]] = {
+    "png": lambda pixels: cv2.imencode(".png", pixels[..., ::-1])[1].tobytes(),
+    "tiff": lambda pixels: tiff(pixels),
+    "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
+    "tiff, BigTIFF": lambda pixels: tiff(pixels, bigtiff=True),
+    "tiff, deflated": lambda pixels: tiff(pixels, compression="zlib", predictor=True),
+    "tiff, LZW": lambda pixels: cv2.imencode(".tif", pixels[..., ::-1])[1].tobytes(),
+    "tiff, tiles": lambda pixels: tiff(pixels, tile=(16, 16)),
+}
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("kind", DEEP)
+def test_16_bit_pixels_are_exact(kind: str, size: tuple[int, int]) -> None:
+    stored = noise(*size, np.uint16)
+    np.testing.assert_array_equal(pixels_of(DEEP[kind](stored)), stored, strict=True)
+
+
+DEEP_GRAY: dict[str, Callable[[np.ndarray], bytes]] = {
+    "png": lambda pixels: cv2.imencode(".png", pixels)[1].tobytes(),
+    "tiff": lambda pixels: tiff(pixels, "minisblack"),
+    "tiff, white is zero": lambda pixels: tiff(65535 - pixels, "miniswhite"),
+}
+
+
+@pytest.mark.parametrize("kind", DEEP_GRAY)
+def test_16_bit_gray_becomes_three_equal_channels(kind: str) -> None:
+    stored = noise(7, 13, np.uint16, 1)
+    np.testing.assert_array_equal(pixels_of(DEEP_GRAY[kind](stored[..., 0])), np.repeat(stored, 3, 2), strict=True)
+
+
+GRAY: dict[str, Callable[[np.ndarray], bytes]] = {
+    "png": lambda pixels: pillow(pixels, "PNG"),
+    "bmp": lambda pixels: pillow(pixels, "BMP"),
+    "tiff": lambda pixels: tiff(pixels, "minisblack"),
+    "tiff, white is zero": lambda pixels: tiff(255 - pixels, "miniswhite"),
+    "jpeg": lambda pixels: pillow(np.full_like(pixels, 77), "JPEG", quality=100),
+}
+
+
+@pytest.mark.parametrize("kind", GRAY)
+def test_gray_becomes_three_equal_channels(kind: str) -> None:
+    stored = np.full((8, 8), 77, np.uint8) if kind == "jpeg" else noise(7, 13, channels=1)[..., 0]
+    np.testing.assert_array_equal(pixels_of(GRAY[kind](stored)), np.repeat(stored[..., None], 3, 2), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("bits", "row", "grays"),
+    [(1, b"\x50", [0, 255, 0, 255]), (2, b"\x1b", [0, 85, 170, 255]), (4, b"\x05\xaf", [0, 85, 170, 255])],
+)
+def test_few_bits_of_gray_are_spread_over_the_whole_range(bits: int, row: bytes, grays: list[int]) -> None:
+    assert pixels_of(png(4, bits, 0, row))[0, :, 0].tolist() == grays
+
+
+def test_bilevel_tiff_is_black_and_white() -> None:
+    stored = noise(5, 19, channels=1)[..., 0] > 100
+    np.testing.assert_array_equal(pixels_of(tiff(stored, "minisblack"))[..., 1], stored * np.uint8(255))
+
+
+PALETTES: dict[str, Callable[[Image.Image], bytes]] = {
+    "png": lambda image: pillow(image, "PNG"),
+    "bmp": lambda image: pillow(image, "BMP"),
+    "tiff": lambda image: pillow(image, "TIFF"),
+    "png, 2 bits": lambda image: pillow(image, "PNG", bits=2),
+}
+
+
+@pytest.mark.parametrize("kind", PALETTES)
+def test_palettes_become_rgb(kind: str) -> None:
+    image = Image.fromarray(smooth()).quantize(4)
+    np.testing.assert_array_equal(pixels_of(PALETTES[kind](image)), np.asarray(image.convert("RGB")), strict=True)
+
+
+@pytest.mark.parametrize("progressive", [False, True], ids=["baseline", "progressive"])
+@pytest.mark.parametrize("subsampling", [0, 1, 2], ids=["444", "422", "420"])
+@pytest.mark.parametrize("size", SIZES)
+def test_jpeg_pixels_are_those_opencv_decodes_by_default(
+    size: tuple[int, int], subsampling: int, progressive: bool
+) -> None:
+    data = pillow(smooth(*size), "JPEG", subsampling=subsampling, progressive=progressive)
+    by_default = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(pixels_of(data), by_default[..., ::-1], strict=True)
+
+
+def test_lossy_webp_is_read_in_rgb_order() -> None:
+    difference = pixels_of(pillow(smooth(), "WEBP", quality=95)).astype(int) - smooth()
+    assert np.abs(difference).mean() < 8
+
+
+def test_jpeg_inside_tiff_is_read_in_rgb_order() -> None:
+    difference = pixels_of(pillow(smooth(), "TIFF", compression="jpeg", quality=95)).astype(int) - smooth()
+    assert np.abs(difference).mean() < 8
+
+
+@pytest.mark.parametrize("data", [pillow(smooth(), "JPEG", exif=exif(6)), tiff(noise(4, 5, np.uint16))])
+def test_the_array_is_contiguous(data: bytes) -> None:
+    assert pixels_of(data).flags.c_contiguous
+
+
+def test_a_bmp_stored_top_down_is_upright() -> None:
+    assert pixels_of(bmp(1, -2, 24, b"\3\2\1\0\6\5\4\0")).tolist() == [[[1, 2, 3]], [[4, 5, 6]]]
+
+
+# Orientation ----------------------------------------------------------------------------------------------------------
+
+# What the EXIF standard says of tag 274: where the stored first row and first column lie in the upright picture.
+UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda stored: stored,
+    2: np.fliplr,
+    3: lambda stored: np.rot90(stored, 2),
+    4: np.flipud,
+    5: lambda stored: stored.swapaxes(0, 1),
+    6: lambda stored: np.rot90(stored, -1),
+    7: lambda stored: np.rot90(stored, 2).swapaxes(0, 1),
+    8: lambda stored: np.rot90(stored, 1),
+}
+
+ORIENTED: dict[str, tuple[Any, Callable[[np.ndarray, int], bytes]]] = {
+    "jpeg": (np.uint8, lambda pixels, turn: pillow(pixels, "JPEG", exif=exif(turn))),
+    "jpeg, big-endian": (np.uint8, lambda pixels, turn: pillow(pixels, "JPEG", exif=exif(turn, ">"))),
+    "png": (np.uint8, lambda pixels, turn: pillow(pixels, "PNG", exif=exif(turn))),
+    "webp": (np.uint8, lambda pixels, turn: pillow(pixels, "WEBP", lossless=True, exif=exif(turn))),
+    "tiff": (np.uint8, lambda pixels, turn: tiff(pixels, extratags=[(274, "H", 1, turn, True)])),
+    "tiff, tiles": (np.uint8, lambda pixels, turn: tiff(pixels, tile=(32, 32), extratags=[(274, "H", 1, turn, True)])),
+    "tiff, BigTIFF": (np.uint8, lambda pixels, turn: tiff(pixels, bigtiff=True, extratags=[(274, "H", 1, turn, True)])),
+    "tiff, 32-bit tag": (np.uint8, lambda pixels, turn: tiff(pixels, extratags=[(274, "I", 1, turn, True)])),
+    "tiff, 16 bits": (np.uint16, lambda pixels, turn: tiff(pixels, extratags=[(274, "H", 1, turn, True)])),
+    "tiff, 16 bits, big-endian": (
+        np.uint16,
+        lambda pixels, turn: tiff(pixels, byteorder=">", extratags=[(274, "H", 1, turn, True)]),
+    ),
+}
+
+
+@pytest.mark.parametrize("turn", UPRIGHT)
+@pytest.mark.parametrize("kind", ORIENTED)
+def test_orientation_is_applied_once(kind: str, turn: int) -> None:
+    dtype, write = ORIENTED[kind]
+    stored = smooth(6, 11).astype(dtype) * dtype(257 if dtype is np.uint16 else 1)
+    photograph = decode(write(stored, turn), max_pixels=66, icc="ignore")
+    as_stored = decode(write(stored, 1), max_pixels=66, icc="ignore").srgb
+    np.testing.assert_array_equal(photograph.srgb, UPRIGHT[turn](as_stored), strict=True)
+    assert photograph.orientation == turn
+    if kind.partition(",")[0] != "jpeg":
+        np.testing.assert_array_equal(as_stored, stored)
+
+
+def test_orientation_of_an_exif_chunk_behind_the_pixels_counts() -> None:
+    assert probe(png(1, 8, 2, b"abc", after=chunk(b"eXIf", exif(5)[6:]))).orientation == 5
+
+
+@pytest.mark.parametrize("value", [0, 9, 65535])
+@pytest.mark.parametrize("kind", ORIENTED)
+def test_an_orientation_that_does_not_exist_is_1(kind: str, value: int) -> None:
+    dtype, write = ORIENTED[kind]
+    photograph = decode(write(noise(4, 6, dtype), value), max_pixels=24, icc="ignore")
+    assert (photograph.orientation, photograph.srgb.shape) == (1, (4, 6, 3))
+
+
+@pytest.mark.parametrize("block", [b"", b"Exif\0\0", b"Exif\0\0garbage", exif(6)[:20], exif(6)[:14] + b"\xff\xff"])
+def test_a_broken_exif_block_is_no_reason_to_refuse_pixels(block: bytes) -> None:
+    assert decode(pillow(smooth(), "JPEG", exif=block or b"\0"), max_pixels=2**26, icc="ignore").orientation == 1
+
+
+def test_a_broken_thumbnail_directory_does_not_hide_the_orientation() -> None:
+    block = exif(6)[:-4] + struct.pack("<I", 2**31)
+    assert probe(pillow(smooth(), "JPEG", exif=block)).orientation == 6
+
+
+# Alpha ----------------------------------------------------------------------------------------------------------------
+
+
+def with_alpha(alpha: int, dtype: Any = np.uint8) -> np.ndarray:
+    """[5, 7, 4], opaque but for one pixel."""
+    stored = np.dstack([noise(5, 7, dtype), np.full((5, 7), np.iinfo(dtype).max, dtype)])
+    stored[3, 2, 3] = alpha
+    return stored
+
+
+def bgra(stored: np.ndarray) -> np.ndarray:
+    return stored[..., [2, 1, 0, 3]]
+
+
+MASKS = (0xFF0000, 0xFF00, 0xFF, 0xFF000000)
+ALPHA: dict[str, tuple[Any, Callable[[np.ndarray], bytes]]] = {
+    "png": (np.uint8, lambda pixels: pillow(pixels, "PNG")),
+    "png, 16 bits": (np.uint16, lambda pixels: cv2.imencode(".png", bgra(pixels))[1].tobytes()),
+    "webp": (np.uint8, lambda pixels: pillow(pixels, "WEBP", lossless=True, exact=True)),
+    "tiff": (np.uint8, lambda pixels: tiff(pixels, extrasamples=["unassalpha"])),
+    "tiff, premultiplied": (np.uint8, lambda pixels: tiff(pixels, extrasamples=["assocalpha"])),
+    "tiff, 16 bits": (np.uint16, lambda pixels: tiff(pixels, extrasamples=["unassalpha"])),
+    "bmp": (np.uint8, lambda pixels: bmp(7, -5, 32, bgra(pixels).tobytes(), MASKS)),
+}
+
+
+@pytest.mark.parametrize("kind", ALPHA)
+def test_an_opaque_alpha_is_dropped(kind: str) -> None:
+    dtype, write = ALPHA[kind]
+    stored = with_alpha(np.iinfo(dtype).max, dtype)
+    np.testing.assert_array_equal(pixels_of(write(stored)), stored[..., :3], strict=True)
+
+
+@pytest.mark.parametrize("kind", ALPHA)
+def test_one_pixel_that_is_almost_opaque_is_refused(kind: str) -> None:
+    dtype, write = ALPHA[kind]
+    assert reason_of(write(with_alpha(np.iinfo(dtype).max - 1, dtype))) == "alpha"
+
+
+@pytest.mark.parametrize("alpha", [255, 254], ids=["opaque", "not"])
+def test_alpha_beside_gray_in_a_png(alpha: int) -> None:
+    data = png(2, 8, 4, bytes([5, 255, 170, alpha]))
+    assert pixels_of(data)[0, :, 0].tolist() == [5, 170] if alpha == 255 else reason_of(data) == "alpha"
+
+
+PALETTE = chunk(b"PLTE", bytes(range(12)))
+# colour type, bits, row, a tRNS that no pixel meets, one that a pixel meets
+TRANSPARENT_KEYS = {
+    "gray 1": (0, 1, b"\x00", b"\0\1", b"\0\0"),
+    "gray 2": (0, 2, b"\x1b", None, b"\0\1"),
+    "gray 4": (0, 4, b"\x5a\x5a", b"\0\3", b"\0\5"),
+    "gray 8": (0, 8, b"\5\6\7\x08", b"\0\4", b"\0\5"),
+    "gray 16": (0, 16, b"\5\1\5\2\5\3\5\4", b"\5\5", b"\5\4"),
+    "rgb 8": (2, 8, bytes(range(12)), b"\0\0\0\1\0\3", b"\0\3\0\4\0\5"),
+    "rgb 16": (2, 16, bytes(range(24)), b"\0\1\2\3\4\4", b"\0\1\2\3\4\5"),
+    "palette": (3, 8, b"\0\1\1\0", b"\xff\xff\0", b"\xff\xfe"),
+}
+
+
+@pytest.mark.parametrize("kind", TRANSPARENT_KEYS)
+def test_a_transparent_colour_in_a_png_is_refused_where_a_pixel_has_it(kind: str) -> None:
+    colour, bits, row, _, met = TRANSPARENT_KEYS[kind]
+    assert reason_of(png(4, bits, colour, row, PALETTE + chunk(b"tRNS", met))) == "alpha"
+
+
+@pytest.mark.parametrize("kind", [kind for kind, case in TRANSPARENT_KEYS.items() if case[3] is not None])
+def test_a_transparent_colour_in_a_png_that_no_pixel_has_is_dropped(kind: str) -> None:
+    colour, bits, row, unmet, _ = TRANSPARENT_KEYS[kind]
+    before = PALETTE if colour == 3 else b""
+    plain = pixels_of(png(4, bits, colour, row, before))
+    np.testing.assert_array_equal(pixels_of(png(4, bits, colour, row, before + chunk(b"tRNS", unmet or b""))), plain)
+
+
+def test_alpha_beside_gray_in_a_tiff_is_refused_because_opencv_drops_it() -> None:
+    assert reason_of(tiff(noise(3, 4, channels=2), "minisblack", extrasamples=["unassalpha"])) == "alpha"
+
+
+def test_the_unused_byte_of_a_32_bit_bmp_is_no_alpha() -> None:
+    assert pixels_of(bmp(1, 1, 32, b"\3\2\1\0")).tolist() == [[[1, 2, 3]]]
+
+
+# Refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_no_bytes_are_empty() -> None:
+    assert reason_of(b"") == "empty"
+
+
+@pytest.mark.parametrize(
+    "data", [b"GIF89a" + bytes(40), b"hello", b"\0", b"\0\0\0\x1cftypheic", b"%PDF-1.4", b"RIFF\4\0\0\0WAVE"]
+)
+def test_other_formats_are_unsupported(data: bytes) -> None:
+    assert reason_of(data) == "unsupported"
+
+
+GRADES = noise(4, 6, channels=1)[..., 0]
+UNSUPPORTED = {
+    "float tiff": tiff(GRADES.astype(np.float32), "minisblack"),
+    "half tiff": tiff(GRADES.astype(np.float16), "minisblack"),
+    "32-bit tiff": tiff(GRADES.astype(np.uint32), "minisblack"),
+    "signed tiff": tiff(GRADES.astype(np.int16), "minisblack"),
+    "lab tiff": tiff(noise(4, 6), "cielab"),
+    "planes of 16 bits": tiff(noise(3, 40, np.uint16, 61), planarconfig="separate"),
+    "small tiles": tiff(noise(40, 61), tile=(16, 16)),
+    "lzma tiff": tiff(noise(4, 6), compression="lzma"),
+    "huge tiles": retagged(tiff(noise(40, 61), tile=(32, 64), compression="zlib"), {322: 2**15, 323: 2**15}),
+    "thumbnail first": tiff(noise(4, 6), subfiletype=1),
+    "16-bit bmp": bmp(1, 1, 16, b"\x1f\x7c\0\0"),
+    "bmp with masks within bytes": bmp(1, 1, 32, bytes(4), (0x3FF00000, 0xFFC00, 0x3FF, 0)),
+}
+
+
+@pytest.mark.parametrize("kind", UNSUPPORTED)
+def test_kinds_that_opencv_would_read_wrongly_are_unsupported(kind: str) -> None:
+    assert reason_of(UNSUPPORTED[kind]) == "unsupported"
+
+
+def test_a_jpeg_of_12_bits_is_unsupported() -> None:
+    data = pillow(smooth(), "JPEG")
+    frame = data.index(b"\xff\xc0")
+    assert reason_of(data[: frame + 4] + b"\x0c" + data[frame + 5 :]) == "unsupported"
+
+
+CMYK = Image.new("CMYK", (5, 4), (10, 20, 30, 40))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "TIFF"])
+def test_printing_inks_are_refused(kind: str) -> None:
+    assert reason_of(pillow(CMYK, kind)) == "cmyk"
+
+
+@pytest.mark.parametrize("kind", ["PNG", "WEBP", "TIFF"])
+def test_more_than_one_picture_is_animated(kind: str) -> None:
+    more = [Image.fromarray(smooth(seed=seed)) for seed in (50, 90)]
+    assert reason_of(pillow(smooth(), kind, save_all=True, append_images=more)) == "animated"
+
+
+def test_a_thumbnail_page_beside_a_full_one_is_fine() -> None:
+    file = io.BytesIO()
+    with tifffile.TiffWriter(file) as writer:
+        writer.write(noise(8, 9), photometric="rgb")
+        writer.write(noise(2, 3), photometric="rgb", subfiletype=1)
+    np.testing.assert_array_equal(pixels_of(file.getvalue()), noise(8, 9))
+
+
+def test_the_limit_of_pixels_is_inclusive() -> None:
+    data = pillow(noise(7, 13), "PNG")
+    assert pixels_of(data, max_pixels=91).shape == (7, 13, 3)
+    assert reason_of(data, max_pixels=90) == "too_large"
+
+
+HUGE = {
+    "png": png(60_000, 8, 2, b"", height=60_000),
+    "bmp": bmp(60_000, 60_000, 24, b""),
+    "jpeg": pillow(smooth(), "JPEG").replace(struct.pack(">HH", 40, 61), struct.pack(">HH", 60_000, 60_000), 1),
+    "tiff": retagged(tiff(noise(40, 61), compression="zlib"), {256: 60_000, 257: 60_000, 278: 60_000}),
+    "webp": b"RIFF"
+    + struct.pack("<I4s4sIB3x6s", 22, b"WEBP", b"VP8X", 10, 0, b"\x5f\xea\0\x5f\xea\0")
+    + struct.pack("<4sI", b"VP8 ", 0),
+}
+
+
+@pytest.mark.parametrize("kind", HUGE)
+def test_a_header_that_claims_3600_megapixels_is_refused_at_once(kind: str) -> None:
+    start = time.perf_counter()
+    reason = reason_of(HUGE[kind] + bytes(10))
+    assert time.perf_counter() - start < 0.05
+    # A BMP is not compressed: one that claims so much is short of it.
+    assert reason == ("truncated" if kind == "bmp" else "too_large")
+
+
+def test_what_opencv_itself_refuses_for_its_size_is_too_large_whatever_the_setting() -> None:
+    assert reason_of(HUGE["png"], max_pixels=2**40) == "too_large"
+    assert reason_of(png(1_000_001, 8, 0, b""), max_pixels=CV2_MAX_PIXELS) == "too_large"
+
+
+def test_a_setting_that_does_not_exist_is_a_value_error() -> None:
+    with pytest.raises(ValueError, match="icc is 'maybe', expected one of ignore, refuse"):
+        decode(pillow(smooth(), "PNG"), max_pixels=1, icc="maybe")
+
+
+# Colour profiles ------------------------------------------------------------------------------------------------------
+
+
+def swapped_primaries() -> bytes:
+    """A profile that is sRGB but for red and green changing places."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    tags = {
+        bytes(profile[at : at + 4]): at for at in range(132, 132 + 12 * int.from_bytes(profile[128:132], "big"), 12)
+    }
+    profile[tags[b"rXYZ"] : tags[b"rXYZ"] + 4], profile[tags[b"gXYZ"] : tags[b"gXYZ"] + 4] = b"gXYZ", b"rXYZ"
+    return bytes(profile)
+
+
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+LAB = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+CARRIERS = ["JPEG", "PNG", "WEBP", "TIFF"]
+
+
+@pytest.mark.parametrize("kind", CARRIERS)
+def test_an_srgb_profile_is_taken(kind: str) -> None:
+    assert pixels_of(pillow(smooth(), kind, icc_profile=SRGB), icc="refuse").shape == (40, 61, 3)
+
+
+@pytest.mark.parametrize("profile", [swapped_primaries(), LAB, b"garbage"], ids=["other primaries", "Lab", "garbage"])
+@pytest.mark.parametrize("kind", CARRIERS)
+def test_any_other_profile_is_refused_when_asked(kind: str, profile: bytes) -> None:
+    assert reason_of(pillow(smooth(), kind, icc_profile=profile), icc="refuse") == "icc"
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF"])
+def test_ignoring_profiles_leaves_the_pixels_alone(kind: str) -> None:
+    data = pillow(smooth(), kind, icc_profile=swapped_primaries())
+    np.testing.assert_array_equal(pixels_of(data, icc="ignore"), smooth())
+
+
+def test_a_profile_in_many_segments_is_put_together() -> None:
+    profile = SRGB + bytes(150_000)
+    assert probe(pillow(smooth(), "JPEG", icc_profile=profile)).icc == profile
+
+
+def test_a_png_profile_that_does_not_unpack_is_refused_when_asked() -> None:
+    data = png(1, 8, 2, b"abc", chunk(b"iCCP", b"name\0\0not deflated"))
+    assert probe(data).icc == b""
+    assert reason_of(data, icc="refuse") == "icc"
+
+
+# Truncation and damage ------------------------------------------------------------------------------------------------
+
+
+def thumbnail_exif() -> bytes:
+    """EXIF with a whole JPEG in it, which has an end-of-image marker of its own."""
+    block = exif(6)
+    small = pillow(smooth(8, 8), "JPEG")
+    link = struct.pack("<I", len(block) - 6)
+    second = struct.pack("<HHHIIHHIII", 2, 513, 4, 1, len(block) - 6 + 30, 514, 4, 1, len(small), 0)
+    return block[:-4] + link + second + small
+
+
+CUTTABLE = {
+    "jpeg": pillow(smooth(), "JPEG"),
+    "jpeg, progressive": pillow(smooth(), "JPEG", progressive=True),
+    "jpeg, restarts": pillow(smooth(), "JPEG", restart_marker_blocks=3),
+    "jpeg, thumbnail": pillow(smooth(), "JPEG", exif=thumbnail_exif()),
+    "jpeg, progressive, thumbnail": pillow(smooth(), "JPEG", exif=thumbnail_exif(), progressive=True),
+    "jpeg, profile": pillow(smooth(), "JPEG", icc_profile=SRGB),
+    "png": pillow(smooth(), "PNG"),
+    "png, 16 bits": cv2.imencode(".png", noise(9, 9, np.uint16))[1].tobytes(),
+    "webp": pillow(smooth(), "WEBP"),
+    "webp, lossless, EXIF": pillow(smooth(), "WEBP", lossless=True, exif=exif(6)),
+    "bmp": pillow(smooth(20, 21), "BMP"),
+    "tiff": tiff(smooth(20, 21)),
+    "tiff, directory first": pillow(smooth(20, 21), "TIFF"),
+    "tiff, deflated, 16 bits": tiff(noise(9, 9, np.uint16), compression="zlib"),
+}
+
+
+@pytest.mark.parametrize("kind", CUTTABLE)
+def test_every_cut_is_refused(kind: str) -> None:
+    data = CUTTABLE[kind]
+    assert pixels_of(data).shape[2] == 3
+    reasons = {reason_of(data[:length]) for length in range(12, len(data))}
+    assert reasons == {"truncated"}
+
+
+@pytest.mark.parametrize("kind", CUTTABLE)
+def test_a_cut_within_the_first_bytes_is_refused(kind: str) -> None:
+    assert {reason_of(CUTTABLE[kind][:length]) for length in range(12)} <= {"empty", "unsupported", "truncated"}
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "png"])
+def test_random_cuts_of_a_larger_file_are_refused(kind: str) -> None:
+    size, options = smooth(700, 900), {"quality": 95, "progressive": "progressive" in kind}
+    data = pillow(size, "PNG") if kind == "png" else pillow(size, "JPEG", **options)
+    cuts = [random.Random(1).randrange(12, len(data)) for _ in range(60)] + [len(data) - 1, len(data) - 2]
+    assert {reason_of(data[:length]) for length in cuts} == {"truncated"}
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "jpeg, thumbnail", "png", "webp", "bmp", "tiff"])
+@pytest.mark.parametrize("tail", [b"\0", b"\xff", pillow(smooth(), "JPEG"), b"\0\0\0\x18ftypmp42" + bytes(99)])
+def test_bytes_after_the_end_are_fine(kind: str, tail: bytes) -> None:
+    np.testing.assert_array_equal(pixels_of(CUTTABLE[kind] + tail), pixels_of(CUTTABLE[kind]))
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png", "webp, lossless, EXIF", "tiff, deflated, 16 bits"])
+def test_pixels_overwritten_with_zeros_up_to_the_end_are_refused(kind: str) -> None:
+    data = CUTTABLE[kind]
+    middle = len(data) // 2
+    assert reason_of(data[:middle] + bytes(len(data) - middle)) in ("truncated", "corrupt")
+
+
+CORRUPT = {
+    "jpeg without a frame": b"\xff\xd8\xff\xe0\0\4ab\xff\xd9",
+    "jpeg without a scan": pillow(smooth(), "JPEG")[:20] + b"\xff\xd9",
+    "jpeg of height 0": pillow(smooth(), "JPEG").replace(struct.pack(">HH", 40, 61), struct.pack(">HH", 0, 61), 1),
+    "png with a flipped bit": CUTTABLE["png"][:-40] + bytes([CUTTABLE["png"][-40] ^ 1]) + CUTTABLE["png"][-39:],
+    "png of width 0": png(0, 8, 2, b""),
+    "png of no colour type": png(1, 8, 5, b"abc"),
+    "png that begins otherwise": b"\x89PNG\r\n\x1a\n" + chunk(b"CgBI", bytes(20)) + chunk(b"IEND"),
+    "webp without a picture": b"RIFF" + struct.pack("<I4s4sI", 12, b"WEBP", b"EXIF", 0),
+    "webp of garbage": b"RIFF" + struct.pack("<I4s4sI", 32, b"WEBP", b"VP8L", 20) + b"\x2f\1\1\1\0" + bytes(15),
+    "tiff without a page": b"II*\0\0\0\0\0",
+    "tiff of few strips": retagged(tiff(smooth(), rowsperstrip=8), {278: 2}),
+    "tiff of short strips": retagged(tiff(smooth()), {279: 100}),
+    "tiff of no rows": retagged(tiff(smooth()), {278: 0}),
+    "bmp of width -1": bmp(-1, 1, 24, bytes(8)),
+}
+
+
+@pytest.mark.parametrize("kind", CORRUPT)
+def test_damage_is_corrupt(kind: str) -> None:
+    assert reason_of(CORRUPT[kind]) == "corrupt"
+
+
+def test_a_chain_of_tiff_pages_that_bites_its_tail_ends() -> None:
+    data = bytearray(tiff(smooth()))
+    (first,) = struct.unpack_from("<I", data, 4)
+    (entries,) = struct.unpack_from("<H", data, first)
+    struct.pack_into("<I", data, first + 2 + 12 * entries, first)
+    np.testing.assert_array_equal(pixels_of(bytes(data)), smooth())
+
+
+@pytest.mark.parametrize("kind", CUTTABLE)
+def test_random_damage_ends_in_pixels_of_the_right_size_or_in_a_reason(kind: str) -> None:
+    generator = random.Random(kind)
+    for _ in range(150):
+        data = bytearray(CUTTABLE[kind])
+        for _ in range(generator.choice((1, 2, 8))):
+            data[generator.randrange(min(len(data), generator.choice((64, 400, 10**6))))] = generator.choice(
+                (0, 255, 17)
+            )
+        try:
+            photograph = decode(bytes(data), max_pixels=2**20, icc="refuse")
+        except SourceError:
+            continue
+        header = probe(bytes(data))
+        assert sorted(photograph.srgb.shape[:2]) == sorted((header.height, header.width))
+
+
+# Headers --------------------------------------------------------------------------------------------------------------
+
+SECOND_OPINION = {**CUTTABLE, "jpeg, gray": pillow(GRADES, "JPEG"), "jpeg, inks": pillow(CMYK, "JPEG")}
+
+
+@pytest.mark.parametrize("kind", SECOND_OPINION)
+def test_a_header_is_what_pillow_reads(kind: str) -> None:
+    header = probe(SECOND_OPINION[kind])
+    with Image.open(io.BytesIO(SECOND_OPINION[kind])) as image:
+        assert (header.width, header.height) == image.size
+        assert header.orientation == image.getexif().get(274, 1)
+        assert header.icc == image.info.get("icc_profile")
+        assert header.format == (image.format or "").lower()
+
+
+def test_a_header_says_all_of_it() -> None:
+    data = cv2.imencode(".png", with_alpha(0, np.uint16))[1].tobytes()
+    assert probe(data) == Header("png", 7, 5, "rgb", 16, has_alpha=True)
+
+
+def test_probing_a_cut_file_says_what_is_missing() -> None:
+    assert probe(CUTTABLE["jpeg"][:-1]).missing == "its end-of-image marker"

@@ -1,0 +1,173 @@
+"""The fast form gives the reference's DN everywhere; a pair is a pure function of (pixels, plan)."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from unprocess_gen import colour, synthetic
+from unprocess_gen.bayer import PATTERNS
+from unprocess_gen.config import Config, GainsConfig, NoiseConfig
+from unprocess_gen.pair import make_pair, reference_pair
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Plan
+
+SENSORS = {8: (0, 255), 10: (64, 1023), 12: (240, 4095), 14: (1024, 16383), 16: (4096, 65535)}
+HIGHLIGHTS = ("per_channel", "gray_mean", "none")
+INVERSE_GAINS = (0.5, 0.8, 1.0 - 2**-53, 1.0, 1.1, 2.05)
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    noise = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
+    return plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise), "5" * 64)
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    """A cut-out with an odd size that holds blown highlights, deep shadows and saturated colours."""
+    return np.ascontiguousarray(synthetic.scene("highlights-0")[150:361:, 300:597])
+
+
+def with_sensor(plan: Plan, bits: int) -> Plan:
+    black, white = SENSORS[bits]
+    return replace(plan, bits=bits, black_level_dn=black, white_level_dn=white)
+
+
+def assert_same(srgb: np.ndarray, plan: Plan) -> None:
+    fast, reference = make_pair(srgb, plan), reference_pair(srgb, plan)
+    np.testing.assert_array_equal(fast.clean, reference.clean)
+    np.testing.assert_array_equal(fast.noisy, reference.noisy)
+    assert fast.counts == reference.counts
+
+
+@pytest.mark.parametrize("highlight", HIGHLIGHTS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_fast_form_equals_the_reference_for_every_gain_and_sensor(
+    scene: np.ndarray, plan: Plan, highlight: str, pattern: str
+) -> None:
+    for inverse, bits in itertools.product(INVERSE_GAINS, SENSORS):
+        assert_same(
+            scene, replace(with_sensor(plan, bits), inverse_rgb_gain=inverse, highlight=highlight, pattern=pattern)
+        )
+
+
+@pytest.mark.parametrize("camera", colour.CAMERAS)
+@pytest.mark.parametrize(("tone", "gamma"), [("smoothstep", 2.2), ("none", 2.2), ("none", "srgb"), ("none", 1.0)])
+def test_fast_form_equals_the_reference_for_every_camera_and_curve(
+    scene: np.ndarray, plan: Plan, camera: str, tone: str, gamma: float | str
+) -> None:
+    matrix = colour.rgb2cam(colour.CAMERAS[camera])
+
+    assert_same(scene, replace(plan, rgb2cam=matrix, tone=tone, gamma=gamma))
+
+
+@pytest.mark.parametrize("clip", ["sensor", "black"])
+@pytest.mark.parametrize(("a_dn", "b_dn2"), [(0.0, 0.0), (0.0, 30.0), (8.0, 0.0), (8.0034, -122.69544), (80.0, 2e4)])
+def test_fast_form_equals_the_reference_for_every_noise(
+    scene: np.ndarray, plan: Plan, clip: str, a_dn: float, b_dn2: float
+) -> None:
+    assert_same(scene, replace(plan, a_dn=a_dn, b_dn2=b_dn2, sensor_clip=clip))
+
+
+def test_fast_form_equals_the_reference_on_sixteen_bits(plan: Plan) -> None:
+    codes = np.random.Generator(np.random.Philox(key=1)).integers(0, 65536, (67, 93, 3)).astype(np.uint16)
+
+    for bits in SENSORS:
+        assert_same(codes, with_sensor(plan, bits))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (1, 1025), (3, 1024), (2, 2049), (513, 1)])
+def test_fast_form_equals_the_reference_for_every_shape(plan: Plan, shape: tuple[int, int]) -> None:
+    srgb = np.random.Generator(np.random.Philox(key=2)).integers(0, 256, (*shape, 3)).astype(np.uint8)
+
+    assert_same(srgb, plan)
+
+
+@settings(max_examples=60, deadline=None)
+@given(top=st.integers(0, 210), left=st.integers(0, 296), height=st.integers(1, 90), width=st.integers(1, 200))
+def test_a_tile_is_the_same_cut_out_of_the_frame(top: int, left: int, height: int, width: int) -> None:
+    noise = NoiseConfig("n", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
+    plan = plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise), "5" * 64)
+    scene = np.ascontiguousarray(synthetic.scene("highlights-0")[150:361, 300:597])
+    whole = make_pair(scene, plan)
+
+    tile = make_pair(scene[top : top + height, left : left + width], plan, origin=(top, left))
+
+    np.testing.assert_array_equal(tile.clean, whole.clean[top : top + height, left : left + width])
+    np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
+
+
+def test_a_frame_comes_out_pixel_by_pixel(plan: Plan, scene: np.ndarray) -> None:
+    whole = make_pair(scene, plan)
+
+    for y, x in [(0, 0), (0, 15), (0, 16), (7, 63), (8, 64), (210, 296)]:
+        pixel = make_pair(scene[y : y + 1, x : x + 1], plan, origin=(y, x))
+        assert pixel.clean[0, 0] == whole.clean[y, x]
+        assert pixel.noisy[0, 0] == whole.noisy[y, x]
+
+
+@pytest.mark.parametrize("bits", SENSORS)
+@pytest.mark.parametrize("highlight", ["per_channel", "gray_mean"])
+@pytest.mark.parametrize("camera", [*colour.CAMERAS, "identity"])
+def test_white_is_white_and_black_is_black(plan: Plan, camera: str, highlight: str, bits: int) -> None:
+    matrix = colour.rgb2cam(colour.CAMERAS[camera]) if camera in colour.CAMERAS else colour.IDENTITY
+    ends = np.array([[[255] * 3, [0] * 3], [[0] * 3, [255] * 3]], dtype=np.uint8)
+    for inverse in (1e-300, 0.3, *INVERSE_GAINS):
+        made = replace(with_sensor(plan, bits), rgb2cam=matrix, highlight=highlight, inverse_rgb_gain=inverse)
+
+        pair = make_pair(ends, made)
+
+        black, white = SENSORS[bits]
+        np.testing.assert_array_equal(pair.clean, [[white, black], [black, white]])
+        assert pair.counts.saturated == 2
+        assert pair.counts.clean_clipped_low == 0
+
+
+def test_white_that_no_gain_lifts_is_not_counted_as_clipped(plan: Plan) -> None:
+    white = np.full((64, 64, 3), 255, dtype=np.uint8)
+
+    for camera in colour.CAMERAS.values():
+        assert make_pair(white, replace(plan, rgb2cam=colour.rgb2cam(camera))).counts.clean_clipped_high == 0
+
+
+def test_without_noise_the_noisy_frame_is_the_clean_one(plan: Plan, scene: np.ndarray) -> None:
+    pair = make_pair(scene, replace(plan, a_dn=0.0, b_dn2=0.0))
+
+    np.testing.assert_array_equal(pair.noisy, pair.clean)
+    assert pair.counts.zero_variance == scene.shape[0] * scene.shape[1]
+
+
+def test_noise_keeps_the_pedestal_unless_told_otherwise(plan: Plan) -> None:
+    dark = np.zeros((128, 128, 3), dtype=np.uint8)
+
+    assert make_pair(dark, plan).noisy.min() < 240
+    assert make_pair(dark, replace(plan, sensor_clip="black")).noisy.min() == 240
+
+
+def test_the_pixels_are_left_untouched(plan: Plan, scene: np.ndarray) -> None:
+    before = scene.copy()
+
+    make_pair(scene, plan)
+
+    np.testing.assert_array_equal(scene, before)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.zeros((4, 4, 3)),
+        np.zeros((4, 4), np.uint8),
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4, 3), np.int16),
+    ],
+)
+@pytest.mark.parametrize("form", [make_pair, reference_pair])
+def test_other_arrays_are_refused(plan: Plan, form: object, wrong: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"expected uint8 or uint16 \[H, W, 3\]"):
+        form(wrong, plan)  # type: ignore[operator]

@@ -1,0 +1,348 @@
+"""Listing, spelling and reading of source files: what is found, in which order, and what is refused without a hang."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen import sources
+from unprocess_gen.errors import ConfigError, SourceError
+from unprocess_gen.records import Source
+from unprocess_gen.sources import Listing, decode_name, encode_name, list_folder, number_twins, read_bytes
+
+
+def listed(root: Path, *include: str, recursive: bool = True, limit: int | None = None) -> Listing:
+    return list_folder(str(root), include or ("*.jpg",), recursive, limit)
+
+
+def paths(listing: Listing) -> list[str]:
+    return [source.path for source in listing.sources]
+
+
+def only(root: Path, *include: str) -> Source:
+    (source,) = listed(root, *include).sources
+    return source
+
+
+def fill(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(name.encode())
+
+
+# Listing --------------------------------------------------------------------------------------------------------------
+
+
+def test_order_is_by_the_bytes_of_the_relative_path(tmp_path: Path) -> None:
+    fill(tmp_path, "b.jpg", "a/z.jpg", "a.jpg", "B.jpg", "é.jpg", "a-b.jpg")
+    assert paths(listed(tmp_path)) == ["B.jpg", "a-b.jpg", "a.jpg", "a/z.jpg", "b.jpg", "é.jpg"]
+
+
+def test_indices_count_from_zero_in_that_order(tmp_path: Path) -> None:
+    fill(tmp_path, "c.jpg", "a.jpg", "b.jpg")
+    assert [source.index for source in listed(tmp_path).sources] == [0, 1, 2]
+
+
+def test_a_limit_keeps_the_first_in_order(tmp_path: Path) -> None:
+    fill(tmp_path, "c.jpg", "a.jpg", "b.jpg")
+    assert paths(listed(tmp_path, limit=2)) == ["a.jpg", "b.jpg"]
+
+
+def test_globs_are_blind_to_case(tmp_path: Path) -> None:
+    fill(tmp_path, "a.JPG", "b.Jpg")
+    assert paths(listed(tmp_path, "*.jPg")) == ["a.JPG", "b.Jpg"]
+
+
+def test_a_glob_with_a_slash_is_held_against_the_relative_path(tmp_path: Path) -> None:
+    fill(tmp_path, "in/a.jpg", "out/a.jpg", "a.jpg")
+    assert paths(listed(tmp_path, "in/*")) == ["in/a.jpg"]
+
+
+def test_files_that_no_glob_matches_are_counted(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "notes.txt", "sub/more.txt")
+    assert listed(tmp_path).not_matched == 2
+
+
+def test_sub_folders_are_left_alone_when_not_recursive(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "sub/b.jpg")
+    assert paths(listed(tmp_path, recursive=False)) == ["a.jpg"]
+
+
+def test_size_is_that_of_the_file_also_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "target.bin").write_bytes(b"12345")
+    (tmp_path / "a.jpg").symlink_to("target.bin")
+    assert only(tmp_path).size_bytes == 5
+
+
+def test_a_link_to_a_folder_is_followed(tmp_path: Path) -> None:
+    fill(tmp_path, "elsewhere/a.jpg", "root/b.jpg")
+    (tmp_path / "root" / "linked").symlink_to("../elsewhere")
+    assert paths(listed(tmp_path / "root")) == ["b.jpg", "linked/a.jpg"]
+
+
+@pytest.mark.parametrize("target", [".", "..", "sub"], ids=["itself", "above the root", "below"])
+def test_links_back_to_an_ancestor_end(tmp_path: Path, target: str) -> None:
+    fill(tmp_path, "root/a.jpg", "root/sub/b.jpg")
+    (tmp_path / "root" / "sub" / "loop").symlink_to(tmp_path / "root" / target)
+    listing = listed(tmp_path / "root")
+    assert listing.skipped_links >= 1
+    assert {"a.jpg", "sub/b.jpg"} <= set(paths(listing))
+
+
+def test_folders_that_link_to_each_other_are_both_listed(tmp_path: Path) -> None:
+    fill(tmp_path, "one/a.jpg", "two/b.jpg")
+    (tmp_path / "one" / "to").symlink_to("../two")
+    (tmp_path / "two" / "to").symlink_to("../one")
+    listing = listed(tmp_path)
+    assert paths(listing) == ["one/a.jpg", "one/to/b.jpg", "two/b.jpg", "two/to/a.jpg"]
+    assert listing.skipped_links == 2
+
+
+def make_directory(path: Path) -> None:
+    path.mkdir()
+    (path / "inside.txt").touch()
+
+
+ODD_ENTRIES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "pipe": (os.mkfifo, "not_a_file"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "not_a_file"),
+    "directory": (make_directory, "not_a_file"),
+    "link to itself": (lambda path: path.symlink_to(path.name), "unreadable"),
+    "dangling link": (lambda path: path.symlink_to("nowhere"), "unreadable"),
+    "link through a file": (lambda path: path.symlink_to("/dev/null/x"), "unreadable"),
+}
+
+
+@pytest.mark.parametrize("kind", ODD_ENTRIES)
+def test_what_is_no_file_is_listed_with_its_reason(tmp_path: Path, kind: str) -> None:
+    make, reason = ODD_ENTRIES[kind]
+    make(tmp_path / "z.jpg")
+    assert only(tmp_path) == Source(0, "z.jpg", "z.jpg", None, reason)
+
+
+@pytest.mark.parametrize("kind", ODD_ENTRIES)
+def test_what_is_no_file_is_refused_on_reading_with_its_reason(tmp_path: Path, kind: str) -> None:
+    make, reason = ODD_ENTRIES[kind]
+    make(tmp_path / "z.jpg")
+    with pytest.raises(SourceError) as caught:
+        read_bytes(str(tmp_path), only(tmp_path))
+    assert caught.value.reason == reason
+
+
+def test_a_directory_whose_name_matches_is_also_entered(tmp_path: Path) -> None:
+    fill(tmp_path, "x.jpg/y.jpg")
+    assert paths(listed(tmp_path)) == ["x.jpg", "x.jpg/y.jpg"]
+
+
+def test_listing_opens_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path, "a.jpg")
+    os.mkfifo(tmp_path / "b.jpg")
+    monkeypatch.setattr(os, "open", lambda *_, **__: pytest.fail("opened"))
+    assert len(listed(tmp_path).sources) == 2
+
+
+def test_an_unreadable_sub_folder_stops_the_run_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path, "a.jpg", "locked/b.jpg")
+    scandir = os.scandir
+
+    def locked(path: str) -> object:  # permissions do not bind root, so the refusal is played
+        if str(path).endswith("locked"):
+            raise PermissionError(13, "Permission denied", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", locked)
+    with pytest.raises(ConfigError, match=r"locked cannot be read \(Permission denied\)"):
+        listed(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not bind root")
+def test_a_folder_without_permission_stops_the_run(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "locked/b.jpg")
+    (tmp_path / "locked").chmod(0)
+    try:
+        with pytest.raises(ConfigError, match="locked cannot be read"):
+            listed(tmp_path)
+    finally:
+        (tmp_path / "locked").chmod(stat.S_IRWXU)
+
+
+def test_a_dangling_link_that_no_glob_matches_is_nobodys_business(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg")
+    (tmp_path / "lock").symlink_to("host:123")
+    assert paths(listed(tmp_path)) == ["a.jpg"]
+
+
+@pytest.mark.parametrize("name", ["missing", "file", "nul\0"])
+def test_a_root_that_is_no_folder_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    fill(tmp_path, "file")
+    with pytest.raises(ConfigError, match=r"^source\.root=") as caught:
+        list_folder(f"{tmp_path}/{name}", ["*.jpg"], True, None)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_match_is_refused_with_the_root_and_the_globs(tmp_path: Path) -> None:
+    fill(tmp_path, "a.txt")
+    with pytest.raises(ConfigError) as caught:
+        listed(tmp_path, "*.jpg", "*.png")
+    assert str(tmp_path) in str(caught.value)
+    assert "['*.jpg', '*.png']" in str(caught.value)
+
+
+# Names ----------------------------------------------------------------------------------------------------------------
+
+HARD_NAMES = {
+    b"new\nline.jpg": "new%0Aline.jpg",
+    b"tab\t.jpg": "tab%09.jpg",
+    b'comma, quote".jpg': 'comma, quote".jpg',
+    b"=1+1.jpg": "%3D1+1.jpg",
+    b"+a.jpg": "%2Ba.jpg",
+    b"-a.jpg": "%2Da.jpg",
+    b"@a.jpg": "%40a.jpg",
+    b"a=b-c+d@e.jpg": "a=b-c+d@e.jpg",
+    b"100%.jpg": "100%25.jpg",
+    b"del\x7f.jpg": "del%7F.jpg",
+    b"\xff\xfe.jpg": "%FF%FE.jpg",
+    b"\xed\xa0\x80.jpg": "%ED%A0%80.jpg",
+    "\u202egnp.jpg".encode(): "%E2%80%AEgnp.jpg",
+    "\u2066a\u061c\u200f.jpg".encode(): "%E2%81%A6a%D8%9C%E2%80%8F.jpg",
+    "\x85\u2028\u2029.jpg".encode(): "%C2%85%E2%80%A8%E2%80%A9.jpg",
+    "e\u0301 é 日本 😀 {}$.jpg".encode(): "e\u0301 é 日本 😀 {}$.jpg",
+    b".hidden.jpg": ".hidden.jpg",
+    b"x" * 251 + b".jpg": "x" * 251 + ".jpg",
+}
+
+
+@pytest.mark.parametrize("raw", HARD_NAMES, ids=HARD_NAMES.values())
+def test_a_hard_name_is_listed_spelled_and_read(tmp_path: Path, raw: bytes) -> None:
+    (tmp_path / os.fsdecode(raw)).write_bytes(b"pixels")
+    source = only(tmp_path)
+    assert source.name == HARD_NAMES[raw]
+    assert os.fsencode(decode_name(source.name)) == raw
+    assert read_bytes(str(tmp_path), source) == b"pixels"
+
+
+@given(st.binary().filter(lambda raw: b"\0" not in raw))
+def test_decode_name_undoes_encode_name_for_any_bytes(raw: bytes) -> None:
+    path = os.fsdecode(raw)
+    assert decode_name(encode_name(path)) == path
+
+
+@given(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])))
+def test_a_spelled_name_is_one_harmless_line_of_utf8(text: str) -> None:
+    name = encode_name(text)
+    name.encode("utf-8")
+    assert len(name.splitlines()) <= 1
+    assert name[:1] not in {*"=+-@\t\r"} - {""}
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def test_an_empty_file_is_refused_as_empty(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    with pytest.raises(SourceError, match=r"^empty: a\.jpg"):
+        read_bytes(str(tmp_path), only(tmp_path))
+
+
+def test_a_file_that_vanished_is_unreadable(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg")
+    source = only(tmp_path)
+    (tmp_path / "a.jpg").unlink()
+    with pytest.raises(SourceError, match=r"^unreadable: a\.jpg: No such file"):
+        read_bytes(str(tmp_path), source)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["pipe", "directory"])
+def test_what_took_the_place_of_a_listed_file_is_not_a_file(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    fill(tmp_path, "a.jpg")
+    source = only(tmp_path)
+    (tmp_path / "a.jpg").unlink()
+    make(tmp_path / "a.jpg")
+    with pytest.raises(SourceError, match=r"^not_a_file"):
+        read_bytes(str(tmp_path), source)
+
+
+def test_a_file_of_another_size_than_listed_stops_the_run(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg")
+    source = only(tmp_path)
+    (tmp_path / "a.jpg").write_bytes(b"longer than before")
+    with pytest.raises(ConfigError, match=r"a\.jpg changed since it was listed: 5 bytes then, 18 now"):
+        read_bytes(str(tmp_path), source)
+
+
+def test_a_file_that_grows_while_it_is_read_stops_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path, "a.jpg")
+    source = only(tmp_path)
+    fstat = os.fstat
+
+    def grow_after(descriptor: int) -> os.stat_result:
+        status = fstat(descriptor)
+        (tmp_path / "a.jpg").write_bytes(b"longer than before")
+        return status
+
+    monkeypatch.setattr(os, "fstat", grow_after)
+    with pytest.raises(ConfigError, match="changed while it was read: 5 bytes then, 18 now"):
+        read_bytes(str(tmp_path), source)
+
+
+def test_a_huge_sparse_file_is_refused_unread(tmp_path: Path) -> None:
+    with (tmp_path / "a.jpg").open("wb") as file:
+        file.truncate(10 * 2**30)
+    with pytest.raises(SourceError, match=r"^too_large"):
+        read_bytes(str(tmp_path), only(tmp_path))
+
+
+def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").touch()
+    source = only(tmp_path)
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        with pytest.raises(SourceError):
+            read_bytes(str(tmp_path), source)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+# Twins ----------------------------------------------------------------------------------------------------------------
+
+
+def occurrences(root: Path) -> dict[str, int]:
+    return {source.path: source.occurrence for source in number_twins(str(root), listed(root).sources)}
+
+
+def test_files_of_the_same_content_are_numbered_in_listing_order(tmp_path: Path) -> None:
+    for name, content in {"c": b"xy", "a": b"xy", "b": b"zz", "d/e": b"xy", "f": b"longer"}.items():
+        (tmp_path / f"{name}.jpg").parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.jpg").write_bytes(content)
+    assert occurrences(tmp_path) == {"a.jpg": 0, "b.jpg": 0, "c.jpg": 1, "d/e.jpg": 2, "f.jpg": 0}
+
+
+def test_only_files_that_share_a_size_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, content in {"a": b"12", "b": b"34", "c": b"567"}.items():
+        (tmp_path / f"{name}.jpg").write_bytes(content)
+    found = listed(tmp_path).sources
+    opened: list[str] = []
+    system_open = os.open
+    monkeypatch.setattr(sources.os, "open", lambda path, *args: opened.append(path) or system_open(path, *args))
+    number_twins(str(tmp_path), found)
+    assert [Path(path).name for path in opened] == ["a.jpg", "b.jpg"]
+
+
+def test_twins_that_cannot_be_read_keep_number_zero(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "b.jpg", "c.jpg")
+    found = listed(tmp_path).sources
+    (tmp_path / "b.jpg").unlink()
+    os.mkfifo(tmp_path / "d.jpg")
+    assert [source.occurrence for source in number_twins(str(tmp_path), found)] == [0, 0, 0]
+
+
+def test_what_is_no_file_is_passed_through(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.jpg")
+    os.mkfifo(tmp_path / "b.jpg")
+    found = listed(tmp_path).sources
+    assert number_twins(str(tmp_path), found) == found
