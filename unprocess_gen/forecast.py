@@ -64,8 +64,8 @@ def forecast(config: Config, n_jobs: int, read_all: bool) -> Forecast:
     per_shard = config.output.pairs_per_shard
     shards = -(-len(sources) // per_shard)
     if exact:
-        sizes = [[one.bytes for one in looks[at : at + per_shard] if one.bytes] for at in range(0, len(looks), per_shard)]
-        total = sum(shard_bytes(pairs) for pairs in sizes)
+        shard_looks = (looks[at : at + per_shard] for at in range(0, len(looks), per_shard))
+        total = sum(shard_bytes([one.bytes for one in shard if one.bytes]) for shard in shard_looks)
     else:
         total = sum(one.bytes for one in looks) * len(sources) // len(looks) + shards * shard_bytes([0])
     seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
@@ -124,7 +124,9 @@ def text(config: Config, told: Forecast) -> str:
 
 
 def _duration(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds < 90 else f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _failures(looks: tuple[Look, ...]) -> list[str]:
@@ -136,9 +138,10 @@ def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
     if not plans:
         return []
     sensor, noise, first = config.sensor, config.noise, plans[0]
-    levels = f"black {noise.black_level_dn}, white {noise.white_level_dn}" if noise.units == "dn" else "black 0, white 1"
+    profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
     lines = [
-        f"noise     {noise.name}: a={noise.a}, b={noise.b} ({noise.units}, {levels}, black {noise.black})",
+        f"noise     {noise.name}: a={noise.a}, b={noise.b} ({noise.units}, black {profile_levels[0]} "
+        f"{noise.black}, white {profile_levels[1]})",
         f"          on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}): "
         f"a_dn {_span([plan.a_dn for plan in plans])}, b_dn2 {_span([plan.b_dn2 for plan in plans])}",
     ]

@@ -92,7 +92,9 @@ def key_text(index: int) -> str:
     return f"{index:08d}"
 
 
-def ok_row(source: Source, sha256: str, orientation: int, shard: int, plan: Plan, pair: Pair, digests: tuple[str, str]) -> Row:
+def ok_row(
+    source: Source, sha256: str, orientation: int, shard: int, plan: Plan, pair: Pair, digests: tuple[str, str]
+) -> Row:
     """Return the row of a pair; ``digests`` are the XXH3-128 of clean and noisy."""
     height, width = pair.clean.shape
     values: dict[str, Value] = {

@@ -88,6 +88,7 @@ class ShardWriter:
 
     @property
     def sha256(self) -> str:
+        """Hex digest of what was written so far."""
         return self._hash.hexdigest()
 
     def add(self, key: str, pair: Pair, row_json: bytes) -> None:

@@ -174,8 +174,8 @@ def sha256(table: Float) -> str:
 
 
 def _frozen(table: Float, expected: str | None) -> Float:
-    if expected is not None and sha256(table) != expected:
-        raise RuntimeError(f"a table came out as {sha256(table)}, expected {expected}: this Python computes differently")
+    if expected is not None and (found := sha256(table)) != expected:
+        raise RuntimeError(f"a table came out as {found}, expected {expected}: this Python computes differently")
     table.flags.writeable = False
     return table
 

@@ -22,7 +22,7 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float
     ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535; ``origin`` places a cut-out in the
     full frame, for the Bayer phase.
     """
-    white = float(np.iinfo(srgb.dtype).max)
+    white = np.float64(np.iinfo(srgb.dtype).max)
     image = TONES[plan.tone](srgb / white, (white - srgb) / white)
     image = expand_gamma(image, plan.gamma)
     image = apply_ccm(image, plan.rgb2cam)

@@ -115,8 +115,7 @@ class Workspace:
         self._same_settings()
         listing = self.work / "sources.json"
         if listing.exists():
-            known = {name: size for name, size in json.loads(listing.read_text(encoding="utf-8"))}
-            self._same_sources(known, sources)
+            self._same_sources(dict(json.loads(listing.read_text(encoding="utf-8"))), sources)
         try:
             for folder in (self.work, self.rows, self.shards):
                 folder.mkdir(exist_ok=True)

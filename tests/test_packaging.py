@@ -1,0 +1,79 @@
+"""What people install: the wheel built from the sdist carries conf/ and manifests/, and runs where no source tree is."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
+
+
+def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with the sdist, and the wheel made from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    done = run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bin folder of an environment of its own, which borrows the dependencies of this one but not the package."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False, symlinks=True)
+    python = folder / "bin" / "python"
+    (wheel,) = built.glob("*.whl")
+    installing = run(
+        *(sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python),
+        *("install", "--no-deps", "--no-index", wheel),
+        cwd=folder,
+    )
+    assert installing.returncode == 0, installing.stderr
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    (folder / "lib" / version / "site-packages" / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return folder / "bin"
+
+
+def test_the_sdist_holds_options_tests_and_readme(built: Path) -> None:
+    (archive,) = built.glob("*.tar.gz")
+    with tarfile.open(archive) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+
+    assert {*OPTIONS, "README.md", "pyproject.toml", "tests/test_packaging.py"} <= names
+
+
+def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
+    (wheel,) = built.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+
+    assert {f"unprocess_gen/{option}" for option in OPTIONS} <= set(names)
+    assert not any(name.startswith(("conf/", "tests/")) for name in names)
+
+
+def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path: Path) -> None:
+    where = run(installed / "python", "-c", "import unprocess_gen; print(unprocess_gen.__file__)", cwd=tmp_path)
+    done = run(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path)
+
+    assert Path(where.stdout.strip()).is_relative_to(installed.parent)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ds"]
+
+
+def test_the_editable_installation_sees_the_source_tree(tmp_path: Path) -> None:
+    done = run(sys.executable, "-m", "unprocess_gen", "--cfg", "job", "camera=choice", cwd=tmp_path)
+
+    assert done.returncode == 0, done.stderr
+    assert "law: choice" in done.stdout
