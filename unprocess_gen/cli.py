@@ -119,7 +119,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def generate(arguments: list[str]) -> int:
     """``gen-dataset [overrides]``: make a dataset, or with ``-m`` one for every combination."""
-    return compose(arguments, _generate)
+    return compose(arguments, _generate, sweep_csv=True)
 
 
 def _generate(config: Config) -> tuple[int, Summary]:
@@ -229,8 +229,10 @@ def conf_dir() -> Path:
     raise ConfigError(f"no conf/config.yaml in or beside {here}: the installation is not whole")
 
 
-def compose(arguments: list[str], task: Task) -> int:
+def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
     """Let Hydra compose the settings and run ``task`` on each; return its exit code, of a sweep the worst.
+
+    ``sweep_csv`` says whether a sweep leaves its table in ``out``.
 
     Raises ConfigError for settings that Hydra or `config.check` refuse; anything a single task raises.
     """
@@ -259,7 +261,8 @@ def compose(arguments: list[str], task: Task) -> int:
             assert isinstance(config, Config)
             if hydra_config.mode == RunMode.MULTIRUN:
                 jobs.append(_sweep_job(config, hydra_config.job.override_dirname, task))
-                _write_sweep(Path(config.out).parent, jobs)
+                if sweep_csv:
+                    _write_sweep(Path(config.out).parent, jobs)
                 outcomes.append(jobs[-1].exit)
             else:
                 check(config)
@@ -310,16 +313,28 @@ def _folder_name(overrides: str) -> str:
 
 
 def _write_sweep(out: Path, jobs: Sequence[Job]) -> None:
-    """Write ``sweep.csv`` anew after every job, where the sweep's folder exists at all."""
+    """Write ``sweep.csv`` anew after every job, where the sweep's folder exists; other sweeps' rows are kept."""
     if not out.is_dir():
         return
+    path = out / "sweep.csv"
+    ours = {job.folder for job in jobs}
+    earlier = [cells for cells in _read_sweep(path) if cells[0] not in ours]
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(Job.__slots__)
     writer.writerows([getattr(job, name) for name in Job.__slots__] for job in jobs)
+    writer.writerows(earlier)
     aside = out / "sweep.csv.part"
     aside.write_text(stream.getvalue(), encoding="utf-8", newline="")
-    os.replace(aside, out / "sweep.csv")
+    os.replace(aside, path)
+
+
+def _read_sweep(path: Path) -> list[list[str]]:
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [cells for cells in csv.reader(stream) if cells][1:]
+    except FileNotFoundError:
+        return []
 
 
 def _refuse_unknown_flags(arguments: Sequence[str]) -> None:

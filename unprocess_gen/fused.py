@@ -16,7 +16,8 @@ for the quadratics (2.3 instead of 1.3), conversions instead of bit views (2.4 i
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import numpy as np
 from numba import njit
@@ -44,8 +45,18 @@ _POSITION_MASK = np.uint64(2 ** (52 - SEGMENT_BITS) - 1)
 _FIRST_ROW = np.uint64(1023 << SEGMENT_BITS)
 _ROUND = 1.5 * 2.0**52
 
-# The frozen options of `njit` for this room; `cache` keeps the machine code between processes.
-_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": False}
+
+def _kernel(function: Callable[..., None]) -> Callable[..., None]:
+    """Compile a kernel: no fastmath, and the machine code kept between processes where there is a place for it.
+
+    Numba keeps it beside this file or below the user's cache folder; where neither can be written, every worker
+    compiles for itself (five seconds).
+    """
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
+    try:
+        return cast(Callable[..., None], njit(cache=True, **options)(function))
+    except RuntimeError:
+        return cast(Callable[..., None], njit(**options)(function))
 
 
 def make_pair(
@@ -88,7 +99,7 @@ def make_pair(
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _pair(
     srgb: Srgb,
     products: Float,
@@ -150,7 +161,7 @@ def _pair(
             )
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
     """Linearise and apply the matrix, for the one channel that each site keeps."""
     e0, e1, e2 = even[0], even[1], even[2]
@@ -165,7 +176,7 @@ def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
         out[x] = (e0[row[x, 0]] + e1[row[x, 1]]) + e2[row[x, 2]]
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _light(signal: Float, gains: Float, headroom: Float, threshold: float, out: Float) -> None:
     """Invert the gains, highlights kept by channel (or not at all, where ``headroom`` is 0)."""
     for x in range(signal.shape[0]):
@@ -174,7 +185,7 @@ def _light(signal: Float, gains: Float, headroom: Float, threshold: float, out: 
         out[x] = i * gains[x] + i * (m * m) * headroom[x]
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _light_by_gray(
     row: Srgb, products: Float, site: NDArray[np.int64], gains: Float, threshold: float, out: Float
 ) -> None:
@@ -191,7 +202,7 @@ def _light_by_gray(
         out[x] = i * max(mask + (1.0 - mask) * gains[c], gains[c])
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _words(
     key: tuple[np.uint64, np.uint64],
     first_block: int,
@@ -222,7 +233,7 @@ def _words(
             out[at + 3 * LANES + lane] = c3
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _normals(
     words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
 ) -> None:
@@ -247,7 +258,7 @@ def _normals(
         out_bits[n] = out_bits[n] ^ ((words[n] & _SIGN) << _32)
 
 
-@njit(**_OPTIONS)
+@_kernel
 def _frames(
     light: Float,
     normals: Float,

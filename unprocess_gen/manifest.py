@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
@@ -30,8 +30,18 @@ class Column:
     """One column: its name, its type and what it holds."""
 
     name: str
-    type: type[str] | type[int] | type[float]
+    type: Callable[[str], str | int | float]
     meaning: str
+
+
+def number_or_text(cell: str) -> str | int | float:
+    """Read a cell that holds a number, or a word instead."""
+    for kind in (int, float):
+        try:
+            return kind(cell)
+        except ValueError:
+            continue
+    return cell
 
 
 COLUMNS = (
@@ -57,7 +67,7 @@ COLUMNS = (
     Column("blue_gain", float, "forward white-balance gain of blue"),
     Column("inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it"),
     Column("tone", str, "tone curve that was inverted: smoothstep or none"),
-    Column("gamma", str, "gamma that was expanded: a number or srgb"),
+    Column("gamma", number_or_text, "gamma that was expanded: a number or srgb"),
     Column("highlight", str, "per_channel, gray_mean or none"),
     Column("highlight_threshold", float, "intensity above which highlights are kept"),
     Column("pattern", str, "Bayer pattern of the top-left 2x2 sites"),
@@ -110,7 +120,7 @@ def ok_row(
         "blue_gain": plan.blue_gain,
         "inverse_rgb_gain": plan.inverse_rgb_gain,
         "tone": plan.tone,
-        "gamma": gamma_text(plan.gamma),
+        "gamma": number_or_text(gamma_text(plan.gamma)),
         "highlight": plan.highlight,
         "highlight_threshold": plan.highlight_threshold,
         "pattern": plan.pattern,
@@ -175,7 +185,7 @@ def plan_of(row: Row) -> Plan:
             blue_gain=_float(row, "blue_gain"),
             inverse_rgb_gain=_float(row, "inverse_rgb_gain"),
             tone=_str(row, "tone"),
-            gamma="srgb" if row["gamma"] == "srgb" else float(_str(row, "gamma")),
+            gamma="srgb" if row["gamma"] == "srgb" else _float(row, "gamma"),
             highlight=_str(row, "highlight"),
             highlight_threshold=_float(row, "highlight_threshold"),
             pattern=_str(row, "pattern"),
@@ -246,22 +256,54 @@ def read_rows(path: Path) -> Iterator[Row]:
 
     Raises DamageError where the file is not a manifest or a value does not fit its column.
     """
+    return (row for _, row in located_rows(path))
+
+
+def located_rows(path: Path) -> Iterator[tuple[int, Row]]:
+    """Yield each row with the byte that it begins at; a row is one line, since names have no line ends in them.
+
+    Raises DamageError as `read_rows` does.
+    """
     try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            reader = csv.reader(stream, strict=True)
-            header = next(reader, [])
-            missing = [name for name in NAMES if name not in header]
-            if missing:
-                raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
-            for cells in reader:
-                yield _typed(dict(zip(header, cells, strict=True)))
-    except (csv.Error, ValueError, UnicodeDecodeError) as error:
+        with path.open("rb") as stream:
+            header = _header(stream.readline(), path)
+            at = stream.tell()
+            for line in stream:
+                yield at, _typed(header, line)
+                at += len(line)
+    except (csv.Error, ValueError) as error:
         raise DamageError(f"{path}: not a readable manifest ({error})") from error
     except FileNotFoundError:
         raise DamageError(f"{path}: no such manifest") from None
 
 
-def _typed(cells: Mapping[str, str]) -> Row:
+def read_row(path: Path, at: int) -> Row:
+    """Return the row that begins at a byte told by `located_rows`; DamageError where none does."""
+    try:
+        with path.open("rb") as stream:
+            header = _header(stream.readline(), path)
+            stream.seek(at)
+            return _typed(header, stream.readline())
+    except (csv.Error, ValueError, OSError) as error:
+        raise DamageError(f"{path}: no row at byte {at} ({error})") from error
+
+
+def _header(line: bytes, path: Path) -> list[str]:
+    header = _cells(line)
+    missing = [name for name in NAMES if name not in header]
+    if missing:
+        raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
+    return header
+
+
+def _cells(line: bytes) -> list[str]:
+    return next(csv.reader([line.decode("utf-8")], strict=True), [])
+
+
+def _typed(header: Sequence[str], line: bytes) -> Row:
+    if not line.endswith(b"\n"):
+        raise ValueError("the last line is cut")
+    cells = dict(zip(header, _cells(line), strict=True))
     return {column.name: column.type(cells[column.name]) if cells[column.name] else None for column in COLUMNS}
 
 

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from unprocess_gen.errors import DamageError
-from unprocess_gen.manifest import read_rows
+from unprocess_gen.manifest import located_rows, read_row
 from unprocess_gen.records import Raw
 from unprocess_gen.shards import MEMBERS, Member, map_array, read_index, shard_name
 
@@ -25,7 +27,8 @@ class RawPairs:
 
     ``pairs[i]`` is a `Sample` with ``clean``, ``noisy`` and ``row``, in the order of the manifest, failed photographs
     left out. Arrays are mapped from the shard (no copy, no unpacking); they are yours to write to, the file does not
-    change. Holds no open file, so it can be pickled, forked and shared between threads.
+    change. Holds no open file and of each row only its place (8 bytes), so it can be pickled, forked and shared between
+    threads, and a million pairs cost 8 MB.
 
     Raises DamageError where the dataset is not whole, IndexError for a number out of range.
 
@@ -35,23 +38,26 @@ class RawPairs:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.rows = [dict(row) for row in read_rows(self.path / "manifest.csv") if row["status"] == "ok"]
+        self._manifest = self.path / "manifest.csv"
+        places = (at for at, row in located_rows(self._manifest) if row["status"] == "ok")
+        self._places = np.fromiter(places, dtype=np.int64)
         self._indexes: dict[int, dict[str, Member]] = {}
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self._places)
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[number] for number in range(len(self)))
 
     def __getitem__(self, number: int) -> Sample:
-        row = self.rows[number]
-        shard = int(row["shard"] or 0)
+        row = dict(read_row(self._manifest, int(self._places[number])))
+        shard = row["shard"]
+        assert isinstance(shard, int)
         path = self.path / "shards" / shard_name(shard)
         if shard not in self._indexes:
             self._indexes[shard] = read_index(path)
         clean, noisy = (self._array(path, shard, f"{row['key']}.{member}") for member in MEMBERS[:2])
-        return Sample(clean, noisy, dict(row))
+        return Sample(clean, noisy, row)
 
     def _array(self, path: Path, shard: int, name: str) -> Raw:
         member = self._indexes[shard].get(name)
