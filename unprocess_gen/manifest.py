@@ -1,9 +1,9 @@
 """The manifest: one row a pair, and a row is a plan. Its columns stand in one tuple.
 
-A row is built once, by `ok_row` or `failed_row`, as a mapping from column to typed value (None where not applicable).
-In CSV, floats are Python's shortest round-trip spelling, so that a row read back is the same plan bit for bit. In the
-shards each row also stands as JSON, padded with blanks to a size that depends on the source's name alone: the size of a
-shard can then be told before it is made.
+A row is built once, by `ok_row` or `failed_row`, as a mapping from column to typed value; where a column does not
+apply, text is empty and a number None. In CSV, floats are Python's shortest round-trip spelling, so that a row read
+back is the same plan bit for bit. In the shards each row also stands as JSON, padded with blanks to a size that depends
+on the source's name alone: the size of a shard can then be told before it is made.
 """
 
 from __future__ import annotations
@@ -33,6 +33,11 @@ class Column:
     type: Callable[[str], str | int | float]
     meaning: str
 
+    @property
+    def empty(self) -> Value:
+        """What an empty cell reads as: no text, or no number."""
+        return "" if self.type is str else None
+
 
 def number_or_text(cell: str) -> str | int | float:
     """Read a cell that holds a number, or a word instead."""
@@ -48,7 +53,7 @@ COLUMNS = (
     Column("key", str, "source index as eight digits; the pair's name in its shard"),
     Column("source", str, "path below the source folder, percent-encoded where unsafe"),
     Column("source_sha256", str, "SHA-256 of the source's bytes"),
-    Column("source_bytes", int, "size of the source"),
+    Column("source_bytes", int, "size of the source; 0 for a built-in scene"),
     Column("status", str, "ok or failed"),
     Column("reason", str, "why it failed"),
     Column("width", int, "of the arrays"),
@@ -160,12 +165,13 @@ def _row(source: Source, sha256: str | None, shard: int, seed: int, values: dict
     known: dict[str, Value] = {
         "key": key_text(source.index),
         "source": source.name,
-        "source_sha256": sha256,
+        "source_sha256": sha256 or "",
         "source_bytes": source.size_bytes,
         "shard": shard,
         "seed": seed,
     }
-    return {name: known.get(name, values.get(name)) for name in NAMES}
+    known |= {name: value for name, value in values.items() if value is not None}
+    return {column.name: known.get(column.name, column.empty) for column in COLUMNS}
 
 
 def plan_of(row: Row) -> Plan:
@@ -224,7 +230,7 @@ def _list(row: Row, name: str) -> tuple[str, ...]:
 
 def _present(row: Row, name: str) -> str | int | float:
     value = row.get(name)
-    if value is None:
+    if value is None or value == "":
         raise ValueError(f"{name} is empty")
     return value
 
@@ -304,7 +310,7 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
     if not line.endswith(b"\n"):
         raise ValueError("the last line is cut")
     cells = dict(zip(header, _cells(line), strict=True))
-    return {column.name: column.type(cells[column.name]) if cells[column.name] else None for column in COLUMNS}
+    return {column.name: column.type(cell) if (cell := cells[column.name]) else column.empty for column in COLUMNS}
 
 
 # ------------------------------------------------------------------------------------------------------------ JSON

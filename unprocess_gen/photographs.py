@@ -17,7 +17,7 @@ def list_photographs(config: SourceConfig) -> sources.Listing:
     """
     if config.root is None:
         scenes = synthetic.listing(config.limit)
-        listed = tuple(Source(index, name, name, None) for index, name in enumerate(scenes))
+        listed = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes))
         return sources.Listing(listed, not_matched=0, skipped_links=0)
     listing = sources.list_folder(config.root, config.include, config.recursive, config.limit)
     numbered = sources.number_twins(config.root, listing.sources)

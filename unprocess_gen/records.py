@@ -18,8 +18,8 @@ class Source:
 
     ``name`` is the manifest's spelling (``/``-joined, percent-encoded where needed); ``path`` the file's path relative
     to the source folder as the operating system spells it (undecodable bytes as surrogate escapes), or the name of a
-    synthetic scene. ``size_bytes`` is None where there is no file to read (``reason`` then says why, unless
-    it is a scene). Files that share a size were hashed beforehand (``sha256``) and identical ones numbered
+    synthetic scene. ``size_bytes`` is None where there is no file to read (``reason`` then says why), and 0
+    for a scene. Files that share a size were hashed beforehand (``sha256``) and identical ones numbered
     (``occurrence``).
     """
 
