@@ -18,7 +18,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -256,8 +256,9 @@ def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
     def on_config(node: DictConfig) -> None:
         hydra_config = HydraConfig.get()
         try:
-            settings = OmegaConf.to_container(node, resolve=True)
-            config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), settings))
+            for key in _unknown_keys(node, Config()):
+                raise ConfigError(f"{_assignment(key, arguments)}: no such key; {_allowed(key)}")
+            config = OmegaConf.to_object(node)
             assert isinstance(config, Config)
             if hydra_config.mode == RunMode.MULTIRUN:
                 jobs.append(_sweep_job(config, hydra_config.job.override_dirname, task))
@@ -274,7 +275,7 @@ def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
 
     try:
         with tempfile.TemporaryDirectory() as aside:  # Hydra writes a multirun.yaml; the datasets keep a config each
-            sys.argv = ["gen-dataset", *arguments]
+            sys.argv = ["gen-dataset", *map(_quoted_path, arguments)]
             if any(argument in SWEEP_FLAGS for argument in arguments):
                 sys.argv += [f"hydra.sweep.dir={aside}", "hydra.sweep.subdir=."]
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(on_config)()
@@ -286,6 +287,18 @@ def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
         if isinstance(outcome, BaseException):
             raise outcome
     return max((code for code in outcomes if isinstance(code, int)), key=SEVERITY.index, default=0)
+
+
+def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> list[str]:
+    """Return the keys that a ``+`` override slipped past the schema."""
+    unknown = []
+    for key in map(str, node):
+        value = getattr(schema, key, None)
+        if not hasattr(schema, key):
+            unknown.append(prefix + key)
+        elif is_dataclass(value):
+            unknown += _unknown_keys(node[key], value, f"{prefix}{key}.")
+    return unknown
 
 
 def _sweep_job(config: Config, overrides: str, task: Task) -> Job:
@@ -335,6 +348,23 @@ def _read_sweep(path: Path) -> list[list[str]]:
             return [cells for cells in csv.reader(stream) if cells][1:]
     except FileNotFoundError:
         return []
+
+
+PATH_KEYS = ("source.root", "out")
+
+
+def _quoted_path(argument: str) -> str:
+    """Return an override of a path so that Hydra's grammar takes it as it stands, with ``~`` expanded.
+
+    Unquoted, a path with an umlaut, an apostrophe or a bracket in it is no word of that grammar.
+    """
+    key, _, path = argument.partition("=")
+    if key not in PATH_KEYS or path in ("", "null") or path[0] in "'\"":
+        return argument
+    path = os.path.expanduser(path).replace("${", "\\${")
+    path = re.sub(r"(\\*)'", r"\1\1\\'", path)
+    path = re.sub(r"(\\+)$", r"\1\1", path)
+    return f"{key}='{path}'"
 
 
 def _refuse_unknown_flags(arguments: Sequence[str]) -> None:
@@ -387,15 +417,13 @@ def _assignment(key: str, arguments: Sequence[str]) -> str:
 
 def _allowed(key: str) -> str:
     """Return what stands where an unknown key was looked for."""
-    import dataclasses
-
     from unprocess_gen.config import Config
 
     node: Any = Config()
     path = key.split(".")[:-1]
     for name in path:
         node = getattr(node, name, None)
-    if not dataclasses.is_dataclass(node):
+    if not is_dataclass(node):
         node, path = Config(), []
-    names = ", ".join(field.name for field in dataclasses.fields(node))
+    names = ", ".join(field.name for field in fields(node))
     return f"{'.'.join(path)} has {names}" if path else f"expected one of {names}"

@@ -179,14 +179,14 @@ def _settle(coordinator_pid: int) -> None:
 
     cv2.setNumThreads(1)
     if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
-        threading.Thread(target=_end_with_parent, args=(os.getppid(),), name=WATCHDOG, daemon=True).start()
+        threading.Thread(target=_end_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
 
 
 WATCHDOG = "unprocess_gen watchdog"
 
 
-def _end_with_parent(parent_pid: int) -> None:
-    while os.getppid() == parent_pid:
+def _end_with_parent(coordinator_pid: int) -> None:
+    while os.getppid() == coordinator_pid:
         time.sleep(PARENT_POLL_S)
     os._exit(1)
 

@@ -97,6 +97,8 @@ class Workspace:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise LockedError(f"out={self.out}: another run is writing to it; wait for it or choose another") from None
+        except OSError as error:
+            raise ConfigError(f"out={self.out}: this file system cannot lock it ({error.strerror})") from error
         foreign = sorted(set(os.listdir(self.out)) - OURS)
         if foreign and not (self.out / "config.yaml").exists():
             raise ConfigError(f"out={self.out}: holds {foreign[0]}, which is not of a dataset; choose an empty folder")
