@@ -94,7 +94,9 @@ def _unit_row(row: Sequence[float]) -> list[float]:
         raise ValueError("a row of the camera matrix sums to zero, so white cannot be kept")
     unit = [entry / total for entry in row]
     largest = max(range(3), key=lambda i: abs(unit[i]))
-    grid = math.ldexp(1.0, max(math.frexp(unit[largest])[1], 1) - 53)
+    # The sum of two entries is 1 less the third: the grid must have room for those too.
+    reach = max(max(abs(entry), abs(1 - entry)) for entry in unit)
+    grid = math.ldexp(1.0, max(math.frexp(reach)[1], 1) - 53)
     unit = [math.floor(entry / grid + 0.5) * grid for entry in unit]
     others = sum(unit[i] for i in range(3) if i != largest)
     unit[largest] = 1.0 - others

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from decimal import Decimal, localcontext
 
 from unprocess_gen import colour
-from unprocess_gen.config import CameraConfig, Config, NoiseConfig, gain_laws, noise_laws
+from unprocess_gen.config import CameraConfig, Config, gain_laws, noise_laws
 from unprocess_gen.records import Law, Plan
 from unprocess_gen.sensor import noise_in_dn
 from unprocess_gen.streams import parameter_uniforms, stream_key
@@ -35,7 +35,8 @@ def plan_image(config: Config, source_sha256: str, occurrence: int = 0) -> Plan:
     camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
     red, blue, inverse_rgb = gain_laws(config.gains)
     a_dn, b_dn2 = plan_noise(config, uniforms)
-    effects, skipped = plan_effects(config.noise, a_dn, b_dn2)
+    span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
+    effects, skipped = plan_effects(config.noise.name, a_dn, b_dn2, span_dn)
     return Plan(
         seed=config.seed,
         stream_key=key,
@@ -110,10 +111,13 @@ def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float
     )
 
 
-def plan_effects(noise: NoiseConfig, a_dn: float, b_dn2: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the effects that are simulated, in order, and those skipped, each with its reason."""
-    if a_dn == 0 and b_dn2 <= 0:
-        return ("quantise",), (f"heteroscedastic: noise={noise.name} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})",)
+def plan_effects(noise: str, a_dn: float, b_dn2: float, span_dn: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the effects that are simulated, in order, and those skipped, each with its reason.
+
+    ``span_dn`` is white less black: where the variance is nowhere above 0 in it, there is no noise to simulate.
+    """
+    if a_dn * span_dn + b_dn2 <= 0:
+        return ("quantise",), (f"heteroscedastic: noise={noise} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})",)
     return ("heteroscedastic", "quantise"), ()
 
 

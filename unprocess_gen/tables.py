@@ -124,18 +124,25 @@ def _build(tone: str, gamma: str, codes: int) -> Float:
 
 def _cached(tone: str, gamma: str, codes: int) -> Float:
     expected = PINNED.get((tone, gamma, codes))
+    path = cache_folder() / f"curve-{tone}-{gamma}-{codes}.bin"
+    table = _read(path, codes, expected)
+    if table is None:
+        table = _build_and_keep(path, tone, gamma, codes, expected)
+    return _frozen(table, expected)
+
+
+def _build_and_keep(path: Path, tone: str, gamma: str, codes: int, expected: str | None) -> Float:
+    """Build the curve, or wait for whoever is building it; without a place to keep it, every process pays."""
     try:
-        folder = cache_folder()
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"curve-{tone}-{gamma}-{codes}.bin"
+        path.parent.mkdir(parents=True, exist_ok=True)
         with _locked(path.with_suffix(".lock")):
-            table = _read(path, codes)
+            table = _read(path, codes, expected)
             if table is None:
                 table = _build(tone, gamma, codes)
                 _write(path, table)
-    except OSError:  # no place to keep it: the price is a few seconds in every process
-        table = _build(tone, gamma, codes)
-    return _frozen(table, expected)
+            return table
+    except OSError:
+        return _build(tone, gamma, codes)
 
 
 def cache_folder() -> Path:
@@ -150,13 +157,15 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
-def _read(path: Path, codes: int) -> Float | None:
+def _read(path: Path, codes: int, expected: str | None) -> Float | None:
+    """Return a kept curve; None where there is none, or one that is damaged or not the pinned one."""
     try:
         content = path.read_bytes()
-    except FileNotFoundError:
+    except OSError:
         return None
     payload, digest = content[:-32], content[-32:]
-    if len(payload) != 8 * codes or hashlib.sha256(payload).digest() != digest:
+    found = hashlib.sha256(payload)
+    if len(payload) != 8 * codes or found.digest() != digest or expected not in (None, found.hexdigest()):
         return None
     return np.frombuffer(payload, dtype="<f8").astype(np.float64)
 
@@ -164,8 +173,13 @@ def _read(path: Path, codes: int) -> Float | None:
 def _write(path: Path, table: Float) -> None:
     payload = table.astype("<f8").tobytes()
     with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as handle:
-        handle.write(payload + hashlib.sha256(payload).digest())
-    os.replace(handle.name, path)
+        try:
+            handle.write(payload + hashlib.sha256(payload).digest())
+            handle.flush()
+            os.replace(handle.name, path)
+        except OSError:
+            os.unlink(handle.name)
+            raise
 
 
 def sha256(table: Float) -> str:
@@ -184,7 +198,7 @@ def _frozen(table: Float, expected: str | None) -> Float:
 
 
 def normal_quantile(p: Decimal) -> Decimal:
-    """Return Phi^-1(p) to some 30 digits for p in [2**-53, 1 - 2**-53]; Newton on `normal_cdf`."""
+    """Return Phi^-1(p) for p in [2**-53, 1 - 2**-53], with 23 digits or more; Newton on `normal_cdf`."""
     with localcontext() as context:
         context.prec = DIGITS
         z = Decimal(NormalDist().inv_cdf(float(p)))

@@ -1,0 +1,87 @@
+"""The colour filter array: four patterns, any origin, any size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.bayer import PATTERNS, mosaic, tile
+
+R, G, B = 0, 1, 2
+
+TILES = {
+    "RGGB": ((R, G), (G, B)),
+    "BGGR": ((B, G), (G, R)),
+    "GRBG": ((G, R), (B, G)),
+    "GBRG": ((G, B), (R, G)),
+}
+
+
+def coloured(height: int, width: int) -> np.ndarray:
+    """Every sample tells its own place: channel · 10⁶ + row · 10³ + column."""
+    y, x, c = np.ogrid[:height, :width, :3]
+    return (c * 10**6 + y * 10**3 + x).astype(np.float64)
+
+
+@pytest.mark.parametrize("pattern", TILES)
+def test_a_tile_is_its_pattern_read_row_by_row(pattern: str) -> None:
+    assert tile(pattern) == TILES[pattern]
+
+
+@pytest.mark.parametrize(
+    ("origin", "expected"),
+    [
+        ((0, 0), ((R, G), (G, B))),
+        ((0, 1), ((G, R), (B, G))),
+        ((1, 0), ((G, B), (R, G))),
+        ((1, 1), ((B, G), (G, R))),
+        ((2, 2), ((R, G), (G, B))),
+        ((101, 4096), ((G, B), (R, G))),
+    ],
+)
+def test_an_origin_shifts_the_tile(origin: tuple[int, int], expected: tuple[tuple[int, int], ...]) -> None:
+    assert tile("RGGB", origin) == expected
+
+
+def test_the_patterns_are_those_four() -> None:
+    assert set(PATTERNS) == set(TILES)
+
+
+@pytest.mark.parametrize("pattern", ["RGBG", "rggb", "", "XTRANS"])
+def test_another_pattern_is_refused_with_those_that_exist(pattern: str) -> None:
+    with pytest.raises(ValueError, match=f"pattern is '{pattern}', expected one of RGGB, BGGR, GRBG, GBRG"):
+        tile(pattern)
+
+
+@pytest.mark.parametrize("pattern", TILES)
+def test_a_mosaic_by_hand(pattern: str) -> None:
+    colours = np.array([[[1, 2, 3], [4, 5, 6]], [[7, 8, 9], [10, 11, 12]]], dtype=np.float64)
+    (a, b), (c, d) = TILES[pattern]
+    assert mosaic(colours, pattern).tolist() == [[(1, 2, 3)[a], (4, 5, 6)[b]], [(7, 8, 9)[c], (10, 11, 12)[d]]]
+
+
+@given(st.sampled_from(PATTERNS), st.integers(1, 9), st.integers(1, 9))
+def test_every_site_keeps_its_own_place_and_the_filters_channel_at_any_size(
+    pattern: str, height: int, width: int
+) -> None:
+    raw = mosaic(coloured(height, width), pattern)
+    assert raw.shape == (height, width)
+    for y in range(height):
+        for x in range(width):
+            assert raw[y, x] == TILES[pattern][y % 2][x % 2] * 10**6 + y * 10**3 + x
+
+
+@pytest.mark.parametrize(("pattern", "channel"), [("RGGB", R), ("BGGR", B), ("GRBG", G), ("GBRG", G)])
+def test_a_single_pixel_is_the_first_site(pattern: str, channel: int) -> None:
+    assert mosaic(coloured(1, 1), pattern).tolist() == [[channel * 10**6]]
+
+
+@given(st.sampled_from(PATTERNS), st.data())
+def test_the_mosaic_of_a_cut_out_is_the_cut_out_of_the_mosaic(pattern: str, data: st.DataObject) -> None:
+    colours = coloured(11, 12)
+    top, left = data.draw(st.integers(0, 10)), data.draw(st.integers(0, 11))
+    bottom, right = data.draw(st.integers(top + 1, 11)), data.draw(st.integers(left + 1, 12))
+    cut = mosaic(colours[top:bottom, left:right], pattern, (top, left))
+    assert (cut == mosaic(colours, pattern)[top:bottom, left:right]).all()

@@ -1,0 +1,297 @@
+"""Camera matrices: white stays white in any order of addition, and nothing else is moved by more than rounding."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from unprocess_gen import colour
+from unprocess_gen.colour import CAMERAS, IDENTITY, RGB2XYZ, Matrix
+
+U = Fraction(1, 2**53)
+"""Half a unit in the last place of 1: what one operation may be off, relatively."""
+
+entries = st.floats(-4, 4, allow_subnormal=False)
+matrices = st.tuples(*[entries] * 9)
+
+
+@st.composite
+def weights(draw: st.DrawFn) -> tuple[float, ...]:
+    """Four uniforms over their sum, the corners and edges included."""
+    uniforms = draw(st.tuples(*[st.floats(0, 1)] * 4))
+    total = sum(uniforms)
+    assume(total > 1e-6)
+    return tuple(uniform / total for uniform in uniforms)
+
+
+def rows(matrix: Matrix) -> list[tuple[float, float, float]]:
+    return [matrix[0:3], matrix[3:6], matrix[6:9]]
+
+
+def sums(row: tuple[float, float, float]) -> set[float]:
+    return {(a + b) + c for a, b, c in itertools.permutations(row)}
+
+
+def exact_product(left: list[Fraction], right: list[Fraction]) -> list[Fraction]:
+    return [sum(left[3 * i + k] * right[3 * k + j] for k in range(3)) for i in range(3) for j in range(3)]
+
+
+def fractions(numbers: Matrix) -> list[Fraction]:
+    return [Fraction(number) for number in numbers]
+
+
+# White ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_rows_of_a_camera_sum_to_exactly_1_in_any_order(camera: str) -> None:
+    for row in rows(colour.rgb2cam(CAMERAS[camera])):
+        assert sums(row) == {1.0}
+
+
+@given(weights())
+def test_rows_of_a_mix_sum_to_exactly_1_in_any_order(mix: tuple[float, ...]) -> None:
+    for row in rows(colour.rgb2cam(colour.mix(tuple(CAMERAS.values()), mix))):
+        assert sums(row) == {1.0}
+
+
+def test_rows_of_many_mixes_sum_to_exactly_1_in_any_order() -> None:
+    """Denser than examples: 5,000 draws of the law itself; without the grid a quarter of the rows would miss."""
+    uniforms = np.random.Generator(np.random.Philox(key=0)).random((5000, 4))
+    for mix in uniforms / uniforms.sum(axis=1, keepdims=True):
+        for row in rows(colour.rgb2cam(colour.mix(tuple(CAMERAS.values()), [float(weight) for weight in mix]))):
+            assert sums(row) == {1.0}
+
+
+@pytest.mark.parametrize("row", [(-3.2, 2.8, 1.4)])
+def test_a_row_with_great_cancellation_sums_to_exactly_1_in_any_order(row: tuple[float, float, float]) -> None:
+    """Two of its entries add up to more than the next power of two above the largest."""
+    normalised = colour.normalise_rows((*row, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    assert sums(normalised[:3]) == {1.0}
+
+
+def test_rows_of_matrices_of_ones_own_sum_to_exactly_1_in_any_order() -> None:
+    """Any matrix that `camera=custom` takes: 20,000 rows with entries up to 4, cancellation and all."""
+    random_rows = np.random.Generator(np.random.Philox(key=1)).uniform(-4, 4, (20_000, 3))
+    taken = [row for row in random_rows.tolist() if abs(sum(row)) > 0.01]
+    missed = [row for row in taken if sums(colour.normalise_rows((*row, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))[:3]) != {1.0}]
+    assert missed == []
+
+
+# Accuracy -------------------------------------------------------------------------------------------------------------
+
+
+def hold_near_exact(xyz2cam: Matrix, exact_xyz2cam: list[Fraction], mixed_of: int) -> None:
+    """Hold each entry to the exactly normalised exact product.
+
+    A sum of n rounded products is off by n·u of the sum of their sizes; a quotient by the sizes' share of the row sum;
+    the grid by two units of 2**-52 of the largest entry. All to first order, hence the last factor.
+    """
+    found = fractions(colour.rgb2cam(xyz2cam))
+    product = exact_product(exact_xyz2cam, fractions(RGB2XYZ))
+    size = exact_product(
+        [abs(entry) for entry in exact_xyz2cam], [abs(entry) for entry in fractions(RGB2XYZ)]
+    )  # no cancellation in the sizes
+    for i in (0, 3, 6):
+        total, total_size = sum(product[i : i + 3]), sum(size[i : i + 3])
+        exact = [entry / total for entry in product[i : i + 3]]
+        largest = max(abs(entry) for entry in exact)
+        for j in range(3):
+            operations = (3 + mixed_of) * U * size[i + j] / abs(total)
+            operations += abs(exact[j]) * ((3 + mixed_of + 2) * U * total_size / abs(total) + U)
+            assert abs(found[i + j] - exact[j]) <= (operations + 2 * 2 * U * largest) * (1 + Fraction(1, 10**6))
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_a_camera_is_the_exactly_normalised_product(camera: str) -> None:
+    hold_near_exact(CAMERAS[camera], fractions(CAMERAS[camera]), 0)
+
+
+@given(weights())
+def test_a_mix_is_the_exactly_normalised_product_of_the_exact_mix(mix: tuple[float, ...]) -> None:
+    """Positive weights: what a mix may be off is relative to matrices of which some entries cancel between cameras."""
+    mixed = colour.mix(tuple(CAMERAS.values()), mix)
+    exact = [sum(Fraction(w) * Fraction(m[i]) for w, m in zip(mix, CAMERAS.values(), strict=True)) for i in range(9)]
+    for i in range(9):
+        size = sum(Fraction(w) * abs(Fraction(m[i])) for w, m in zip(mix, CAMERAS.values(), strict=True))
+        assert abs(Fraction(mixed[i]) - exact[i]) <= 4 * U * size * (1 + Fraction(1, 10**6)) + Fraction(1, 2**1070)
+    hold_near_exact(mixed, fractions(mixed), 0)
+
+
+@given(weights())
+def test_the_grid_moves_no_entry_by_more_than_two_units_of_the_largest(mix: tuple[float, ...]) -> None:
+    product = colour.multiply(colour.mix(tuple(CAMERAS.values()), mix), RGB2XYZ)
+    for plain, found in zip(rows(product), rows(colour.normalise_rows(product)), strict=True):
+        total = sum(Fraction(entry) for entry in plain)
+        largest = max(abs(entry) for entry in found)
+        for entry, unit in zip(plain, found, strict=True):
+            assert abs(Fraction(unit) - Fraction(entry) / total) <= 2 * Fraction(1, 2**52) * Fraction(largest)
+
+
+def test_a_product_by_hand() -> None:
+    left, right = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0), (1.0, 0.0, 2.0, 0.0, 1.0, 0.0, 3.0, 0.0, 1.0)
+    assert colour.multiply(left, right) == (10.0, 2.0, 5.0, 22.0, 5.0, 14.0, 37.0, 8.0, 24.0)
+
+
+def test_a_mix_by_hand() -> None:
+    assert colour.mix((IDENTITY, (2.0,) * 9), (0.25, 0.5)) == (1.25, 1.0, 1.0, 1.0, 1.25, 1.0, 1.0, 1.0, 1.25)
+
+
+def test_a_mix_needs_a_weight_for_every_matrix() -> None:
+    with pytest.raises(ValueError, match="argument"):
+        colour.mix((IDENTITY, IDENTITY), (1.0,))
+
+
+def test_rows_that_sum_to_1_already_stay_as_they_are() -> None:
+    assert colour.normalise_rows(IDENTITY) == IDENTITY
+
+
+def test_a_matrix_has_nine_numbers() -> None:
+    with pytest.raises(ValueError, match="nine numbers, got 8"):
+        colour.matrix([1.0] * 8)
+
+
+# Inverse --------------------------------------------------------------------------------------------------------------
+
+
+def exact_inverse(numbers: Matrix) -> list[Fraction] | None:
+    """Gauss and Jordan's elimination in fractions: another road than cofactors."""
+    left = [[Fraction(entry) for entry in row] + [Fraction(int(i == j)) for j in range(3)] for i, row in
+            enumerate(rows(numbers))]  # fmt: skip
+    for column in range(3):
+        pivot = next((row for row in range(column, 3) if left[row][column]), None)
+        if pivot is None:
+            return None
+        left[column], left[pivot] = left[pivot], left[column]
+        left[column] = [entry / left[column][column] for entry in left[column]]
+        for row in range(3):
+            if row != column:
+                factor = left[row][column]
+                left[row] = [a - factor * b for a, b in zip(left[row], left[column], strict=True)]
+    return [entry for row in left for entry in row[3:]]
+
+
+@given(matrices)
+def test_an_inverse_is_exact_and_rounded_once(own: Matrix) -> None:
+    exact = exact_inverse(own)
+    assume(exact is not None and max(abs(entry) for entry in exact) < 1e300)
+    assert list(colour.invert(own)) == [float(entry) for entry in exact or ()]
+
+
+@pytest.mark.parametrize(
+    "singular",
+    [
+        (0.0,) * 9,
+        (1.0, 2.0, 3.0, 2.0, 4.0, 6.0, 1.0, 1.0, 1.0),
+        (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0),
+        (0.0, 1.0, 1.0, 0.0, 1.0, 2.0, 0.0, 2.0, 1.0),
+    ],
+)
+def test_a_singular_matrix_is_refused(singular: Matrix) -> None:
+    with pytest.raises(ValueError, match="singular"):
+        colour.invert(singular)
+    assert colour.condition(singular) == math.inf
+    with pytest.raises(ValueError, match="not invertible"):
+        colour.normalise_rows(singular)
+    with pytest.raises(ValueError, match="not invertible"):
+        colour.rgb2cam(singular)
+
+
+def nearly_singular(condition: float) -> Matrix:
+    """Two rows that differ by e: the norm is 2 + e, the inverse's (2 + e) / e; the condition number 4 / e + 4 + e."""
+    e = 4 / condition
+    return (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 1.0 + e)
+
+
+@pytest.mark.parametrize("condition", [1e3, 1e8, 9e9])
+def test_a_matrix_that_keeps_some_digits_is_taken_and_white_stays_white(condition: float) -> None:
+    own = nearly_singular(condition)
+    assert colour.condition(own) == pytest.approx(condition, rel=5 / condition + condition / 2**53)
+    for row in rows(colour.normalise_rows(own)):
+        assert sums(row) == {1.0}
+
+
+@pytest.mark.parametrize("condition", [1.1e10, 1e14])
+def test_a_matrix_that_keeps_too_few_digits_is_refused(condition: float) -> None:
+    with pytest.raises(ValueError, match=r"not invertible \(condition number above 1e\+10\)"):
+        colour.normalise_rows(nearly_singular(condition))
+
+
+def test_a_condition_number_by_hand() -> None:
+    """Largest row sums 7 and 3 (of (1, 2; 3, 4)⁻¹ = (-2, 1; 1.5, -0.5)): 21."""
+    assert colour.condition((1.0, 2.0, 0.0, 3.0, 4.0, 0.0, 0.0, 0.0, 1.0)) == 21.0
+
+
+def test_a_row_that_sums_to_zero_is_refused() -> None:
+    with pytest.raises(ValueError, match="sums to zero"):
+        colour.normalise_rows((1.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_an_entry_that_is_no_number_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        colour.normalise_rows((bad, *IDENTITY[1:]))
+
+
+def test_entries_too_great_for_a_double_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"finite|not invertible"):
+        colour.rgb2cam((1e308,) * 4 + (-1e308,) * 5)
+
+
+# The four cameras -----------------------------------------------------------------------------------------------------
+
+
+def as_array(camera: Matrix) -> np.ndarray:
+    return np.array(camera).reshape(3, 3)
+
+
+@pytest.mark.parametrize(
+    ("camera", "condition", "determinant"),
+    [
+        ("nexus_6p", 1.842, 0.529),
+        ("sony_a7r", 2.724, 0.2435),
+        ("olympus_em10", 2.392, 0.2595),
+        ("sony_rx100", 2.027, 0.325),
+    ],
+)
+def test_a_camera_is_as_well_conditioned_as_research_measured(
+    camera: str, condition: float, determinant: float
+) -> None:
+    """To the digits it gives."""
+    found = as_array(colour.rgb2cam(CAMERAS[camera]))
+    assert abs(np.linalg.cond(found, 2) - condition) <= 0.0005
+    assert abs(np.linalg.det(found) - determinant) <= 0.0005
+
+
+@given(weights())
+def test_no_mix_is_worse_conditioned_than_the_worst_camera(mix: tuple[float, ...]) -> None:
+    found = as_array(colour.rgb2cam(colour.mix(tuple(CAMERAS.values()), mix)))
+    assert 1.835 <= np.linalg.cond(found, 2) <= 2.7245
+    assert 0.243 <= np.linalg.det(found) <= 0.530
+
+
+@pytest.mark.parametrize(
+    ("camera", "low", "high"),
+    [
+        ("nexus_6p", (-0.1214, -0.0269, 0.0), (1.1214, 1.0269, 1.0)),
+        ("sony_a7r", (0.0, 0.0, -0.0057), (1.0, 1.0, 1.0057)),
+        ("olympus_em10", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+        ("sony_rx100", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+    ],
+)
+def test_a_camera_sees_the_rgb_cube_within_the_range_research_measured(
+    camera: str, low: tuple[float, ...], high: tuple[float, ...]
+) -> None:
+    found = as_array(colour.rgb2cam(CAMERAS[camera]))
+    assert np.abs(np.minimum(found, 0).sum(axis=1) - low).max() <= 0.00005
+    assert np.abs(np.maximum(found, 0).sum(axis=1) - high).max() <= 0.00005
+
+
+def test_the_cameras_stand_in_the_order_of_the_manifests_weights() -> None:
+    assert list(CAMERAS) == ["nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100"]

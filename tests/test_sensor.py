@@ -1,0 +1,147 @@
+"""From light to digital numbers, and profiles from their own units to the sensor's."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.sensor import noise_in_dn, noisy_limits, quantise, to_dn
+
+IMX385, GENERIC_14 = (240, 4095), (1024, 16383)
+
+
+def convert(a: float, b: float, **options: object) -> tuple[float, float]:
+    defaults = {"units": "dn", "black": "subtracted", "profile_levels_dn": IMX385, "sensor_levels_dn": IMX385}
+    return noise_in_dn(a, b, **(defaults | options))  # type: ignore[arg-type]
+
+
+def hold_close(found: float, exact: Fraction, operations: int) -> None:
+    """Each operation is off by half a unit in the last place, 2**-53, at the most."""
+    assert abs(Fraction(found) - exact) <= operations * abs(exact) / 2**53 * (1 + Fraction(1, 10**6))
+
+
+# Light to DN ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("black", "white"), [(240, 4095), (64, 1023), (256, 4095), (1024, 16383), (4096, 65535), (0, 1)]
+)
+def test_black_and_white_are_exactly_the_sensors_levels(black: int, white: int) -> None:
+    assert to_dn(np.array([[0.0, 1.0]]), black, white).tolist() == [[black, white]]
+
+
+def test_light_outside_0_and_1_is_clipped() -> None:
+    light = np.array([[-0.5, -1e-300, 1 + 2**-52, 9.0, math.inf]])
+    assert to_dn(light, 240, 4095).tolist() == [[240, 240, 4095, 4095, 4095]]
+
+
+def test_light_in_between_is_a_line_and_not_rounded() -> None:
+    assert to_dn(np.array([[0.25, 0.5, 2.0**-12]]), 100, 4196).tolist() == [[1124, 2148, 101]]
+    assert to_dn(np.array([[2.0**-13]]), 100, 4196).tolist() == [[100.5]]
+
+
+# Quantising -----------------------------------------------------------------------------------------------------------
+
+
+def test_halves_are_rounded_to_even() -> None:
+    assert quantise(np.array([0.5, 1.5, 2.5, 3.5, 4094.5]), 0, 4095).tolist() == [0, 2, 2, 4, 4094]
+
+
+def test_all_else_is_rounded_to_the_nearest() -> None:
+    below, above = math.nextafter(2.5, 0), math.nextafter(2.5, 9)
+    assert quantise(np.array([0.49, 0.51, below, above, 7.0]), 0, 4095).tolist() == [0, 1, 2, 3, 7]
+
+
+def test_values_are_clipped_before_they_are_cast() -> None:
+    """A cast alone would wrap: 70000 to 4464, and -1 to 65535 or to 0, by the processor."""
+    values = np.array([-1.0, -70000.0, 70000.0, 1e10, 1e300, math.inf, -math.inf])
+    assert quantise(values, 0, 65535).tolist() == [0, 0, 65535, 65535, 65535, 65535, 0]
+
+
+def test_the_limits_are_the_callers() -> None:
+    assert quantise(np.array([-5.0, 239.6, 240.4, 4095.6]), 240, 4095).tolist() == [240, 240, 240, 4095]
+
+
+def test_rounding_comes_before_the_clip() -> None:
+    """The same for whole limits, which is why counts can be taken of rounded values."""
+    assert quantise(np.array([239.5, 4095.5]), 240, 4095).tolist() == [240, 4095]
+
+
+@given(st.integers(0, 65535))
+def test_whole_numbers_pass_unchanged(dn: int) -> None:
+    assert quantise(np.array([float(dn)]), 0, 65535).tolist() == [dn]
+
+
+def test_quantised_frames_are_uint16() -> None:
+    assert quantise(np.zeros((2, 3)), 0, 1).dtype == np.uint16
+
+
+@pytest.mark.parametrize(
+    ("bits", "black", "clip", "limits"),
+    [(12, 240, "sensor", (0, 4095)), (12, 240, "black", (240, 4095)), (16, 4096, "sensor", (0, 65535)),
+     (10, 64, "black", (64, 1023)), (14, 0, "black", (0, 16383))],
+)  # fmt: skip
+def test_noisy_frames_keep_the_pedestal_unless_told_to_clip_at_black(
+    bits: int, black: int, clip: str, limits: tuple[int, int]
+) -> None:
+    assert noisy_limits(bits, black, clip) == limits
+
+
+# Noise profiles -------------------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0, 1e4), st.floats(-1e6, 1e6))
+def test_a_profile_on_its_own_sensor_stays_as_it_is_to_the_last_bit(a: float, b: float) -> None:
+    assert convert(a, b) == (a, b)
+
+
+def test_a_line_with_the_black_level_in_it_moves_to_black() -> None:
+    """RVDD: -2043.51144 + 8.0034 · 240 = -122.69544; the sum's own size, 2043, decides its rounding."""
+    a, b = convert(8.0034, -2043.51144, black="included")
+    assert a == 8.0034
+    exact = Fraction("-122.69544")
+    slack = Fraction(math.ulp(8.0034)) / 2 * 240 + Fraction(math.ulp(2043.51144)) * Fraction(3, 2)
+    assert abs(Fraction(b) - exact) <= slack
+
+
+def test_a_line_with_the_black_level_in_it_gives_the_same_variance_at_every_level() -> None:
+    """Zero at 255.33 DN, as its author's line is: 2043.51144 / 8.0034."""
+    a, b = convert(8.0034, -2043.51144, black="included")
+    for raw in (240, 255.33, 300, 4095):
+        published = Fraction("8.0034") * Fraction(str(raw)) - Fraction("2043.51144")
+        assert abs(Fraction(a) * (Fraction(str(raw)) - 240) + Fraction(b) - published) <= Fraction(1, 10**11)
+
+
+def test_a_profile_meets_more_bits_through_the_scale_of_the_levels() -> None:
+    """s = 15359 / 3855: slope times s, intercept times s²."""
+    s = Fraction(16383 - 1024, 4095 - 240)
+    a, b = convert(6.955588, 38.117816, sensor_levels_dn=GENERIC_14)
+    hold_close(a, Fraction(6.955588) * s, 2)
+    hold_close(b, Fraction(38.117816) * s * s, 4)
+
+
+def test_the_profiles_black_level_is_taken_out_before_the_scale() -> None:
+    s = Fraction(16383 - 1024, 4095 - 240)
+    _, b = convert(1.0, 10.0, black="included", sensor_levels_dn=GENERIC_14)
+    hold_close(b, 250 * s * s, 4)
+
+
+def test_normalized_units_take_the_sensors_own_range() -> None:
+    """Brooks et al.: a · 3855, b · 3855²; the profile has no levels of its own."""
+    a, b = convert(0.01, 0.001, units="normalized", profile_levels_dn=(0, 0))
+    hold_close(a, Fraction(0.01) * 3855, 1)
+    hold_close(b, Fraction(0.001) * 3855**2, 2)
+
+
+@given(st.floats(1e-4, 50), st.floats(0, 2000), st.floats(0, 1))
+def test_the_noise_to_signal_ratio_does_not_know_the_sensors_bits(a: float, b: float, light: float) -> None:
+    """The variance over the range squared is the same on both sensors, to the rounding of four operations."""
+    other_a, other_b = convert(a, b, sensor_levels_dn=GENERIC_14)
+    here = (Fraction(a) * Fraction(light) * 3855 + Fraction(b)) / 3855**2
+    there = (Fraction(other_a) * Fraction(light) * 15359 + Fraction(other_b)) / 15359**2
+    assert abs(here - there) <= 4 * here / 2**53 * (1 + Fraction(1, 10**6)) + Fraction(1, 2**1000)

@@ -1,0 +1,323 @@
+"""Algorithm 1's steps, each against other hands: mpmath, fractions, the article's formula, Brooks' numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen import colour, unprocess
+from unprocess_gen.config import Config, GainsConfig, NoiseConfig
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Plan
+from unprocess_gen.sensor import to_dn
+
+EPS = 2.0**-52
+GAINS = (1e-300, 1e-12, 0.2, 0.5, 1 - 2.0**-53, 1.0, 1.5)
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    noise = NoiseConfig("none", "dn", "subtracted", 12, 240, 4095, 0.0, 0.0)
+    return plan_image(Config(gains=GainsConfig(1.0, 1.0, 1.0), noise=noise), "a" * 64)
+
+
+def codes(top: int, step: int = 1) -> np.ndarray:
+    return np.arange(0, top + 1, step)
+
+
+def tone_of(code: np.ndarray, top: int) -> np.ndarray:
+    """As `unprocess.unprocess` calls it."""
+    return unprocess.inverse_smoothstep(code / top, (top - code) / top)
+
+
+def true_tone(code: int, top: int) -> mpmath.mpf:
+    """The article's formula in 60 digits."""
+    return mpmath.mpf("0.5") - mpmath.sin(mpmath.asin(1 - 2 * mpmath.mpf(int(code)) / top) / 3)
+
+
+def worst_units(found: np.ndarray, exact: list[mpmath.mpf]) -> float:
+    """The largest error in units in the last place of the true value."""
+    errors = [abs(mpmath.mpf(float(f)) - e) / math.ulp(float(e)) for f, e in zip(found, exact, strict=True)]
+    return float(max(errors))
+
+
+# Tone and gamma -------------------------------------------------------------------------------------------------------
+
+GRIDS = [
+    pytest.param(255, 1, id="8 bit"),
+    pytest.param(65535, 37, id="16 bit, every 37th"),
+    pytest.param(65535, 1, id="16 bit", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("top", "step"), GRIDS)
+def test_the_tone_curve_is_within_5_units_in_the_last_place(top: int, step: int) -> None:
+    inner = codes(top, step)[1:-1]
+    with mpmath.workdps(60):
+        assert worst_units(tone_of(inner, top), [true_tone(code, top) for code in inner]) <= 5
+
+
+@pytest.mark.parametrize(("top", "step"), GRIDS)
+def test_tone_and_gamma_together_are_within_12_units_in_the_last_place(top: int, step: int) -> None:
+    """Gamma as the double it is; it lies 1.8e-16 above 2.2, which would be three units more at the 14th 16-bit code."""
+    inner = codes(top, step)[1:-1]
+    with mpmath.workdps(60):
+        exact = [true_tone(code, top) ** mpmath.mpf(2.2) for code in inner]
+        assert worst_units(unprocess.expand_gamma(tone_of(inner, top), 2.2), exact) <= 12
+
+
+@pytest.mark.parametrize("top", [255, 65535])
+def test_the_tone_curve_keeps_black_white_and_the_middle(top: int) -> None:
+    assert tone_of(np.array([0, top]), top).tolist() == [0.0, 1.0]
+    middle = unprocess.inverse_smoothstep(np.array(0.5), np.array(0.5))
+    assert abs(middle - 0.5) <= 5 * EPS / 2
+
+
+@pytest.mark.parametrize("top", [255, 65535])
+def test_the_tone_curve_rises_from_code_to_code(top: int) -> None:
+    assert (np.diff(tone_of(codes(top), top)) > 0).all()
+
+
+@pytest.mark.parametrize("top", [255, 65535])
+def test_the_tone_curve_inverts_the_cubic(top: int) -> None:
+    """Five units in y, through a slope of at most 1.5, and the five operations of the cubic, whose terms reach 3."""
+    y = tone_of(codes(top), top)
+    assert np.abs(y * y * (3 - 2 * y) - codes(top) / top).max() <= (1.5 * 5 + 5) * EPS
+
+
+def test_no_tone_leaves_the_image_as_it_is() -> None:
+    x = codes(255) / 255
+    assert unprocess.no_tone(x, 1 - x) is x
+
+
+@pytest.mark.parametrize("gamma", [2.2, 1.8, 1.0, "srgb"])
+def test_gamma_keeps_black_and_white(gamma: float | str) -> None:
+    assert unprocess.expand_gamma(np.array([0.0, 1.0]), gamma).tolist() == [0.0, 1.0]
+
+
+def test_a_gamma_of_1_changes_nothing() -> None:
+    v = codes(65535) / 65535
+    assert (unprocess.expand_gamma(v, 1.0) == v).all()
+
+
+def test_srgb_is_the_standards_curve() -> None:
+    """Within 8 units: a sum and a quotient, 1 unit each at the most, to the power of 2.4, and the power's own 4."""
+    inner = codes(65535, 37)[1:]
+    with mpmath.workdps(60):
+        v = [mpmath.mpf(int(code)) / 65535 for code in inner]
+        exact = [
+            x / mpmath.mpf("12.92")
+            if x <= mpmath.mpf("0.04045")
+            else ((x + mpmath.mpf("0.055")) / mpmath.mpf("1.055")) ** mpmath.mpf("2.4")
+            for x in v
+        ]
+        assert worst_units(unprocess.expand_gamma(inner / 65535, "srgb"), exact) <= 2 * 2.4 + 4
+
+
+def test_srgb_has_no_step_at_its_joint_beyond_the_standards_own() -> None:
+    """IEC 61966-2-1 rounds its constants, so the pieces meet to 2.4e-9: a millionth of the light there."""
+    joint = 0.04045
+    below, above = unprocess.expand_gamma(np.array([joint, math.nextafter(joint, 1)]), "srgb")
+    with mpmath.workdps(30):
+        v = mpmath.mpf("0.04045")
+        step = float(((v + mpmath.mpf("0.055")) / mpmath.mpf("1.055")) ** mpmath.mpf("2.4") - v / mpmath.mpf("12.92"))
+    assert 0 < step < 2.4e-9
+    assert abs((above - below) - step) <= 10 * math.ulp(above)
+
+
+# Colour ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_matrix_is_applied_to_each_triplet() -> None:
+    ccm = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    image = np.array([[[1.0, 10.0, 100.0], [0.5, 0.25, 0.125]]])
+    assert unprocess.apply_ccm(image, ccm).tolist() == [[[321.0, 654.0, 987.0], [1.375, 4.0, 6.625]]]
+
+
+@given(st.lists(st.floats(-2, 2), min_size=9, max_size=9), st.lists(st.floats(0, 1), min_size=3, max_size=3))
+def test_products_are_added_from_left_to_right(ccm: list[float], rgb: list[float]) -> None:
+    """The order is part of the definition: the fused form must give the same last bit."""
+    found = unprocess.apply_ccm(np.array([[rgb]]), tuple(ccm))[0, 0]
+    r, g, b = rgb
+    assert found.tolist() == [(ccm[i] * r + ccm[i + 1] * g) + ccm[i + 2] * b for i in (0, 3, 6)]
+
+
+# Gains ----------------------------------------------------------------------------------------------------------------
+
+BROOKS = (0.8 / 2.15, 0.8, 0.8 / 1.7)
+"""Inverse gains at the centres of Brooks' laws: .372, .8, .471."""
+
+
+@pytest.mark.parametrize(
+    ("highlight", "rgb", "expected"),
+    [
+        # Red: its mean, 0.47, is no highlight for Brooks' code; for the article its red channel is white.
+        ("gray_mean", ("1", "1/5", "1/5"), ("16/43", "4/25", "8/85")),
+        ("per_channel", ("1", "1/5", "1/5"), ("1", "4/25", "8/85")),
+        # Yellow, with a mean of 0.83.
+        ("gray_mean", ("1", "1", "1/2"), ("16/43", "4/5", "4/17")),
+        ("per_channel", ("1", "1", "1/2"), ("1", "1", "4/17")),
+        # A pale orange: mean 0.95, mask ¼: gains ¼ + ¾k. By channel: masks 1, ¼ and 0.
+        ("gray_mean", ("1", "19/20", "9/10"), ("91/172", "323/400", "369/680")),
+        ("per_channel", ("1", "19/20", "9/10"), ("1", "323/400", "36/85")),
+        ("none", ("1", "19/20", "9/10"), ("16/43", "19/25", "36/85")),
+        # No light, and white.
+        ("gray_mean", ("0", "0", "0"), ("0", "0", "0")),
+        ("gray_mean", ("1", "1", "1"), ("1", "1", "1")),
+        ("per_channel", ("1", "1", "1"), ("1", "1", "1")),
+        ("none", ("1", "1", "1"), ("16/43", "4/5", "8/17")),
+    ],
+)
+def test_highlights_by_hand(highlight: str, rgb: tuple[str, ...], expected: tuple[str, ...]) -> None:
+    """Rounding of i, or of the mean's three operations, is ten times as large in a mask of width 0.1, twice in its
+    square: 2 · 10 · (3 + 1) half units, and ten more for all that follows.
+    """
+    image = np.array([[[float(Fraction(value)) for value in rgb]]])
+    found = unprocess.invert_gains(image, BROOKS, highlight, 0.9)[0, 0]
+    for value, exact in zip(found, expected, strict=True):
+        assert abs(value - float(Fraction(exact))) <= (80 + 10) * EPS / 2
+
+
+def test_brooks_mask_by_hand_in_numbers_that_do_not_round() -> None:
+    """Threshold ¾, mean ⅞: mask ¼. A gain k below 1 becomes ¼ + ¾k; one above 1 stays."""
+    image = np.array([[[1.0, 0.875, 0.75]]])
+    found = unprocess.invert_gains(image, (0.25, 0.5, 2.0), "gray_mean", 0.75)
+    assert found.tolist() == [[[0.4375, 0.875 * 0.625, 1.5]]]
+
+
+def test_the_articles_mask_by_hand_in_numbers_that_do_not_round() -> None:
+    """Threshold ½: masks 1, ¼ and 0; i·k + i·mask·(1 - k), and a gain above 1 stays."""
+    image = np.array([[[1.0, 0.75, 0.5]]])
+    assert unprocess.invert_gains(image, (0.25, 0.5, 0.5), "per_channel", 0.5).tolist() == [[[1.0, 0.46875, 0.25]]]
+    assert unprocess.invert_gains(image, (2.0, 2.0, 2.0), "per_channel", 0.5).tolist() == [[[2.0, 1.5, 1.0]]]
+
+
+GRID = np.linspace(0, 1, 10**6 + 1)
+
+
+@pytest.mark.parametrize("k", GAINS)
+def test_per_channel_is_the_articles_function(k: float) -> None:
+    """k·i + 100·i·(i - 0.9)²·(1 - k), with 0.9 a double, 2.3e-17 above: 4.6e-16 in the mask; eight roundings beside."""
+    article = GRID * k + 100 * GRID * np.maximum(GRID - 0.9, 0) ** 2 * max(1 - k, 0)
+    found = unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9)
+    assert np.abs(found - article).max() <= 2 * 2.3e-16 * 1.0 + 2 * 8 * EPS / 2
+
+
+@pytest.mark.parametrize("k", GAINS)
+def test_per_channel_rises_all_the_way(k: float) -> None:
+    assert (np.diff(unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9)) > 0).all()
+
+
+@pytest.mark.parametrize("k", GAINS)
+def test_per_channel_has_no_step(k: float) -> None:
+    """Its slope is k up to the threshold and nowhere above 21 - 20k (at white); a step would show as more."""
+    slope = k if k >= 1 else 21 - 20 * k
+    steps = np.diff(unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9))
+    assert steps.max() <= slope * 1e-6 + 4 * EPS * max(k, 1)
+    dark = np.diff(unprocess.invert_gains_per_channel(GRID[GRID <= 0.9], np.array(k), 0.9))
+    assert dark.max() <= k * 1e-6 + 4 * EPS * k
+
+
+@pytest.mark.parametrize("k", GAINS)
+def test_per_channel_stays_within_0_and_white(k: float) -> None:
+    found = unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9)
+    assert (found[0], found[-1]) == (0.0, max(k, 1.0))
+    assert found.max() <= max(k, 1.0)
+
+
+@pytest.mark.parametrize("highlight", ["per_channel", "gray_mean"])
+def test_white_stays_exactly_1_for_two_million_gains_below_1(highlight: str) -> None:
+    """100·(1 - 0.9)² in place of the quotient would give less than 1 for five in six of them."""
+    generator = np.random.Generator(np.random.Philox(key=0))
+    k = np.concatenate([generator.random(10**6), np.exp2(-60 * generator.random(10**6))])
+    white = np.ones((len(k), 1, 3)) if highlight == "gray_mean" else np.ones(len(k))
+    gains = np.repeat(k, 3).reshape(-1, 1, 3) if highlight == "gray_mean" else k
+    assert (k < 1).all()
+    assert (unprocess.HIGHLIGHTS[highlight](white, gains, 0.9) == 1).all()
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.9, 0.99, 1 - 2.0**-53])
+def test_a_mask_is_0_up_to_its_threshold_and_exactly_1_at_white(threshold: float) -> None:
+    i = np.array([-0.1, 0.0, threshold / 2, threshold, 1.0])
+    assert unprocess.highlight_mask(i, threshold).tolist() == [0, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("k", GAINS)
+def test_both_ways_to_keep_highlights_are_one_on_gray(k: float) -> None:
+    """The mean of three equal values may be off by three half units, which the mask's width makes thirty, squaring
+    sixty; ten more for the rest.
+    """
+    gray = np.repeat(np.linspace(0, 1, 10_001), 3).reshape(-1, 1, 3)
+    gains = np.array([k, k, k])
+    one = unprocess.invert_gains_per_channel(gray, gains, 0.9)
+    other = unprocess.invert_gains_gray_mean(gray, gains, 0.9)
+    assert np.abs(one - other).max() <= (60 + 10) * EPS / 2 * max(k, 1)
+
+
+def test_both_ways_to_keep_highlights_part_on_saturated_colours() -> None:
+    red = np.array([[[1.0, 0.2, 0.2]]])
+    one, other = (unprocess.invert_gains(red, BROOKS, way, 0.9)[0, 0, 0] for way in ("per_channel", "gray_mean"))
+    assert one == 1.0
+    assert other == BROOKS[0]
+
+
+@given(st.floats(-0.2, 1.2), st.floats(0.1, 3))
+def test_none_is_the_gain_and_nothing_else(i: float, k: float) -> None:
+    assert unprocess.invert_gains(np.full((1, 1, 3), i), (k, k, k), "none", 0.9).tolist() == [[[i * k] * 3]]
+
+
+def test_each_channel_has_its_own_gain() -> None:
+    found = unprocess.invert_gains(np.full((2, 2, 3), 0.5), (0.25, 0.5, 1.5), "per_channel", 0.9)
+    assert found.tolist() == [[[0.125, 0.25, 0.75]] * 2] * 2
+
+
+def test_inverse_gains_are_the_inverse_brightening_over_the_forward_gains(plan: Plan) -> None:
+    assert replace(plan, red_gain=2.0, blue_gain=1.6, inverse_rgb_gain=0.8).inverse_gains == (0.4, 0.8, 0.5)
+
+
+# The whole of it ------------------------------------------------------------------------------------------------------
+
+CAMERAS = [*colour.CAMERAS, "identity"]
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("highlight", ["per_channel", "gray_mean"])
+@pytest.mark.parametrize("inverse", [1e-300, 0.3, 0.8, 1 - 2.0**-53, 1.0, 1.1, 2.05])
+def test_black_is_exactly_0_and_white_1_or_the_gain_above_it(
+    plan: Plan, camera: str, dtype: type, highlight: str, inverse: float
+) -> None:
+    matrix = colour.rgb2cam(colour.CAMERAS[camera]) if camera in colour.CAMERAS else colour.IDENTITY
+    ends = np.zeros((2, 4, 3), dtype=dtype)
+    ends[:, 2:] = np.iinfo(dtype).max
+    made = replace(plan, rgb2cam=matrix, highlight=highlight, inverse_rgb_gain=inverse, red_gain=2.1, blue_gain=1.7)
+    light = unprocess.unprocess(ends, made)
+    red, green, blue = (max(1.0, gain) for gain in made.inverse_gains)
+    assert light.tolist() == [[0, 0, red, green], [0, 0, green, blue]]
+    assert to_dn(light, 240, 4095).tolist() == [[240, 240, 4095, 4095]] * 2
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_without_highlights_white_is_the_inverse_gain(plan: Plan, camera: str) -> None:
+    matrix = colour.rgb2cam(colour.CAMERAS[camera]) if camera in colour.CAMERAS else colour.IDENTITY
+    white = np.full((2, 2, 3), 255, dtype=np.uint8)
+    made = replace(plan, rgb2cam=matrix, highlight="none", inverse_rgb_gain=0.8, red_gain=2.0, blue_gain=1.6)
+    assert unprocess.unprocess(white, made).tolist() == [[0.4, 0.8], [0.8, 0.5]]
+
+
+def test_grays_stay_gray_whatever_the_camera(plan: Plan) -> None:
+    """The three products' sizes add up to below 2, so their roundings to below 3 units."""
+    gray = np.repeat(np.arange(256, dtype=np.uint8), 12).reshape(-1, 2, 2, 3)
+    expected = unprocess.expand_gamma(tone_of(codes(255), 255), 2.2)
+    for camera in colour.CAMERAS.values():
+        made = replace(plan, rgb2cam=colour.rgb2cam(camera), inverse_rgb_gain=1.0)
+        for code in range(256):
+            light = unprocess.unprocess(gray[code], made)
+            assert np.abs(light - expected[code]).max() <= 3 * EPS * expected[code]
