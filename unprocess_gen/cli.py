@@ -17,7 +17,7 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import FrameType
@@ -38,6 +38,9 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset -m camera=sony_a7r,nexus_6p noise=imx385_iso1600,imx385_iso3200 out=sweep
                                                a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset plan [overrides] [--all]         what would be made; writes nothing
+  gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
+  gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
+                                               make rows again and compare, or write their arrays
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
 
 Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
@@ -155,6 +158,8 @@ def _plan(config: Config, read_all: bool) -> tuple[int, None]:
 
 
 AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
+VERIFY_KEYS = {"source.root": str, "--regenerate": int}
+REPLAY_KEYS = {"source.root": str, "--rows": str, "--keys": str, "--to": str}
 
 
 def again(arguments: list[str]) -> int:
@@ -163,7 +168,7 @@ def again(arguments: list[str]) -> int:
 
     if not arguments or "=" in arguments[0]:
         raise ConfigError("again: expected the folder of a dataset, then source.root=… and out=…")
-    folder, chosen = Path(arguments[0]), _again_values(arguments[1:])
+    folder, chosen = Path(arguments[0]), _values("again", AGAIN_KEYS, arguments[1:])
     config, kind = settings.read_dataset_yaml(folder / "config.yaml")
     if "out" not in chosen:
         raise ConfigError("again: out=… is missing: the folder to make it in")
@@ -179,16 +184,20 @@ def again(arguments: list[str]) -> int:
     return code
 
 
-def _again_values(arguments: list[str]) -> dict[str, Any]:
+def _values(verb: str, known: Mapping[str, Callable[[str], Any]], arguments: Sequence[str]) -> dict[str, Any]:
+    """Read ``key=value`` and ``--flag value`` (or ``--flag=value``); ConfigError for anything else."""
     values: dict[str, Any] = {}
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key not in AGAIN_KEYS:
-            raise ConfigError(f"again: {argument}: expected only {', '.join(AGAIN_KEYS)}; all else is in config.yaml")
+    waiting = iter(arguments)
+    for argument in waiting:
+        key, equals, value = argument.partition("=")
+        if key not in known:
+            raise ConfigError(f"{verb}: {argument}: expected {', '.join(known)}")
+        if not equals and (not key.startswith("--") or (value := next(waiting, "")) == ""):
+            raise ConfigError(f"{verb}: {argument}: a value is missing")
         try:
-            values[key] = AGAIN_KEYS[key](value)
+            values[key] = known[key](os.path.expanduser(value))
         except ValueError:
-            raise ConfigError(f"{argument}: expected a whole number") from None
+            raise ConfigError(f"{verb}: {key}={value}: expected a whole number") from None
     return values
 
 
@@ -201,7 +210,47 @@ def _compare(old: Path, new: Path) -> str:
     return f"manifest.csv {'is the same as' if before == after else 'DIFFERS from'} that of {old}"
 
 
-VERBS: dict[str, Callable[[list[str]], int]] = {"plan": plan, "again": again}
+def verify(arguments: list[str]) -> int:
+    """``gen-dataset verify DIR [--regenerate N] [source.root=…]``: check every byte against the manifest."""
+    from unprocess_gen import verify as room
+
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError("verify: expected the folder of a dataset")
+    folder, chosen = Path(arguments[0]), _values("verify", VERIFY_KEYS, arguments[1:])
+    damages = [str(damage) for damage in room.verify(folder)]
+    manifest, count = folder / "manifest.csv", chosen.get("--regenerate", 0)
+    if count and not damages:
+        root = room.source_root(manifest, chosen.get("source.root"))
+        replayed = room.replay(room.spread(manifest, count), root)
+        damages += [f"{one.key} ({one.source}): {one.complaint}" for one in replayed if one.complaint]
+    for damage in damages:
+        print(f"gen-dataset: {folder}: {damage}", file=sys.stderr)
+    if damages:
+        return 4
+    print(f"{folder} is whole" + (f"; {count} pairs were made again, bit for bit" if count else ""))
+    return 0
+
+
+def replay(arguments: list[str]) -> int:
+    """``gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]``: make rows again."""
+    from unprocess_gen import verify as room
+
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError("replay: expected a manifest.csv, or the folder of a dataset")
+    manifest, chosen = Path(arguments[0]), _values("replay", REPLAY_KEYS, arguments[1:])
+    manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
+    to = Path(chosen["--to"]) if "--to" in chosen else None
+    rows = room.choose(manifest, chosen.get("--rows"), chosen.get("--keys"))
+    same = different = 0
+    for one in room.replay(rows, room.source_root(manifest, chosen.get("source.root")), to):
+        same, different = same + (not one.complaint), different + bool(one.complaint)
+        if one.complaint:
+            print(f"gen-dataset: {one.key} ({one.source}): {one.complaint}", file=sys.stderr)
+    print(f"{same} pairs are the same, bit for bit; {different} are not" + (f"; arrays in {to}" if to else ""))
+    return 4 if different else 0
+
+
+VERBS: dict[str, Callable[[list[str]], int]] = {"plan": plan, "verify": verify, "replay": replay, "again": again}
 
 # ------------------------------------------------------------------------------------------------- Hydra, and sweeps
 

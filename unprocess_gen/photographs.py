@@ -7,6 +7,7 @@ import hashlib
 from unprocess_gen import decode, sources, synthetic
 from unprocess_gen.config import SourceConfig
 from unprocess_gen.errors import ConfigError, SourceError
+from unprocess_gen.manifest import Row
 from unprocess_gen.records import Photograph, Source
 
 
@@ -22,6 +23,13 @@ def list_photographs(config: SourceConfig) -> sources.Listing:
     listing = sources.list_folder(config.root, config.include, config.recursive, config.limit)
     numbered = sources.number_twins(config.root, listing.sources)
     return sources.Listing(numbered, listing.not_matched, listing.skipped_links)
+
+
+def source_of(row: Row) -> Source:
+    """Return the source that a row was made from."""
+    name, size = str(row["source"]), row["source_bytes"]
+    path = sources.decode_name(name)
+    return Source(int(str(row["key"])), name, path, size if isinstance(size, int) else None)
 
 
 def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:

@@ -15,6 +15,7 @@ import json
 import math
 import mmap
 import tarfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple
@@ -48,6 +49,12 @@ def _npy_header(shape: tuple[int, ...]) -> bytes:
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": "<u2", "fortran_order": False, "shape": shape})
     return stream.getvalue()
+
+
+def _tar_header(name: str, size: int) -> bytes:
+    info = tarfile.TarInfo(name)
+    info.size = size
+    return info.tobuf(format=tarfile.USTAR_FORMAT)
 
 
 def _padding(size: int) -> int:
@@ -99,9 +106,7 @@ class ShardWriter:
         self._member(f"{key}.{MEMBERS[2]}", len(row_json), row_json)
 
     def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
-        info = tarfile.TarInfo(name)
-        info.size = size
-        for part in (info.tobuf(format=tarfile.USTAR_FORMAT), *parts, b"\0" * _padding(size)):
+        for part in (_tar_header(name, size), *parts, b"\0" * _padding(size)):
             self._write(part)
 
     def _write(self, content: bytes | memoryview) -> None:
@@ -163,3 +168,64 @@ def read_json(path: Path, member: Member) -> dict[str, Any]:
     with path.open("rb") as stream:
         stream.seek(member.offset)
         return dict(json.loads(stream.read(member.size)))
+
+
+# ------------------------------------------------------------------------------------------------------- verifying
+
+
+class Expected(NamedTuple):
+    """What a shard must hold of one pair: the arrays' shape and XXH3-128, and the row's JSON to the byte."""
+
+    key: str
+    width: int
+    height: int
+    clean_xxh3: str
+    noisy_xxh3: str
+    json: bytes
+
+
+PIECE = 2**20
+
+
+def check_members(path: Path, pairs: Sequence[Expected]) -> Iterator[tuple[str, str, str]]:
+    """Yield (key, member, what is wrong) for every member that is not as expected, and for what follows the last.
+
+    Tar headers, npy headers, JSON and padding are held to the byte, arrays to their digest, so that a shard without a
+    complaint has just the bytes it was written with.
+    """
+    with path.open("rb") as stream:
+        for pair in pairs:
+            head = _npy_header((pair.height, pair.width))
+            size = len(head) + 2 * pair.width * pair.height
+            for member, digest in zip(MEMBERS, (pair.clean_xxh3, pair.noisy_xxh3), strict=False):
+                found = [*_check_bytes(stream, _tar_header(f"{pair.key}.{member}", size), "tar header")]
+                found += _check_bytes(stream, head, "npy header")
+                found += _check_digest(stream, size - len(head), digest)
+                found += _check_bytes(stream, b"\0" * _padding(size), "padding")
+                yield from ((pair.key, member, what) for what in found)
+            header = _tar_header(f"{pair.key}.{MEMBERS[2]}", len(pair.json))
+            whole = header + pair.json + b"\0" * _padding(len(pair.json))
+            yield from ((pair.key, MEMBERS[2], what) for what in _check_bytes(stream, whole, "member"))
+        rest = stream.read(len(END) + 1)
+        if rest != END:
+            yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"
+
+
+def _check_bytes(stream: BinaryIO, wanted: bytes, what: str) -> Iterator[str]:
+    found = stream.read(len(wanted))
+    if len(found) < len(wanted):
+        yield f"its {what} is cut short"
+    elif found != wanted:
+        at = next(i for i, (a, b) in enumerate(zip(found, wanted, strict=True)) if a != b)
+        yield f"its {what} differs from what the manifest says, from byte {at} on"
+
+
+def _check_digest(stream: BinaryIO, size: int, wanted: str) -> Iterator[str]:
+    digest, left = xxhash.xxh3_128(), size
+    while left and (piece := stream.read(min(PIECE, left))):
+        digest.update(piece)
+        left -= len(piece)
+    if left:
+        yield f"its data are cut short by {left} bytes"
+    elif digest.hexdigest() != wanted:
+        yield f"the XXH3-128 of its data is {digest.hexdigest()}, the manifest says {wanted}"

@@ -178,7 +178,7 @@ def _write(path: Path, table: Float) -> None:
             handle.flush()
             os.replace(handle.name, path)
         except OSError:
-            os.unlink(handle.name)
+            Path(handle.name).unlink()
             raise
 
 

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from unprocess_gen.config import differences
+from unprocess_gen.config import differences, one_line
 from unprocess_gen.errors import ConfigError, DamageError, LockedError, MachineError
 from unprocess_gen.manifest import NAMES, Row, read_rows, write_rows
 from unprocess_gen.records import Source
@@ -139,7 +139,7 @@ class Workspace:
         self._same_settings()
         known = {str(row["source"]): row["source_bytes"] for row in read_rows(self.out / "manifest.csv")}
         self._same_sources(known, sources)
-        facts: dict[str, Any] = json.loads((self.out / "dataset.json").read_text(encoding="utf-8"))
+        facts = read_dataset(self.out / "dataset.json")
         for entry in facts["shards"]:
             _same_size(self.out, entry)
         shutil.rmtree(self.work, ignore_errors=True)
@@ -229,7 +229,7 @@ class Workspace:
                 **facts,
                 "shards": [self.entry(shard) for shard in range(shards)],
             }
-            self._write(self.out / "dataset.json", json.dumps(dataset, indent=1) + "\n")
+            self._write(self.out / "dataset.json", dataset_text(dataset))
             shutil.rmtree(self.work)
         except OSError as error:
             raise machine_error(error, self.out) from error
@@ -260,6 +260,29 @@ class Workspace:
 
 OURS = {"config.yaml", "manifest.csv", "dataset.json", "shards", ".work"}
 """What a dataset's folder holds."""
+
+
+def dataset_text(facts: dict[str, Any]) -> str:
+    """Return ``dataset.json``: the facts, and last the SHA-256 of the text without it."""
+    return _text(facts | {"dataset_sha256": hashlib.sha256(_text(facts).encode()).hexdigest()})
+
+
+def read_dataset(path: Path) -> dict[str, Any]:
+    """Return what a ``dataset.json`` says; DamageError where a byte of it is not as it was written."""
+    try:
+        text = path.read_bytes().decode("ascii")
+        facts = json.loads(text)
+        facts.pop("dataset_sha256")
+        whole = dataset_text(facts) == text
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise DamageError(f"{path}: cannot be read ({one_line(error)})") from error
+    if not whole:
+        raise DamageError(f"{path}: is not as it was written: its own SHA-256 does not fit")
+    return dict(facts)
+
+
+def _text(facts: dict[str, Any]) -> str:
+    return json.dumps(facts, indent=1) + "\n"
 
 
 def machine_error(error: OSError, path: Path) -> MachineError:
