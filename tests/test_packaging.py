@@ -1,4 +1,4 @@
-"""What people install: the wheel built from the sdist carries conf/ and manifests/, and runs where no source tree is."""
+"""What people install: the wheel built from the sdist carries conf/ and manifests/, and runs without a source tree."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import FrameType
@@ -65,10 +65,22 @@ Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 finished with failed i
 SEVERITY = (0, 3, 11, 4, 2, 5, 1)
 """Exit codes from good to bad: a sweep ends with the worst of its jobs."""
 
-HYDRA_FLAGS = re.compile(
-    "--(hydra-help|resolve|run|multirun|shell-completion)|-(r|m|sc)"
-    "|(--(cfg|package|config-path|config-name|config-dir|info|experimental-rerun)|-(c|p|cp|cn|cd|i))(=.*)?"
-)
+ANY = ("…",)
+HYDRA_FLAGS: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("--hydra-help",): (),
+    ("--resolve",): (),
+    ("--run", "-r"): (),
+    ("--multirun", "-m"): (),
+    ("--shell-completion", "-sc"): (),
+    ("--cfg", "-c"): ("job", "hydra", "all"),
+    ("--info", "-i"): ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
+    ("--package", "-p"): ANY,
+    ("--config-path", "-cp"): ANY,
+    ("--config-name", "-cn"): ANY,
+    ("--config-dir", "-cd"): ANY,
+}
+"""Hydra's flags (each in its spellings) and the values they take; its own parser answers mistakes with a page."""
+
 SWEEP_FLAGS = ("-m", "--multirun")
 
 
@@ -79,6 +91,9 @@ class Terminated(BaseException):
 def main() -> int:
     """Run ``gen-dataset`` with the arguments of this process; return the exit code."""
     signal.signal(signal.SIGTERM, _terminate)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that cannot show a sign is no reason to stop
     try:
         return run(sys.argv[1:])
     except UnprocessGenError as error:
@@ -285,7 +300,7 @@ def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
 
     Raises ConfigError for settings that Hydra or `config.check` refuse; anything a single task raises.
     """
-    _refuse_unknown_flags(arguments)
+    _check_arguments(arguments)
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra's switch for: raise, do not print
     import hydra
     from hydra.core.config_store import ConfigStore
@@ -328,7 +343,7 @@ def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
             if any(argument in SWEEP_FLAGS for argument in arguments):
                 sys.argv += [f"hydra.sweep.dir={aside}", "hydra.sweep.subdir=."]
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(on_config)()
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError, ValueError) as error:
         raise ConfigError(_explain(error, arguments)) from error
     for outcome in outcomes:
         if isinstance(outcome, OmegaConfBaseException):
@@ -416,12 +431,37 @@ def _quoted_path(argument: str) -> str:
     return f"{key}='{path}'"
 
 
-def _refuse_unknown_flags(arguments: Sequence[str]) -> None:
-    for argument in arguments:
-        if argument.startswith("-") and not HYDRA_FLAGS.fullmatch(argument):
-            raise ConfigError(f"{argument}: no such flag; see gen-dataset --help")
-        if argument.startswith("~"):
+def _check_arguments(arguments: Sequence[str]) -> None:
+    """Refuse what is no flag and no setting; ConfigError."""
+    waiting = iter(arguments)
+    for argument in waiting:
+        if argument.startswith("-"):
+            _check_flag(argument, waiting)
+        elif argument.startswith("~"):
             raise ConfigError(f"{argument}: a setting cannot be taken away; choose another value or option")
+        elif "=" not in argument:
+            raise ConfigError(f"{argument}: expected a setting key=value; see gen-dataset --help")
+        else:
+            _check_group(*argument.lstrip("+").split("=", 1))
+
+
+def _check_flag(argument: str, waiting: Iterator[str]) -> None:
+    flag, equals, value = argument.partition("=")
+    allowed = next((values for spellings, values in HYDRA_FLAGS.items() if flag in spellings), None)
+    if allowed is None or (equals and not allowed):
+        raise ConfigError(f"{argument}: no such flag; see gen-dataset --help")
+    value = value if equals or not allowed else next(waiting, "")
+    if allowed and (not value or (allowed != ANY and value not in allowed)):
+        raise ConfigError(f"{flag} {value}: expected {'a value' if allowed == ANY else ', '.join(allowed)}")
+
+
+def _check_group(key: str, value: str) -> None:
+    """Refuse a group's option that is no word: Hydra merges a list of them, and stumbles over a number."""
+    folder = conf_dir() / key
+    word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
+    if key.isalpha() and folder.is_dir() and not word:
+        options = ", ".join(sorted(path.stem for path in folder.glob("*.yaml")))
+        raise ConfigError(f"{key}={value}: expected the name of an option: {options}")
 
 
 # --------------------------------------------------------------------------------------- Hydra's errors, in one line

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -122,6 +123,11 @@ class Config:
 CAMERA_LAWS = ("fixed", "convex", "choice", "identity", "custom")
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
 MAX_PAIRS_PER_SHARD = 10**6
+MAX_VARIANCE = 1e15
+"""Chosen: far above any sensor, and nothing overflows on the way to DN."""
+
+NAME = re.compile(r"[\w.+-]{1,100}", re.ASCII)
+"""What a camera or a noise profile may be called: it stands in every row."""
 
 # ------------------------------------------------------------------------------------------------------------ laws
 
@@ -143,7 +149,9 @@ def _log_range(low: float, high: float) -> str | None:
 
 
 def _line(slope: float, intercept: float, std: float) -> str | None:
-    return None if std >= 0 else "the standard deviation must be 0 or more"
+    if not (abs(slope) <= 10 and abs(intercept) <= 50 and 0 <= std <= 10):
+        return "expected a slope of -10 to 10, an intercept of -50 to 50, a standard deviation of 0 to 10"
+    return None
 
 
 LAW_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
@@ -209,6 +217,9 @@ def noise_laws(noise: NoiseConfig) -> tuple[Law, Law]:
     a, b = law("noise.a", noise.a, A_LAWS), law("noise.b", noise.b, B_LAWS)
     if lowest(a) < 0:
         raise ConfigError(f"noise.a={_text(noise.a)}: the variance's slope must be 0 or more")
+    for name, drawn in (("a", a), ("b", b)):
+        if max(abs(number) for number in drawn.numbers) > MAX_VARIANCE:
+            raise ConfigError(f"noise.{name}={_text(getattr(noise, name))}: expected at most {MAX_VARIANCE:g}")
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
         raise ConfigError(f"noise.a={_text(noise.a)}: noise.b depends on its logarithm, so it must be above 0")
     return a, b
@@ -255,8 +266,11 @@ def _check_source(source: SourceConfig) -> None:
 
 def _check_camera(camera: CameraConfig) -> None:
     _one_of("camera.law", camera.law, CAMERA_LAWS)
+    _check_name("camera.name", camera.name)
     if camera.law == "fixed":
         _one_of("camera.name", camera.name, tuple(colour.CAMERAS))
+    elif camera.law != "custom":
+        _one_of("camera.name", camera.name, (camera.law,))
     if camera.law != "custom":
         if camera.xyz2cam is not None:
             raise ConfigError(f"camera.xyz2cam={camera.xyz2cam}: only camera=custom takes a matrix")
@@ -286,6 +300,7 @@ def _check_sensor(sensor: SensorConfig) -> None:
 
 
 def _check_noise(noise: NoiseConfig) -> None:
+    _check_name("noise.name", noise.name)
     _one_of("noise.units", noise.units, ("dn", "normalized"))
     _one_of("noise.black", noise.black, ("subtracted", "included"))
     _one_of("noise.negative_variance", noise.negative_variance, ("refuse", "clip"))
@@ -322,6 +337,11 @@ def _black_share(noise: NoiseConfig) -> float:
     if noise.black != "included" or noise.black_level_dn is None:
         return 0.0
     return lowest(law("noise.a", noise.a, A_LAWS)) * noise.black_level_dn
+
+
+def _check_name(key: str, name: str) -> None:
+    if not NAME.fullmatch(name):
+        raise ConfigError(f"{key}={name[:40]!r}: expected up to 100 letters, digits, and . _ + -")
 
 
 def _one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
@@ -389,7 +409,7 @@ def read_dataset_yaml(path: Path) -> tuple[Config, str]:
 
 def differences(ours: str, theirs: str) -> list[str]:
     """Return what differs between two ``config.yaml`` texts, as ``key=value (there: value)``."""
-    here, there = (_flat(yaml.safe_load(text)) for text in (ours, theirs))
+    here, there = _flat(yaml.safe_load(ours)), _flat(yaml.safe_load(theirs))
     return [
         f"{key}={_text(here.get(key))} (there: {_text(there.get(key))})"
         for key in sorted(here.keys() | there.keys())

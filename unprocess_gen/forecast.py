@@ -145,8 +145,10 @@ def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
         f"          on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}): "
         f"a_dn {_span([plan.a_dn for plan in plans])}, b_dn2 {_span([plan.b_dn2 for plan in plans])}",
     ]
-    if min(plan.b_dn2 for plan in plans) < 0:
-        zero = max(-plan.b_dn2 / plan.a_dn for plan in plans)
+    zero = max(
+        (-plan.b_dn2 / plan.a_dn for plan in plans if "heteroscedastic" in plan.effects and plan.a_dn), default=0
+    )
+    if zero > 0:
         lines.append(f"          no noise up to {zero:.2f} DN above black, where the fitted variance is below 0")
     lines += [f"effect    {name}: {EFFECT_REASONS[name]}" for name in first.effects]
     lines += [f"skipped   {reason}" for reason in first.skipped]

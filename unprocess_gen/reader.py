@@ -51,16 +51,15 @@ class RawPairs:
 
     def __getitem__(self, number: int) -> Sample:
         row = dict(read_row(self._manifest, int(self._places[number])))
-        shard = row["shard"]
-        assert isinstance(shard, int)
+        shard, shape = int(row["shard"] or 0), (int(row["height"] or 0), int(row["width"] or 0))
         path = self.path / "shards" / shard_name(shard)
         if shard not in self._indexes:
             self._indexes[shard] = read_index(path)
-        clean, noisy = (self._array(path, shard, f"{row['key']}.{member}") for member in MEMBERS[:2])
+        clean, noisy = (self._array(path, shard, f"{row['key']}.{member}", shape) for member in MEMBERS[:2])
         return Sample(clean, noisy, row)
 
-    def _array(self, path: Path, shard: int, name: str) -> Raw:
+    def _array(self, path: Path, shard: int, name: str, shape: tuple[int, int]) -> Raw:
         member = self._indexes[shard].get(name)
         if member is None:
             raise DamageError(f"{path}: member {name} is missing")
-        return map_array(path, member)
+        return map_array(path, member, shape)

@@ -13,11 +13,13 @@ from __future__ import annotations
 
 import os
 import platform
+import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -132,13 +134,27 @@ def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made
     """Yield the shards in order as they are made; MachineError where a worker dies."""
     parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
     try:
-        with closing(parallel(delayed(make_shard)(bench, task) for task in tasks)) as results:
-            yield from results
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # of what an interrupt cancelled
+            with _interrupts_blocked():
+                results = parallel(delayed(make_shard)(bench, task) for task in tasks)
+            with closing(results):
+                yield from results
     except TerminatedWorkerError as error:
         raise MachineError(
             "a worker process died, most likely out of memory; what is committed is kept, run again to go on, "
             f"with fewer workers than n_jobs={n_jobs}"
         ) from error
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Hold SIGINT back while workers start: they inherit that, so that Ctrl-C is the coordinator's alone to answer."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # --------------------------------------------------------------------------------------------------- in the workers

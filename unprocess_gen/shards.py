@@ -11,14 +11,13 @@ from __future__ import annotations
 import errno
 import hashlib
 import io
-import json
 import math
 import mmap
 import tarfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import xxhash
@@ -144,30 +143,22 @@ def read_index(path: Path) -> dict[str, Member]:
     return index
 
 
-def map_array(path: Path, member: Member) -> Raw:
-    """Return an array that lies in the file: mapped, not copied, and private, so that writing to it is harmless."""
+def map_array(path: Path, member: Member, shape: tuple[int, int]) -> Raw:
+    """Return an array that lies in the file: mapped, not copied, and private, so that writing to it is harmless.
+
+    DamageError where the member is not a uint16 array of ``shape``, or the file is gone or too short.
+    """
     start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
-    with path.open("rb") as stream:
-        end = member.offset + member.size
-        mapped = mmap.mmap(stream.fileno(), end - start, access=mmap.ACCESS_COPY, offset=start)
-    head = io.BytesIO(mapped[member.offset - start : member.offset - start + 128])
+    skipped, header = member.offset - start, _npy_header(shape)
     try:
-        version = np.lib.format.read_magic(head)
-        if version != (1, 0):
-            raise ValueError(f"version {version} of the npy format")
-        shape, _, dtype = np.lib.format.read_array_header_1_0(head)
-        if dtype != np.dtype("<u2") or head.tell() + 2 * math.prod(shape) != member.size:
-            raise ValueError(f"{dtype} {shape} in {member.size} bytes")
-    except ValueError as error:
-        raise DamageError(f"{path}: the member at byte {member.offset} is not an array ({error})") from error
-    return np.ndarray(shape, dtype, mapped, member.offset - start + head.tell())
-
-
-def read_json(path: Path, member: Member) -> dict[str, Any]:
-    """Return the row that stands beside a pair."""
-    with path.open("rb") as stream:
-        stream.seek(member.offset)
-        return dict(json.loads(stream.read(member.size)))
+        with path.open("rb") as stream:
+            mapped = mmap.mmap(stream.fileno(), skipped + member.size, access=mmap.ACCESS_COPY, offset=start)
+    except (OSError, ValueError) as error:
+        raise DamageError(f"{path}: the member at byte {member.offset} cannot be read ({error})") from error
+    size = len(header) + 2 * math.prod(shape)
+    if member.size != size or mapped[skipped : skipped + len(header)] != header:
+        raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {shape[1]} x {shape[0]} DN")
+    return np.ndarray(shape, np.dtype("<u2"), mapped, skipped + len(header))
 
 
 # ------------------------------------------------------------------------------------------------------- verifying

@@ -32,7 +32,7 @@ DEFAULT_COUNT = 10
 
 
 def listing(limit: int | None) -> tuple[str, ...]:
-    """The names of the first ``limit`` scenes (None: ten), kinds taking turns; a shorter listing starts a longer one."""
+    """The names of the first ``limit`` scenes (None: ten), kinds taking turns; a shorter listing begins a longer."""
     count = DEFAULT_COUNT if limit is None else limit
     if count < 0:
         raise ValueError(f"limit of synthetic scenes {limit!r}: expected None or an integer of 0 or more")

@@ -219,11 +219,12 @@ def _replay(row: Row, root: str | None, to: Path | None) -> str:
     try:
         sha256, photograph = load(SourceConfig(root=root, max_pixels=NO_LIMIT), source_of(row))
     except SourceError as error:
-        return f"its source cannot be used ({error})"
+        sha256 = error.sha256 or str(row["source_sha256"])
+        return _changed(sha256, row) or f"its source cannot be used ({error})"
     except ConfigError as error:
         return str(error)
-    if sha256 != row["source_sha256"]:
-        return f"its source has changed: SHA-256 is {sha256}, the row says {row['source_sha256']}"
+    if complaint := _changed(sha256, row):
+        return complaint
     pair = make_pair(photograph.srgb, plan_of(row))
     if to is not None:
         _keep(pair, to, str(row["key"]))
@@ -232,6 +233,12 @@ def _replay(row: Row, root: str | None, to: Path | None) -> str:
         for name, found in (("clean", array_xxh3(pair.clean)), ("noisy", array_xxh3(pair.noisy)))
         if found != row[f"{name}_xxh3"]
     )
+
+
+def _changed(sha256: str, row: Row) -> str:
+    if sha256 == row["source_sha256"]:
+        return ""
+    return f"its source has changed: SHA-256 is {sha256}, the row says {row['source_sha256']}"
 
 
 def _keep(pair: Pair, to: Path, key: str) -> None:

@@ -27,6 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from yaml import YAMLError
+
 from unprocess_gen.config import differences, one_line
 from unprocess_gen.errors import ConfigError, DamageError, LockedError, MachineError
 from unprocess_gen.manifest import NAMES, Row, read_rows, write_rows
@@ -117,7 +119,7 @@ class Workspace:
         self._same_settings()
         listing = self.work / "sources.json"
         if listing.exists():
-            self._same_sources(dict(json.loads(listing.read_text(encoding="utf-8"))), sources)
+            self._same_sources(_read_listing(listing), sources)
         try:
             for folder in (self.work, self.rows, self.shards):
                 folder.mkdir(exist_ok=True)
@@ -136,6 +138,8 @@ class Workspace:
         Raises ConfigError where it was made from other settings or sources, DamageError where a shard is missing or of
         another size.
         """
+        if not (self.out / "config.yaml").exists():
+            raise DamageError(f"{self.out}/config.yaml: is missing from a finished dataset; remove {self.out}")
         self._same_settings()
         known = {str(row["source"]): row["source_bytes"] for row in read_rows(self.out / "manifest.csv")}
         self._same_sources(known, sources)
@@ -149,7 +153,10 @@ class Workspace:
         path = self.out / "config.yaml"
         if not path.exists():
             return
-        differing = differences(self.config_yaml, path.read_text(encoding="utf-8"))
+        try:
+            differing = differences(self.config_yaml, path.read_text(encoding="utf-8"))
+        except (ValueError, YAMLError) as error:
+            raise DamageError(f"{path}: cannot be read ({one_line(error)}); choose another out") from error
         if differing:
             raise ConfigError(
                 f"out={self.out}: was begun with other settings: {_some(differing)}; choose another out, or remove it"
@@ -178,7 +185,7 @@ class Workspace:
     def _is_committed(self, shard: int) -> bool:
         try:
             entry = self.entry(shard)
-        except FileNotFoundError:
+        except (FileNotFoundError, ValueError, KeyError):
             return False
         try:
             _same_size(self.out, entry)
@@ -260,6 +267,13 @@ class Workspace:
 
 OURS = {"config.yaml", "manifest.csv", "dataset.json", "shards", ".work"}
 """What a dataset's folder holds."""
+
+
+def _read_listing(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise DamageError(f"{path}: cannot be read ({one_line(error)}); remove the folder and start again") from error
 
 
 def dataset_text(facts: dict[str, Any]) -> str:

@@ -1,0 +1,210 @@
+"""What the tests share: a folder of photographs, a dataset made of it, and ways to the command line."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+from PIL import Image
+
+from unprocess_gen import cli as door_room
+from unprocess_gen import runner
+from unprocess_gen.config import Config, check
+
+COMMAND = Path(sys.executable).with_name("gen-dataset")
+
+
+def pixels(seed: int, height: int, width: int, dtype: type = np.uint8, channels: int = 3) -> np.ndarray:
+    """Smooth random colours with some of them saturated, so that highlights and shadows both occur."""
+    noise = np.random.default_rng(seed).random((height // 4 + 2, width // 4 + 2, channels)) * 1.3 - 0.1
+    smooth = cv2.resize(noise, (width, height), interpolation=cv2.INTER_LINEAR).reshape(height, width, channels)
+    return (np.clip(smooth, 0, 1) * np.iinfo(dtype).max).astype(dtype)
+
+
+def fill(folder: Path, count: int, first: int = 0) -> Path:
+    """Write ``count`` small PNGs, all of another content and size, and return their folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(first, first + count):
+        Image.fromarray(pixels(i, 12 + i % 5, 16 + i % 7)).save(folder / f"{i:03d}.png")
+    return folder
+
+
+PHOTOS = (
+    "50%25.png",
+    "%3Dformula.png",
+    "comma, and space.jpg",
+    "deep.png",
+    "gray.png",
+    "one.png",
+    "scan.tif",
+    "strip.bmp",
+    "sub/inner one.jpg",
+    "sub/été.png",
+    "turned.jpg",
+    "web.webp",
+    "wide.png",
+)
+"""The photographs of the fixture `photos`, as a manifest spells and orders them."""
+
+
+@pytest.fixture(scope="session")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of small photographs, `PHOTOS`, and a text file that no glob matches."""
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "sub").mkdir()
+    image = Image.fromarray
+    image(pixels(1, 9, 14)).save(folder / "=formula.png")
+    image(pixels(2, 12, 12)).save(folder / "50%.png")
+    image(pixels(3, 23, 37)).save(folder / "comma, and space.jpg", quality=95)
+    cv2.imwrite(str(folder / "deep.png"), pixels(4, 11, 13, np.uint16))
+    image(pixels(5, 21, 19)[..., 0]).save(folder / "gray.png")
+    image(pixels(6, 1, 1)).save(folder / "one.png")
+    image(pixels(7, 15, 25)).save(folder / "scan.tif", compression="tiff_lzw")
+    image(pixels(8, 3, 40)).save(folder / "strip.bmp")
+    image(pixels(9, 16, 16)).save(folder / "sub" / "inner one.jpg")
+    image(pixels(10, 17, 18)).save(folder / "sub" / "été.png")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image(pixels(11, 16, 24)).save(folder / "turned.jpg", exif=exif)
+    image(pixels(12, 20, 22)).save(folder / "web.webp", lossless=True)
+    image(pixels(13, 17, 131)).save(folder / "wide.png")
+    (folder / "notes.txt").write_text("not a photograph")
+    return folder
+
+
+Settings = Callable[..., Config]
+
+
+@pytest.fixture(scope="session")
+def settings() -> Settings:
+    """Return a function that composes settings from overrides, as the command line does, without checking them."""
+
+    @functools.cache
+    def groups(*choices: str) -> DictConfig:
+        ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
+        with initialize_config_dir(str(door_room.conf_dir()), version_base="1.3"):
+            return compose("config", overrides=list(choices))
+
+    def composed(*overrides: str) -> Config:
+        keys = {override: override.split("=")[0] for override in overrides}
+        chosen = [override for override, key in keys.items() if (door_room.conf_dir() / key).is_dir()]
+        node = copy.deepcopy(groups(*chosen))  # composing takes 0.1 s, so single values are set afterwards
+        for override in OverridesParser.create().parse_overrides([one for one in overrides if one not in chosen]):
+            OmegaConf.update(node, override.key_or_group, override.value())
+        loaded = OmegaConf.to_container(node, resolve=True)
+        config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), loaded))
+        assert isinstance(config, Config)
+        return config
+
+    return composed
+
+
+Make = Callable[..., runner.Summary]
+
+
+@pytest.fixture(scope="session")
+def make(settings: Settings) -> Make:
+    """Return a function that makes a dataset in this process: source folder (None: scenes), out, overrides."""
+
+    def made(root: Path | None, out: Path, *overrides: str, n_jobs: int = 1) -> runner.Summary:
+        config = settings(*overrides)
+        config.source.root, config.out, config.n_jobs = None if root is None else str(root), str(out), n_jobs
+        check(config)
+        return runner.generate(config)
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def dataset(photos: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a finished dataset of `photos`: 13 pairs in three shards. Tests read it and leave it as it is."""
+    out = tmp_path_factory.mktemp("made") / "ds"
+    make(photos, out, "output.pairs_per_shard=5")
+    return out
+
+
+def _tree_hash(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for path in sorted([folder / "manifest.csv", folder / "config.yaml", *(folder / "shards").rglob("*")]):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(folder)}\0{len(content)}\0".encode() + content)
+    return digest.hexdigest()
+
+
+@pytest.fixture(scope="session")
+def tree_hash() -> Callable[[Path], str]:
+    """Return a function that hashes what a dataset's data are: names and bytes of shards, manifest and config."""
+    return _tree_hash
+
+
+def environment(**changes: str) -> dict[str, str]:
+    """Return this process's environment with changes."""
+    return os.environ | {"HYDRA_FULL_ERROR": ""} | changes
+
+
+Cli = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture
+def cli(tmp_path: Path) -> Cli:
+    """Return a function that runs ``gen-dataset`` in a process of its own, in ``tmp_path`` unless told otherwise."""
+
+    def called(*arguments: object, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
+        command = [str(COMMAND), *map(str, arguments)]
+        return subprocess.run(
+            command,
+            cwd=cwd or tmp_path,
+            env=environment(**env),
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    return called
+
+
+class Done(NamedTuple):
+    """How a call ended: its exit code and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+
+Door = Callable[..., Done]
+
+
+@pytest.fixture
+def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[Door]:
+    """Return a function that calls the command line's `main` in this process, in ``tmp_path``: quicker than `cli`."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "")
+    before = signal.getsignal(signal.SIGTERM)
+
+    def called(*arguments: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["gen-dataset", *map(str, arguments)])
+        capfd.readouterr()
+        try:
+            code = door_room.main()
+        except SystemExit as error:  # argparse, below Hydra
+            code = int(error.code or 0)
+        return Done(code, *capfd.readouterr())
+
+    yield called
+    signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,388 @@
+"""The command line: exit codes, one line for every mistake, nothing written by a refusal, verbs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from conftest import COMMAND, fill
+
+from unprocess_gen import __version__, cli
+
+Door = Callable[..., Any]
+Cli = Callable[..., "subprocess.CompletedProcess[str]"]
+Make = Callable[..., Any]
+
+REFUSED = [
+    (["camera=nope"], r"camera=nope: no such option; expected one of choice, convex, custom, identity, nexus_6p, "),
+    (["noise=imx385"], r"noise=imx385: no such option; expected one of brooks2019, heteroscedastic, imx385_iso12800, "),
+    (["gains=Fixed"], r"gains=Fixed: no such option; expected one of brooks2019, "),
+    (["source.rot=photos"], r"source.rot=photos: no such key; source has root, include, recursive, limit, "),
+    (["sed=1"], r"sed=1: no such key; expected one of source, camera, gains, isp, sensor, noise, output, seed, out, "),
+    (["camera.blck=3"], r"camera.blck=3: no such key; camera has name, law, xyz2cam"),
+    (["+new=1"], r"new=1: no such key; expected one of source, camera, "),
+    (["+source.new=1"], r"source.new=1: no such key; source has root, "),
+    (["++new=1"], r"new=1: no such key; expected one of source, camera, "),
+    (["~camera"], r"~camera: a setting cannot be taken away"),
+    (["~camera.law=convex"], r"~camera.law=convex: a setting cannot be taken away"),
+    (["+camera=convex"], r".*camera.*more than once"),
+    (["seed=abc"], r"seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
+    (["seed=2.5"], r"seed=2.5: Value '2.5' of type 'float' could not be converted to Integer"),
+    (["seed=true"], r"seed=true: .* could not be converted to Integer"),
+    (["seed=null"], r"seed=null: field 'seed' is not Optional"),
+    (["gains.threshold=high"], r"gains.threshold=high: Value 'high' of type 'str' could not be converted to Float"),
+    (["source.recursive=perhaps"], r"source.recursive=perhaps: .*\bbool"),
+    (["source.include=a.jpg"], r"source.include=a.jpg: "),
+    (["seed=${no.such}"], r"seed=\$\{no.such\}: Interpolation key 'no.such' not found"),
+    (["seed=1,2"], r"Ambiguous value for argument 'seed=1,2'.*--multirun"),
+    (["word"], r"word: no such verb; expected plan, .*again or settings key=value"),
+    (["camera=convex", "word"], r"word: expected a setting key=value"),
+    (["camera.name"], r"camera.name: expected a setting key=value"),
+    ([""], r"."),
+    (["seed=[1"], r".*\[1"),
+    (["a b=c"], r".*a b=c"),
+    (["--flag"], r"--flag: no such flag; see gen-dataset --help"),
+    (["-x"], r"-x: no such flag"),
+    (["-j2"], r"-j2: no such flag"),
+    (["--multirun=2"], r"--multirun=2: no such flag"),
+    (["plan", "--any"], r"--any: no such flag"),
+    (["plan", "camera=nope"], r"camera=nope: no such option"),
+    (["plan", "seed=-1"], r"seed=-1: expected 0 to "),
+    (["--config-dir", "/no/such"], r".*'/no/such' not found"),
+    (["--config-name", "other"], r".*'other'"),
+    (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs nine numbers"),
+    (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a law"),
+    (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
+    (["gains.red=0"], r"gains.red=0: a gain must be above 0"),
+    (["out="], r"out='': expected the name of a folder"),
+    (["-m", "camera=nope,convex"], r"camera=nope: no such option"),
+    (["-m", "seed=1,x"], r"seed=1,x: Value 'x' of type 'str' could not be converted to Integer"),
+    (["again"], r"again: expected the folder of a dataset"),
+    (["again", "out=x"], r"again: expected the folder of a dataset"),
+    (["again", "/no/such", "out=x"], r"/no/such/config.yaml: no such file"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
+def test_a_mistake_costs_one_line_exit_code_2_and_writes_nothing(
+    arguments: list[str], sentence: str, door: Door, tmp_path: Path
+) -> None:
+    done = door(*arguments)
+    assert (done.code, done.out) == (2, "")
+    assert re.match("gen-dataset: " + sentence, done.err), done.err
+    assert done.err.count("\n") == 1 and done.err.endswith("\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+GROUP_VALUES = ["camera=null", "noise=3200", "sensor=12", "gains=2.0", "isp=true"]
+
+
+@pytest.mark.parametrize("argument", GROUP_VALUES)
+def test_a_group_that_is_given_a_number_is_refused_in_one_line(argument: str, door: Door) -> None:
+    done = door(argument)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+
+
+@pytest.mark.parametrize("arguments", [("--cfg", "nope"), ("--cfg",), ("--info", "nope"), ("--config-name",)])
+def test_a_flag_with_a_wrong_value_costs_one_line(arguments: tuple[str, ...], door: Door) -> None:
+    done = door(*arguments)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+
+
+def test_a_refusal_by_a_process_is_one_line_on_stderr_and_exit_code_2(cli: Cli, tmp_path: Path) -> None:
+    done = cli("camera=nope", "out=there")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_is_one_line_even_where_the_user_set_hydra_full_error(cli: Cli) -> None:
+    assert cli("seed=abc", HYDRA_FULL_ERROR="1").stderr.count("\n") == 1
+
+
+def test_an_empty_folder_is_refused_and_nothing_written(door: Door, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = door("source.root=empty")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "source.root=empty: no file matches source.include=" in done.err
+    assert os.listdir(tmp_path) == ["empty"]
+
+
+def test_an_out_below_a_file_is_refused(door: Door, tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "file").touch()
+    done = door(f"source.root={photos}", "out=file/ds")
+    assert (done.code, done.err) == (2, "gen-dataset: out=file/ds: cannot be written (Not a directory)\n")
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_an_out_that_is_a_file_is_refused(door: Door, tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    done = door(f"source.root={photos}", "out=file")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_users_own_options_are_checked_like_ours(door: Door, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/bad.yaml").write_text("name: bad\nblak: 3\n")
+    done = door("--config-dir", "mine", "noise=bad")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "blak" in done.err
+
+
+def test_a_profile_without_units_is_refused(door: Door, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/bare.yaml").write_text("name: bare\nunits: null\na: 1\nb: 1\n")
+    done = door("--config-dir=mine", "noise=bare", "noise.black=subtracted")
+    assert (done.code, done.err) == (2, "gen-dataset: noise.units=null: expected one of dn, normalized\n")
+
+
+def test_an_option_that_is_no_yaml_is_refused_in_one_line(door: Door, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/broken.yaml").write_text("name: [")
+    done = door("--config-dir", "mine", "noise=broken")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+
+
+def test_users_own_options_are_found_and_used(door: Door, tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/quiet.yaml").write_text(
+        "name: quiet\nunits: normalized\nblack: subtracted\na: 0.001\nb: 0\n"
+    )
+    done = door(
+        "--config-dir", "mine", "noise=quiet", "noise.bits=null", f"source.root={photos}", "n_jobs=1", "--cfg", "job"
+    )
+    assert (done.code, yaml.safe_load(done.out)["noise"]["name"]) == (0, "quiet")
+
+
+# Answers that write nothing -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("-h",), ("plan", "--help"), ("camera=nope", "--help")])
+def test_help_is_answered_whatever_stands_beside_it(arguments: tuple[str, ...], door: Door) -> None:
+    done = door(*arguments)
+    assert (done.code, done.out, done.err) == (0, cli.HELP, "")
+
+
+def test_help_names_every_verb_group_and_option() -> None:
+    for verb in cli.VERBS:
+        assert f"gen-dataset {verb}" in cli.HELP
+    for folder in cli.conf_dir().glob("*/"):
+        named = re.search(rf"^  {folder.name} +(.*)$", cli.HELP, re.MULTILINE)
+        assert named is not None
+        options = {file.stem for file in folder.glob("*.yaml")} - {"default"}
+        missing = options - set(named[1].split())
+        assert missing <= {"imx385_iso3200", "imx385_iso6400", "imx385_iso12800"}  # told by an ellipsis
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; sys.argv = ['gen-dataset', '--help']; from unprocess_gen import cli; assert cli.main() == 0; "
+        "print({'hydra', 'omegaconf', 'numpy', 'numba', 'cv2', 'joblib', 'PIL', 'yaml', 'tqdm'} & set(sys.modules),"
+        " file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "set()\n"
+
+
+def test_version_is_that_of_the_package(door: Door) -> None:
+    assert door("--version") == (0, f"unprocess_gen {__version__}\n", "")
+
+
+def test_help_is_shown_on_a_terminal_that_is_not_utf8(cli: Cli) -> None:
+    assert cli("--help", PYTHONIOENCODING="ascii").returncode == 0
+
+
+def test_cfg_job_prints_the_settings_and_writes_nothing(door: Door, tmp_path: Path) -> None:
+    done = door("--cfg", "job", "seed=7", "camera=sony_a7r")
+    loaded = yaml.safe_load(done.out)
+    assert (done.code, loaded["seed"], loaded["camera"]["name"]) == (0, 7, "sony_a7r")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cfg_job_shows_no_settings_of_hydra(door: Door) -> None:
+    assert "hydra" not in yaml.safe_load(door("--cfg", "job").out)
+
+
+def test_completion_of_an_option_works_and_writes_nothing(cli: Cli, tmp_path: Path) -> None:
+    line = "gen-dataset camera=s"
+    done = cli("-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
+    assert (done.returncode, done.stdout.split()) == (0, ["camera=sony_a7r", "camera=sony_rx100"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_scripts_name_the_command(shell: str, door: Door) -> None:
+    done = door("-sc", f"install={shell}")
+    assert done.code == 0
+    assert "gen-dataset" in done.out
+
+
+# generate -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_bare_command_makes_ds_from_the_scenes_and_nothing_else(cli: Cli, tmp_path: Path) -> None:
+    done = cli()
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"ds: 10 pairs in 2 shards, [\d.]+ MB, 0 failed; 10 of 10 made now, [\d.]+ s\n", done.stdout)
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
+        "ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards", "ds/shards/shard-00000.tar",
+        "ds/shards/shard-00001.tar",
+    ]  # fmt: skip
+
+
+def test_failed_photographs_end_with_exit_code_3_and_are_counted(door: Door, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 2) / "empty.png").touch()
+    done = door("source.root=p", "n_jobs=1")
+    assert done.code == 3
+    assert "2 pairs in 1 shards" in done.out
+    assert "1 failed (1 empty; see ds/manifest.csv)" in done.out
+
+
+def test_as_many_failed_photographs_as_allowed_end_with_exit_code_0(door: Door, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 2) / "empty.png").touch()
+    assert door("source.root=p", "n_jobs=1", "source.max_failed=1").code == 0
+
+
+def test_a_finished_dataset_with_failed_photographs_still_ends_with_3(door: Door, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 2) / "empty.png").touch()
+    door("source.root=p", "n_jobs=1")
+    done = door("source.root=p", "n_jobs=1")
+    assert (done.code, "ds is complete: 2 pairs" in done.out) == (3, True)
+
+
+def test_an_absent_value_of_max_failed_allows_none(door: Door, tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        fill(tmp_path / "p", 1).joinpath(name).touch()
+    assert door("source.root=p", "n_jobs=1", "source.max_failed=1").code == 3
+
+
+# plan -----------------------------------------------------------------------------------------------------------------
+
+
+def test_plan_writes_nothing(door: Door, tmp_path: Path, photos: Path) -> None:
+    done = door("plan", f"source.root={photos}", "out=a/b/c")
+    assert (done.code, done.err) == (0, "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def told_bytes(text: str) -> int:
+    return int(re.search(r"^bytes +([\d,]+) in shards$", text, re.MULTILINE)[1].replace(",", ""))  # type: ignore[index]
+
+
+@pytest.mark.parametrize("shard", [1, 5, 8])
+def test_plan_all_tells_the_exact_bytes_of_the_shards(
+    shard: int, door: Door, make: Make, photos: Path, tmp_path: Path
+) -> None:
+    told = door("plan", "--all", f"source.root={photos}", f"output.pairs_per_shard={shard}")
+    make(photos, tmp_path / "ds", f"output.pairs_per_shard={shard}")
+    assert told_bytes(told.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+
+
+def test_plan_all_tells_the_exact_bytes_where_photographs_fail(door: Door, make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 5)
+    for name in ("000.png", "002.png", "003.png"):
+        (source / name).write_bytes(b"")
+    told = door("plan", "--all", "source.root=p", "output.pairs_per_shard=2")
+    make(source, tmp_path / "ds", "output.pairs_per_shard=2")
+    assert told_bytes(told.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+
+
+def test_plan_tells_about_how_many_bytes_where_it_read_a_sample(door: Door, make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 40)
+    told = door("plan", "source.root=p")
+    make(source, tmp_path / "ds")
+    about = re.search(r"^bytes +about ([\d,]+)", told.out, re.MULTILINE)
+    assert about is not None, told.out
+    real = sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+    assert int(about[1].replace(",", "")) == pytest.approx(real, rel=0.1)
+
+
+def test_plan_names_what_would_fail_and_why(door: Door, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "empty.png").touch()
+    assert re.search(r"^fails +empty.png: empty$", door("plan", "source.root=p").out, re.MULTILINE)
+
+
+def test_plan_prints_the_conversion_of_the_noise(door: Door, photos: Path) -> None:
+    told = door("plan", f"source.root={photos}", "sensor=generic_14bit", "noise=imx385_iso1600").out
+    scale = (16383 - 1024) / (4095 - 240)
+    assert f"a_dn {3.513262 * scale:.6g}, b_dn2 {11.917691 * scale**2:.6g}" in told
+
+
+# again ----------------------------------------------------------------------------------------------------------------
+
+
+def test_again_makes_the_same_dataset_from_its_config_yaml(
+    door: Door, dataset: Path, photos: Path, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    done = door("again", dataset, f"source.root={photos}", "out=new", "n_jobs=1")
+    assert (done.code, done.out.splitlines()[-1]) == (0, f"manifest.csv is the same as that of {dataset}")
+    assert tree_hash(tmp_path / "new") == tree_hash(dataset)
+
+
+def test_again_of_scenes_needs_no_source(
+    door: Door, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    make(None, tmp_path / "old", "source.limit=2", "noise=brooks2019", "seed=5", "gains.red=2")
+    done = door("again", "old", "out=new", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert tree_hash(tmp_path / "new") == tree_hash(tmp_path / "old")
+
+
+def test_again_says_where_the_new_dataset_differs(door: Door, make: Make, tmp_path: Path) -> None:
+    make(fill(tmp_path / "p", 2), tmp_path / "old")
+    fill(tmp_path / "other", 2, first=7)
+    done = door("again", "old", "source.root=other", "out=new", "n_jobs=1")
+    assert (done.code, done.out.splitlines()[-1]) == (0, "manifest.csv DIFFERS from that of old")
+
+
+AGAIN_REFUSED = [
+    ([], r"again: out=… is missing"),
+    (["out=new"], r"again: .* was made from a source of kind folder: give source.root="),
+    (["out=new", "source.root=p", "seed=1"], r"again: seed=1: expected source.root, out, n_jobs"),
+    (["out=new", "source.root=p", "word"], r"again: word: expected source.root"),
+    (["out=new", "source.root=p", "n_jobs=two"], r"again: n_jobs=two: expected a whole number"),
+    (["out=new", "source.root=p", "n_jobs=0"], r"n_jobs=0: expected 1 to 1024"),
+    (["out=new", "source.root=/no/such"], r"source.root=/no/such: no such folder"),
+    (["out=", "source.root=p"], r"out='': expected the name of a folder"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), AGAIN_REFUSED)
+def test_again_refuses_what_it_cannot_mean(
+    arguments: list[str], sentence: str, door: Door, dataset: Path, tmp_path: Path
+) -> None:
+    fill(tmp_path / "p", 1)
+    done = door("again", dataset, *arguments)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert re.match("gen-dataset: " + sentence, done.err), done.err
+    assert os.listdir(tmp_path) == ["p"]
+
+
+def test_again_of_scenes_refuses_a_source_root(door: Door, make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "old", "source.limit=1")
+    fill(tmp_path / "p", 1)
+    done = door("again", "old", "source.root=p", "out=new")
+    assert (done.code, "was made from a source of kind synthetic: leave source.root out" in done.err) == (2, True)
+    assert not (tmp_path / "new").exists()
+
+
+# Where it runs --------------------------------------------------------------------------------------------------------
+
+
+def test_the_console_script_is_installed_beside_python() -> None:
+    assert COMMAND.is_file()
+
+
+def test_dataset_json_says_which_folder_a_relative_source_was(door: Door, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 1)
+    door("source.root=p", "n_jobs=1")
+    facts = json.loads((tmp_path / "ds/dataset.json").read_text())
+    assert facts["source"] == {"kind": "folder", "root": str(tmp_path / "p")}

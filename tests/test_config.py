@@ -1,0 +1,454 @@
+"""Settings: the values of ``conf/`` against their sources, what is refused and in which words, config.yaml."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen import cli
+from unprocess_gen.config import (
+    NOT_DATA,
+    Config,
+    check,
+    dataset_yaml,
+    differences,
+    law,
+    read_dataset_yaml,
+    source_kind,
+)
+from unprocess_gen.errors import ConfigError
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Law
+
+Settings = Callable[..., Config]
+FILES = sorted(path.relative_to(cli.conf_dir()) for path in cli.conf_dir().glob("*/*.yaml"))
+MATRIX = "[0.7, 0.1, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]"
+NEEDS = {
+    "camera/custom.yaml": [f"camera.xyz2cam={MATRIX}"],
+    "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
+}
+SHA256 = "0" * 64
+
+
+# What stands in conf/ -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_every_option_composes_and_passes_the_checks(file: Path, settings: Settings) -> None:
+    check(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_every_option_says_all_keys_of_its_group(file: Path) -> None:
+    group = getattr(Config(), str(file.parent))
+    written = yaml.safe_load((cli.conf_dir() / file).read_text(encoding="utf-8"))
+    assert set(written) == {field.name for field in dataclasses.fields(group)}
+
+
+def test_options_are_those_of_the_contract() -> None:
+    options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in cli.conf_dir().glob("*/")}
+    assert options == {
+        "source": {"default"},
+        "camera": {
+            "convex", "sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p", "choice", "identity", "custom",
+        },
+        "gains": {
+            "brooks2019", "fixed", "paper_min", "paper_max", "paper_literal", "fig6_top", "fig6_bottom", "unity",
+        },
+        "isp": {"smoothstep_gamma22", "gamma22", "srgb", "linear"},
+        "sensor": {"imx385_12bit", "generic_10bit", "generic_12bit", "generic_14bit", "generic_16bit"},
+        "noise": {
+            "imx385_iso1600", "imx385_iso3200", "imx385_iso6400", "imx385_iso12800", "imx385_iso25600",
+            "imx385_iso3200_rvdd", "brooks2019", "heteroscedastic", "none",
+        },
+        "output": {"webdataset"},
+    }  # fmt: skip
+
+
+def test_defaults_are_those_of_the_contract(settings: Settings) -> None:
+    config = settings()
+    assert (config.seed, config.out, config.n_jobs) == (0, "ds", -1)
+    assert (config.source.root, config.source.limit, config.source.recursive) == (None, None, True)
+    assert (config.source.max_pixels, config.source.max_failed, config.source.icc) == (2**26, 0, "ignore")
+    assert (config.camera.name, config.camera.law) == ("convex", "convex")
+    assert (config.isp.tone, config.isp.gamma) == ("smoothstep", 2.2)
+    assert (config.noise.name, config.output.layout, config.output.pairs_per_shard) == (
+        "imx385_iso3200", "webdataset", 8,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "photo.JPEG", "photo.png", "a.tif", "a.tiff", "a.webp", "a.bmp"])
+def test_default_globs_match_every_kind_of_photograph(name: str, settings: Settings, tmp_path: Path) -> None:
+    from unprocess_gen.sources import list_folder
+
+    (tmp_path / name).write_bytes(b"x")
+    assert len(list_folder(str(tmp_path), settings().source.include, True, None).sources) == 1
+
+
+CRVD = {
+    1600: (3.513262, 11.917691),
+    3200: (6.955588, 38.117816),
+    6400: (13.486051, 130.818508),
+    12800: (26.585953, 484.539790),
+    25600: (52.032536, 1819.818657),
+}
+
+
+@pytest.mark.parametrize("iso", CRVD)
+def test_imx385_profiles_hold_the_numbers_of_crvd(iso: int, settings: Settings) -> None:
+    noise = settings(f"noise=imx385_iso{iso}").noise
+    assert (noise.a, noise.b) == CRVD[iso]
+    assert (noise.units, noise.black, noise.bits, noise.black_level_dn, noise.white_level_dn) == (
+        "dn", "subtracted", 12, 240, 4095,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("iso", CRVD)
+def test_imx385_profiles_reach_the_plan_unchanged_on_their_own_sensor(iso: int, settings: Settings) -> None:
+    plan = plan_image(settings(f"noise=imx385_iso{iso}"), SHA256)
+    assert (plan.a_dn, plan.b_dn2) == CRVD[iso]
+
+
+def test_rvdd_profile_is_the_authors_line_with_black_included(settings: Settings) -> None:
+    noise = settings("noise=imx385_iso3200_rvdd").noise
+    assert (noise.a, noise.b, noise.black, noise.negative_variance) == (8.0034, -2043.51144, "included", "clip")
+
+
+def test_rvdd_line_is_122_dn2_below_zero_at_black(settings: Settings) -> None:
+    plan = plan_image(settings("noise=imx385_iso3200_rvdd"), SHA256)
+    assert plan.b_dn2 == pytest.approx(8.0034 * 240 - 2043.51144, abs=1e-9)
+    assert -plan.b_dn2 / plan.a_dn == pytest.approx(15.33, abs=0.005)
+
+
+def test_brooks_noise_is_the_published_law(settings: Settings) -> None:
+    noise = settings("noise=brooks2019").noise
+    assert (noise.units, noise.a, noise.b) == (
+        "normalized", ["log_uniform", 0.0001, 0.012], ["log_linear_in_a", 2.18, 1.2, 0.26],
+    )  # fmt: skip
+
+
+def test_no_noise_has_no_variance(settings: Settings) -> None:
+    plan = plan_image(settings("noise=none"), SHA256)
+    assert (plan.a_dn, plan.b_dn2, plan.effects) == (0, 0, ("quantise",))
+
+
+@pytest.mark.parametrize("sensor", ["imx385_12bit", "generic_10bit", "generic_14bit", "generic_16bit"])
+def test_heteroscedastic_numbers_are_in_dn_of_the_sensor_in_use(sensor: str, settings: Settings) -> None:
+    plan = plan_image(settings(f"sensor={sensor}", "noise=heteroscedastic", "noise.a=3.5", "noise.b=12"), SHA256)
+    assert (plan.a_dn, plan.b_dn2) == (3.5, 12)
+
+
+def test_a_profile_meets_a_sensor_of_other_levels_by_their_ratio(settings: Settings) -> None:
+    plan = plan_image(settings("sensor=generic_14bit", "noise=imx385_iso1600"), SHA256)
+    scale = (16383 - 1024) / (4095 - 240)
+    assert (plan.a_dn, plan.b_dn2) == pytest.approx((3.513262 * scale, 11.917691 * scale**2), rel=1e-15)
+
+
+GAINS = {
+    "brooks2019": (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["truncated_normal", 0.8, 0.1, 0.5, 1.1]),
+    "fixed": (2.15, 1.7, 0.8),
+    "paper_min": (1.9, 1.5, 1 / 0.85),
+    "paper_max": (2.4, 1.9, 1 / 2.05),
+    "paper_literal": (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["inverse_truncated_normal", 0.8, 0.1, 0.5, 1.1]),
+    "fig6_top": (1.9, 1.5, 0.85),
+    "fig6_bottom": (2.4, 1.9, 2.05),
+    "unity": (1, 1, 1),
+}
+
+
+@pytest.mark.parametrize("name", GAINS)
+def test_gains_are_those_of_the_contract(name: str, settings: Settings) -> None:
+    gains = settings(f"gains={name}").gains
+    assert (gains.red, gains.blue, gains.inverse_rgb) == GAINS[name]
+    assert gains.highlight == ("none" if name == "unity" else "per_channel")
+    assert gains.threshold == 0.9
+
+
+SENSORS = {
+    "imx385_12bit": (12, 240, 4095),
+    "generic_10bit": (10, 64, 1023),
+    "generic_12bit": (12, 256, 4095),
+    "generic_14bit": (14, 1024, 16383),
+    "generic_16bit": (16, 4096, 65535),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_sensors_are_those_of_the_contract(name: str, settings: Settings) -> None:
+    sensor = settings(f"sensor={name}").sensor
+    assert (sensor.bits, sensor.black_level_dn, sensor.white_level_dn) == SENSORS[name]
+    assert (sensor.pattern, sensor.clip) == ("RGGB", "sensor")
+
+
+ISPS = {
+    "smoothstep_gamma22": ("smoothstep", 2.2),
+    "gamma22": ("none", 2.2),
+    "srgb": ("none", "srgb"),
+    "linear": ("none", 1),
+}
+
+
+@pytest.mark.parametrize("name", ISPS)
+def test_isps_are_those_of_the_contract(name: str, settings: Settings) -> None:
+    isp = settings(f"isp={name}").isp
+    assert (isp.tone, isp.gamma) == ISPS[name]
+
+
+# What is refused ------------------------------------------------------------------------------------------------------
+
+REFUSED = [
+    ("seed=-1", r"seed=-1: expected 0 to 9223372036854775807"),
+    ("seed=9223372036854775808", r"seed=9223372036854775808: expected 0 to 9223372036854775807"),
+    ("n_jobs=0", r"n_jobs=0: expected 1 to 1024 or -1"),
+    ("n_jobs=-2", r"n_jobs=-2: expected 1 to 1024 or -1"),
+    ("out=''", r"out='': expected the name of a folder"),
+    ("source.root=/no/such/folder", r"source.root=/no/such/folder: no such folder"),
+    ("source.include=[]", r"source.include=\[\]: expected at least one pattern"),
+    ("source.limit=0", r"source.limit=0: expected 1 to 1000000000 or null"),
+    ("source.max_pixels=0", r"source.max_pixels=0: expected 1 to "),
+    ("source.max_failed=-1", r"source.max_failed=-1: expected 0 to "),
+    ("source.icc=convert", r"source.icc=convert: expected one of ignore, refuse"),
+    ("camera.law=mean", r"camera.law=mean: expected one of fixed, convex, choice, identity, custom"),
+    ("camera.law=fixed", r"camera.name=convex: expected one of nexus_6p, sony_a7r, olympus_em10, sony_rx100"),
+    (f"camera.xyz2cam={MATRIX}", r"camera.xyz2cam=\[0.7, .*\]: only camera=custom takes a matrix"),
+    ("camera.law=custom", r"camera.xyz2cam=null: camera=custom needs nine numbers"),
+    ("camera.law=custom;camera.xyz2cam=[1,2,3]", r"camera.xyz2cam=\[1.0, 2.0, 3.0\]: .*nine"),
+    ("camera.law=custom;camera.xyz2cam=[1,2,3,2,4,6,1,1,1]", r"camera.xyz2cam=\[1.0, 2.0, .*\]: .*invert"),
+    ("camera.law=custom;camera.xyz2cam=[0,0,0,0,0,0,0,0,0]", r"camera.xyz2cam=\[0.0, 0.0, .*\]: "),
+    ("camera.law=custom;camera.xyz2cam=[nan,0,0,0,1,0,0,0,1]", r"camera.xyz2cam=\[nan, 0.0, .*\]: "),
+    ("camera.law=custom;camera.xyz2cam=[inf,0,0,0,1,0,0,0,1]", r"camera.xyz2cam=\[inf, 0.0, .*\]: "),
+    ("gains.red=0", r"gains.red=0: a gain must be above 0"),
+    ("gains.blue=-1.5", r"gains.blue=-1.5: a gain must be above 0"),
+    ("gains.inverse_rgb=0.0", r"gains.inverse_rgb=0.0: a gain must be above 0"),
+    ("gains.red=nan", r"gains.red=nan: expected a finite number or a law: \[uniform, lowest, highest\]"),
+    ("gains.red=inf", r"gains.red=inf: expected a finite number or a law"),
+    ("gains.red=null", r"gains.red=null: expected a finite number or a law"),
+    ("gains.red=true", r"gains.red=True: expected a finite number or a law"),
+    ("gains.red=two", r"gains.red=two: expected a finite number or a law"),
+    ("gains.red=[]", r"gains.red=\[\]: expected a finite number or a law"),
+    ("gains.red=[normal,2,1]", r"gains.red=\[normal, 2, 1\]: expected a finite number or a law: \[uniform"),
+    ("gains.red=[uniform,2]", r"gains.red=\[uniform, 2\]: expected finite numbers: \[uniform, lowest, highest\]"),
+    ("gains.red=[uniform,1,nan]", r"gains.red=\[uniform, 1, nan\]: expected finite numbers"),
+    ("gains.red=[uniform,2,1]", r"gains.red=\[uniform, 2, 1\]: the lowest value must lie below the highest"),
+    ("gains.red=[uniform,0,2]", r"gains.red=\[uniform, 0, 2\]: a gain must be above 0"),
+    ("gains.red=[uniform,2,2]", r"gains.red=\[uniform, 2, 2\]: the lowest value must lie below the highest"),
+    ("gains.blue=[truncated_normal,1,0,0.5,2]", r"gains.blue=.*: the standard deviation must be above 0"),
+    ("gains.blue=[truncated_normal,1,0.1,0.5,1.7]", r"gains.blue=.*: the limits must lie within six standard dev"),
+    ("gains.inverse_rgb=[truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: a gain must be above 0"),
+    ("gains.inverse_rgb=[inverse_truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: a gain must be above 0"),
+    ("gains.red=[inverse_truncated_normal,1,1,0.5,2]", r"gains.red=.*: expected a finite number or a law"),
+    ("gains.highlight=clip", r"gains.highlight=clip: expected one of per_channel, gray_mean, none"),
+    ("gains.threshold=1", r"gains.threshold=1.0: expected 0 up to, but not including, 1"),
+    ("gains.threshold=-0.1", r"gains.threshold=-0.1: expected 0 up to"),
+    ("gains.threshold=nan", r"gains.threshold=nan: expected 0 up to"),
+    ("isp.tone=filmic", r"isp.tone=filmic: expected one of smoothstep, none"),
+    ("isp.gamma=0", r"isp.gamma=0: expected a number from 0.1 to 10, or srgb"),
+    ("isp.gamma=nan", r"isp.gamma=nan: expected a number from 0.1 to 10, or srgb"),
+    ("isp.gamma=rec709", r"isp.gamma=rec709: expected a number from 0.1 to 10, or srgb"),
+    ("isp.gamma=true", r"isp.gamma=True: expected a number from 0.1 to 10, or srgb"),
+    ("sensor.bits=0", r"sensor.bits=0: expected 1 to 16"),
+    ("sensor.bits=17", r"sensor.bits=17: expected 1 to 16"),
+    ("sensor.black_level_dn=-1", r"sensor.black_level_dn=-1: expected 0 to 4094"),
+    ("sensor.black_level_dn=4095", r"sensor.black_level_dn=4095: expected 0 to 4094"),
+    ("sensor.white_level_dn=240", r"sensor.white_level_dn=240: expected 241 to 4095 \(above the black level"),
+    ("sensor.white_level_dn=100", r"sensor.white_level_dn=100: expected 241 to 4095"),
+    ("sensor.white_level_dn=4096", r"sensor.white_level_dn=4096: expected 241 to 4095"),
+    ("sensor.pattern=RGBW", r"sensor.pattern=RGBW: expected one of RGGB, BGGR, GRBG, GBRG"),
+    ("sensor.clip=none", r"sensor.clip=none: needs float output, and output.layout=webdataset writes uint16"),
+    ("sensor.clip=white", r"sensor.clip=white: expected one of sensor, black"),
+    ("noise.units=null", r"noise.units=null: expected one of dn, normalized"),
+    ("noise.units=electrons", r"noise.units=electrons: expected one of dn, normalized"),
+    ("noise.black=null", r"noise.black=null: expected one of subtracted, included"),
+    ("noise.negative_variance=abs", r"noise.negative_variance=abs: expected one of refuse, clip"),
+    ("noise.bits=null", r"noise.units=dn: imx385_iso3200 must say the bits, .* got null, 240, 4095"),
+    ("noise.black_level_dn=null", r"noise.units=dn: imx385_iso3200 must say the bits, .* got 12, null, 4095"),
+    ("noise.white_level_dn=null", r"noise.units=dn: imx385_iso3200 must say the bits, .* got 12, 240, null"),
+    ("noise.white_level_dn=240", r"noise.white_level_dn=240: expected 241 to 4095"),
+    ("noise.white_level_dn=5000", r"noise.white_level_dn=5000: expected 241 to 4095"),
+    ("noise.black_level_dn=-1", r"noise.black_level_dn=-1: expected 0 to 4094"),
+    ("noise.a=null", r"noise.a=null: expected a finite number or a law: \[uniform, .*\]; \[log_uniform, .*\]"),
+    ("noise.a=nan", r"noise.a=nan: expected a finite number"),
+    ("noise.a=inf", r"noise.a=inf: expected a finite number"),
+    ("noise.b=nan", r"noise.b=nan: expected a finite number"),
+    ("noise.b=-inf", r"noise.b=-inf: expected a finite number"),
+    ("noise.a=-1", r"noise.a=-1: the variance's slope must be 0 or more"),
+    ("noise.a=[uniform,-1,1]", r"noise.a=\[uniform, -1, 1\]: the variance's slope must be 0 or more"),
+    ("noise.a=[log_uniform,0,1]", r"noise.a=\[log_uniform, 0, 1\]: the lowest value must be above 0"),
+    ("noise=brooks2019;noise.a=0", r"noise.a=0: noise.b depends on its logarithm, so it must be above 0"),
+    ("noise=brooks2019;noise.b=[log_linear_in_a,2,1,-1]", r"noise.b=.*: expected a slope of -10 to 10"),
+    ("noise=brooks2019;noise.black=included", r"noise.black=included: normalized units have black at 0"),
+    ("noise.b=-1", r"noise.b=-1: the variance at black is -1, below 0; say noise.negative_variance=clip"),
+    ("noise.b=[uniform,-1,1]", r"noise.b=\[uniform, -1, 1\]: the variance at black is -1, below 0"),
+    ("noise=brooks2019;noise.b=-0.1", r"noise.b=-0.1: the variance at black is -0.1, below 0"),
+    ("noise=imx385_iso3200_rvdd;noise.negative_variance=refuse", r"noise.b=-2043.51144: the variance at black is -122"),
+    ("output.layout=zip", r"output.layout=zip: expected one of webdataset"),
+    ("output.pairs_per_shard=0", r"output.pairs_per_shard=0: expected 1 to 1000000"),
+    ("output.pairs_per_shard=1000001", r"output.pairs_per_shard=1000001: expected 1 to 1000000"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "sentence"), REFUSED, ids=[overrides for overrides, _ in REFUSED])
+def test_a_bad_value_is_refused_with_its_key_its_value_and_what_is_allowed(
+    overrides: str, sentence: str, settings: Settings
+) -> None:
+    config = settings(*overrides.split(";"))
+    with pytest.raises(ConfigError, match="^" + sentence) as error:
+        check(config)
+    assert "\n" not in str(error.value)
+
+
+ACCEPTED = [
+    "seed=9223372036854775807", "n_jobs=1024", "source.limit=1", "source.max_pixels=1", "gains.red=1e-9",
+    "gains.red=[uniform,0.001,9]", "gains.threshold=0", "gains.threshold=0.999", "isp.gamma=0.1", "isp.gamma=10",
+    "sensor.bits=16", "sensor.black_level_dn=0", "sensor.black_level_dn=4094", "sensor.white_level_dn=241",
+    "noise.a=0", "noise.b=0", "noise.a=[uniform,0,1]", "output.pairs_per_shard=1", "output.pairs_per_shard=1000000",
+    "sensor.clip=black", "sensor.pattern=GBRG", "noise.bits=14",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("override", ACCEPTED)
+def test_values_on_the_edge_of_what_is_allowed_are_accepted(override: str, settings: Settings) -> None:
+    check(settings(override))
+
+
+def test_a_negative_b_is_accepted_where_the_profile_says_clip(settings: Settings) -> None:
+    check(settings("noise.b=-1", "noise.negative_variance=clip"))
+
+
+def test_a_source_root_that_is_a_file_is_refused(settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"source.root=.*/file: no such folder"):
+        check(settings(f"source.root={tmp_path}/file"))
+
+
+@given(low=st.floats(0.01, 5), width=st.floats(0.01, 5))
+def test_a_law_reads_as_its_kind_and_numbers(low: float, width: float) -> None:
+    assert law("gains.red", ["uniform", low, low + width], ("uniform",)) == Law("uniform", (low, low + width))
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53))
+def test_a_number_reads_as_a_constant(value: float) -> None:
+    assert law("noise.a", value, ("uniform",)) == Law("constant", (float(value),))
+
+
+# config.yaml ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_config_yaml_reads_back_to_the_same_text(file: Path, settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), []))
+    text = dataset_yaml(config)
+    (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
+    again, kind = read_dataset_yaml(tmp_path / "config.yaml")
+    assert kind == "synthetic"
+    assert dataset_yaml(again) == text
+
+
+@given(
+    numbers=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=3, max_size=3),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_config_yaml_keeps_every_number_to_the_last_bit(
+    numbers: list[float], seed: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    config = Config(seed=seed)
+    config.noise.a, config.noise.b, config.gains.threshold = numbers
+    path = tmp_path_factory.mktemp("yaml") / "config.yaml"
+    path.write_text(dataset_yaml(config), encoding="utf-8")
+    again, _ = read_dataset_yaml(path)
+    assert repr((again.seed, again.noise.a, again.noise.b, again.gains.threshold)) == repr((seed, *numbers))
+
+
+def test_config_yaml_of_a_folder_says_so_and_not_where_it_is(settings: Settings, tmp_path: Path) -> None:
+    loaded = yaml.safe_load(dataset_yaml(settings(f"source.root={tmp_path}")))
+    assert loaded["source"]["kind"] == "folder"
+    assert str(tmp_path) not in dataset_yaml(settings(f"source.root={tmp_path}"))
+
+
+def test_source_kind_follows_from_the_root(settings: Settings) -> None:
+    assert source_kind(settings()) == "synthetic"
+    assert source_kind(settings("source.root=photos")) == "folder"
+
+
+def test_keys_that_do_not_decide_the_data_are_left_out(settings: Settings) -> None:
+    loaded = yaml.safe_load(dataset_yaml(settings()))
+    assert NOT_DATA == {"": ("out", "n_jobs"), "source": ("root", "max_failed")}
+    assert {"out", "n_jobs"}.isdisjoint(loaded)
+    assert {"root", "max_failed"}.isdisjoint(loaded["source"])
+
+
+def test_every_other_key_is_there(settings: Settings) -> None:
+    loaded = yaml.safe_load(dataset_yaml(settings()))
+    for field in dataclasses.fields(Config):
+        if dataclasses.is_dataclass(group := getattr(Config(), field.name)):
+            names = {key.name for key in dataclasses.fields(group)} - set(NOT_DATA.get(field.name, ()))
+            assert set(loaded[field.name]) - {"kind"} == names
+        else:
+            assert field.name in loaded or field.name in NOT_DATA[""]
+
+
+@pytest.mark.parametrize("keys", ["out=elsewhere", "n_jobs=3", "source.max_failed=7"])
+def test_what_does_not_decide_the_data_does_not_change_the_text(keys: str, settings: Settings) -> None:
+    assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
+
+
+SPELLINGS = [
+    ("gains.red=2", "gains.red=2.0"),
+    ("gains.red=[uniform,1,2]", "gains.red=[uniform,1.0,2.0]"),
+    ("noise.a=3", "noise.a=3.0"),
+    ("noise.b=30", "noise.b=3e1"),
+    ("isp.gamma=2", "isp.gamma=2.0"),
+    ("gains.threshold=0", "gains.threshold=0.0"),
+]
+
+
+@pytest.mark.parametrize(("one", "other"), SPELLINGS)
+def test_one_number_has_one_spelling(one: str, other: str, settings: Settings) -> None:
+    assert dataset_yaml(settings(one)) == dataset_yaml(settings(other))
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["seed=1", "source.limit=3", "camera=choice", "gains.red=2", "isp=srgb", "sensor.clip=black", "noise.a=3"],
+)
+def test_what_decides_the_data_changes_the_text(override: str, settings: Settings) -> None:
+    assert dataset_yaml(settings(override)) != dataset_yaml(settings())
+
+
+def test_differences_name_key_and_both_values(settings: Settings) -> None:
+    ours, theirs = dataset_yaml(settings("seed=1", "isp=srgb")), dataset_yaml(settings())
+    assert differences(ours, theirs) == [
+        "isp.gamma=srgb (there: 2.2)",
+        "isp.tone=none (there: smoothstep)",
+        "seed=1 (there: 0)",
+    ]
+
+
+def test_equal_settings_have_no_differences(settings: Settings) -> None:
+    assert differences(dataset_yaml(settings()), dataset_yaml(settings())) == []
+
+
+def test_a_missing_config_yaml_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"config.yaml: no such file; expected the config.yaml of a dataset"):
+        read_dataset_yaml(tmp_path / "config.yaml")
+
+
+NOT_CONFIGS: list[Any] = [
+    b"", b"[1, 2]", b"seed: 0", b"a: [", b"\xff\xfe", b"source: {kind: folder, rot: 1}", b"source: 3",
+    b"source: {kind: folder}\nseed: abc", b"source: {kind: folder}\nnew: 1",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("content", NOT_CONFIGS)
+def test_what_is_not_a_datasets_config_yaml_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"config.yaml: not the config.yaml of a dataset \(") as error:
+        read_dataset_yaml(tmp_path / "config.yaml")
+    assert "\n" not in str(error.value)

@@ -1,0 +1,106 @@
+"""What a run would make, told before: which photographs are read, and when a number is exact."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import fill
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.errors import ConfigError
+from unprocess_gen.forecast import SAMPLE, forecast, spread, text
+from unprocess_gen.records import Source
+
+Settings = Callable[..., Any]
+
+
+def listing(count: int) -> tuple[Source, ...]:
+    return tuple(Source(i, f"{i}.png", f"{i}.png", 1) for i in range(count))
+
+
+@given(total=st.integers(1, 500), count=st.integers(1, 50))
+def test_a_spread_is_as_many_different_sources_in_order(total: int, count: int) -> None:
+    indices = [source.index for source in spread(listing(total), count)]
+    assert len(indices) == min(total, count)
+    assert indices == sorted(set(indices))
+
+
+@given(total=st.integers(1, 500), count=st.integers(1, 50))
+def test_a_spread_is_even(total: int, count: int) -> None:
+    indices = [source.index for source in spread(listing(total), count)]
+    gaps = [after - before for before, after in zip(indices, [*indices[1:], total], strict=True)]
+    assert max(gaps) - min(gaps) <= 1
+    assert indices[0] == 0
+
+
+def test_few_photographs_are_all_read_and_the_bytes_exact(settings: Settings, tmp_path: Path) -> None:
+    told = forecast(settings(f"source.root={fill(tmp_path / 'p', SAMPLE)}"), 1, read_all=False)
+    assert (told.exact, len(told.looks)) == (True, SAMPLE)
+
+
+def test_of_many_photographs_a_sample_is_read(settings: Settings, tmp_path: Path) -> None:
+    told = forecast(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=False)
+    assert (told.exact, len(told.looks), told.sources, told.shards) == (False, SAMPLE, SAMPLE + 1, 3)
+
+
+def test_all_are_read_when_asked(settings: Settings, tmp_path: Path) -> None:
+    told = forecast(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=True)
+    assert (told.exact, len(told.looks)) == (True, SAMPLE + 1)
+
+
+def test_about_is_said_where_not_all_were_read(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}")
+    assert "about" in next(
+        line for line in text(config, forecast(config, 1, False)).splitlines() if line.startswith("bytes")
+    )
+    assert "about" not in next(
+        line for line in text(config, forecast(config, 1, True)).splitlines() if line.startswith("bytes")
+    )
+
+
+def test_time_is_divided_by_the_workers(settings: Settings, tmp_path: Path) -> None:
+    told = forecast(settings(f"source.root={fill(tmp_path / 'p', 3)}"), 4, read_all=True)
+    assert told.seconds == pytest.approx(sum(look.seconds for look in told.looks) / 4)
+
+
+def test_a_photograph_that_fails_takes_no_bytes_and_keeps_its_reason(settings: Settings, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
+    told = forecast(settings(f"source.root={tmp_path / 'p'}"), 1, read_all=True)
+    assert (told.bytes, told.looks[0].reason, told.looks[0].plan) == (0, "empty", None)
+
+
+def test_free_bytes_are_those_of_the_nearest_folder_that_exists(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", f"out={tmp_path}/not/yet/there")
+    assert forecast(config, 1, True).free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
+
+
+def test_a_forecast_of_nothing_but_failures_can_be_told(settings: Settings, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
+    config = settings(f"source.root={tmp_path / 'p'}")
+    assert "fails     000.png: empty" in text(config, forecast(config, 1, True))
+
+
+def test_skipped_effects_are_told_with_their_reason(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=none")
+    assert "skipped   heteroscedastic: noise=none has no variance" in text(config, forecast(config, 1, True))
+
+
+def test_shadows_without_noise_are_told(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=imx385_iso3200_rvdd")
+    assert "no noise up to 15.33 DN above black" in text(config, forecast(config, 1, True))
+
+
+def test_an_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no file matches source.include="):
+        forecast(settings(f"source.root={tmp_path}"), 1, read_all=False)
+
+
+def test_a_negative_b_without_slope_can_be_told(settings: Settings, tmp_path: Path) -> None:
+    overrides = ("noise.a=0", "noise.b=-5", "noise.negative_variance=clip")
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", *overrides)
+    assert "b_dn2 -5" in text(config, forecast(config, 1, True))

@@ -1,0 +1,220 @@
+"""`RawPairs`: a finished dataset, read back without a copy."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import pickle
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import fill
+
+import unprocess_gen
+from unprocess_gen import RawPairs
+from unprocess_gen.errors import DamageError
+from unprocess_gen.manifest import read_rows
+from unprocess_gen.pair import make_pair
+from unprocess_gen.photographs import load
+from unprocess_gen.plan import plan_image
+from unprocess_gen.records import Source
+from unprocess_gen.shards import array_xxh3
+
+
+def test_raw_pairs_is_the_name_of_the_package() -> None:
+    assert unprocess_gen.RawPairs.__module__ == "unprocess_gen.reader"
+
+
+def test_a_name_the_package_lacks_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'unprocess_gen' has no attribute 'RawPears'"):
+        unprocess_gen.RawPears  # noqa: B018
+
+
+def test_the_length_is_the_number_of_pairs(dataset: Path) -> None:
+    assert len(RawPairs(dataset)) == 13
+
+
+def test_a_path_may_be_a_string(dataset: Path) -> None:
+    assert len(RawPairs(str(dataset))) == 13
+
+
+def test_pairs_are_those_that_their_photographs_and_plans_give(
+    dataset: Path, photos: Path, settings: Callable[..., Any]
+) -> None:
+    config = settings(f"source.root={photos}")
+    for sample in RawPairs(dataset):
+        name = str(sample.row["source"]).replace("%25", "%").replace("%3D", "=")
+        sha256, photograph = load(config.source, Source(0, name, name, sample.row["source_bytes"]))
+        expected = make_pair(photograph.srgb, plan_image(config, sha256))
+        assert np.array_equal(sample.clean, expected.clean)
+        assert np.array_equal(sample.noisy, expected.noisy)
+
+
+def test_arrays_are_uint16(dataset: Path) -> None:
+    assert {array.dtype for sample in RawPairs(dataset) for array in sample[:2]} == {np.dtype(np.uint16)}
+
+
+def test_iteration_goes_in_order_of_the_manifest(dataset: Path) -> None:
+    assert [sample.row["key"] for sample in RawPairs(dataset)] == [f"{i:08d}" for i in range(13)]
+
+
+def test_a_sample_unpacks_as_clean_noisy_row(dataset: Path) -> None:
+    clean, noisy, row = RawPairs(dataset)[0]
+    assert (array_xxh3(clean), array_xxh3(noisy)) == (row["clean_xxh3"], row["noisy_xxh3"])
+
+
+@pytest.mark.parametrize("number", [-1, -13])
+def test_negative_numbers_count_from_the_end(number: int, dataset: Path) -> None:
+    assert RawPairs(dataset)[number].row == RawPairs(dataset)[13 + number].row
+
+
+@pytest.mark.parametrize("number", [13, -14, 10**9])
+def test_a_number_out_of_range_is_an_index_error(number: int, dataset: Path) -> None:
+    with pytest.raises(IndexError):
+        RawPairs(dataset)[number]
+
+
+def test_a_number_of_numpy_will_do(dataset: Path) -> None:
+    assert RawPairs(dataset)[np.int64(2)].row["key"] == "00000002"  # type: ignore[call-overload]
+
+
+def test_failed_photographs_are_left_out(make: Callable[..., Any], tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 4) / "001.png").write_bytes(b"")
+    make(tmp_path / "p", tmp_path / "ds", "output.pairs_per_shard=1")
+    assert [sample.row["source"] for sample in RawPairs(tmp_path / "ds")] == ["000.png", "002.png", "003.png"]
+
+
+# Mapped, not copied ---------------------------------------------------------------------------------------------------
+
+
+def test_arrays_lie_in_the_file(dataset: Path) -> None:
+    sample = RawPairs(dataset)[3]
+    assert isinstance(sample.clean.base, mmap.mmap)
+    assert isinstance(sample.noisy.base, mmap.mmap)
+
+
+def test_arrays_start_at_a_multiple_of_64_bytes(dataset: Path) -> None:
+    assert {array.ctypes.data % 64 for sample in RawPairs(dataset) for array in sample[:2]} == {0}
+
+
+def test_writing_to_an_array_does_not_touch_the_file(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    before = [path.read_bytes() for path in sorted((dataset / "shards").iterdir())]
+    sample = pairs[2]
+    sample.clean[:] = 7
+    assert (sample.clean == 7).all()
+    assert [path.read_bytes() for path in sorted((dataset / "shards").iterdir())] == before
+    assert array_xxh3(pairs[2].clean) == sample.row["clean_xxh3"]
+
+
+def test_writing_to_a_row_does_not_touch_the_next_one(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    pairs[0].row["source"] = "mine"
+    assert pairs[0].row["source"] != "mine"
+
+
+def test_arrays_outlive_the_reader_and_the_file(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "ds")
+    sample = RawPairs(tmp_path / "ds")[0]
+    shutil.rmtree(tmp_path / "ds")
+    assert array_xxh3(sample.clean) == sample.row["clean_xxh3"]
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_no_file_stays_open(dataset: Path) -> None:
+    before = open_files()
+    pairs = RawPairs(dataset)
+    for i in range(len(pairs)):
+        assert pairs[i].clean.size
+    assert open_files() == before
+
+
+# Shared ---------------------------------------------------------------------------------------------------------------
+
+
+def digests(dataset: Path) -> list[Any]:
+    return [row["noisy_xxh3"] for row in read_rows(dataset / "manifest.csv")]
+
+
+def digest(pairs: RawPairs, number: int) -> str:
+    return array_xxh3(pairs[number].noisy)
+
+
+def test_it_can_be_pickled_before_and_after_use(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    for _ in range(2):
+        copy = pickle.loads(pickle.dumps(pairs))
+        assert [digest(copy, i) for i in range(13)] == digests(dataset)
+        assert digest(pairs, 0) == digests(dataset)[0]
+
+
+def test_several_processes_read_it(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(digest, [pairs] * 13, range(13)))
+    assert found == digests(dataset)
+
+
+def test_several_threads_read_it(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda i: digest(pairs, i % 13), range(52)))
+    assert found == digests(dataset) * 4
+
+
+# Damage ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(dataset, tmp_path / "ds"))
+
+
+def test_a_folder_that_is_no_dataset_is_damage(tmp_path: Path) -> None:
+    with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
+        RawPairs(tmp_path)
+
+
+def test_a_manifest_that_goes_missing_is_damage(copy: Path) -> None:
+    pairs = RawPairs(copy)
+    (copy / "manifest.csv").unlink()
+    with pytest.raises(DamageError, match=r"manifest.csv: no row at byte"):
+        pairs[0]
+
+
+def test_a_missing_shard_is_damage(copy: Path) -> None:
+    (copy / "shards/shard-00001.tar").unlink()
+    pairs = RawPairs(copy)
+    assert pairs[0].clean.size
+    with pytest.raises(DamageError, match=r"shard-00001.tar: not a whole shard"):
+        pairs[5]
+
+
+def test_a_truncated_shard_is_damage(copy: Path) -> None:
+    path = copy / "shards/shard-00001.tar"
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(DamageError, match=r"shard-00001.tar: not a whole shard"):
+        RawPairs(copy)[5]
+
+
+def test_a_shard_of_other_images_is_damage(copy: Path) -> None:
+    shutil.copy(copy / "shards/shard-00000.tar", copy / "shards/shard-00001.tar")
+    with pytest.raises(DamageError, match=r"shard-00001.tar: member 00000005.clean.npy is missing"):
+        RawPairs(copy)[5]
+
+
+def test_a_shard_that_goes_missing_after_its_first_use_is_damage(copy: Path) -> None:
+    pairs = RawPairs(copy)
+    assert pairs[5].clean.size
+    (copy / "shards/shard-00001.tar").unlink()
+    with pytest.raises(DamageError):
+        pairs[6]

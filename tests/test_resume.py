@@ -1,0 +1,556 @@
+"""A run that is killed, stopped, refused or run again: what is on disk afterwards."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from conftest import COMMAND, environment, fill, pixels
+from PIL import Image
+
+from unprocess_gen import runner
+from unprocess_gen.errors import ConfigError, DamageError, LockedError, MachineError
+
+Make = Callable[..., Any]
+Door = Callable[..., Any]
+Hash = Callable[[Path], str]
+ONE = "output.pairs_per_shard=1"
+WAIT_S = 60
+
+
+@pytest.fixture(scope="module")
+def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill(tmp_path_factory.mktemp("forty") / "p", 40)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(forty: Path, make: Make, tree_hash: Hash) -> str:
+    make(forty, forty.parent / "ds", ONE)
+    return tree_hash(forty.parent / "ds")
+
+
+@contextmanager
+def running(*arguments: object, cwd: Path) -> Iterator[subprocess.Popen[str]]:
+    """Start ``gen-dataset`` in a session of its own; whatever of it is left afterwards is killed."""
+    process = subprocess.Popen(
+        [str(COMMAND), *map(str, arguments)], cwd=cwd, env=environment(), text=True, start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        for pid in session(process.pid):
+            os.kill(pid, signal.SIGKILL)
+        process.communicate()
+
+
+def session(leader: int) -> list[int]:
+    """Return the processes of a session that are alive."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == leader and fields[0] not in "ZX":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def workers(leader: int) -> list[int]:
+    """Return the worker processes of a run."""
+    return [pid for pid in session(leader) if b"popen_loky_posix" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+def wait_for(what: Callable[[], Any], seconds: float = WAIT_S) -> Any:
+    until = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.002)
+    return found
+
+
+def committed(out: Path) -> int:
+    return len(list((out / "shards").glob("*.tar")))
+
+
+def kill_group(process: subprocess.Popen[str]) -> None:
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def assert_whole(out: Path) -> None:
+    assert sorted(os.listdir(out)) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
+    entries = json.loads((out / "dataset.json").read_text())["shards"]
+    assert sorted(os.listdir(out / "shards")) == [Path(entry["file"]).name for entry in entries]
+
+
+# Killed ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_killed_ten_times_ends_as_if_undisturbed(
+    forty: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path
+) -> None:
+    """The moments are spread over the run: each is so many shards in, and a few random milliseconds later."""
+    moment = random.Random(385)
+    out = tmp_path / "ds"
+    for kill in range(10):
+        with running(f"source.root={forty}", ONE, f"n_jobs={1 + (kill % 3 == 0)}", cwd=tmp_path) as process:
+            wait_for(lambda at=4 * kill: (out.exists() and committed(out) >= at) or process.poll() is not None)
+            time.sleep(moment.uniform(0, 0.05))
+            assert process.poll() is None, process.communicate()
+            kill_group(process)
+        assert not (out / "dataset.json").exists()
+        assert committed(out) >= 4 * kill
+    make(forty, out, ONE)
+    assert tree_hash(out) == undisturbed
+    assert_whole(out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_killed_at_any_time_ends_as_if_undisturbed(
+    seed: int, make: Make, tree_hash: Hash, tmp_path: Path
+) -> None:
+    """The moments are random from the start of the process on, imports included, and again until it is done."""
+    moment = random.Random(seed)
+    source, out, kills = fill(tmp_path / "p", 400), tmp_path / "ds", 0
+    while not (out / "dataset.json").exists():
+        with running(f"source.root={source}", ONE, "n_jobs=2", cwd=tmp_path) as process:
+            try:
+                assert process.wait(moment.uniform(0.5, 4)) == 0
+            except subprocess.TimeoutExpired:
+                kill_group(process)
+                kills += 1
+        assert kills < 100
+    assert kills > 0
+    make(source, out, ONE)  # sweeps what a kill after the last rename may have left
+    make(source, tmp_path / "undisturbed", ONE)
+    assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
+    assert_whole(out)
+
+
+class Killed(BaseException):
+    """The machine stopped here."""
+
+
+FILES = 10
+"""Renames of a run of three shards: sources.json, config.yaml, rows and shard of each, manifest.csv, dataset.json."""
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+@pytest.mark.parametrize("number", range(FILES))
+def test_a_run_that_ends_before_or_after_any_of_its_renames_can_be_finished(
+    number: int, renamed: bool, make: Make, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, out = fill(tmp_path / "p", 5), tmp_path / "ds"
+    seen: list[Path] = []
+    replace = os.replace
+
+    def stops(old: Any, new: Any) -> None:
+        stop = len(seen) == number and tmp_path in Path(new).parents
+        seen.append(Path(new))
+        if not stop or renamed:
+            replace(old, new)
+        if stop:
+            raise Killed
+
+    monkeypatch.setattr(os, "replace", stops)
+    with pytest.raises(Killed):
+        make(source, out, "output.pairs_per_shard=2")
+    monkeypatch.undo()
+    make(source, out, "output.pairs_per_shard=2")
+    make(source, tmp_path / "undisturbed", "output.pairs_per_shard=2")
+    assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
+    assert_whole(out)
+
+
+def test_a_run_has_as_many_renames_as_are_tested(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", lambda old, new: (seen.append(Path(new).name), replace(old, new)))
+    make(fill(tmp_path / "p", 5), tmp_path / "ds", "output.pairs_per_shard=2")
+    assert seen == [
+        "sources.json", "config.yaml", "00000.json", "shard-00000.tar", "00001.json", "shard-00001.tar", "00002.json",
+        "shard-00002.tar", "manifest.csv", "dataset.json",
+    ]  # fmt: skip
+    assert len(seen) == FILES
+
+
+# Begun ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def begun(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Photographs p, and a dataset ds of which two shards of three are committed."""
+    source = fill(tmp_path / "p", 6)
+    replace = os.replace
+
+    def stops(old: Any, new: Any) -> None:
+        if Path(new).name == "00002.json":
+            raise Killed
+        replace(old, new)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(os, "replace", stops)
+        make(source, tmp_path / "ds", "output.pairs_per_shard=2")
+    assert committed(tmp_path / "ds") == 2
+    return tmp_path
+
+
+def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {
+        str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_a_run_goes_on_with_what_is_not_committed(begun: Path, make: Make) -> None:
+    before = snapshot(begun / "ds/shards")
+    summary = make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    assert (summary.made, summary.rows) == (2, 6)
+    after = snapshot(begun / "ds/shards")
+    assert {name: after[name] for name in before} == before
+
+
+def test_what_an_earlier_run_left_half_written_is_swept_at_the_start(
+    begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = begun / "ds/.work/tmp/shard-00002.tar.1.1"
+    left.write_bytes(b"half")
+    there: list[bool] = []
+    list_tasks = runner.shard_tasks
+    monkeypatch.setattr(runner, "shard_tasks", lambda *given: (there.append(left.exists()), list_tasks(*given))[1])
+    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    assert there == [False]
+
+
+def test_nothing_half_written_is_left_at_the_end(begun: Path, make: Make) -> None:
+    (begun / "ds/.work/tmp/shard-00002.tar.1.1").write_bytes(b"half")
+    (begun / "ds/.work/manifest.csv.part").write_text("half")
+    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    assert_whole(begun / "ds")
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: os.truncate(path, 600)], ids=["deleted", "cut off"])
+def test_a_committed_shard_that_is_not_whole_is_made_again(
+    damage: Callable[[Path], Any], begun: Path, make: Make, tree_hash: Hash
+) -> None:
+    damage(begun / "ds/shards/shard-00000.tar")
+    summary = make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    make(begun / "p", begun / "undisturbed", "output.pairs_per_shard=2")
+    assert summary.made == 4
+    assert tree_hash(begun / "ds") == tree_hash(begun / "undisturbed")
+
+
+def test_progress_begins_where_the_earlier_run_ended(begun: Path, make: Make, capfd: Any) -> None:
+    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    assert "gen-dataset: 6/6 pairs" in capfd.readouterr().err
+
+
+@pytest.fixture
+def finished(begun: Path, make: Make) -> Path:
+    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    return begun
+
+
+def add(source: Path) -> None:
+    Image.fromarray(pixels(77, 9, 9)).save(source / "new.png")
+
+
+CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
+    ("seed=1", lambda source: None, r"was begun with other settings: seed=1 \(there: 0\)"),
+    ("isp=srgb", lambda source: None, r"was begun with other settings: isp.gamma=srgb \(there: 2.2\); isp.tone=none"),
+    ("source.limit=5", lambda source: None, r"was begun with other settings: source.limit=5 \(there: null\)"),
+    ("seed=0", add, r"was begun with other sources: new.png is new"),
+    ("seed=0", lambda source: (source / "003.png").unlink(), r"was begun with other sources: 003.png is gone"),
+    (
+        "seed=0",
+        lambda source: (source / "003.png").write_bytes(b"x"),
+        r"was begun with other sources: 003.png has 1 bytes, had \d+",
+    ),
+    (
+        "seed=0",
+        lambda source: (source / "003.png").rename(source / "x.png"),
+        r"was begun with other sources: x.png is new; 003.png is gone",
+    ),
+    (
+        "seed=0",
+        lambda source: [path.unlink() for path in sorted(source.iterdir())[:5]],
+        r"000.png is gone; 001.png is gone; 002.png is gone; and 2 more",
+    ),
+]
+
+
+@pytest.mark.parametrize("state", ["begun", "finished"])
+@pytest.mark.parametrize(("override", "change", "sentence"), CHANGES)
+def test_other_settings_or_sources_on_the_same_out_are_refused_and_change_nothing(
+    state: str, override: str, change: Callable[[Path], Any], sentence: str, request: pytest.FixtureRequest, make: Make
+) -> None:
+    folder: Path = request.getfixturevalue(state)
+    before = snapshot(folder / "ds")
+    change(folder / "p")
+    with pytest.raises(ConfigError, match=f"^out=.*/ds: .*{sentence}.*; choose another out, or remove it$"):
+        make(folder / "p", folder / "ds", "output.pairs_per_shard=2", override)
+    assert snapshot(folder / "ds") == before
+
+
+def test_a_scene_dataset_is_not_gone_on_with_from_a_folder(begun: Path, make: Make) -> None:
+    with pytest.raises(ConfigError, match=r"source.kind=synthetic \(there: folder\)"):
+        make(None, begun / "ds", "output.pairs_per_shard=2")
+
+
+# Finished -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_does_nothing_and_says_so(finished: Path, door: Door) -> None:
+    before = snapshot(finished)
+    done = door("source.root=p", "output.pairs_per_shard=2")
+    assert (done.code, done.err) == (0, "")
+    assert done.out.startswith("ds is complete: 6 pairs in 3 shards")
+    assert done.out.endswith("; nothing to do\n")
+    assert snapshot(finished) == before
+
+
+def test_a_finished_dataset_of_scenes_is_complete_too(make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.limit=1")
+    assert make(None, tmp_path / "ds", "source.limit=1").made == 0
+
+
+def test_a_finished_dataset_whose_shard_is_missing_is_damage(finished: Path, door: Door) -> None:
+    (finished / "ds/shards/shard-00001.tar").unlink()
+    done = door("source.root=p", "output.pairs_per_shard=2")
+    assert (done.code, done.err.count("\n")) == (4, 1)
+    assert "shard-00001.tar: is missing, the dataset says " in done.err
+
+
+def test_a_finished_dataset_whose_shard_has_another_size_is_damage(finished: Path, make: Make) -> None:
+    os.truncate(finished / "ds/shards/shard-00001.tar", 700)
+    with pytest.raises(DamageError, match=r"shard-00001.tar: has 700 bytes, the dataset says \d+"):
+        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+
+
+def test_a_finished_dataset_without_its_manifest_is_damage(finished: Path, make: Make) -> None:
+    (finished / "ds/manifest.csv").unlink()
+    with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
+        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+
+
+def test_a_finished_dataset_without_its_config_is_damage(finished: Path, make: Make) -> None:
+    (finished / "ds/config.yaml").unlink()
+    with pytest.raises((DamageError, ConfigError)):
+        make(finished / "p", finished / "ds", "output.pairs_per_shard=2", "seed=1")
+
+
+@pytest.mark.parametrize(
+    ("state", "name"),
+    [
+        ("begun", "config.yaml"),
+        ("begun", ".work/sources.json"),
+        ("finished", "dataset.json"),
+    ],
+)
+def test_a_file_of_ours_that_cannot_be_read_is_told_in_one_line(
+    state: str, name: str, request: pytest.FixtureRequest, door: Door
+) -> None:
+    folder: Path = request.getfixturevalue(state)
+    (folder / "ds" / name).write_text("{[")
+    done = door("source.root=p", "output.pairs_per_shard=2", "n_jobs=1")
+    assert done.code in (2, 4)
+    assert done.err.count("\n") == 1
+
+
+def test_a_committed_shard_whose_rows_cannot_be_read_is_made_again(begun: Path, make: Make) -> None:
+    (begun / "ds/.work/rows/00000.json").write_text("{[")
+    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    assert_whole(begun / "ds")
+
+
+def test_what_a_kill_between_the_last_rename_and_the_sweep_left_goes(finished: Path, make: Make) -> None:
+    (finished / "ds/.work/rows").mkdir(parents=True)
+    make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+    assert_whole(finished / "ds")
+
+
+# Whose folder ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def held(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[None]:
+    folder.mkdir(exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    fcntl.flock(handle, how)
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
+def test_a_folder_that_another_run_holds_is_refused_with_11(door: Door, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 1)
+    with held(tmp_path / "ds"):
+        done = door("source.root=p")
+    assert done == (11, "", "gen-dataset: out=ds: another run is writing to it; wait for it or choose another\n")
+    assert list((tmp_path / "ds").iterdir()) == []
+
+
+def test_a_finished_dataset_that_another_run_holds_is_refused(finished: Path, make: Make) -> None:
+    with held(finished / "ds"), pytest.raises(LockedError):
+        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+
+
+def test_a_run_holds_its_folder_for_itself_alone(finished: Path, make: Make) -> None:
+    with held(finished / "ds", fcntl.LOCK_SH), pytest.raises(LockedError):
+        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+
+
+def test_a_run_lets_go_of_its_folder(finished: Path) -> None:
+    with held(finished / "ds"):
+        pass
+
+
+def test_two_runs_at_once_make_one_dataset(forty: Path, undisturbed: str, tree_hash: Hash, tmp_path: Path) -> None:
+    arguments = (f"source.root={forty}", ONE, "n_jobs=1")
+    with running(*arguments, cwd=tmp_path) as one, running(*arguments, cwd=tmp_path) as other:
+        codes = sorted((one.wait(WAIT_S), other.wait(WAIT_S)))
+    assert codes in ([0, 0], [0, 11])  # one may be done before the other begins
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+def test_a_folder_with_other_files_is_refused_and_left_alone(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "ds").mkdir()
+    (tmp_path / "ds/thesis.tex").write_text("mine")
+    with pytest.raises(ConfigError, match=r"out=.*/ds: holds thesis.tex, which is not of a dataset; choose an empty"):
+        make(fill(tmp_path / "p", 1), tmp_path / "ds")
+    assert os.listdir(tmp_path / "ds") == ["thesis.tex"]
+
+
+def test_an_empty_folder_is_taken(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "ds").mkdir()
+    make(fill(tmp_path / "p", 1), tmp_path / "ds")
+    assert_whole(tmp_path / "ds")
+
+
+# Stopped --------------------------------------------------------------------------------------------------------------
+
+LONG = ("source.limit=400", ONE, "n_jobs=2")
+
+
+class Stopped(NamedTuple):
+    """A run that got a signal: its exit code, stderr, processes left five seconds later, and its folder."""
+
+    number: int
+    code: int
+    err: str
+    left: list[int]
+    out: Path
+
+
+SIGNALS = [(number, group) for number in (signal.SIGINT, signal.SIGTERM) for group in (False, True)]
+
+
+@pytest.fixture(scope="module", params=SIGNALS, ids=["INT", "INT to the group", "TERM", "TERM to the group"])
+def stopped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
+    number, group = request.param
+    folder = tmp_path_factory.mktemp("stopped")
+    with running(*LONG, cwd=folder) as process:
+        wait_for(lambda: committed(folder / "ds") or process.poll() is not None)
+        assert workers(process.pid), process.communicate()
+        (os.killpg if group else os.kill)(process.pid, number)
+        _, err = process.communicate(timeout=15)
+        until = time.monotonic() + 5
+        while (left := session(process.pid)) and time.monotonic() < until:
+            time.sleep(0.05)
+    return Stopped(number, process.returncode, err, left, folder / "ds")
+
+
+def test_a_signal_ends_the_run_with_its_code(stopped: Stopped) -> None:
+    assert stopped.code == {signal.SIGINT: 130, signal.SIGTERM: 143}[stopped.number]
+
+
+def test_a_signal_leaves_no_process_behind(stopped: Stopped) -> None:
+    assert stopped.left == []
+
+
+def test_a_signal_leaves_the_dataset_unfinished(stopped: Stopped) -> None:
+    assert (stopped.out / ".work/sources.json").exists()
+    assert not (stopped.out / "dataset.json").exists()
+
+
+def test_a_signal_leaves_nothing_on_stderr_but_our_own_lines(stopped: Stopped) -> None:
+    assert [line for line in stopped.err.splitlines() if not line.startswith("gen-dataset: ")] == []
+
+
+def test_workers_end_with_a_run_that_is_killed(tmp_path: Path) -> None:
+    with running(*LONG, cwd=tmp_path) as process:
+        wait_for(lambda: committed(tmp_path / "ds"))
+        assert len(workers(process.pid)) == 2
+        os.kill(process.pid, signal.SIGKILL)
+        wait_for(lambda: not session(process.pid), seconds=10)
+
+
+def test_a_worker_that_dies_ends_the_run_with_5_in_one_line(tmp_path: Path) -> None:
+    with running(*LONG, cwd=tmp_path) as process:
+        wait_for(lambda: committed(tmp_path / "ds"))
+        os.kill(workers(process.pid)[0], signal.SIGKILL)
+        _, err = process.communicate(timeout=30)
+        lines = [line for line in err.splitlines() if "pairs/s" not in line]
+        assert (process.returncode, len(lines)) == (5, 1), err
+        assert "a worker process died" in lines[0]
+        wait_for(lambda: not session(process.pid), seconds=10)
+
+
+# The machine ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_cannot_be_written_ends_the_run_with_5_and_a_rerun_finishes_it(
+    make: Make, tree_hash: Hash, tmp_path: Path
+) -> None:
+    """A limit on the size of files stands for a full disk."""
+    source = fill(tmp_path / "p", 3)
+    Image.fromarray(pixels(5, 300, 300)).save(source / "large.png")
+    command = f"ulimit -f 300; exec {COMMAND} source.root=p n_jobs=1 {ONE}"
+    done = subprocess.run(
+        ["bash", "-c", command],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (5, ""), done.stderr
+    lines = [line for line in done.stderr.splitlines() if "pairs/s" not in line]
+    assert len(lines) == 1
+    assert "File too large" in lines[0] and "bytes free" in lines[0]
+    assert committed(tmp_path / "ds") == 3
+    assert list((tmp_path / "ds/.work/tmp").iterdir()) == []
+    make(source, tmp_path / "ds", ONE)
+    make(source, tmp_path / "undisturbed", ONE)
+    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")
+
+
+def test_an_out_that_vanishes_is_the_machines_failure(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_tasks = runner.run_tasks
+
+    def vanishing(*arguments: Any) -> Iterator[Any]:
+        for made in run_tasks(*arguments):
+            (tmp_path / "ds").rename(tmp_path / "elsewhere")
+            yield made
+
+    monkeypatch.setattr(runner, "run_tasks", vanishing)
+    with pytest.raises(MachineError, match=r"the folder is gone"):
+        make(fill(tmp_path / "p", 1), tmp_path / "ds")

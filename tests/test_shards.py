@@ -1,0 +1,281 @@
+"""Shards: tar files that any tool reads, whose bytes depend on nothing but their members."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import subprocess
+import tarfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xxhash
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen import RawPairs
+from unprocess_gen.errors import DamageError
+from unprocess_gen.records import Counts, Pair
+from unprocess_gen.shards import (
+    Member,
+    ShardWriter,
+    array_xxh3,
+    map_array,
+    pair_bytes,
+    read_index,
+    shard_bytes,
+    shard_name,
+)
+
+COUNTS = Counts(0, 0, 0, 0, 0, 0)
+
+
+def pair(height: int, width: int, seed: int = 0) -> Pair:
+    clean, noisy = np.random.default_rng(seed).integers(0, 65536, (2, height, width), dtype=np.uint16)
+    return Pair(clean, noisy, COUNTS)
+
+
+def read_json(path: Path, name: str) -> dict:
+    with tarfile.open(path, "r:") as archive:
+        return json.load(archive.extractfile(name))
+
+
+def written(path: Path, *pairs: Pair, json_bytes: int = 512) -> ShardWriter:
+    with ShardWriter(path) as writer:
+        for i, one in enumerate(pairs):
+            writer.add(f"{i:08d}", one, json.dumps({"key": i}).encode().ljust(json_bytes))
+    return writer
+
+
+@pytest.fixture
+def shard(tmp_path: Path) -> Path:
+    written(tmp_path / "a.tar", pair(5, 7, 1), pair(8, 4, 2))
+    return tmp_path / "a.tar"
+
+
+NAMES = [f"{i:08d}.{name}" for i in range(2) for name in ("clean.npy", "noisy.npy", "json")]
+
+
+def test_tar_lists_the_members_of_an_image_side_by_side(shard: Path) -> None:
+    done = subprocess.run(["tar", "-tf", shard], capture_output=True, text=True, check=True)
+    assert (done.stdout.splitlines(), done.stderr) == (NAMES, "")
+
+
+def test_tar_unpacks_arrays_that_numpy_loads(shard: Path, tmp_path: Path) -> None:
+    subprocess.run(["tar", "-xf", shard, "-C", tmp_path], check=True)
+    assert np.array_equal(np.load(tmp_path / "00000001.noisy.npy"), pair(8, 4, 2).noisy)
+
+
+def test_pythons_tarfile_reads_members_that_numpy_loads(shard: Path) -> None:
+    with tarfile.open(shard, "r:") as archive:
+        assert archive.getnames() == NAMES
+        for name, expected in (
+            ("00000000.clean.npy", pair(5, 7, 1).clean),
+            ("00000000.noisy.npy", pair(5, 7, 1).noisy),
+        ):
+            member = archive.extractfile(name)
+            assert member is not None
+            loaded = np.load(io.BytesIO(member.read()))
+            assert (loaded.dtype, loaded.tolist()) == (np.dtype("<u2"), expected.tolist())
+
+
+def test_headers_hold_no_time_owner_or_other_mode(shard: Path) -> None:
+    with tarfile.open(shard, "r:") as archive:
+        for info in archive:
+            assert (info.mtime, info.uid, info.gid, info.uname, info.gname, info.mode) == (0, 0, 0, "", "", 0o644)
+            assert info.isreg()
+
+
+def test_the_same_members_give_the_same_bytes_at_any_time(tmp_path: Path) -> None:
+    written(tmp_path / "a.tar", pair(5, 7))
+    time.sleep(1.1)  # tar keeps whole seconds
+    written(tmp_path / "b.tar", pair(5, 7))
+    assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
+
+
+def test_arrays_of_any_layout_give_the_same_bytes(tmp_path: Path) -> None:
+    one = pair(5, 7)
+    other = Pair(np.asfortranarray(one.clean), one.noisy.astype(">u2"), COUNTS)
+    written(tmp_path / "a.tar", one)
+    written(tmp_path / "b.tar", other)
+    assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
+
+
+def test_size_and_digest_are_those_of_the_file(tmp_path: Path) -> None:
+    writer = written(tmp_path / "a.tar", pair(5, 7), pair(33, 65))
+    content = (tmp_path / "a.tar").read_bytes()
+    assert writer.sha256 == hashlib.sha256(content).hexdigest()
+    assert writer.bytes == len(content)
+
+
+SIZES = [(1, 1), (1, 2), (2, 1), (3, 5), (16, 16), (17, 31), (1, 191), (1, 193), (255, 1), (1000, 1)]
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_the_bytes_of_a_pair_are_told_exactly(height: int, width: int, tmp_path: Path) -> None:
+    writer = written(tmp_path / "a.tar", pair(height, width), json_bytes=700)
+    assert shard_bytes([pair_bytes(width, height, 700)]) == writer.bytes
+
+
+def test_the_bytes_of_a_shard_are_told_exactly(tmp_path: Path) -> None:
+    writer = written(tmp_path / "a.tar", *(pair(height, width) for height, width in SIZES))
+    assert shard_bytes([pair_bytes(width, height, 512) for height, width in SIZES]) == writer.bytes
+
+
+def test_no_pair_is_no_bytes() -> None:
+    assert shard_bytes([]) == 0
+
+
+@given(width=st.integers(1, 10**6), height=st.integers(1, 10**6))
+def test_arrays_start_where_eight_bytes_do(width: int, height: int) -> None:
+    assert (pair_bytes(width, height, 512) - 4 * width * height) > 0
+    assert pair_bytes(width, height, 512) % 512 == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "name"), [(0, "shard-00000.tar"), (99999, "shard-99999.tar"), (100000, "shard-100000.tar")]
+)
+def test_shards_are_numbered(number: int, name: str) -> None:
+    assert shard_name(number) == name
+
+
+def test_a_digest_is_xxh3_of_the_little_endian_bytes() -> None:
+    array = np.array([[1, 256], [65535, 0]], np.uint16)
+    expected = xxhash.xxh3_128_hexdigest(bytes([1, 0, 0, 1, 255, 255, 0, 0]))
+    assert array_xxh3(array) == array_xxh3(array.astype(">u2")) == array_xxh3(np.asfortranarray(array)) == expected
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_exists_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "a.tar").write_text("mine")
+    with pytest.raises(FileExistsError):
+        ShardWriter(tmp_path / "a.tar")
+    assert (tmp_path / "a.tar").read_text() == "mine"
+
+
+def test_an_error_leaves_no_end_of_archive(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), ShardWriter(tmp_path / "a.tar") as writer:
+        writer.add("00000000", pair(2, 2), b"{}")
+        raise KeyError
+    with pytest.raises(DamageError, match="not a whole shard"):
+        read_index(tmp_path / "a.tar")
+
+
+class Trickle(io.RawIOBase):
+    """A file that takes a few bytes at a time, then none at all."""
+
+    name = "trickle"
+
+    def __init__(self, room: int) -> None:
+        self.content, self.room = b"", room
+
+    def write(self, content: Any) -> int:
+        taken = bytes(content[: min(37, self.room - len(self.content))])
+        self.content += taken
+        return len(taken)
+
+
+def test_a_file_that_takes_little_at_a_time_gets_all_of_it(tmp_path: Path) -> None:
+    whole = written(tmp_path / "a.tar", pair(5, 7))
+    with ShardWriter(tmp_path / "b.tar") as writer:
+        writer._file.close()
+        writer._file = trickle = Trickle(10**6)  # type: ignore[assignment]
+        writer.add("00000000", pair(5, 7), json.dumps({"key": 0}).encode().ljust(512))
+    assert writer.sha256 == whole.sha256 == hashlib.sha256(trickle.content).hexdigest()
+
+
+def test_a_file_that_takes_no_more_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="takes no more bytes") as error, ShardWriter(tmp_path / "b.tar") as writer:
+        writer._file.close()
+        writer._file = Trickle(100)  # type: ignore[assignment]
+        writer.add("00000000", pair(5, 7), b"{}")
+    assert error.value.errno == errno.EIO
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def test_the_index_is_that_of_tarfile(shard: Path) -> None:
+    with tarfile.open(shard, "r:") as archive:
+        expected = {info.name: Member(info.offset_data, info.size) for info in archive}
+    assert read_index(shard) == expected
+
+
+def test_mapped_arrays_are_those_written(shard: Path) -> None:
+    index = read_index(shard)
+    for i, one in enumerate((pair(5, 7, 1), pair(8, 4, 2))):
+        assert np.array_equal(map_array(shard, index[f"{i:08d}.clean.npy"], one.clean.shape), one.clean)
+        assert np.array_equal(map_array(shard, index[f"{i:08d}.noisy.npy"], one.clean.shape), one.noisy)
+
+
+def test_json_is_read_from_its_place(shard: Path) -> None:
+    assert read_json(shard, "00000001.json") == {"key": 1}
+
+
+@pytest.mark.parametrize("kept", [0, 1, 511, 512, 700, 1024, 3000])
+def test_a_shard_cut_off_anywhere_is_damage(kept: int, shard: Path) -> None:
+    os.truncate(shard, kept)
+    with pytest.raises(DamageError, match=r"a.tar: not a whole shard"):
+        read_index(shard)
+
+
+def test_a_missing_shard_is_damage(tmp_path: Path) -> None:
+    with pytest.raises(DamageError, match=r"a.tar: not a whole shard"):
+        read_index(tmp_path / "a.tar")
+
+
+def test_a_header_that_changed_is_damage(shard: Path) -> None:
+    content = bytearray(shard.read_bytes())
+    content[0] ^= 1
+    shard.write_bytes(content)
+    with pytest.raises(DamageError, match="not a whole shard"):
+        read_index(shard)
+
+
+@pytest.mark.parametrize("at", [0, 6, 7, 20, 52, 60])
+def test_a_member_that_is_no_array_of_ours_is_damage(at: int, shard: Path) -> None:
+    member = read_index(shard)["00000000.clean.npy"]
+    content = bytearray(shard.read_bytes())
+    content[member.offset + at] ^= 0x11
+    shard.write_bytes(content)
+    with pytest.raises(DamageError, match=r"a.tar: the member at byte 512 is not an array"):
+        map_array(shard, member, (5, 7))
+
+
+def test_a_shard_cut_off_after_its_index_was_read_is_damage(shard: Path) -> None:
+    member = read_index(shard)["00000001.noisy.npy"]
+    os.truncate(shard, 1024)
+    with pytest.raises(DamageError):
+        map_array(shard, member, (8, 4))
+
+
+# WebDataset -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore")  # those of another library
+def test_the_webdataset_library_loads_a_dataset_as_it_is(dataset: Path) -> None:
+    wds = pytest.importorskip("webdataset")
+    urls = [str(path) for path in sorted((dataset / "shards").iterdir())]
+    samples = list(wds.WebDataset(urls, shardshuffle=False, empty_check=False).decode())
+    assert len(samples) == len(RawPairs(dataset)) == 13
+    for sample, ours in zip(samples, RawPairs(dataset), strict=True):
+        assert sample["__key__"] == ours.row["key"]
+        assert sample["clean.npy"].dtype == sample["noisy.npy"].dtype == np.uint16
+        assert np.array_equal(sample["clean.npy"], ours.clean)
+        assert np.array_equal(sample["noisy.npy"], ours.noisy)
+        assert sample["json"] == ours.row
+
+
+def test_rows_in_the_shards_are_typed_rows_of_the_manifest(dataset: Path) -> None:
+    for sample in RawPairs(dataset):
+        path = dataset / "shards" / shard_name(sample.row["shard"])
+        row = read_json(path, f"{sample.row['key']}.json")
+        assert repr(row) == repr(sample.row)
