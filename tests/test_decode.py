@@ -6,6 +6,7 @@ Every file is made here, by Pillow, tifffile, OpenCV or by hand; Pillow's readin
 from __future__ import annotations
 
 import io
+import os
 import random
 import struct
 import time
@@ -659,3 +660,50 @@ def test_a_header_says_all_of_it() -> None:
 
 def test_probing_a_cut_file_says_what_is_missing() -> None:
     assert probe(CUTTABLE["jpeg"][:-1]).missing == "its end-of-image marker"
+
+
+# What a file lost from its middle -------------------------------------------------------------------------------------
+
+
+def noisy_picture() -> Image.Image:
+    return Image.fromarray(np.random.default_rng(7).integers(0, 256, (64, 64, 3)).astype(np.uint8))
+
+
+@pytest.mark.parametrize("cut", range(300, 3300, 370))
+def test_a_jpeg_that_lost_its_middle_and_kept_its_end_is_corrupt(cut: int) -> None:
+    stream = io.BytesIO()
+    noisy_picture().save(stream, "JPEG", quality=85)
+    data = stream.getvalue()
+    with pytest.raises(SourceError, match="corrupt"):
+        decode(data[: cut + 400] + data[-2:], max_pixels=2**26, icc="ignore")
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_deflate"])
+def test_a_tiff_whose_compressed_data_are_broken_is_corrupt(compression: str) -> None:
+    stream = io.BytesIO()
+    noisy_picture().save(stream, "TIFF", compression=compression)
+    data = bytearray(stream.getvalue())
+    data[400:460] = bytes(byte ^ 0x55 for byte in data[400:460])
+    with pytest.raises(SourceError, match="corrupt"):
+        decode(bytes(data), max_pixels=2**26, icc="ignore")
+
+
+def test_a_refusal_leaves_stderr_clean(capfd: pytest.CaptureFixture[str]) -> None:
+    test_a_jpeg_that_lost_its_middle_and_kept_its_end_is_corrupt(1410)
+    assert capfd.readouterr().err == ""
+
+
+def test_what_a_codec_says_of_a_whole_picture_is_passed_on(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = io.BytesIO()
+    noisy_picture().save(stream, "PNG")
+    true_imdecode = cv2.imdecode
+
+    def chatty(buffer: np.ndarray, flags: int) -> np.ndarray:
+        os.write(2, b"something harmless\n")
+        return true_imdecode(buffer, flags)
+
+    monkeypatch.setattr(cv2, "imdecode", chatty)
+    decode(stream.getvalue(), max_pixels=2**26, icc="ignore")
+    assert capfd.readouterr().err == "something harmless\n"

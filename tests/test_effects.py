@@ -15,7 +15,7 @@ from moments import REACH, SAMPLER_ERROR, bernstein
 
 from unprocess_gen import tables
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
-from unprocess_gen.effects import EFFECTS, heteroscedastic, noise_variance, normals
+from unprocess_gen.effects import heteroscedastic, noise_variance, normals
 from unprocess_gen.plan import plan_image
 from unprocess_gen.records import Plan
 from unprocess_gen.streams import words
@@ -177,7 +177,3 @@ def test_noise_is_neither_rounded_nor_clipped(plan: Plan) -> None:
     assert noisy.min() < 0
     assert noisy.max() > 4095
     assert (noisy != np.rint(noisy)).any()
-
-
-def test_effects_stand_in_the_order_light_meets_them() -> None:
-    assert EFFECTS == ("heteroscedastic", "quantise")

@@ -19,7 +19,7 @@ FLOORS = (
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
     },
     {"pair", "photographs", "plan", "reader", "workspace"},
-    {"forecast", "runner", "verify"},
+    {"forecast", "runner", "sweep", "verify"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}

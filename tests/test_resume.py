@@ -397,6 +397,23 @@ def held(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[None]:
         os.close(handle)
 
 
+@pytest.mark.parametrize("name", ["shards/shard-00000.tar", "manifest.csv", "dataset.json", "photo.jpg"])
+def test_a_folder_with_files_of_anyone_else_is_refused_and_left_alone(name: str, make: Make, tmp_path: Path) -> None:
+    path = tmp_path / "ds" / name
+    path.parent.mkdir(parents=True)
+    path.write_text("precious")
+    with pytest.raises(ConfigError, match="which is not of a dataset; choose an empty folder"):
+        make(fill(tmp_path / "p", 1), tmp_path / "ds")
+    assert path.read_text() == "precious"
+    assert sorted(entry.name for entry in (tmp_path / "ds").iterdir()) == [name.split("/")[0]]
+
+
+def test_a_shard_that_no_run_made_is_refused(begun: Path, make: Make) -> None:
+    (begun / "ds/shards/shard-00009.tar").write_text("stale")
+    with pytest.raises(ConfigError, match=r"holds .*shard-00009.tar, which no run of ours made"):
+        make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+
+
 def test_a_folder_that_another_run_holds_is_refused_with_11(door: Door, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
     with held(tmp_path / "ds"):

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen import sources
-from unprocess_gen.errors import ConfigError, SourceError
+from unprocess_gen.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.records import Source
 from unprocess_gen.sources import Listing, decode_name, encode_name, list_folder, number_twins, read_bytes
 
@@ -272,7 +272,7 @@ def test_a_file_of_another_size_than_listed_stops_the_run(tmp_path: Path) -> Non
     fill(tmp_path, "a.jpg")
     source = only(tmp_path)
     (tmp_path / "a.jpg").write_bytes(b"longer than before")
-    with pytest.raises(ConfigError, match=r"a\.jpg changed since it was listed: 5 bytes then, 18 now"):
+    with pytest.raises(MachineError, match=r"a\.jpg changed since it was listed: 5 bytes then, 18 now"):
         read_bytes(str(tmp_path), source)
 
 
@@ -287,7 +287,7 @@ def test_a_file_that_grows_while_it_is_read_stops_the_run(tmp_path: Path, monkey
         return status
 
     monkeypatch.setattr(os, "fstat", grow_after)
-    with pytest.raises(ConfigError, match="changed while it was read: 5 bytes then, 18 now"):
+    with pytest.raises(MachineError, match="changed while it was read: 5 bytes then, 18 now"):
         read_bytes(str(tmp_path), source)
 
 

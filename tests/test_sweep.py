@@ -78,7 +78,24 @@ def test_a_job_that_fails_stops_no_other_and_the_worst_code_is_returned(
 def test_the_error_of_a_job_is_one_line_that_names_it(door: Door, source: Path) -> None:
     done = door("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     errors = [line for line in done.err.splitlines() if "pairs/s" not in line]
-    assert errors == ["gen-dataset: gains.red=0: gains.red=0: a gain must be above 0"]
+    assert errors == ["gen-dataset: gains.red=0: gains.red=0: a gain must be above 0, from 0.001 to 1000"]
+
+
+def test_an_option_that_is_not_there_stops_no_other_job(door: Door, source: Path, tmp_path: Path) -> None:
+    done = door("source.root=p", "-m", "camera=sony_a7r,nosuch,nexus_6p", "out=sweep", "n_jobs=1")
+    assert done.code == 2
+    assert "gen-dataset: camera=nosuch: camera=nosuch: no such option; expected one of choice, " in done.err
+    with (tmp_path / "sweep/sweep.csv").open(newline="") as stream:
+        assert [(row["folder"], row["exit"]) for row in csv.DictReader(stream)] == [
+            ("camera=sony_a7r", "0"),
+            ("camera=nosuch", "2"),
+            ("camera=nexus_6p", "0"),
+        ]
+
+
+def test_a_glob_stands_for_the_options_that_match(door: Door, source: Path, tmp_path: Path) -> None:
+    assert door("-m", "camera=glob(s*)", "source.root=p", "out=sweep", "n_jobs=1").code == 0
+    assert sorted(os.listdir(tmp_path / "sweep")) == ["camera=sony_a7r", "camera=sony_rx100", "sweep.csv"]
 
 
 def test_a_sweep_in_which_every_job_is_refused_writes_nothing(door: Door, source: Path, tmp_path: Path) -> None:

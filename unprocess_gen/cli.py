@@ -2,29 +2,28 @@
 
 Verbs are dispatched before Hydra, and ``--help`` is answered before it too (its own takes half a second). Hydra prints
 several lines for a mistake and always ends with 1; so it is told to raise, and every mistake becomes one line here. An
-exception that leaves a Hydra task costs a second line, so tasks hand over their outcome instead; that is also what lets
-a sweep go on. Everything heavy is imported where it is first used.
+exception that leaves a Hydra task costs a second line, so tasks hand over their outcome instead. Of a sweep Hydra only
+parses the values; each job is then composed for itself. Everything heavy is imported where it is first used.
 """
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import io
+import itertools
 import os
 import re
 import signal
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen import __version__
-from unprocess_gen.errors import ConfigError, UnprocessGenError
+from unprocess_gen.errors import ConfigError, DamageError, UnprocessGenError
+from unprocess_gen.sweep import Job, folder_name, overrides_text, worst, write_table
 
 if TYPE_CHECKING:
     from unprocess_gen.config import Config
@@ -62,9 +61,6 @@ Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 finished with failed i
             5 the machine failed (disk full) · 11 another run holds the output · 130, 143 stopped by a signal
 """
 
-SEVERITY = (0, 3, 11, 4, 2, 5, 1)
-"""Exit codes from good to bad: a sweep ends with the worst of its jobs."""
-
 ANY = ("…",)
 HYDRA_FLAGS: dict[tuple[str, ...], tuple[str, ...]] = {
     ("--hydra-help",): (),
@@ -98,6 +94,9 @@ def main() -> int:
         return run(sys.argv[1:])
     except UnprocessGenError as error:
         return _report(error)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nobody reads on: no second complaint at exit
+        return 141
     except KeyboardInterrupt:
         return 130
     except Terminated:
@@ -168,7 +167,9 @@ def plan(arguments: list[str]) -> int:
 def _plan(config: Config, read_all: bool) -> tuple[int, None]:
     from unprocess_gen import forecast, runner
 
-    print(forecast.text(config, forecast.forecast(config, runner.effective_jobs(config.n_jobs, 10**6), read_all)))
+    told = forecast.forecast(config, runner.effective_jobs(config.n_jobs, 10**6), read_all)
+    print(f"out       {config.out}")
+    print(forecast.text(config, told))
     return 0, None
 
 
@@ -195,7 +196,10 @@ def again(arguments: list[str]) -> int:
     config.source.max_failed = chosen.get("source.max_failed", config.source.max_failed)
     settings.check(config)
     code, _ = _generate(config)
-    print(_compare(folder, Path(config.out)))
+    difference = _difference(folder, Path(config.out))
+    if difference:
+        raise DamageError(difference)
+    print(f"the same as {folder}, bit for bit")
     return code
 
 
@@ -216,13 +220,13 @@ def _values(verb: str, known: Mapping[str, Callable[[str], Any]], arguments: Seq
     return values
 
 
-def _compare(old: Path, new: Path) -> str:
-    """Say whether two datasets have the same manifest, and with it the same arrays."""
+def _difference(old: Path, new: Path) -> str:
+    """Return what is wrong where two datasets do not have the same manifest, and with it the same arrays."""
     try:
-        before, after = (hashlib.sha256((folder / "manifest.csv").read_bytes()).hexdigest() for folder in (old, new))
-    except OSError:
-        return f"{old} has no manifest.csv to compare with"
-    return f"manifest.csv {'is the same as' if before == after else 'DIFFERS from'} that of {old}"
+        before, after = ((folder / "manifest.csv").read_bytes() for folder in (old, new))
+    except OSError as error:
+        return f"{error.filename}: cannot be read, so the two datasets cannot be compared"
+    return "" if before == after else f"{new}/manifest.csv differs from that of {old}: were these the same sources?"
 
 
 def verify(arguments: list[str]) -> int:
@@ -267,21 +271,9 @@ def replay(arguments: list[str]) -> int:
 
 VERBS: dict[str, Callable[[list[str]], int]] = {"plan": plan, "verify": verify, "replay": replay, "again": again}
 
-# ------------------------------------------------------------------------------------------------- Hydra, and sweeps
+# ----------------------------------------------------------------------------------------------------------- Hydra
 
-Outcome = tuple[int, Any]
-Task = Callable[["Config"], Outcome]
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One dataset of a sweep, as ``sweep.csv`` tells it."""
-
-    folder: str
-    overrides: str
-    rows: int | None
-    failed: int | None
-    exit: int
+Task = Callable[["Config"], tuple[int, "Summary | None"]]
 
 
 def conf_dir() -> Path:
@@ -294,19 +286,36 @@ def conf_dir() -> Path:
 
 
 def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
-    """Let Hydra compose the settings and run ``task`` on each; return its exit code, of a sweep the worst.
+    """Compose the settings and run ``task`` on them, with ``-m`` on every combination; return the exit code.
 
-    ``sweep_csv`` says whether a sweep leaves its table in ``out``.
-
-    Raises ConfigError for settings that Hydra or `config.check` refuse; anything a single task raises.
+    ``sweep_csv`` says whether a sweep leaves its table in ``out``. Raises ConfigError for settings that Hydra or
+    `config.check` refuse, and whatever the task of a single run raises.
     """
-    _check_arguments(arguments)
+    flags, overrides = _sort_arguments(arguments)
+    swept = any(flag in SWEEP_FLAGS for flag in flags)
+    flags = [flag for flag in flags if flag not in SWEEP_FLAGS]
+    if not swept:
+        return compose_one(flags, overrides, task)
+    jobs: list[Job] = []
+    out: Path | None = None
+    for job_overrides in expand(flags, overrides):
+        job, composed_out = _sweep_job(flags, job_overrides, task)
+        jobs.append(job)
+        out = composed_out or out
+        if sweep_csv and out is not None:
+            write_table(out, jobs)
+    return worst(job.exit for job in jobs)
+
+
+def compose_one(flags: list[str], overrides: list[str], task: Task) -> int:
+    """Let Hydra compose one set of settings and run ``task`` on it; 0 where a flag asked Hydra to print and stop.
+
+    Hydra is told to raise, and the task's outcome is handed out of it: what leaves a Hydra task costs a second line.
+    """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra's switch for: raise, do not print
     import hydra
     from hydra.core.config_store import ConfigStore
-    from hydra.core.hydra_config import HydraConfig
     from hydra.errors import HydraException
-    from hydra.types import RunMode
     from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
@@ -315,42 +324,91 @@ def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
 
     ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
     outcomes: list[int | BaseException] = []
-    jobs: list[Job] = []
 
     def on_config(node: DictConfig) -> None:
-        hydra_config = HydraConfig.get()
         try:
             for key in _unknown_keys(node, Config()):
-                raise ConfigError(f"{_assignment(key, arguments)}: no such key; {_allowed(key)}")
+                raise ConfigError(f"{_assignment(key, overrides)}: no such key; {_allowed(key)}")
             config = OmegaConf.to_object(node)
             assert isinstance(config, Config)
-            if hydra_config.mode == RunMode.MULTIRUN:
-                jobs.append(_sweep_job(config, hydra_config.job.override_dirname, task))
-                if sweep_csv:
-                    _write_sweep(Path(config.out).parent, jobs)
-                outcomes.append(jobs[-1].exit)
-            else:
-                check(config)
-                outcomes.append(task(config)[0])
+            check(config)
+            outcomes.append(task(config)[0])
         except BaseException as error:
             outcomes.append(error)
-            if isinstance(error, KeyboardInterrupt | Terminated):
-                raise
 
     try:
-        with tempfile.TemporaryDirectory() as aside:  # Hydra writes a multirun.yaml; the datasets keep a config each
-            sys.argv = ["gen-dataset", *map(_quoted_path, arguments)]
-            if any(argument in SWEEP_FLAGS for argument in arguments):
-                sys.argv += [f"hydra.sweep.dir={aside}", "hydra.sweep.subdir=."]
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(on_config)()
+        sys.argv = ["gen-dataset", *flags, *overrides]
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(on_config)()
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError) as error:
-        raise ConfigError(_explain(error, arguments)) from error
+        raise ConfigError(_explain(error, overrides)) from error
     for outcome in outcomes:
         if isinstance(outcome, OmegaConfBaseException):
-            raise ConfigError(_explain(outcome, arguments)) from outcome
+            raise ConfigError(_explain(outcome, overrides)) from outcome
         if isinstance(outcome, BaseException):
             raise outcome
-    return max((code for code in outcomes if isinstance(code, int)), key=SEVERITY.index, default=0)
+        return outcome
+    return 0
+
+
+def expand(flags: list[str], overrides: list[str]) -> list[list[str]]:
+    """Return the overrides of every job of a sweep: the product of the swept values, the last changing fastest.
+
+    Hydra's own sweeper checks all jobs first and lets one that cannot be composed stop all others; here each job
+    stands for itself.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create(config_loader=_Options(flags)).parse_overrides(overrides)  # type: ignore[arg-type]
+        choices = [
+            [f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()]
+            if one.is_sweep_override()
+            else [f"{one.get_key_element()}={one.get_value_element_as_str()}"]
+            for one in parsed
+        ]
+    except HydraException as error:
+        raise ConfigError(_explain(error, overrides)) from error
+    return [list(job) for job in itertools.product(*choices)]
+
+
+class _Options:
+    """What Hydra's parser asks for ``glob(…)``: the options of a group."""
+
+    def __init__(self, flags: list[str]) -> None:
+        named = [value for flag, value in itertools.pairwise(flags) if flag in ("--config-dir", "-cd")]
+        self.folders = [conf_dir(), *map(Path, named)]
+
+    def get_group_options(self, group_name: str, *_: Any, **__: Any) -> list[str]:
+        """Return the names of a group's options, ours and those of ``--config-dir``."""
+        return sorted({path.stem for folder in self.folders for path in (folder / group_name).glob("*.yaml")})
+
+
+def _sweep_job(flags: list[str], overrides: list[str], task: Task) -> tuple[Job, Path | None]:
+    """Run one job of a sweep in its own folder below ``out``; whatever goes wrong becomes its exit code.
+
+    Returns the job and the sweep's ``out``, None where the settings could not even be composed.
+    """
+    text = overrides_text(overrides)
+    folder = folder_name(text)
+    outs: list[Path] = []
+    summaries: list[Summary | None] = []
+
+    def in_its_folder(config: Config) -> tuple[int, None]:
+        outs.append(Path(config.out))
+        config.out = str(outs[0] / folder)
+        code, summary = task(config)
+        summaries.append(summary)
+        return code, None
+
+    try:
+        code = compose_one(flags, overrides, in_its_folder)
+    except Exception as error:
+        code = _report(error, f"{folder}: ")
+    summary = summaries[0] if summaries else None
+    failed = None if summary is None else sum(summary.failed.values())
+    job = Job(folder, text, None if summary is None else summary.rows, failed, code)
+    return job, outs[0] if outs else None
 
 
 def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> list[str]:
@@ -363,55 +421,6 @@ def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> list[str]:
         elif is_dataclass(value):
             unknown += _unknown_keys(node[key], value, f"{prefix}{key}.")
     return unknown
-
-
-def _sweep_job(config: Config, overrides: str, task: Task) -> Job:
-    """Make one dataset of a sweep below ``out``; whatever goes wrong becomes its exit code."""
-    from unprocess_gen.config import check
-
-    folder = _folder_name(overrides)
-    config.out = str(Path(config.out) / folder)
-    try:
-        check(config)
-        code, summary = task(config)
-    except Exception as error:
-        return Job(folder, overrides, None, None, _report(error, f"{folder}: "))
-    if summary is None:
-        return Job(folder, overrides, None, None, code)
-    return Job(folder, overrides, summary.rows, sum(summary.failed.values()), code)
-
-
-def _folder_name(overrides: str) -> str:
-    """Return the overrides as a folder's name: slashes encoded, a long one cut and told apart by its digest."""
-    name = overrides.replace("%", "%25").replace("/", "%2F") or "default"
-    if len(os.fsencode(name)) <= 200:
-        return name
-    return name.encode()[:180].decode(errors="ignore") + "-" + hashlib.sha256(name.encode()).hexdigest()[:16]
-
-
-def _write_sweep(out: Path, jobs: Sequence[Job]) -> None:
-    """Write ``sweep.csv`` anew after every job, where the sweep's folder exists; other sweeps' rows are kept."""
-    if not out.is_dir():
-        return
-    path = out / "sweep.csv"
-    ours = {job.folder for job in jobs}
-    earlier = [cells for cells in _read_sweep(path) if cells[0] not in ours]
-    stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(Job.__slots__)
-    writer.writerows([getattr(job, name) for name in Job.__slots__] for job in jobs)
-    writer.writerows(earlier)
-    aside = out / "sweep.csv.part"
-    aside.write_text(stream.getvalue(), encoding="utf-8", newline="")
-    os.replace(aside, path)
-
-
-def _read_sweep(path: Path) -> list[list[str]]:
-    try:
-        with path.open(encoding="utf-8", newline="") as stream:
-            return [cells for cells in csv.reader(stream) if cells][1:]
-    except FileNotFoundError:
-        return []
 
 
 PATH_KEYS = ("source.root", "out")
@@ -431,28 +440,40 @@ def _quoted_path(argument: str) -> str:
     return f"{key}='{path}'"
 
 
-def _check_arguments(arguments: Sequence[str]) -> None:
-    """Refuse what is no flag and no setting; ConfigError."""
+def _sort_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return Hydra's flags with their values, and the overrides; ConfigError for what is neither.
+
+    Hydra's own parser loses track where a flag stands between overrides.
+    """
+    flags: list[str] = []
+    overrides: list[str] = []
     waiting = iter(arguments)
     for argument in waiting:
         if argument.startswith("-"):
-            _check_flag(argument, waiting)
+            flags += _read_flag(argument, waiting)
         elif argument.startswith("~"):
             raise ConfigError(f"{argument}: a setting cannot be taken away; choose another value or option")
         elif "=" not in argument:
             raise ConfigError(f"{argument}: expected a setting key=value; see gen-dataset --help")
+        elif argument.startswith("hydra") and not argument.startswith("hydra.searchpath="):
+            raise ConfigError(f"{argument}: Hydra's own settings are fixed, but for hydra.searchpath")
         else:
             _check_group(*argument.lstrip("+").split("=", 1))
+            overrides.append(_quoted_path(argument))
+    return flags, overrides
 
 
-def _check_flag(argument: str, waiting: Iterator[str]) -> None:
+def _read_flag(argument: str, waiting: Iterator[str]) -> list[str]:
     flag, equals, value = argument.partition("=")
     allowed = next((values for spellings, values in HYDRA_FLAGS.items() if flag in spellings), None)
     if allowed is None or (equals and not allowed):
         raise ConfigError(f"{argument}: no such flag; see gen-dataset --help")
-    value = value if equals or not allowed else next(waiting, "")
-    if allowed and (not value or (allowed != ANY and value not in allowed)):
+    if not allowed:
+        return [flag]
+    value = value if equals else next(waiting, "")
+    if not value or (allowed != ANY and value not in allowed):
         raise ConfigError(f"{flag} {value}: expected {'a value' if allowed == ANY else ', '.join(allowed)}")
+    return [flag, value]
 
 
 def _check_group(key: str, value: str) -> None:

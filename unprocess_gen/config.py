@@ -123,6 +123,9 @@ class Config:
 CAMERA_LAWS = ("fixed", "convex", "choice", "identity", "custom")
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
 MAX_PAIRS_PER_SHARD = 10**6
+MIN_GAIN, MAX_GAIN = 1e-3, 1e3
+"""Chosen: no camera comes near either, and no product or quotient of them overflows."""
+
 MAX_VARIANCE = 1e15
 """Chosen: far above any sensor, and nothing overflows on the way to DN."""
 
@@ -193,6 +196,13 @@ def lowest(drawn: Law) -> float:
     return drawn.numbers[0] if drawn.kind in ("uniform", "log_uniform") else 0.0
 
 
+def highest(drawn: Law) -> float:
+    """Return a value that no draw of the law lies above."""
+    if drawn.kind == "inverse_truncated_normal":
+        return 1 / drawn.numbers[2] if drawn.numbers[2] > 0 else math.inf
+    return math.inf if drawn.kind == "log_linear_in_a" else drawn.numbers[-1]
+
+
 GAIN_LAWS = ("uniform", "truncated_normal")
 INVERSE_GAIN_LAWS = (*GAIN_LAWS, "inverse_truncated_normal")
 A_LAWS = ("uniform", "log_uniform")
@@ -207,8 +217,9 @@ def gain_laws(gains: GainsConfig) -> tuple[Law, Law, Law]:
         law("gains.inverse_rgb", gains.inverse_rgb, INVERSE_GAIN_LAWS),
     )
     for name, drawn in zip(("red", "blue", "inverse_rgb"), laws, strict=True):
-        if not lowest(drawn) > 0:
-            raise ConfigError(f"gains.{name}={_text(getattr(gains, name))}: a gain must be above 0")
+        if not (lowest(drawn) >= MIN_GAIN and highest(drawn) <= MAX_GAIN):
+            value = _text(getattr(gains, name))
+            raise ConfigError(f"gains.{name}={value}: a gain must be above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}")
     return laws
 
 
@@ -251,6 +262,8 @@ def check(config: Config) -> None:
 
 
 def _check_source(source: SourceConfig) -> None:
+    if source.root == "":
+        raise ConfigError("source.root='': expected a folder; null stands for the built-in scenes")
     if source.root is not None and not Path(source.root).is_dir():
         raise ConfigError(f"source.root={source.root}: no such folder; null stands for the built-in scenes")
     if not source.include:
@@ -261,7 +274,7 @@ def _check_source(source: SourceConfig) -> None:
     _in_range("source.max_failed", source.max_failed, 0, 10**9)
     _one_of("source.icc", source.icc, ("ignore", "refuse"))
     if source.icc == "refuse" and find_spec("PIL") is None:
-        raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install 'unprocess_gen[icc]'")
+        raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
 
 
 def _check_camera(camera: CameraConfig) -> None:
@@ -273,7 +286,7 @@ def _check_camera(camera: CameraConfig) -> None:
         _one_of("camera.name", camera.name, (camera.law,))
     if camera.law != "custom":
         if camera.xyz2cam is not None:
-            raise ConfigError(f"camera.xyz2cam={camera.xyz2cam}: only camera=custom takes a matrix")
+            raise ConfigError(f"camera.xyz2cam={camera.xyz2cam}: a matrix needs camera.law=custom, not {camera.law}")
         return
     if camera.xyz2cam is None:
         raise ConfigError("camera.xyz2cam=null: camera=custom needs nine numbers, XYZ to camera, row by row")
@@ -281,6 +294,8 @@ def _check_camera(camera: CameraConfig) -> None:
         colour.rgb2cam(colour.matrix(camera.xyz2cam))
     except ValueError as error:
         raise ConfigError(f"camera.xyz2cam={camera.xyz2cam}: {error}") from error
+    if camera.name in (*colour.CAMERAS, *CAMERA_LAWS) and camera.name != "custom":
+        raise ConfigError(f"camera.name={camera.name}: is taken; give a camera of your own another name")
 
 
 def _check_sensor(sensor: SensorConfig) -> None:

@@ -13,9 +13,6 @@ from unprocess_gen.records import Float, Plan
 from unprocess_gen.streams import Words, words
 from unprocess_gen.tables import SEGMENTS, normal_table
 
-EFFECTS = ("heteroscedastic", "quantise")
-"""In the order light meets them. Names stand in every manifest: add, never rename."""
-
 
 def normals(uniforms: Words) -> Float:
     """Map uint32 words to standard normals by inverse CDF, same shape, float64, |z| up to 6.34.

@@ -113,11 +113,11 @@ def text(config: Config, told: Forecast) -> str:
     about = "" if told.exact else "about "
     lines = [
         f"sources   {told.sources} ({config.source.root or 'built-in scenes'}), {len(told.looks)} of them read",
-        f"pairs     {told.sources} at the most, in {told.shards} shards of {config.output.pairs_per_shard}",
+        f"pairs     {_pairs(told)}, in {told.shards} shards of {config.output.pairs_per_shard}",
         f"bytes     {about}{told.bytes:,} in shards" + ("" if told.exact else " (--all reads every source: exact)"),
         f"disk      {told.free_bytes:,} bytes free" + ("" if told.free_bytes > told.bytes else ": NOT ENOUGH"),
         f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}",
-        *_failures(told.looks),
+        *_failures(config, told),
         *_noise(config, told.looks),
     ]
     return "\n".join(lines)
@@ -129,8 +129,16 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _failures(looks: tuple[Look, ...]) -> list[str]:
-    return [f"fails     {one.source.name}: {one.reason}" for one in looks if one.reason]
+def _pairs(told: Forecast) -> str:
+    failed = sum(one.reason is not None for one in told.looks)
+    return str(told.sources - failed) if told.exact else f"{told.sources - failed} at the most"
+
+
+def _failures(config: Config, told: Forecast) -> list[str]:
+    lines = [f"fails     {one.source.name}: {one.reason}" for one in told.looks if one.reason]
+    if len(lines) > config.source.max_failed:
+        lines.append(f"          more than source.max_failed={config.source.max_failed}: the run will end with 3")
+    return lines
 
 
 def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:

@@ -7,8 +7,7 @@ before we can say why, and the walks that prove a file whole meet every header f
 
 OpenCV (4.12, 5.0) refuses every prefix of a file itself, but older ones, and ``imread`` of any version, hand out a
 half-gray JPEG. So a whole file is one that holds its end-of-image marker, IEND, or the last strip; bytes after the end
-(motion photos) are fine. A JPEG that lost its middle and kept its end, and an 8-bit TIFF whose compressed data are
-broken, are not noticed, like most bit rot in a JPEG: only a hash recorded earlier tells.
+(motion photos) are fine. What a file lost from its middle shows when it is decoded (`decode`).
 """
 
 from __future__ import annotations

@@ -9,7 +9,6 @@ on the source's name alone: the size of a shard can then be told before it is ma
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -63,10 +62,10 @@ COLUMNS = (
     Column("seed", int, "seed of the run"),
     Column("stream_key", str, "key of the image's random streams, 16 hex digits"),
     Column("camera", str, "convex, or the camera"),
-    Column("w_nexus_6p", float, "weight of this camera in the mix"),
-    Column("w_sony_a7r", float, "weight of this camera in the mix"),
-    Column("w_olympus_em10", float, "weight of this camera in the mix"),
-    Column("w_sony_rx100", float, "weight of this camera in the mix"),
+    Column("w_nexus_6p", float, "weight of this camera in the mix; 0 where it is not part of it"),
+    Column("w_sony_a7r", float, "weight of this camera in the mix; 0 where it is not part of it"),
+    Column("w_olympus_em10", float, "weight of this camera in the mix; 0 where it is not part of it"),
+    Column("w_sony_rx100", float, "weight of this camera in the mix; 0 where it is not part of it"),
     *(Column(f"rgb2cam_{i}{j}", float, "linear sRGB to camera, row and column") for i in range(3) for j in range(3)),
     Column("red_gain", float, "forward white-balance gain of red"),
     Column("blue_gain", float, "forward white-balance gain of blue"),
@@ -238,19 +237,11 @@ def _present(row: Row, name: str) -> str | int | float:
 # ------------------------------------------------------------------------------------------------------------- CSV
 
 
-def write_rows(stream: TextIO, rows: Iterable[Row], header: bool = True) -> None:
+def write_rows(stream: TextIO, rows: Iterable[Row]) -> None:
     """Write rows as CSV: ``\\n`` line ends, quotes only where needed, empty for None."""
     writer = csv.writer(stream, lineterminator="\n")
-    if header:
-        writer.writerow(NAMES)
+    writer.writerow(NAMES)
     writer.writerows([_cell(row[name]) for name in NAMES] for row in rows)
-
-
-def csv_text(rows: Iterable[Row], header: bool = True) -> str:
-    """Return rows as CSV text."""
-    stream = io.StringIO(newline="")
-    write_rows(stream, rows, header)
-    return stream.getvalue()
 
 
 def _cell(value: Value) -> str:

@@ -6,7 +6,7 @@ import hashlib
 
 from unprocess_gen import decode, sources, synthetic
 from unprocess_gen.config import SourceConfig
-from unprocess_gen.errors import ConfigError, SourceError
+from unprocess_gen.errors import MachineError, SourceError
 from unprocess_gen.manifest import Row
 from unprocess_gen.records import Photograph, Source
 
@@ -35,7 +35,7 @@ def source_of(row: Row) -> Source:
 def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
     """Return the SHA-256 of a source's bytes (of a scene's pixels) and its decoded pixels.
 
-    Raises SourceError, with the digest as ``sha256`` where the bytes could be read; ConfigError where the file is not
+    Raises SourceError, with the digest as ``sha256`` where the bytes could be read; MachineError where the file is not
     the one that was listed.
     """
     if config.root is None:
@@ -44,7 +44,7 @@ def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
     content = sources.read_bytes(config.root, source)
     digest = hashlib.sha256(content).hexdigest()
     if source.sha256 not in (None, digest):
-        raise ConfigError(f"source {source.name} changed while the run was on; start again into another out")
+        raise MachineError(f"source {source.name} changed while the run was on; start again into another out")
     try:
         return digest, decode.decode(content, max_pixels=config.max_pixels, icc=config.icc)
     except SourceError as error:

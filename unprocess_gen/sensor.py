@@ -10,9 +10,6 @@ import numpy as np
 
 from unprocess_gen.records import Float, Raw
 
-CLIPS = ("sensor", "black")
-"""How noisy frames are clipped; `noisy_limits` says to what."""
-
 
 def to_dn(light: Float, black_level_dn: int, white_level_dn: int) -> Float:
     """Clip light to [0, 1] and map it to [black, white], unrounded, ``[H, W]`` float64."""

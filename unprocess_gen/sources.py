@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from unprocess_gen.errors import ConfigError, SourceError
+from unprocess_gen.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.records import Source
 
 _Result = TypeVar("_Result")
@@ -127,7 +127,7 @@ def read_bytes(root: str, source: Source) -> bytes:
     SourceError
         ``source.reason`` if the listing gave one; ``not_a_file``, ``unreadable``, ``too_large`` (over
         `MAX_FILE_BYTES`) or ``empty``.
-    ConfigError
+    MachineError
         The size is not the listed one: the folder changed under us.
     """
     with _opened(root, source) as file:
@@ -260,7 +260,7 @@ def _check_regular(source: Source, status: os.stat_result) -> None:
 
 def _check_size(source: Source, size_bytes: int, when: str) -> None:
     if size_bytes != source.size_bytes:
-        raise ConfigError(
+        raise MachineError(
             f"source {source.name} changed {when}: {source.size_bytes} bytes then, {size_bytes} now; "
             "run again when nothing writes to source.root"
         )

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from unprocess_gen.config import SourceConfig
-from unprocess_gen.errors import ConfigError, DamageError, SourceError
+from unprocess_gen.errors import ConfigError, DamageError, MachineError, SourceError
 from unprocess_gen.manifest import Row, located_rows, plan_of, read_row, read_rows, row_json
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import load, source_of
@@ -221,7 +221,7 @@ def _replay(row: Row, root: str | None, to: Path | None) -> str:
     except SourceError as error:
         sha256 = error.sha256 or str(row["source_sha256"])
         return _changed(sha256, row) or f"its source cannot be used ({error})"
-    except ConfigError as error:
+    except MachineError as error:
         return str(error)
     if complaint := _changed(sha256, row):
         return complaint

@@ -21,6 +21,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -101,7 +102,11 @@ class Workspace:
             raise LockedError(f"out={self.out}: another run is writing to it; wait for it or choose another") from None
         except OSError as error:
             raise ConfigError(f"out={self.out}: this file system cannot lock it ({error.strerror})") from error
-        foreign = sorted(set(os.listdir(self.out)) - OURS)
+        self._refuse_foreign_files()
+
+    def _refuse_foreign_files(self) -> None:
+        """Refuse a folder that holds what no run of ours left there, so that nothing of anyone's is overwritten."""
+        foreign = sorted(set(os.listdir(self.out)) - {".work"})
         if foreign and not (self.out / "config.yaml").exists():
             raise ConfigError(f"out={self.out}: holds {foreign[0]}, which is not of a dataset; choose an empty folder")
 
@@ -121,16 +126,25 @@ class Workspace:
         if listing.exists():
             self._same_sources(_read_listing(listing), sources)
         try:
-            for folder in (self.work, self.rows, self.shards):
-                folder.mkdir(exist_ok=True)
+            self.work.mkdir(exist_ok=True)
+            self.rows.mkdir(exist_ok=True)
             shutil.rmtree(self.tmp, ignore_errors=True)
             self.tmp.mkdir()
             if not listing.exists():
                 self._write(listing, json.dumps([[source.name, source.size_bytes] for source in sources]))
             if not (self.out / "config.yaml").exists():
                 self._write(self.out / "config.yaml", self.config_yaml)
+            self.shards.mkdir(exist_ok=True)  # after config.yaml, by which a later run knows the folder for ours
+            self._refuse_foreign_shards()
         except OSError as error:
             raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
+
+    def _refuse_foreign_shards(self) -> None:
+        for path in sorted(self.shards.iterdir()):
+            if not self._rows_path(_shard_number(path.name)).exists():
+                raise ConfigError(
+                    f"out={self.out}: holds {path}, which no run of ours made; remove it or choose another"
+                )
 
     def check_complete(self, sources: Sequence[Source]) -> dict[str, Any]:
         """Return the ``dataset.json`` of a finished dataset.
@@ -265,10 +279,6 @@ class Workspace:
         _sync(path.parent)
 
 
-OURS = {"config.yaml", "manifest.csv", "dataset.json", "shards", ".work"}
-"""What a dataset's folder holds."""
-
-
 def _read_listing(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
@@ -325,6 +335,12 @@ def _same_size(out: Path, entry: dict[str, Any]) -> None:
     if size != entry["bytes"]:
         found = "is missing" if size is None else f"has {size} bytes"
         raise DamageError(f"{path}: {found}, the dataset says {entry['bytes']}; remove {out} and make it again")
+
+
+def _shard_number(name: str) -> int:
+    """Return the number in a shard's file name, -1 for other names."""
+    found = re.fullmatch(r"shard-(\d{5,})\.tar", name)
+    return int(found[1]) if found else -1
 
 
 def _some(differing: Sequence[str]) -> str:
