@@ -353,7 +353,7 @@ def test_again_says_where_the_new_dataset_differs(door: Door, make: Make, tmp_pa
     done = door("again", "old", "source.root=other", "out=new", "n_jobs=1")
     assert (done.code, done.err.splitlines()[-1]) == (
         4,
-        "gen-dataset: new/manifest.csv differs from that of old: were these the same sources?",
+        "gen-dataset: new/manifest.csv: differs from that of old: were these the same sources?",
     )
 
 
