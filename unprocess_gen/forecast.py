@@ -6,6 +6,7 @@ read, since a pair's size depends on its width, height and name alone.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import time
@@ -81,7 +82,7 @@ def spread(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
 
 
 def look(config: Config, source: Source) -> Look:
-    """Make one pair and throw it away."""
+    """Make one pair, with the digests that its shard takes, and throw it away."""
     started = time.perf_counter()
     try:
         sha256, photograph = load(config.source, source)
@@ -89,7 +90,9 @@ def look(config: Config, source: Source) -> Look:
         return Look(source, 0, time.perf_counter() - started, None, error.reason)
     plan = plan_image(config, sha256, source.occurrence)
     pair = make_pair(photograph.srgb, plan)
-    array_xxh3(pair.clean), array_xxh3(pair.noisy)
+    for frame in (pair.clean, pair.noisy):
+        array_xxh3(frame)
+        hashlib.sha256(frame.data)
     height, width = pair.clean.shape
     size = pair_bytes(width, height, json_size(source.name))
     return Look(source, size, time.perf_counter() - started, plan, None)
@@ -116,7 +119,8 @@ def text(config: Config, told: Forecast) -> str:
         f"pairs     {_pairs(told)}, in {told.shards} shards of {config.output.pairs_per_shard}",
         f"bytes     {about}{told.bytes:,} in shards" + ("" if told.exact else " (--all reads every source: exact)"),
         f"disk      {told.free_bytes:,} bytes free" + ("" if told.free_bytes > told.bytes else ": NOT ENOUGH"),
-        f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}",
+        f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}, "
+        "and what the disk takes to write it",
         *_failures(config, told),
         *_noise(config, told.looks),
     ]

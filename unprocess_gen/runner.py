@@ -6,7 +6,10 @@ joblib's ordered generator: at most two shards a worker wait for an earlier one.
 joblib.
 
 A worker whose coordinator is gone ends within a second (`_end_with_parent`): otherwise loky would keep it, and its
-memory, for minutes. One that dies (out of memory, most likely) ends the run with exit code 5; committed shards stay.
+memory, for minutes. When a worker dies (out of memory, most likely) loky ends all of them, within half a second. Each
+shard that was being made then is tried again alone; where its worker dies again, the photograph it was at has killed
+twice: its shard is given up for this run, with provisional rows ``worker_died``, and the next run tries it again. With
+one job the coordinator is the worker, and dies itself.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen.config import Config, dataset_yaml, source_kind
-from unprocess_gen.errors import MachineError, SourceError
+from unprocess_gen.errors import SourceError
 from unprocess_gen.manifest import Row, failed_row, key_text, ok_row, row_json
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
@@ -98,14 +101,20 @@ def generate(config: Config) -> Summary:
         todo = [task for task in tasks if task.shard not in done]
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         bench = Bench(config, str(workspace.tmp), os.getpid())
+        given_up: dict[int, Made] = {}
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
             for made in run_tasks(bench, todo, n_jobs):
-                workspace.commit(made)
+                if made.killer is None:
+                    workspace.commit(made)
+                else:
+                    given_up[made.shard] = made
+                    print(f"gen-dataset: {made.killer}: its worker died twice; run again to retry it", file=sys.stderr)
                 progress.advance(made.rows)
         seconds = time.monotonic() - started
-        failed = count_reasons(workspace.committed_rows(range(len(tasks))))
+        failed = count_reasons(workspace.all_rows(len(tasks), given_up))
         facts = workspace.finish(
             len(tasks),
+            given_up,
             {
                 "pairs": len(listing.sources) - sum(failed.values()),
                 "failed": failed,
@@ -131,20 +140,54 @@ def effective_jobs(n_jobs: int, tasks: int) -> int:
 
 
 def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
-    """Yield the shards in order as they are made; MachineError where a worker dies."""
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
+    """Yield the shards as they are made: in order, but for those that are tried again after a worker died."""
+    waiting = list(tasks)
+    while waiting:
+        done: set[int] = set()
+        try:
+            for made in _run_pool(bench, waiting, n_jobs):
+                done.add(made.shard)
+                yield made
+            return
+        except TerminatedWorkerError:
+            waiting = [task for task in waiting if task.shard not in done]
+        suspects = [task for task in waiting if _busy_path(bench, task).exists()]
+        for task in suspects or waiting[:n_jobs]:
+            yield from _run_alone(bench, task)
+            waiting.remove(task)
+
+
+def _run_alone(bench: Bench, task: Task) -> Iterator[Made]:
+    """Yield a shard that is made by a worker with nobody beside it; given up where that worker dies too."""
     try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # of what an interrupt cancelled
-            with _interrupts_blocked():
-                results = parallel(delayed(make_shard)(bench, task) for task in tasks)
-            with closing(results):
-                yield from results
-    except TerminatedWorkerError as error:
-        raise MachineError(
-            "a worker process died, most likely out of memory; what is committed is kept, run again to go on, "
-            f"with fewer workers than n_jobs={n_jobs}"
-        ) from error
+        yield from _run_pool(bench, [task], n_jobs=2)  # with one job it would be the coordinator that dies
+    except TerminatedWorkerError:
+        killer = next((one for one in task.sources if str(one.index) == _read_busy(bench, task)), task.sources[0])
+        rows = (failed_row(one, None, task.shard, bench.config.seed, "worker_died") for one in task.sources)
+        yield Made(task.shard, None, 0, None, tuple(rows), killer=killer.name)
+
+
+def _run_pool(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
+    """Yield the shards in order as they are made; TerminatedWorkerError where a worker dies."""
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # of what an interrupt cancelled
+        with _interrupts_blocked():
+            results = parallel(delayed(make_shard)(bench, task) for task in tasks)
+        with closing(results):
+            yield from results
+
+
+def _busy_path(bench: Bench, task: Task) -> Path:
+    """Return the file that names the source which a worker is at, while it makes a shard."""
+    return Path(bench.tmp) / f"{task.shard}.busy"
+
+
+def _read_busy(bench: Bench, task: Task) -> str:
+    try:
+        return _busy_path(bench, task).read_text()
+    except FileNotFoundError:
+        return ""
 
 
 @contextmanager
@@ -166,14 +209,22 @@ def make_shard(bench: Bench, task: Task) -> Made:
     path = Path(bench.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     try:
         with ShardWriter(path) as writer:
-            rows = tuple(_make_row(bench.config, task.shard, source, writer) for source in task.sources)
+            rows = tuple(_make_rows(bench, task, writer))
+        _busy_path(bench, task).unlink()
         if any(row["status"] == "ok" for row in rows):
             return Made(task.shard, str(path), writer.bytes, writer.sha256, rows)
         path.unlink()
         return Made(task.shard, None, 0, None, rows)
     except OSError as error:
-        path.unlink(missing_ok=True)
+        for left in (path, _busy_path(bench, task)):
+            left.unlink(missing_ok=True)
         raise machine_error(error, Path(bench.tmp)) from error
+
+
+def _make_rows(bench: Bench, task: Task, writer: ShardWriter) -> Iterator[Row]:
+    for source in task.sources:
+        _busy_path(bench, task).write_text(str(source.index))
+        yield _make_row(bench.config, task.shard, source, writer)
 
 
 def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -> Row:

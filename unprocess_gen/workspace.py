@@ -5,8 +5,8 @@
     out/.work/tmp/               shards that workers are writing; swept at every start
     out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists
     out/shards/                  committed shards only
-    out/manifest.csv             written when every shard is committed
-    out/dataset.json             written last: the dataset is complete; then .work goes
+    out/manifest.csv             written when every shard is committed or given up for now
+    out/dataset.json             written last: the dataset is complete, and .work goes, unless a shard is provisional
 
 Only the coordinator moves anything to its final name: synced first, rows before shard, so whatever moment a run is
 killed at, a shard in place has its rows, and all else is made again to the same bytes. The lock is the kernel's
@@ -42,18 +42,23 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A shard that a worker finished: where it lies (None: no pair in it, no file), and its rows."""
+    """A shard that a worker finished: where it lies (None: no pair in it, no file), and its rows.
+
+    ``killer`` names the photograph at which workers died twice; then the rows are provisional and there is no file.
+    """
 
     shard: int
     path: str | None
     bytes: int
     sha256: str | None
     rows: tuple[Row, ...]
+    killer: str | None = None
 
     def entry(self) -> dict[str, Any]:
         """Return what ``dataset.json`` says of the shard."""
         pairs = sum(row["status"] == "ok" for row in self.rows)
         return {
+            **({"provisional": True} if self.killer else {}),
             "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
             "pairs": pairs,
             "failed": len(self.rows) - pairs,
@@ -112,8 +117,9 @@ class Workspace:
 
     @property
     def complete(self) -> bool:
-        """Whether the dataset is finished."""
-        return (self.out / "dataset.json").exists()
+        """Whether the dataset is finished: nothing is left to make, or to try again."""
+        path = self.out / "dataset.json"
+        return path.exists() and not any(entry.get("provisional") for entry in read_dataset(path)["shards"])
 
     def begin(self, sources: Sequence[Source]) -> None:
         """Start, or go on with what an earlier run began.
@@ -237,10 +243,13 @@ class Workspace:
         except OSError as error:
             raise machine_error(error, self.out) from error
 
-    def finish(self, shards: int, facts: dict[str, Any]) -> dict[str, Any]:
-        """Write ``manifest.csv`` and, last, ``dataset.json``; return what the latter says. MachineError on failure."""
+    def finish(self, shards: int, given_up: dict[int, Made], facts: dict[str, Any]) -> dict[str, Any]:
+        """Write ``manifest.csv`` and, last, ``dataset.json``; return what the latter says. MachineError on failure.
+
+        Shards that are ``given_up`` for now have provisional rows; then ``.work`` stays, for the next run to go on.
+        """
         try:
-            manifest_sha256 = self._write_manifest(shards)
+            manifest_sha256 = self._write_manifest(self.all_rows(shards, given_up))
             config_sha256 = hashlib.sha256(self.config_yaml.encode()).hexdigest()
             fingerprint = hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
             dataset = {
@@ -248,18 +257,25 @@ class Workspace:
                 "manifest_sha256": manifest_sha256,
                 "config_sha256": config_sha256,
                 **facts,
-                "shards": [self.entry(shard) for shard in range(shards)],
+                "shards": [
+                    given_up[shard].entry() if shard in given_up else self.entry(shard) for shard in range(shards)
+                ],
             }
             self._write(self.out / "dataset.json", dataset_text(dataset))
-            shutil.rmtree(self.work)
+            shutil.rmtree(self.tmp if given_up else self.work)
         except OSError as error:
             raise machine_error(error, self.out) from error
         return dataset
 
-    def _write_manifest(self, shards: int) -> str:
+    def all_rows(self, shards: int, given_up: dict[int, Made]) -> Iterator[Row]:
+        """Yield every row of the dataset, in source order."""
+        for shard in range(shards):
+            yield from given_up[shard].rows if shard in given_up else self.committed_rows([shard])
+
+    def _write_manifest(self, rows: Iterable[Row]) -> str:
         path = self.out / "manifest.csv"
         with self._written_aside(path) as stream:
-            write_rows(stream, self.committed_rows(range(shards)))
+            write_rows(stream, rows)
         with path.open("rb") as content:
             return hashlib.file_digest(content, "sha256").hexdigest()
 
