@@ -12,8 +12,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import cli
+from unprocess_gen import cli, plan, tables, unprocess
 from unprocess_gen.config import (
+    HIGHLIGHTS,
+    LAW_NUMBERS,
     NOT_DATA,
     Config,
     check,
@@ -455,3 +457,9 @@ def test_what_is_not_a_datasets_config_yaml_is_refused_in_one_line(content: byte
     with pytest.raises(ConfigError, match=r"config.yaml: not the config.yaml of a dataset \(") as error:
         read_dataset_yaml(tmp_path / "config.yaml")
     assert "\n" not in str(error.value)
+
+
+def test_choices_are_those_of_the_rooms_that_serve_them() -> None:
+    assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
+    assert set(unprocess.TONES) == set(tables.TONES) == {"smoothstep", "none"}
+    assert set(LAW_NUMBERS) == set(plan.LAWS)
