@@ -457,3 +457,19 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(
     out, err = capfd.readouterr()
     assert out == ""
     assert re.fullmatch(r"gen-dataset: 13/13 pairs, [\d.]+ pairs/s, 0 failed, 0 s left\n", err)
+
+
+def test_the_summary_adds_up_the_manifests_counts(dataset: Path) -> None:
+    rows = [sample.row for sample in RawPairs(dataset)]
+    known = facts(dataset)["sites"]
+    assert known["all"] == sum(row["width"] * row["height"] for row in rows)
+    assert {name: sum(row[name] for row in rows) for name in runner.COUNTS} == {
+        name: known[name] for name in runner.COUNTS
+    }
+
+
+def test_sites_without_noise_variance_are_told(make: Make, tmp_path: Path) -> None:
+    """The line of RVDD has a variance below 0 up to 15.33 DN above black."""
+    Image.fromarray(np.zeros((10, 10, 3), np.uint8)).save(tmp_path / "black.png")
+    summary = make(tmp_path, tmp_path / "ds", "noise=imx385_iso3200_rvdd")
+    assert (summary.sites["all"], summary.sites["zero_variance"]) == (100, 100)

@@ -144,6 +144,8 @@ def _generate(config: Config) -> tuple[int, Summary]:
 
     summary = runner.generate(config)
     print(_sentence(summary))
+    if summary.made and summary.sites["all"]:
+        print(_limits(summary.sites))
     too_many = sum(summary.failed.values()) > config.source.max_failed
     return 3 if too_many else 0, summary
 
@@ -156,6 +158,17 @@ def _sentence(summary: Summary) -> str:
     if not summary.made:
         return f"{summary.out} is complete: {facts}; nothing to do"
     return f"{summary.out}: {facts}; {summary.made} of {summary.rows} made now, {summary.seconds:.1f} s"
+
+
+def _limits(sites: dict[str, int]) -> str:
+    """Say which share of the sites met a limit, so that nobody trains on clipped data unawares."""
+    share = {name: f"{count / sites['all']:.3%}" for name, count in sites.items()}
+    return (
+        f"of {sites['all']:,} sites, clean: {share['clean_clipped_low']} were clipped at black, "
+        f"{share['clean_clipped_high']} at white, {share['saturated']} are saturated; "
+        f"noisy: {share['noisy_clipped_low']} were clipped low, {share['noisy_clipped_high']} high; "
+        f"{share['zero_variance']} have no noise variance"
+    )
 
 
 def plan(arguments: list[str]) -> int:

@@ -23,7 +23,7 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from unprocess_gen.manifest import Row, failed_row, key_text, ok_row, row_json
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
 from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Source
+from unprocess_gen.records import Counts, Source
 from unprocess_gen.shards import ShardWriter, array_xxh3, shard_name
 from unprocess_gen.workspace import Made, Workspace, machine_error
 
@@ -50,11 +50,15 @@ PLAIN_LINE_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a run came to: rows by status, how many were made just now, and where."""
+    """What a run came to: rows by status, how many were made just now, and where.
+
+    ``sites`` holds the sum of width x height, and of each of the manifest's counts (`COUNTS`).
+    """
 
     out: Path
     pairs: int
     failed: dict[str, int]
+    sites: dict[str, int]
     shards: int
     bytes: int
     made: int
@@ -111,13 +115,14 @@ def generate(config: Config) -> Summary:
                     print(f"gen-dataset: {made.killer}: its worker died twice; run again to retry it", file=sys.stderr)
                 progress.advance(made.rows)
         seconds = time.monotonic() - started
-        failed = count_reasons(workspace.all_rows(len(tasks), given_up))
+        failed, sites = tally(workspace.all_rows(len(tasks), given_up))
         facts = workspace.finish(
             len(tasks),
             given_up,
             {
                 "pairs": len(listing.sources) - sum(failed.values()),
                 "failed": failed,
+                "sites": sites,
                 "not_matched": listing.not_matched,
                 "skipped_links": listing.skipped_links,
                 "source": {"kind": source_kind(config), "root": _absolute(config.source.root)},
@@ -298,14 +303,21 @@ class Progress:
             )
 
 
-def count_reasons(rows: Iterable[Row]) -> dict[str, int]:
-    """Return how many rows failed, by reason."""
-    counts: dict[str, int] = {}
+COUNTS = tuple(field.name for field in fields(Counts))
+
+
+def tally(rows: Iterable[Row]) -> tuple[dict[str, int], dict[str, int]]:
+    """Return how many rows failed, by reason, and how many sites of the others met which limit."""
+    reasons: dict[str, int] = {}
+    sites = dict.fromkeys(("all", *COUNTS), 0)
     for row in rows:
         if row["status"] != "ok":
-            reason = str(row["reason"])
-            counts[reason] = counts.get(reason, 0) + 1
-    return dict(sorted(counts.items()))
+            reasons[str(row["reason"])] = reasons.get(str(row["reason"]), 0) + 1
+            continue
+        sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
+        for name in COUNTS:
+            sites[name] += int(row[name] or 0)
+    return dict(sorted(reasons.items())), sites
 
 
 def machine() -> dict[str, Any]:
@@ -322,6 +334,7 @@ def _summary(out: Path, facts: dict[str, Any], made: int, started: float) -> Sum
         out=out,
         pairs=facts["pairs"],
         failed=facts["failed"],
+        sites=facts["sites"],
         shards=len(facts["shards"]),
         bytes=sum(entry["bytes"] for entry in facts["shards"]),
         made=made,
