@@ -177,7 +177,7 @@ def _run_pool(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made
     parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # of what an interrupt cancelled
-        with _interrupts_blocked():
+        with _interrupts_ignored():
             results = parallel(delayed(make_shard)(bench, task) for task in tasks)
         with closing(results):
             yield from results
@@ -196,13 +196,19 @@ def _read_busy(bench: Bench, task: Task) -> str:
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Hold SIGINT back while workers start: they inherit that, so that Ctrl-C is the coordinator's alone to answer."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore SIGINT while workers start: they inherit that, so that Ctrl-C is the coordinator's alone to answer.
+
+    Blocking it instead does not last: loky's resource tracker unblocks it on its way.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.signal(signal.SIGINT, before)
 
 
 # --------------------------------------------------------------------------------------------------- in the workers
@@ -246,11 +252,12 @@ def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -
 
 
 def _settle(coordinator_pid: int) -> None:
-    """Keep OpenCV to one thread, and a worker from outliving its coordinator."""
+    """Keep OpenCV to one thread; keep a worker from answering Ctrl-C, and from outliving its coordinator."""
     import cv2
 
     cv2.setNumThreads(1)
     if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=_end_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
 
 
