@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import time
@@ -17,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from conftest import COMMAND, environment, fill, pixels
+from conftest import COMMAND, Cli, environment, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs, runner
@@ -521,76 +519,70 @@ def test_workers_end_with_a_run_that_is_killed(tmp_path: Path) -> None:
         wait_for(lambda: not session(process.pid), seconds=10)
 
 
-def kill_workers_at(out: Path, shard: int, leader: int, times: int) -> None:
-    """Kill the workers of a run each time that one of them begins on a shard."""
-    busy, seen = out / f".work/tmp/{shard}.busy", 0
+DEADLY = """
+import hashlib, os, pathlib, signal
 
-    def begun_anew() -> int:
-        try:
-            at = busy.stat().st_mtime_ns
-        except FileNotFoundError:
-            return 0
-        return at if at != seen else 0
+deaths, killer, sha256 = pathlib.Path(os.environ["DEATHS"]), pathlib.Path(os.environ["KILLER"]), hashlib.sha256
 
-    for _ in range(times):
-        seen = wait_for(begun_anew)
-        for pid in workers(leader):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+
+def deadly(data=b"", **options):
+    left = int(deaths.read_text())
+    if left and isinstance(data, bytes) and data == killer.read_bytes():
+        deaths.write_text(str(left - 1))
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sha256(data, **options)
+
+
+hashlib.sha256 = deadly
+"""
+"""A module that every process of a run imports first: hashing one photograph kills the worker, so many times."""
+
+TWELVE = ("source.root=p", "output.pairs_per_shard=4", "n_jobs=2")
+
+
+def run_with_deaths(cli: Cli, folder: Path, deaths: int) -> subprocess.CompletedProcess[str]:
+    """Make the dataset of twelve photographs, of which the tenth (in the third shard) kills its worker."""
+    fill(folder / "p", 12)
+    (folder / "site").mkdir()
+    (folder / "site/sitecustomize.py").write_text(DEADLY)
+    (folder / "deaths").write_text(str(deaths))
+    return cli(
+        *TWELVE, PYTHONPATH=str(folder / "site"), DEATHS=str(folder / "deaths"), KILLER=str(folder / "p/009.png")
+    )
 
 
 @pytest.fixture(scope="module")
 def twelve_undisturbed(make: Make, tree_hash: Hash, tmp_path_factory: pytest.TempPathFactory) -> str:
-    out = tmp_path_factory.mktemp("twelve_undisturbed") / "ds"
-    make(None, out, "source.limit=12", "output.pairs_per_shard=4")
-    return tree_hash(out)
+    folder = tmp_path_factory.mktemp("undisturbed")
+    make(fill(folder / "p", 12), folder / "ds", "output.pairs_per_shard=4")
+    return tree_hash(folder / "ds")
 
 
-TWELVE = ("source.limit=12", "output.pairs_per_shard=4", "n_jobs=2")
-
-
-def test_a_worker_that_dies_once_changes_nothing(twelve_undisturbed: str, tree_hash: Hash, tmp_path: Path) -> None:
-    with running(*TWELVE, cwd=tmp_path) as process:
-        kill_workers_at(tmp_path / "ds", 2, process.pid, times=1)
-        out, err = process.communicate(timeout=WAIT_S)
-        assert process.returncode == 0, err
-        assert "12 pairs in 3 shards" in out
-        wait_for(lambda: not session(process.pid), seconds=10)
+def test_a_worker_that_dies_once_changes_nothing(
+    twelve_undisturbed: str, cli: Cli, tree_hash: Hash, tmp_path: Path
+) -> None:
+    done = run_with_deaths(cli, tmp_path, deaths=1)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "deaths").read_text() == "0"
+    assert "12 pairs in 3 shards" in done.stdout
     assert tree_hash(tmp_path / "ds") == twelve_undisturbed
     assert not (tmp_path / "ds/.work").exists()
 
 
-@pytest.fixture(scope="module")
-def given_up(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
-    """A dataset whose third shard killed its worker twice, the run's exit code and stderr."""
-    folder = tmp_path_factory.mktemp("given_up")
-    with running(*TWELVE, cwd=folder) as process:
-        kill_workers_at(folder / "ds", 2, process.pid, times=2)
-        _, err = process.communicate(timeout=WAIT_S)
-        return folder, process.returncode, err
-
-
-def test_a_photograph_that_kills_twice_is_given_up_for_now(given_up: tuple[Path, int, str]) -> None:
-    folder, code, err = given_up
-    lines = [line for line in err.splitlines() if "pairs/s" not in line]
-    assert (code, len(lines)) == (3, 1), err
-    assert "its worker died twice; run again to retry it" in lines[0]
-    rows = list(read_rows(folder / "ds/manifest.csv"))
-    assert [row["reason"] for row in rows] == [""] * 8 + ["worker_died"] * 4
-    assert [entry.get("provisional", False) for entry in read_dataset(folder / "ds/dataset.json")["shards"]] == [
-        False,
-        False,
-        True,
-    ]
-    assert not (folder / "ds/shards/shard-00002.tar").exists()
-    assert len(RawPairs(folder / "ds")) == 8
-
-
-def test_the_next_run_tries_again_what_was_given_up(
-    given_up: tuple[Path, int, str], twelve_undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path
+def test_a_photograph_that_kills_twice_is_given_up_and_tried_again_by_the_next_run(
+    twelve_undisturbed: str, cli: Cli, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
-    shutil.copytree(given_up[0] / "ds", tmp_path / "ds")
-    assert make(None, tmp_path / "ds", *TWELVE[:2]).made == 4
+    done = run_with_deaths(cli, tmp_path, deaths=2)
+    lines = [line for line in done.stderr.splitlines() if "pairs/s" not in line]
+    assert (done.returncode, lines) == (3, ["gen-dataset: 009.png: its worker died twice; run again to retry it"])
+    rows = list(read_rows(tmp_path / "ds/manifest.csv"))
+    assert [row["reason"] for row in rows] == [""] * 8 + ["worker_died"] * 4
+    entries = read_dataset(tmp_path / "ds/dataset.json")["shards"]
+    assert [entry.get("provisional", False) for entry in entries] == [False, False, True]
+    assert not (tmp_path / "ds/shards/shard-00002.tar").exists()
+    assert len(RawPairs(tmp_path / "ds")) == 8
+
+    assert make(tmp_path / "p", tmp_path / "ds", TWELVE[1]).made == 4
     assert tree_hash(tmp_path / "ds") == twelve_undisturbed
     assert not (tmp_path / "ds/.work").exists()
 
