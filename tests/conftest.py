@@ -28,6 +28,8 @@ from unprocess_gen.config import Config, check
 
 COMMAND = Path(sys.executable).with_name("gen-dataset")
 
+np.seterr(all="raise")  # in every test: no NaN, overflow, underflow or division by zero goes by unseen
+
 
 def pixels(seed: int, height: int, width: int, dtype: type = np.uint8, channels: int = 3) -> np.ndarray:
     """Smooth random colours with some of them saturated, so that highlights and shadows both occur."""

@@ -63,13 +63,14 @@ def moments(mean: float, std: float, low: int, high: int) -> Moments:
     shift = float(probability @ offset)
     deviation = offset - shift
     ends = (min(max(round(mean + side * REACH * std), low), high) - centre - shift for side in (-1, 1))
-    return Moments(
-        mean=centre + shift,
-        variance=float(probability @ deviation**2),
-        third=float(probability @ deviation**3),
-        fourth=float(probability @ deviation**4),
-        reach=max(abs(end) for end in ends),
-    )
+    with np.errstate(under="ignore"):  # a probability below 1e-308 may well come out as 0
+        return Moments(
+            mean=centre + shift,
+            variance=float(probability @ deviation**2),
+            third=float(probability @ deviation**3),
+            fourth=float(probability @ deviation**4),
+            reach=max(abs(end) for end in ends),
+        )
 
 
 def bernstein(variance: float, reach: float, count: int, false_alarm: float = FALSE_ALARM) -> float:

@@ -15,7 +15,7 @@ FLOORS = (
     {"errors", "records"},
     {"bayer", "colour", "headers", "streams", "tables"},
     {
-        *("config", "decode", "effects", "fused", "manifest"),
+        *("config", "decode", "effects", "fused", "manifest", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
     },
     {"pair", "photographs", "plan", "reader", "workspace"},

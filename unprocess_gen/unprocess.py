@@ -19,15 +19,21 @@ from unprocess_gen.records import Float, Plan, Srgb
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
     """Return the clean mosaic before clipping, ``[H, W]`` float64 with 0 at black and 1 at white.
 
-    ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535; ``origin`` places a cut-out in the
-    full frame, for the Bayer phase.
+    Arguments as for `camera_light`; ``origin`` places a cut-out in the full frame, for the Bayer phase.
+    """
+    return mosaic(camera_light(srgb, plan), plan.pattern, origin)
+
+
+def camera_light(srgb: Srgb, plan: Plan) -> Float:
+    """Return what falls on the sensor, before clipping and without the mosaic: ``[H, W, 3]`` float64, 1 at white.
+
+    ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535.
     """
     white = np.float64(np.iinfo(srgb.dtype).max)
     image = TONES[plan.tone](srgb / white, (white - srgb) / white)
     image = expand_gamma(image, plan.gamma)
     image = apply_ccm(image, plan.rgb2cam)
-    image = invert_gains(image, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
-    return mosaic(image, plan.pattern, origin)
+    return invert_gains(image, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:
