@@ -210,6 +210,7 @@ REFUSED = [
     ("seed=9223372036854775808", r"seed=9223372036854775808: expected 0 to 9223372036854775807"),
     ("n_jobs=0", r"n_jobs=0: expected 1 to 1024 or -1"),
     ("n_jobs=-2", r"n_jobs=-2: expected 1 to 1024 or -1"),
+    ("self_test=off", r"self_test=off: expected one of stop, go_on"),
     ("out=''", r"out='': expected the name of a folder"),
     ("source.root=/no/such/folder", r"source.root=/no/such/folder: no such folder"),
     ("source.include=[]", r"source.include=\[\]: expected at least one pattern"),
@@ -384,8 +385,8 @@ def test_source_kind_follows_from_the_root(settings: Settings) -> None:
 
 def test_keys_that_do_not_decide_the_data_are_left_out(settings: Settings) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings()))
-    assert NOT_DATA == {"": ("out", "n_jobs"), "source": ("root", "max_failed")}
-    assert {"out", "n_jobs"}.isdisjoint(loaded)
+    assert NOT_DATA == {"": ("out", "n_jobs", "self_test"), "source": ("root", "max_failed")}
+    assert {"out", "n_jobs", "self_test"}.isdisjoint(loaded)
     assert {"root", "max_failed"}.isdisjoint(loaded["source"])
 
 
@@ -399,7 +400,7 @@ def test_every_other_key_is_there(settings: Settings) -> None:
             assert field.name in loaded or field.name in NOT_DATA[""]
 
 
-@pytest.mark.parametrize("keys", ["out=elsewhere", "n_jobs=3", "source.max_failed=7"])
+@pytest.mark.parametrize("keys", ["out=elsewhere", "n_jobs=3", "self_test=go_on", "source.max_failed=7"])
 def test_what_does_not_decide_the_data_does_not_change_the_text(keys: str, settings: Settings) -> None:
     assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
 

@@ -18,7 +18,7 @@ FLOORS = (
         *("config", "decode", "effects", "fused", "manifest", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
     },
-    {"pair", "photographs", "plan", "reader", "workspace"},
+    {"pair", "photographs", "plan", "reader", "selftest", "workspace"},
     {"forecast", "runner", "sweep", "verify"},
     {"cli"},
 )

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from unprocess_gen import tables
+from unprocess_gen.errors import MachineError
 
 CURVES_8 = [key[:2] for key in tables.PINNED if key[2] == 256]
 CURVES_16 = [key[:2] for key in tables.PINNED if key[2] == 65536]
@@ -109,7 +110,7 @@ def test_the_default_curve_has_the_spot_values_that_research_found_independently
 
 def test_a_curve_that_comes_out_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch, fresh: None) -> None:
     monkeypatch.setitem(tables.PINNED, ("none", "2.2", 256), "0" * 64)
-    with pytest.raises(RuntimeError, match="expected 0000"):
+    with pytest.raises(MachineError, match="expected 0000"):
         tables.linear_table("none", 2.2, 256)
 
 
@@ -226,7 +227,7 @@ def test_a_whole_file_with_another_curve_in_it_is_built_anew_where_the_hash_is_p
 
 def test_a_curve_that_comes_out_otherwise_than_pinned_is_refused(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(tables.PINNED, ("none", "1.8", CODES), "0" * 64)
-    with pytest.raises(RuntimeError, match="a table came out as"):
+    with pytest.raises(MachineError, match="a table came out as"):
         tables.linear_table("none", 1.8, CODES)
 
 
@@ -266,6 +267,7 @@ TWINS = f"""
 import sys, time
 from pathlib import Path
 from unprocess_gen import tables
+from unprocess_gen.errors import MachineError
 here, me = Path(sys.argv[1]), sys.argv[2]
 build = tables._build
 def slow(*curve):

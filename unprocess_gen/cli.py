@@ -50,7 +50,7 @@ Settings are key=value, in any order. Groups (group=option; their keys are group
   sensor   imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit
   noise    imx385_iso1600 … imx385_iso25600 imx385_iso3200_rvdd brooks2019 heteroscedastic none
   output   webdataset
-and at the top: seed (0), out (ds), n_jobs (-1: all cores).
+and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on).
 
   --cfg job           print the settings and stop      --config-dir DIR   add a folder of your own options
   -m, --multirun      sweep over comma-separated values

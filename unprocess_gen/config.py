@@ -106,7 +106,7 @@ class OutputConfig:
 
 @dataclass
 class Config:
-    """All settings of a run; ``out``, ``n_jobs``, ``source.root`` and ``source.max_failed`` do not decide the data."""
+    """All settings of a run; those in `NOT_DATA` do not decide the data."""
 
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
@@ -118,10 +118,14 @@ class Config:
     seed: int = 0
     out: str = "ds"
     n_jobs: int = -1
+    self_test: str = "stop"
 
 
 CAMERA_LAWS = ("fixed", "convex", "choice", "identity", "custom")
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
+SELF_TESTS = ("stop", "go_on")
+"""What a failed self-test does to a run."""
+
 MAX_PAIRS_PER_SHARD = 10**6
 MIN_GAIN, MAX_GAIN = 1e-3, 1e3
 """Chosen: no camera comes near either, and no product or quotient of them overflows."""
@@ -244,6 +248,7 @@ def check(config: Config) -> None:
     _in_range("seed", config.seed, 0, 2**63 - 1)
     if config.n_jobs != -1:
         _in_range("n_jobs", config.n_jobs, 1, 1024, " or -1 for one a core")
+    _one_of("self_test", config.self_test, SELF_TESTS)
     if not config.out:
         raise ConfigError("out='': expected the name of a folder")
     _check_source(config.source)
@@ -381,7 +386,7 @@ def _text(value: Any) -> str:
 
 # ----------------------------------------------------------------------------------------- the dataset's config.yaml
 
-NOT_DATA = {"": ("out", "n_jobs"), "source": ("root", "max_failed")}
+NOT_DATA = {"": ("out", "n_jobs", "self_test"), "source": ("root", "max_failed")}
 """Keys that do not decide a dataset's bytes, by group; its ``config.yaml`` leaves them out."""
 
 

@@ -32,6 +32,7 @@ from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
+from unprocess_gen import selftest
 from unprocess_gen.config import Config, dataset_yaml, source_kind
 from unprocess_gen.errors import SourceError
 from unprocess_gen.manifest import Row, failed_row, key_text, ok_row, row_json
@@ -106,6 +107,7 @@ def generate(config: Config) -> Summary:
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         bench = Bench(config, str(workspace.tmp), os.getpid())
         given_up: dict[int, Made] = {}
+        warned = False
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
             for made in run_tasks(bench, todo, n_jobs):
                 if made.killer is None:
@@ -113,6 +115,9 @@ def generate(config: Config) -> Summary:
                 else:
                     given_up[made.shard] = made
                     print(f"gen-dataset: {made.killer}: its worker died twice; run again to retry it", file=sys.stderr)
+                if made.self_test and not warned:
+                    warned = True
+                    print(f"gen-dataset: the self-test failed: {made.self_test}; going on as told", file=sys.stderr)
                 progress.advance(made.rows)
         seconds = time.monotonic() - started
         failed, sites = tally(workspace.all_rows(len(tasks), given_up))
@@ -215,15 +220,16 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def make_shard(bench: Bench, task: Task) -> Made:
-    """Make one shard aside and return its rows; MachineError where the file cannot be written."""
+    """Make one shard aside and return its rows; MachineError if the disk or the self-test fails."""
     _settle(bench.coordinator_pid)
+    failed = _self_test(bench.config)
     path = Path(bench.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     try:
         with ShardWriter(path) as writer:
             rows = tuple(_make_rows(bench, task, writer))
         _busy_path(bench, task).unlink()
         if any(row["status"] == "ok" for row in rows):
-            return Made(task.shard, str(path), writer.bytes, writer.sha256, rows)
+            return Made(task.shard, str(path), writer.bytes, writer.sha256, rows, self_test=failed)
         path.unlink()
         return Made(task.shard, None, 0, None, rows)
     except OSError as error:
@@ -259,6 +265,13 @@ def _settle(coordinator_pid: int) -> None:
     if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=_end_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
+
+
+def _self_test(config: Config) -> str | None:
+    """Return what is wrong with this process, None where nothing is; MachineError unless told to go on."""
+    if config.self_test == "stop":
+        selftest.check(", or say self_test=go_on")
+    return "; ".join(selftest.failures()) or None
 
 
 WATCHDOG = "unprocess_gen watchdog"

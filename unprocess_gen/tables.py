@@ -27,6 +27,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+from unprocess_gen.errors import MachineError
 from unprocess_gen.records import Float
 
 DIGITS = 40
@@ -51,7 +52,7 @@ def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
 
     ``tone`` is ``smoothstep`` or ``none``; ``gamma`` a power or ``srgb``; ``codes`` 256 or 65536. Entry k is the
     inverse tone curve of k / (codes - 1), expanded; the first entry is 0 and the last 1. Raises ValueError for other
-    names and RuntimeError where a pinned curve does not come out as published.
+    names and MachineError where a pinned curve does not come out as published.
     """
     if tone not in TONES:
         raise ValueError(f"tone is {tone!r}, expected one of {', '.join(TONES)}")
@@ -70,7 +71,7 @@ def normal_table() -> Float:
     """Return the quadratics of the normal quantile, float64 ``[1024, 3]``, read-only.
 
     Row ``e * 32 + s`` covers j in [2**e * (1 + s/32), 2**e * (1 + (s+1)/32)), where the tail probability is
-    p = j / 2**33; with t = j / 2**e - 1 - s/32 the quantile -Phi^-1(p) is c0 + t * (c1 + t * c2). RuntimeError where
+    p = j / 2**33; with t = j / 2**e - 1 - s/32 the quantile -Phi^-1(p) is c0 + t * (c1 + t * c2). MachineError where
     the table does not come out as published.
     """
     return _normal_table()
@@ -189,7 +190,7 @@ def sha256(table: Float) -> str:
 
 def _frozen(table: Float, expected: str | None) -> Float:
     if expected is not None and (found := sha256(table)) != expected:
-        raise RuntimeError(f"a table came out as {found}, expected {expected}: this Python computes differently")
+        raise MachineError(f"a table came out as {found}, expected {expected}: this Python computes differently")
     table.flags.writeable = False
     return table
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from unprocess_gen import selftest
 from unprocess_gen.config import SourceConfig
 from unprocess_gen.errors import ConfigError, DamageError, MachineError, SourceError
 from unprocess_gen.manifest import Row, located_rows, plan_of, read_row, read_rows, row_json
@@ -204,8 +205,10 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
     """Make the pairs of rows again, compare them with the rows' digests, and keep them in ``to`` if it is given.
 
     ``root`` is the folder of the sources; rows of built-in scenes need none. Failed photographs have no pair and are
-    passed over. Raises ConfigError where a row needs a folder and there is none.
+    passed over. Raises ConfigError where a row needs a folder and there is none, MachineError where this machine
+    computes differently (`selftest`).
     """
+    selftest.check()
     for row in rows:
         if row["status"] != "ok":
             continue

@@ -45,6 +45,7 @@ class Made:
     """A shard that a worker finished: where it lies (None: no pair in it, no file), and its rows.
 
     ``killer`` names the photograph at which workers died twice; then the rows are provisional and there is no file.
+    ``self_test`` says what was wrong with the process that made the shard, where the run was told to go on with it.
     """
 
     shard: int
@@ -53,12 +54,14 @@ class Made:
     sha256: str | None
     rows: tuple[Row, ...]
     killer: str | None = None
+    self_test: str | None = None
 
     def entry(self) -> dict[str, Any]:
         """Return what ``dataset.json`` says of the shard."""
         pairs = sum(row["status"] == "ok" for row in self.rows)
         return {
             **({"provisional": True} if self.killer else {}),
+            **({"self_test": self.self_test} if self.self_test else {}),
             "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
             "pairs": pairs,
             "failed": len(self.rows) - pairs,
@@ -252,14 +255,14 @@ class Workspace:
             manifest_sha256 = self._write_manifest(self.all_rows(shards, given_up))
             config_sha256 = hashlib.sha256(self.config_yaml.encode()).hexdigest()
             fingerprint = hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
+            entries = [given_up[shard].entry() if shard in given_up else self.entry(shard) for shard in range(shards)]
             dataset = {
                 "fingerprint": fingerprint,
                 "manifest_sha256": manifest_sha256,
                 "config_sha256": config_sha256,
+                "self_test": "failed" if any("self_test" in entry for entry in entries) else "passed",
                 **facts,
-                "shards": [
-                    given_up[shard].entry() if shard in given_up else self.entry(shard) for shard in range(shards)
-                ],
+                "shards": entries,
             }
             self._write(self.out / "dataset.json", dataset_text(dataset))
             shutil.rmtree(self.tmp if given_up else self.work)

@@ -1,0 +1,171 @@
+"""A process that computes differently is found before it makes a pair, and a dataset says when it was made by one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Door
+
+from unprocess_gen import effects, fused, selftest, streams, tables
+from unprocess_gen.errors import MachineError
+from unprocess_gen.pair import reference_pair
+from unprocess_gen.shards import array_xxh3
+
+
+@pytest.fixture(autouse=True)
+def _fresh() -> Iterator[None]:
+    selftest.failures.cache_clear()
+    yield
+    selftest.failures.cache_clear()
+
+
+def test_this_machine_computes_as_all_others() -> None:
+    assert selftest.failures() == ()
+
+
+@pytest.mark.parametrize("highlight", selftest.GOLDEN)
+def test_the_golden_pair_is_the_references(highlight: str) -> None:
+    plan = replace(selftest.GOLDEN_PLAN, highlight=highlight)
+    pair = reference_pair(selftest.golden_picture(), plan, (1, 57))
+
+    assert (array_xxh3(pair.clean), array_xxh3(pair.noisy)) == selftest.GOLDEN[highlight]
+
+
+def test_the_golden_picture_meets_every_limit() -> None:
+    """Clipped low and high, saturated, highlights of both kinds, every code of 8 bits."""
+    picture = selftest.golden_picture()
+    counts = reference_pair(picture, selftest.GOLDEN_PLAN, (1, 57)).counts
+
+    assert set(np.unique(picture)) == set(range(256))
+    assert min(counts.noisy_clipped_low, counts.noisy_clipped_high, counts.saturated) > 0
+
+
+def last_bit(table: np.ndarray) -> np.ndarray:
+    """The table with one entry in the middle one unit in the last place greater."""
+    changed = table.copy()
+    changed.flat[changed.size // 2 + 1] = np.nextafter(changed.flat[changed.size // 2 + 1], np.inf)
+    return changed
+
+
+@pytest.mark.parametrize("build", ["_build", "_quadratic"])
+def test_a_table_off_by_a_unit_in_the_last_place_is_found(build: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    true: Callable[..., object] = getattr(tables, build)
+    monkeypatch.setattr(tables, build, lambda *given: last_bit(np.array(true(*given)) * (1 + 2**-20)))
+    tables._linear_table.cache_clear()
+    tables._normal_table.cache_clear()
+    try:
+        with pytest.raises(MachineError, match=r"the self-test failed: a table came out as [0-9a-f]{64}, expected"):
+            selftest.check()
+    finally:
+        tables._linear_table.cache_clear()
+        tables._normal_table.cache_clear()
+
+
+def test_a_philox_with_another_constant_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "ROUNDS", 9)
+
+    assert "Philox of 00000000 is not Random123's" in selftest.failures()
+
+
+@pytest.mark.parametrize("kernel", ["_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray"])
+def test_a_kernel_that_computes_otherwise_is_found(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernels run as plain Python here, one of them nudged."""
+    for name in ("_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray", "_pair"):
+        monkeypatch.setattr(fused, name, getattr(fused, name).py_func)
+    monkeypatch.setattr(fused, kernel, nudged(getattr(fused, kernel)))
+    with np.errstate(over="ignore"):
+        failed = selftest.failures()
+
+    assert any("the golden" in one for one in failed)
+
+
+def nudged(kernel: Callable[..., None]) -> Callable[..., None]:
+    """The kernel, whose last output is a little greater: a bit of the words, half a DN of signal or of noise."""
+
+    def other(*given: object) -> None:
+        kernel(*given)
+        for argument in reversed(given):
+            if isinstance(argument, np.ndarray) and argument.size > 9 and argument.flags.writeable:
+                argument += {"uint64": 2**20, "uint16": 1, "float64": 0.5}[argument.dtype.name]
+                return
+
+    return other
+
+
+GOLDEN = {"per_channel": ("0" * 32, "0" * 32)}
+
+
+def test_a_failed_self_test_stops_the_run_before_the_first_pair(
+    door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+
+    done = door("n_jobs=1", "source.limit=2")
+
+    assert done.code == 5
+    assert done.err.startswith("gen-dataset: the self-test failed: the golden clean frame (per_channel) is 443ea2ae")
+    assert done.err.endswith("or say self_test=go_on\n")
+    assert len(done.err.splitlines()) == 1
+    assert list((tmp_path / "ds" / "shards").iterdir()) == []
+    assert not (tmp_path / "ds" / "dataset.json").exists()
+
+
+def test_told_to_go_on_the_run_goes_on_and_the_dataset_says_so(
+    door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+
+    done = door("n_jobs=1", "source.limit=3", "output.pairs_per_shard=2", "self_test=go_on")
+
+    facts = json.loads((tmp_path / "ds" / "dataset.json").read_text())
+    assert done.code == 0
+    assert done.err.count("the self-test failed: the golden clean frame") == 1
+    assert facts["self_test"] == "failed"
+    assert all("the golden clean frame" in entry["self_test"] for entry in facts["shards"])
+
+
+def test_only_the_shards_of_the_failing_process_are_named(
+    door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = ("n_jobs=1", "source.limit=4", "output.pairs_per_shard=2", "self_test=go_on")
+    assert door(*whole, "out=other").code == 0
+    with monkeypatch.context() as patched:
+        patched.setattr("unprocess_gen.workspace.Workspace.finish", interrupted)
+        assert door(*whole).code == 130
+    (tmp_path / "ds" / ".work" / "rows" / "00001.json").unlink()
+    (tmp_path / "ds" / "shards" / "shard-00001.tar").unlink()
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+    selftest.failures.cache_clear()
+
+    assert door(*whole).code == 0
+
+    shards = json.loads((tmp_path / "ds" / "dataset.json").read_text())["shards"]
+    assert [("self_test" in entry) for entry in shards] == [False, True]
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_whole_dataset_says_that_the_self_test_passed(dataset: Path) -> None:
+    assert json.loads((dataset / "dataset.json").read_text())["self_test"] == "passed"
+
+
+def test_a_replay_on_such_a_machine_is_refused(dataset: Path, door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+
+    assert door("replay", dataset / "manifest.csv").code == 5
+
+
+def test_the_golden_pair_depends_on_the_normals_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else a change of the sampler that both forms share would go by unseen."""
+    true = effects.normals
+    monkeypatch.setattr(effects, "normals", lambda uniforms: -true(uniforms))
+    pair = reference_pair(selftest.golden_picture(), selftest.GOLDEN_PLAN, (1, 57))
+
+    assert array_xxh3(pair.noisy) != selftest.GOLDEN["per_channel"][1]

@@ -1,0 +1,109 @@
+"""Before a process makes data, it shows that it computes what every other machine does. It takes a millisecond.
+
+Three proofs, from the ground up: the exact tables have their published digests; Philox gives Random123's known answers;
+and a small picture becomes the very pair it became on every machine before, through the same compiled kernels that make
+the dataset. A compiler, a library or a processor that rounds otherwise shows up here, not in data that somebody trained
+on for a week. The golden pair covers the 8-bit kernel, both branches of the highlights, every pattern phase and both
+ends of the sensor; the 16-bit curves are held to their digests when they are first read.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from unprocess_gen import fused
+from unprocess_gen.errors import MachineError
+from unprocess_gen.records import Plan, Srgb
+from unprocess_gen.shards import array_xxh3
+from unprocess_gen.streams import philox4x32
+from unprocess_gen.tables import linear_table, normal_table
+
+KNOWN_ANSWERS = (
+    # Random123's kat_vectors, philox4x32-10: counter, key, output.
+    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    (
+        (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+        (0xA4093822, 0x299F31D0),
+        (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+    ),
+)
+
+GOLDEN_PLAN = Plan(
+    seed=0,
+    stream_key=0x0123456789ABCDEF,
+    camera="custom",
+    weights=(0.0, 0.0, 0.0, 0.0),
+    rgb2cam=(0.5625, 0.3125, 0.125, 0.125, 0.75, 0.125, 0.03125, 0.21875, 0.75),
+    red_gain=2.15,
+    blue_gain=1.7,
+    inverse_rgb_gain=0.8,
+    tone="smoothstep",
+    gamma=2.2,
+    highlight="per_channel",
+    highlight_threshold=0.9,
+    pattern="GRBG",
+    bits=10,
+    black_level_dn=64,
+    white_level_dn=1023,
+    sensor_clip="sensor",
+    noise="imx385_iso25600",
+    a_dn=55.0,
+    b_dn2=2500.0,
+    effects=("heteroscedastic",),
+    skipped=(),
+    accuracy="exact",
+    methods=(),
+)
+GOLDEN = {
+    # highlight: XXH3-128 of the clean and of the noisy frame
+    "per_channel": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
+    "gray_mean": ("b4c0b18f1bbccbf881c82b00455253e9", "16f26b70e50c70f03babed405092f5b2"),
+}
+
+
+def check(way_out: str = "") -> None:
+    """Raise MachineError, with every proof that failed, where this process computes differently."""
+    if failures():
+        raise MachineError(
+            f"the self-test failed: {'; '.join(failures())}; this machine computes differently from others: try other "
+            f"versions of numpy and numba{way_out}"
+        )
+
+
+@functools.lru_cache(maxsize=1)
+def failures() -> tuple[str, ...]:
+    """Return each proof that failed, in words; once in a process."""
+    return tuple(_failures())
+
+
+def _failures() -> Iterator[str]:
+    try:
+        curve, quantiles = linear_table("smoothstep", 2.2, 256), normal_table()
+    except MachineError as error:
+        yield str(error)
+        return
+    for counter, key, answer in KNOWN_ANSWERS:
+        words = philox4x32(tuple(np.array([word], dtype=np.uint64) for word in counter), key[0] | key[1] << 32)
+        if tuple(int(word[0]) for word in words) != answer:
+            yield f"Philox of {counter[0]:08x} is not Random123's"
+    for highlight, wanted in GOLDEN.items():
+        plan = replace(GOLDEN_PLAN, highlight=highlight)
+        pair = fused.make_pair(golden_picture(), plan, curve, quantiles, (0.0, 1023.0), (1, 57))
+        for name, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), wanted, strict=True):
+            if (found := array_xxh3(frame)) != digest:
+                yield f"the golden {name} frame ({highlight}) is {found}, expected {digest}"
+
+
+def golden_picture() -> Srgb:
+    """Return a picture of 19 x 83 pixels in integer arithmetic: ramps, every code, and stripes of black and white."""
+    y, x = np.mgrid[0:19, 0:83]
+    ramp = (x * 255 // 82, (x * 31 + y * 83) % 256, 255 - y * 255 // 18)
+    picture = np.stack(ramp, axis=-1).astype(np.uint8)
+    picture[:, 20:40] = 255
+    picture[:, 50:70] = 0
+    return picture
