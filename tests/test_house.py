@@ -20,6 +20,7 @@ FLOORS = (
     },
     {"pair", "photographs", "plan", "reader", "selftest", "workspace"},
     {"forecast", "runner", "sweep", "verify"},
+    {"repair"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}

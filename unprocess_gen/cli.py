@@ -15,7 +15,7 @@ import re
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
@@ -38,6 +38,7 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
                                                a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset plan [overrides] [--all]         what would be made; writes nothing
   gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
+  gen-dataset verify DIR --repair              … and make again what is damaged, to the same bytes
   gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
                                                make rows again and compare, or write their arrays
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
@@ -237,24 +238,37 @@ def _values(verb: str, known: Mapping[str, Callable[[str], Any]], arguments: Seq
 
 
 def verify(arguments: list[str]) -> int:
-    """``gen-dataset verify DIR [--regenerate N] [source.root=…]``: check every byte against the manifest."""
+    """``gen-dataset verify DIR [--regenerate N] [--repair] [source.root=…]``: check every byte, mend what is wrong."""
+    from unprocess_gen import repair
     from unprocess_gen import verify as room
+
+    mend = "--repair" in arguments
+    arguments = [argument for argument in arguments if argument != "--repair"]
 
     if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
         raise ConfigError("verify: expected the folder of a dataset")
     folder, chosen = Path(arguments[0]), _values("verify", VERIFY_KEYS, arguments[1:])
-    damages = [str(damage) for damage in room.verify(folder)]
+    damages = _told(folder, room.verify(folder))
+    if damages and mend:
+        for step in repair.repair(folder, room.source_root(folder / "manifest.csv", chosen.get("source.root"))):
+            print(step, file=sys.stdout if step.mended else sys.stderr)
+        damages = _told(folder, room.verify(folder))
     manifest, count = folder / "manifest.csv", chosen.get("--regenerate", 0)
     if count and not damages:
         root = room.source_root(manifest, chosen.get("source.root"))
         replayed = room.replay(room.spread(manifest, count), root)
-        damages += [f"{one.key} ({one.source}): {one.complaint}" for one in replayed if one.complaint]
-    for damage in damages:
-        print(f"gen-dataset: {folder}: {damage}", file=sys.stderr)
+        damages += _told(folder, (f"{one.key} ({one.source}): {one.complaint}" for one in replayed if one.complaint))
     if damages:
         return 4
     print(f"{folder} is whole" + (f"; {count} pairs were made again, bit for bit" if count else ""))
     return 0
+
+
+def _told(folder: Path, damages: Iterable[object]) -> list[str]:
+    told = [str(damage) for damage in damages]
+    for damage in told:
+        print(f"gen-dataset: {folder}: {damage}", file=sys.stderr)
+    return told
 
 
 def replay(arguments: list[str]) -> int:

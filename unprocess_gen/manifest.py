@@ -8,6 +8,7 @@ on the source's name alone: the size of a shard can then be told before it is ma
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -272,6 +273,17 @@ def located_rows(path: Path) -> Iterator[tuple[int, Row]]:
         raise DamageError(f"{path}: not a readable manifest ({error})") from error
     except FileNotFoundError:
         raise DamageError(f"{path}: no such manifest") from None
+
+
+def readable_rows(path: Path) -> Iterator[Row]:
+    """Yield the rows of those lines of a damaged manifest that still read as rows; none where there is no file."""
+    try:
+        lines = path.read_bytes().splitlines(keepends=True)
+    except OSError:
+        return
+    for line in lines[1:]:
+        with contextlib.suppress(csv.Error, ValueError):
+            yield _typed(NAMES, line)
 
 
 def read_row(path: Path, at: int) -> Row:

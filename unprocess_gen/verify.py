@@ -220,17 +220,36 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
 
 def _replay(row: Row, root: str | None, to: Path | None) -> str:
     try:
+        pair = _make(row, root)
+    except DamageError as error:
+        return str(error)
+    if to is not None:
+        _keep(pair, to, str(row["key"]))
+    return _unlike(pair, row)
+
+
+def make_again(row: Row, root: str | None) -> Pair:
+    """Return the pair of a row; DamageError where its source has changed, or the pair is not the row's."""
+    pair = _make(row, root)
+    if complaint := _unlike(pair, row):
+        raise DamageError(complaint)
+    return pair
+
+
+def _make(row: Row, root: str | None) -> Pair:
+    try:
         sha256, photograph = load(SourceConfig(root=root, max_pixels=NO_LIMIT), source_of(row))
     except SourceError as error:
         sha256 = error.sha256 or str(row["source_sha256"])
-        return _changed(sha256, row) or f"its source cannot be used ({error})"
+        raise DamageError(_changed(sha256, row) or f"its source cannot be used ({error})") from error
     except MachineError as error:
-        return str(error)
+        raise DamageError(str(error)) from error
     if complaint := _changed(sha256, row):
-        return complaint
-    pair = make_pair(photograph.srgb, plan_of(row))
-    if to is not None:
-        _keep(pair, to, str(row["key"]))
+        raise DamageError(complaint)
+    return make_pair(photograph.srgb, plan_of(row))
+
+
+def _unlike(pair: Pair, row: Row) -> str:
     return "; ".join(
         f"the XXH3-128 of {name} is {found}, the row says {row[f'{name}_xxh3']}"
         for name, found in (("clean", array_xxh3(pair.clean)), ("noisy", array_xxh3(pair.noisy)))

@@ -101,6 +101,14 @@ class Workspace:
         """
         try:
             self.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
+        self.hold()
+        self._refuse_foreign_files()
+
+    def hold(self) -> None:
+        """Hold a folder that is there; raises LockedError and ConfigError as `open` does."""
+        try:
             self._lock = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
             raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
@@ -110,7 +118,6 @@ class Workspace:
             raise LockedError(f"out={self.out}: another run is writing to it; wait for it or choose another") from None
         except OSError as error:
             raise ConfigError(f"out={self.out}: this file system cannot lock it ({error.strerror})") from error
-        self._refuse_foreign_files()
 
     def _refuse_foreign_files(self) -> None:
         """Refuse a folder that holds what no run of ours left there, so that nothing of anyone's is overwritten."""
@@ -238,11 +245,11 @@ class Workspace:
         record = {"entry": made.entry(), "rows": [[row[name] for name in NAMES] for row in made.rows]}
         try:
             if made.path is not None:
-                _sync(Path(made.path))
+                sync(Path(made.path))
             self._write(self._rows_path(made.shard), json.dumps(record, separators=(",", ":")))
             if made.path is not None:
                 os.replace(made.path, self.shards / shard_name(made.shard))
-                _sync(self.shards)
+                sync(self.shards)
         except OSError as error:
             raise machine_error(error, self.out) from error
 
@@ -253,17 +260,8 @@ class Workspace:
         """
         try:
             manifest_sha256 = self._write_manifest(self.all_rows(shards, given_up))
-            config_sha256 = hashlib.sha256(self.config_yaml.encode()).hexdigest()
-            fingerprint = hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
             entries = [given_up[shard].entry() if shard in given_up else self.entry(shard) for shard in range(shards)]
-            dataset = {
-                "fingerprint": fingerprint,
-                "manifest_sha256": manifest_sha256,
-                "config_sha256": config_sha256,
-                "self_test": "failed" if any("self_test" in entry for entry in entries) else "passed",
-                **facts,
-                "shards": entries,
-            }
+            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, facts)
             self._write(self.out / "dataset.json", dataset_text(dataset))
             shutil.rmtree(self.tmp if given_up else self.work)
         except OSError as error:
@@ -295,7 +293,7 @@ class Workspace:
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(aside, path)
-        _sync(path.parent)
+        sync(path.parent)
 
 
 def _read_listing(path: Path) -> dict[str, Any]:
@@ -303,6 +301,27 @@ def _read_listing(path: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
         raise DamageError(f"{path}: cannot be read ({one_line(error)}); remove the folder and start again") from error
+
+
+def dataset_facts(
+    config_yaml: str, manifest_sha256: str, entries: list[dict[str, Any]], facts: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what ``dataset.json`` says, the settings' text among it, so that ``config.yaml`` can be had back."""
+    config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
+    return {
+        "fingerprint": fingerprint(config_sha256, manifest_sha256),
+        "manifest_sha256": manifest_sha256,
+        "config_sha256": config_sha256,
+        "self_test": "failed" if any("self_test" in entry for entry in entries) else "passed",
+        **facts,
+        "config": config_yaml,
+        "shards": entries,
+    }
+
+
+def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
+    """Return the one number that stands for a dataset: of its settings, and of its manifest, which holds all digests."""
+    return hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
 
 
 def dataset_text(facts: dict[str, Any]) -> str:
@@ -338,7 +357,8 @@ def machine_error(error: OSError, path: Path) -> MachineError:
     return MachineError(f"{error.filename or path}: {what} ({free}); what is committed is kept, run again to go on")
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Have what was written to a file, or renamed into a folder, survive a loss of power."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -353,7 +373,9 @@ def _same_size(out: Path, entry: dict[str, Any]) -> None:
     size = path.stat().st_size if path.is_file() else None
     if size != entry["bytes"]:
         found = "is missing" if size is None else f"has {size} bytes"
-        raise DamageError(f"{path}: {found}, the dataset says {entry['bytes']}; remove {out} and make it again")
+        raise DamageError(
+            f"{path}: {found}, the dataset says {entry['bytes']}; gen-dataset verify {out} --repair mends it"
+        )
 
 
 def _shard_number(name: str) -> int:

@@ -1,0 +1,265 @@
+"""Whatever is damaged is made again to the same bytes, nothing else is touched, and what cannot be mended is said."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Door, Make
+
+from unprocess_gen import repair as room
+from unprocess_gen.verify import verify
+
+FILES = ("config.yaml", "manifest.csv", "dataset.json", *(f"shards/shard-0000{number}.tar" for number in range(4)))
+Hash = Callable[[Path], str]
+
+
+@pytest.fixture(scope="module")
+def sources(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The photographs, and two files that cannot be used."""
+    folder = tmp_path_factory.mktemp("sources") / "photos"
+    shutil.copytree(photos, folder)
+    (folder / "broken.jpg").write_bytes((folder / "turned.jpg").read_bytes()[:300])
+    (folder / "sub" / "empty.png").touch()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(sources: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("repair") / "ds"
+    make(sources, out, "output.pairs_per_shard=4")
+    return out
+
+
+@pytest.fixture
+def copy(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "ds"))
+
+
+def assert_mended(copy: Path, whole: Path, door: Door, *arguments: object) -> str:
+    """Return what the command said."""
+    done = door("verify", copy, "--repair", *arguments)
+    assert done.code == 0, done.err
+    assert contents(copy) == contents(whole)
+    assert verify(copy) == []
+    return done.out
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file() and "set_aside" not in path.parts)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def flip(path: Path, bit: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
+def lost(folder: Path) -> bool:
+    """Whether ``dataset.json`` could not be proved to be the run's own."""
+    return json.loads((folder / "dataset.json").read_text())["run"] is None
+
+
+def hold_flips_mended(whole: Path, copy: Path, door: Door, name: str, count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for bit in rng.integers(0, 8 * (whole / name).stat().st_size, count):
+        flip(copy / name, int(bit))
+        assert door("verify", copy, "--repair").code == 0, f"bit {bit} of {name}"
+        assert verify(copy) == []
+        found, wanted = contents(copy), contents(whole)
+        if name == "dataset.json" and lost(copy):
+            del found[name], wanted[name]
+            shutil.copy(whole / name, copy / name)
+        assert found == wanted
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_flipped_bit_is_mended(name: str, whole: Path, copy: Path, door: Door) -> None:
+    hold_flips_mended(whole, copy, door, name, 4, seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILES)
+def test_a_hundred_flipped_bits_in_every_file_are_mended(name: str, whole: Path, copy: Path, door: Door) -> None:
+    hold_flips_mended(whole, copy, door, name, 100, seed=2)
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name != "dataset.json"])
+def test_a_missing_file_is_made_again(name: str, whole: Path, copy: Path, door: Door) -> None:
+    (copy / name).unlink()
+    assert_mended(copy, whole, door)
+
+
+@pytest.mark.parametrize("name", [name for name in FILES if name != "dataset.json"])
+@pytest.mark.parametrize("share", [0, 0.3, 0.8])
+def test_a_truncated_file_is_made_again(name: str, share: float, whole: Path, copy: Path, door: Door) -> None:
+    os.truncate(copy / name, int(share * (copy / name).stat().st_size))
+    assert_mended(copy, whole, door)
+
+
+@pytest.mark.parametrize("size", [0, 50, 100, 150, 200, 250, 300, 350, 500, 1000, -2])
+def test_a_truncated_dataset_json_is_written_anew(size: int, whole: Path, copy: Path, door: Door) -> None:
+    os.truncate(copy / "dataset.json", size % (copy / "dataset.json").stat().st_size)
+
+    assert door("verify", copy, "--repair").code == 0
+    assert verify(copy) == []
+    assert {name: copy.joinpath(name).read_bytes() for name in FILES if name != "dataset.json"} == {
+        name: whole.joinpath(name).read_bytes() for name in FILES if name != "dataset.json"
+    }
+
+
+def test_all_shards_are_made_again(whole: Path, copy: Path, door: Door) -> None:
+    shutil.rmtree(copy / "shards")
+    assert_mended(copy, whole, door)
+
+
+def test_manifest_and_shards_are_made_again_together(whole: Path, copy: Path, door: Door) -> None:
+    (copy / "manifest.csv").unlink()
+    flip(copy / FILES[4], 40_000)
+    (copy / FILES[5]).unlink()
+    assert_mended(copy, whole, door)
+
+
+def test_swapped_shards_change_places_again(whole: Path, copy: Path, door: Door) -> None:
+    first, second = copy / FILES[3], copy / FILES[4]
+    first.rename(copy / "other")
+    second.rename(first)
+    (copy / "other").rename(second)
+    assert_mended(copy, whole, door)
+
+
+def test_a_foreign_file_is_moved_not_lost(whole: Path, copy: Path, door: Door) -> None:
+    for content in ("one", "two"):
+        (copy / "shards" / "notes.txt").write_text(content)
+        said = assert_mended(copy, whole, door)
+        assert "shards/notes.txt: moved to" in said
+    assert [path.read_text() for path in sorted((copy / "set_aside").iterdir())] == ["one", "two"]
+
+
+def test_only_damaged_pairs_are_made_again(whole: Path, copy: Path, door: Door, sources: Path, tmp_path: Path) -> None:
+    """With no source there but that of the damaged pair."""
+    rows = [json.loads(line) for line in _json_rows(whole, 1)]
+    only = tmp_path / "only"
+    only.mkdir()
+    shutil.copy(sources / rows[1]["source"], only / rows[1]["source"])
+    content = (copy / FILES[4]).read_bytes()
+    at = content.index(f"{rows[1]['key']}.noisy.npy".encode()) + 512 + 128
+    flip(copy / FILES[4], 8 * at + 3)
+
+    said = assert_mended(copy, whole, door, f"source.root={only}")
+
+    assert said.splitlines()[0] == f"{FILES[4]}: 1 of {len(rows)} pairs made again, the others kept"
+
+
+def _json_rows(folder: Path, shard: int) -> list[str]:
+    return [json.dumps(row) for row in room.rows_inside(folder / "shards" / f"shard-{shard:05d}.tar")]
+
+
+def test_a_lost_manifest_needs_no_source_while_the_shards_are_sound(
+    copy: Path, door: Door, make: Make, tmp_path: Path
+) -> None:
+    make(None, tmp_path / "scenes", "source.limit=3")
+    before = contents(tmp_path / "scenes")
+    (tmp_path / "scenes" / "manifest.csv").unlink()
+
+    done = door("verify", tmp_path / "scenes", "--repair")
+
+    assert done.out.splitlines()[0] == "manifest.csv: written again from the rows in the shards"
+    assert contents(tmp_path / "scenes") == before
+
+
+def test_a_lost_dataset_json_is_written_anew_and_says_so(whole: Path, copy: Path, door: Door) -> None:
+    (copy / "dataset.json").unlink()
+
+    done = door("verify", copy, "--repair", f"source.root={whole}")
+
+    new, old = (json.loads((folder / "dataset.json").read_text()) for folder in (copy, whole))
+    assert done.code == 0
+    assert "which machine made the dataset, when and with what, is lost" in done.out
+    assert {name for name in old if old[name] != new[name]} == {
+        *("dataset_sha256", "not_matched", "run", "skipped_links", "source", "versions")
+    }
+
+
+def test_a_changed_source_is_named_and_the_rest_is_mended(
+    copy: Path, whole: Path, door: Door, sources: Path, tmp_path: Path
+) -> None:
+    changed = Path(shutil.copytree(sources, tmp_path / "changed"))
+    row = json.loads(_json_rows(whole, 1)[0])
+    shutil.copy(changed / "wide.png", changed / row["source"])
+    (copy / FILES[4]).unlink()
+    (copy / FILES[5]).unlink()
+
+    done = door("verify", copy, "--repair", f"source.root={changed}")
+
+    assert done.code == 4
+    assert f"{FILES[4]}: cannot be mended: " in done.err
+    assert f"cannot be mended: source {row['source']}" in done.err
+    assert (copy / FILES[5]).read_bytes() == (whole / FILES[5]).read_bytes()
+    assert not (copy / ".work").exists()
+
+
+@pytest.mark.parametrize("other", ["config.yaml", "manifest.csv"])
+def test_what_no_part_holds_any_more_is_refused_in_one_line(other: str, copy: Path, door: Door) -> None:
+    flip(copy / other, 8 * (copy / other).read_bytes().index(b"deep.png" if other == "manifest.csv" else b"webp") + 1)
+    flip(copy / "dataset.json", 8 * (copy / "dataset.json").read_bytes().index(b'"host"') + 1)
+
+    done = door("verify", copy, "--repair")
+
+    assert done.code == 4
+    assert done.err.splitlines()[-1].startswith(f"gen-dataset: {copy}: both {other} and dataset.json are damaged; make")
+
+
+def test_a_dataset_that_a_run_holds_is_left_alone(copy: Path, door: Door) -> None:
+    flip(copy / FILES[3], 999)
+    before = contents(copy)
+    handle = os.open(copy, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+
+    done = door("verify", copy, "--repair")
+
+    os.close(handle)
+    assert done.code == 11
+    assert contents(copy) == before
+
+
+def test_a_whole_dataset_is_not_touched(whole: Path, copy: Path, door: Door) -> None:
+    before = {path: path.stat().st_mtime_ns for path in copy.rglob("*")}
+    assert door("verify", copy, "--repair").out == f"{copy} is whole\n"
+    assert {path: path.stat().st_mtime_ns for path in copy.rglob("*")} == before
+
+
+def test_an_interrupted_repair_makes_nothing_worse(
+    whole: Path, copy: Path, door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged = (FILES[3], FILES[5])
+    for name in damaged:
+        flip(copy / name, 77_777 % (8 * (copy / name).stat().st_size))
+    with monkeypatch.context() as patched:
+        patched.setattr(room.os, "replace", _interrupt)
+        assert door("verify", copy, "--repair").code == 130
+    assert {damage.file for damage in verify(copy)} == set(damaged)
+
+    assert_mended(copy, whole, door)
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_finished_dataset_with_a_missing_shard_points_to_the_repair(
+    copy: Path, sources: Path, make: Make, door: Door
+) -> None:
+    (copy / FILES[3]).unlink()
+
+    done = door(f"source.root={sources}", "out=ds", "output.pairs_per_shard=4")
+
+    assert done.code == 4
+    assert "gen-dataset verify ds --repair" in done.err
