@@ -13,7 +13,7 @@ HOUSE = Path(unprocess_gen.__file__).parent
 
 FLOORS = (
     {"errors", "records"},
-    {"bayer", "colour", "headers", "streams", "tables"},
+    {"bayer", "colour", "compiled", "headers", "streams", "tables"},
     {
         *("config", "decode", "effects", "fused", "manifest", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
@@ -30,7 +30,7 @@ ONLY_IN = {
     "hydra": {"cli"},
     "omegaconf": {"cli", "config"},
     "joblib": {"runner"},
-    "numba": {"fused"},
+    "numba": {"compiled"},
     "cv2": {"decode", "runner"},
     "PIL": {"decode"},
     "tarfile": {"shards"},

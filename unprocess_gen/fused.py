@@ -18,14 +18,11 @@ outer loop and rows in the inner (5.7 in all).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, cast
-
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from unprocess_gen.bayer import tile
+from unprocess_gen.compiled import kernel
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
 from unprocess_gen.tables import SEGMENTS
@@ -46,19 +43,6 @@ _POSITION_BITS = np.uint64(52 - SEGMENT_BITS)
 _POSITION_MASK = np.uint64(2 ** (52 - SEGMENT_BITS) - 1)
 _FIRST_ROW = np.uint64(1023 << SEGMENT_BITS)
 _ROUND = 1.5 * 2.0**52
-
-
-def _kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """Compile a kernel: no fastmath, and the machine code kept between processes where there is a place for it.
-
-    Numba keeps it beside this file or below the user's cache folder; where neither can be written, every worker
-    compiles for itself (five seconds).
-    """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
-    try:
-        return cast(Callable[..., None], njit(cache=True, **options)(function))
-    except RuntimeError:
-        return cast(Callable[..., None], njit(**options)(function))
 
 
 def make_pair(
@@ -101,7 +85,7 @@ def make_pair(
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
-@_kernel
+@kernel
 def _pair(
     srgb: Srgb,
     products: Float,
@@ -170,7 +154,7 @@ def _pair(
             )
 
 
-@_kernel
+@kernel
 def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
     """Linearise and apply the matrix, for the one channel that each site keeps."""
     e0, e1, e2 = even[0], even[1], even[2]
@@ -185,7 +169,7 @@ def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
         out[x] = (e0[row[x, 0]] + e1[row[x, 1]]) + e2[row[x, 2]]
 
 
-@_kernel
+@kernel
 def _light_by_gray(
     row: Srgb, products: Float, site: NDArray[np.int64], gains: Float, threshold: float, out: Float
 ) -> None:
@@ -202,7 +186,7 @@ def _light_by_gray(
         out[x] = i * max(mask + (1.0 - mask) * gains[c], gains[c])
 
 
-@_kernel
+@kernel
 def _words(
     key: tuple[np.uint64, np.uint64],
     first_block: int,
@@ -233,7 +217,7 @@ def _words(
             out[at + 3 * LANES + lane] = c3
 
 
-@_kernel
+@kernel
 def _normals(
     words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
 ) -> None:
@@ -258,7 +242,7 @@ def _normals(
         out_bits[n] = out_bits[n] ^ ((words[n] & _SIGN) << _32)
 
 
-@_kernel
+@kernel
 def _clean_frame(
     signal: Float,
     gains: Float,
@@ -288,7 +272,7 @@ def _clean_frame(
     counts[4] += saturated
 
 
-@_kernel
+@kernel
 def _noisy_frame(
     unrounded: Float,
     normals: Float,

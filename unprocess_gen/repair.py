@@ -157,8 +157,8 @@ AGAIN = "make the dataset again with the settings and sources it was made from"
 def _is_proved(folder: Path, *proofs: str) -> bool:
     """Whether a damaged ``dataset.json`` still says one of the things that prove another file.
 
-    Each file has more than one such proof, so that damage to one of them leaves the other. Where no digest is left at all, with
-    the whole file perhaps, there is nothing to contradict it either.
+    Each file has more than one such proof, so that damage to one of them leaves the other. Where no digest is left at
+    all, with the whole file perhaps, there is nothing to contradict it either.
     """
     try:
         left = (folder / "dataset.json").read_bytes()

@@ -320,7 +320,7 @@ def dataset_facts(
 
 
 def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
-    """Return the one number that stands for a dataset: of its settings, and of its manifest, which holds all digests."""
+    """Return the digest that stands for a dataset: of its settings, and of its manifest, which holds all others."""
     return hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
 
 

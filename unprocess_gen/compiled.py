@@ -1,0 +1,24 @@
+"""How loops become machine code. The only room that names Numba.
+
+No fastmath: nothing is reordered and no multiply-add is fused, so every processor rounds alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from numba import njit
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a kernel, and keep the machine code between processes where there is a place for it.
+
+    Numba keeps it beside the kernel's file or below the user's cache folder; where neither can be written, every worker
+    compiles for itself (five seconds).
+    """
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
+    try:
+        return cast(Callable[..., Any], njit(cache=True, **options)(function))
+    except RuntimeError:
+        return cast(Callable[..., Any], njit(**options)(function))
