@@ -371,3 +371,11 @@ def test_json_size_fills_whole_blocks_of_tar(length: int) -> None:
 def test_no_number_in_json_is_lost_to_nan(settings: Callable[..., Any]) -> None:
     loaded = json.loads(row_json(row_of(plan_image(settings(), SHA256))), parse_constant=lambda text: pytest.fail(text))
     assert all(math.isfinite(value) for value in loaded.values() if isinstance(value, float))
+
+
+def test_a_key_that_is_no_number_is_damage(dataset: Path, tmp_path: Path) -> None:
+    """It becomes part of a file's name."""
+    text = (dataset / "manifest.csv").read_text(encoding="utf-8")
+    (tmp_path / "manifest.csv").write_text(text.replace("\n00000001,", "\n../../x1,"), encoding="utf-8")
+    with pytest.raises(DamageError, match=r"the key is '../../x1', expected eight digits"):
+        list(read_rows(tmp_path / "manifest.csv"))

@@ -346,3 +346,11 @@ def test_what_is_no_file_is_passed_through(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "b.jpg")
     found = listed(tmp_path).sources
     assert number_twins(str(tmp_path), found) == found
+
+
+@pytest.mark.skipif(not Path("/proc/cpuinfo").exists(), reason="no file here that is longer than it says")
+def test_a_file_that_says_it_is_empty_and_is_not_is_taken_at_its_word(tmp_path: Path) -> None:
+    (tmp_path / "a.png").symlink_to("/proc/cpuinfo")
+    (source,) = sources.list_folder(str(tmp_path), ["*.png"], True, None).sources
+    with pytest.raises(SourceError, match=r"^empty"):
+        sources.read_bytes(str(tmp_path), source)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +101,9 @@ NAMES = tuple(column.name for column in COLUMNS)
 
 JSON_BYTES = 2560
 """Room for a row without its source's name: the longest numbers in every column take 2,150 bytes."""
+
+
+KEY = re.compile(r"\d{8,}")
 
 
 def key_text(index: int) -> str:
@@ -313,6 +317,8 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
     if not line.endswith(b"\n"):
         raise ValueError("the last line is cut")
     cells = dict(zip(header, _cells(line), strict=True))
+    if not KEY.fullmatch(cells["key"]):
+        raise ValueError(f"the key is {cells['key'][:40]!r}, expected eight digits")
     return {column.name: column.type(cell) if (cell := cells[column.name]) else column.empty for column in COLUMNS}
 
 

@@ -131,6 +131,10 @@ def read_bytes(root: str, source: Source) -> bytes:
         The size is not the listed one: the folder changed under us.
     """
     with _opened(root, source) as file:
+        if (
+            source.size_bytes == 0 and os.fstat(file.fileno()).st_size == 0
+        ):  # some grow as they are read: /proc has such
+            raise SourceError("empty", f"{source.name} has 0 bytes")
         data = _reading(source, file.read)
     _check_size(source, len(data), "while it was read")
     if not data:

@@ -1,0 +1,414 @@
+"""Names made to break a list, a shell, a spreadsheet or a path: each is spelled harmlessly and found again to the byte.
+
+One dataset is made of photographs whose names and folders are hostile, all of another content; what is written is then
+read with Python's csv, json and tarfile. Folders with hostile names are given as ``source.root`` and as ``out`` on the
+command line. Hypothesis adds names that nobody thought of: two hundred, or ten thousand in the slow proof.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import re
+import tarfile
+import unicodedata
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from conftest import Door, Make
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from unprocess_gen import RawPairs
+from unprocess_gen.records import Source
+from unprocess_gen.sources import decode_name, encode_name, list_folder, read_bytes
+from unprocess_gen.verify import choose, replay
+
+FORMULA_STARTS = tuple("=+-@\t\r")
+UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+"""What a terminal would obey, or a reader would not see: control and bidirectional characters, and ends of lines."""
+
+NAMES: tuple[bytes, ...] = (
+    # ends of lines, separators, quotes
+    *(
+        b"line\nfeed.jpg",
+        b"carriage\rreturn.jpg",
+        b"both\r\n.jpg",
+        b"tab\t.jpg",
+        b"\n.jpg",
+        b"\x0b\x0c\x1c\x1d\x1e.jpg",
+    ),
+    *(
+        b"com,ma.jpg",
+        b'quo"te.jpg',
+        b'"quoted".jpg',
+        b'".jpg',
+        b'"".jpg',
+        b"semi;colon.jpg",
+        b"pipe|.jpg",
+        b"'single'.jpg",
+        b",.jpg",
+    ),
+    "next\u0085line.jpg".encode(),
+    "line\u2028and\u2029paragraph.jpg".encode(),
+    # formulas
+    *(
+        b"=1+1.jpg",
+        b"+1.jpg",
+        b"-1.jpg",
+        b"@SUM(1).jpg",
+        b"\t=1.jpg",
+        b"\r=1.jpg",
+        b"=cmd|' C'!A0.jpg",
+        b"==.jpg",
+        b"=.jpg",
+        b"-.jpg",
+    ),
+    # what a shell, Hydra or a glob would take for its own
+    *(b"-rf.jpg", b"--help.jpg", b"${x}.jpg", b"$(id).jpg", b"`id`.jpg", b"[x]*.jpg", b"?.jpg", b"{a,b}.jpg", b"~.jpg"),
+    *(b"back\\slash.jpg", b"n\\n.jpg", b"a&b.jpg", b"#.jpg", b"null.jpg", b"a=b.jpg", b"<a>.jpg"),
+    # dots, blanks, percent signs
+    *(b".jpg", b"..jpg", b"...jpg", b". .jpg", b" lead.jpg", b"trail .jpg", b" .jpg", b"%.jpg", b"%25.jpg"),
+    *(b"%2F.jpg", b"a%2Fb.jpg", b"..%2f..%2fb.jpg", b"%0A.jpg", b"%FF.jpg", b"%%.jpg", b"%s%n.jpg", b"%u202E.jpg"),
+    # bytes that are not UTF-8
+    *(
+        b"\xff.jpg",
+        b"\xc3.jpg",
+        b"\xc3(.jpg",
+        b"\xed\xa0\x80.jpg",
+        b"\xc0\xaf.jpg",
+        b"\xf5\x80\x80\x80.jpg",
+        b"\x80=.jpg",
+    ),
+    # directions, widths, looks
+    *("\u202egpj.jpg".encode(), "a\u202bb\u202c.jpg".encode(), "\u2066\u2067\u2068\u2069.jpg".encode()),
+    *("\u061c\u200e\u200f.jpg".encode(), "zero\u200bwidth.jpg".encode(), "zero\u200dwidth.jpg".encode()),
+    *(b"zerowidth.jpg", "\ufeffbom.jpg".encode(), b"bom.jpg", "soft\u00adhyphen.jpg".encode()),
+    *(
+        "שלום.jpg".encode(),
+        "مرحبا.jpg".encode(),
+        "日本語.jpg".encode(),
+        "👩‍👩‍👧‍👦.jpg".encode(),
+        "\U000e0041.jpg".encode(),
+    ),
+    # twins: by case, by normal form, by look
+    *(b"case.jpg", b"CASE.jpg", b"Case.JPG", "ß.jpg".encode(), b"ss.jpg", "ı.jpg".encode(), b"i.jpg", b"I.jpg"),
+    *(unicodedata.normalize(form, "é.jpg").encode() for form in ("NFC", "NFD")),
+    *(unicodedata.normalize(form, "각Å.jpg").encode() for form in ("NFC", "NFD")),
+    *("\u0430.jpg".encode(), b"a.jpg"),
+    # control characters, names of devices elsewhere, and the longest there are
+    *(
+        b"\x1b[31m.jpg",
+        b"\x1b]0;title\x07.jpg",
+        b"\x7f.jpg",
+        b"\x01.jpg",
+        b"con.jpg",
+        b"NUL.jpg",
+        b"aux.h.png",
+        b"COM1.jpg",
+    ),
+    *(b"x" * 251 + b".jpg", b"\xff" * 251 + b".jpg", b"%" * 251 + b".jpg", "\u202e".encode() * 83 + b".jpg"),
+)
+FOLDERS: tuple[bytes, ...] = (
+    *(b"=dir", b"new\nline", b"\xff", b"...", b"  ", b"--", b"%2e%2e", b"a\tb", b'"d', b",,", b"~", b"$x", b"\\"),
+    *(
+        "\u202e".encode(),
+        "\u0065\u0301".encode(),
+        "\u00e9".encode(),
+        b"\xff" * 255,
+        b"\xff" * 255 + b"/" + b"\xfe" * 255,
+    ),
+)
+
+
+def photograph(number: int) -> bytes:
+    """A photograph of three by four pixels unlike any other."""
+    stream = io.BytesIO()
+    rgb = np.frombuffer(hashlib.sha256(b"%d" % number).digest() + bytes(4), np.uint8).reshape(3, 4, 3)
+    Image.fromarray(rgb).save(stream, "PNG")
+    return stream.getvalue()
+
+
+class Made(NamedTuple):
+    """A dataset of hostile names: the files' contents by their path, and all that stood beside the dataset."""
+
+    root: Path
+    out: Path
+    contents: dict[bytes, bytes]
+    beside: list[tuple[bytes, int, int]]
+
+
+def beside(top: Path, out: Path) -> list[tuple[bytes, int, int]]:
+    """Every path below ``top`` but those in ``out``, with its size and time."""
+    found = []
+    for folder, folders, files in os.walk(os.fsencode(top)):
+        folders[:] = [name for name in folders if os.path.join(folder, name) != os.fsencode(out)]
+        for name in files:
+            status = os.lstat(os.path.join(folder, name))
+            found.append((os.path.join(folder, name), status.st_size, status.st_mtime_ns))
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A dataset of photographs that bear `NAMES`, and of one in each of `FOLDERS`."""
+    top = tmp_path_factory.mktemp("names")
+    root, out = top / "photos", top / "ds"
+    paths = [*NAMES, *(folder + b"/=x,\n.jpg" for folder in FOLDERS)]
+    contents = {path: photograph(number) for number, path in enumerate(paths)}
+    for path, content in contents.items():
+        full = Path(os.fsdecode(os.path.join(os.fsencode(root), path)))
+        full.parent.mkdir(parents=True, exist_ok=True)
+        full.write_bytes(content)
+    before = beside(top, out)
+    make(root, out, "output.pairs_per_shard=16")
+    return Made(root, out, contents, before)
+
+
+def cells(out: Path) -> list[list[str]]:
+    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
+        return list(csv.reader(stream, strict=True))
+
+
+def table(out: Path) -> list[dict[str, str]]:
+    head, *rows = cells(out)
+    return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+# In the manifest ------------------------------------------------------------------------------------------------------
+
+
+def test_every_hostile_name_becomes_a_pair(made: Made) -> None:
+    rows = table(made.out)
+    assert (len(rows), {row["status"] for row in rows}) == (len(made.contents), {"ok"})
+
+
+def test_the_csv_gives_back_the_exact_bytes_of_every_name(made: Made) -> None:
+    assert [os.fsencode(decode_name(row["source"])) for row in table(made.out)] == sorted(made.contents)
+
+
+def test_no_two_names_become_one(made: Made) -> None:
+    assert len({row["source"] for row in table(made.out)}) == len(made.contents)
+
+
+def test_each_name_stands_beside_the_digest_of_its_own_file(made: Made) -> None:
+    stated = {os.fsencode(decode_name(row["source"])): row["source_sha256"] for row in table(made.out)}
+    assert stated == {path: hashlib.sha256(content).hexdigest() for path, content in made.contents.items()}
+
+
+def test_a_row_is_one_line_for_any_reader_of_lines(made: Made) -> None:
+    text = (made.out / "manifest.csv").read_bytes().decode("utf-8")
+    assert len(text.splitlines()) == len(made.contents) + 1
+
+
+def test_no_cell_begins_as_a_formula_unless_it_is_a_number(made: Made) -> None:
+    suspicious = [cell for row in cells(made.out) for cell in row if cell.startswith(FORMULA_STARTS)]
+    assert suspicious, "some entries of rgb2cam are negative"
+    for cell in suspicious:
+        float(cell)
+
+
+def test_no_source_begins_as_a_formula(made: Made) -> None:
+    assert not [row["source"] for row in table(made.out) if row["source"].startswith(FORMULA_STARTS)]
+
+
+def test_no_cell_has_a_control_or_bidirectional_character(made: Made) -> None:
+    assert not [cell for row in cells(made.out) for cell in row if UNSEEN.search(cell)]
+
+
+# On the disk ----------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_beside_the_dataset_is_written_or_changed(made: Made) -> None:
+    assert beside(made.root.parent, made.out) == made.beside
+
+
+def test_no_file_of_the_dataset_has_a_name_from_outside(made: Made) -> None:
+    own = re.compile(r"(config\.yaml|dataset\.json|manifest\.csv|\.\w+|shards/shard-\d{5}\.tar)")
+    files = [str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()]
+    assert [name for name in files if not own.fullmatch(name)] == []
+
+
+def test_members_are_named_by_key_alone(made: Made) -> None:
+    found: list[str] = []
+    for shard in sorted((made.out / "shards").iterdir()):
+        with tarfile.open(shard) as opened:
+            found += opened.getnames()
+    kinds = ("clean.npy", "noisy.npy", "json")
+    assert found == [f"{number:08d}.{kind}" for number in range(len(made.contents)) for kind in kinds]
+
+
+def test_the_json_in_a_shard_spells_the_name_as_the_manifest_does(made: Made) -> None:
+    found: list[str] = []
+    for shard in sorted((made.out / "shards").iterdir()):
+        with tarfile.open(shard) as opened:
+            for member in opened.getmembers():
+                if member.name.endswith(".json"):
+                    found.append(json.loads(opened.extractfile(member).read())["source"])  # type: ignore[union-attr]
+    assert found == [row["source"] for row in table(made.out)]
+
+
+# Found again ----------------------------------------------------------------------------------------------------------
+
+
+def test_replay_finds_each_source_again_by_its_key(made: Made) -> None:
+    for row in table(made.out):
+        (one,) = replay(choose(made.out / "manifest.csv", None, row["key"]), str(made.root))
+        assert (one.key, one.source, one.complaint) == (row["key"], row["source"], "")
+
+
+def test_replay_keeps_arrays_under_keys_alone(made: Made, door: Door, tmp_path: Path) -> None:
+    done = door("replay", made.out, "--keys", "00000000,00000007", "--to", tmp_path / "kept")
+    assert done.code == 0
+    kept = sorted(path.name for path in (tmp_path / "kept").iterdir())
+    assert kept == [f"0000000{key}.{kind}.npy" for key in (0, 7) for kind in ("clean", "noisy")]
+
+
+def test_verify_makes_every_pair_again(made: Made, door: Door) -> None:
+    count = len(made.contents)
+    done = door("verify", made.out, "--regenerate", count)
+    assert (done.code, done.out) == (0, f"{made.out} is whole; {count} pairs were made again, bit for bit\n")
+
+
+def test_raw_pairs_gives_every_name(made: Made) -> None:
+    assert [sample.row["source"] for sample in RawPairs(made.out)] == [row["source"] for row in table(made.out)]
+
+
+def test_the_same_folder_again_does_nothing(made: Made, door: Door) -> None:
+    done = door(f"source.root={made.root}", f"out={made.out}", "output.pairs_per_shard=16")
+    assert (done.code, "nothing to do" in done.out) == (0, True)
+
+
+# On the terminal ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> Path:
+    """A folder of hostile names without a picture behind any of them."""
+    folder = tmp_path / "broken"
+    folder.mkdir()
+    for name in NAMES:
+        Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(b"no picture")
+    return folder
+
+
+@pytest.mark.parametrize("verb", [(), ("plan", "--all")], ids=["a run", "plan"])
+def test_no_name_reaches_the_terminal_as_it_is(verb: tuple[str, ...], broken: Path, door: Door) -> None:
+    done = door(*verb, f"source.root={broken}", "out=made", "n_jobs=1")
+    said = (done.out + done.err).replace("\n", "")
+    assert done.code in (0, 3)
+    assert UNSEEN.findall(said) == []
+
+
+# Folders on the command line ------------------------------------------------------------------------------------------
+
+FOLDER_NAMES = (
+    *(" a b ", "apo's", 'quo"te', "a'b\"c'", "=", "eq=ual", "a,b", "[1,2]", "{a:1}", "(x)", "$HOME", "${oc.env:HOME}"),
+    *("$(id)", "back\\slash", "trail\\", "\\'", "new\nline", "\x1b[31m", "a #b", "%41", "a: b", "-x", "true", "1e3"),
+    *("e\u0301te\u0301", "日本 😀", "\u202egnp", "\u2028", "\udcff\udcfe", "x" * 255),
+)
+
+
+@pytest.mark.parametrize("name", FOLDER_NAMES, ids=ascii)
+def test_folders_of_any_name_are_used_as_they_are_or_refused_in_one_line(name: str, door: Door, tmp_path: Path) -> None:
+    root, out = tmp_path / name, tmp_path / f"{name[:254]}2"
+    root.mkdir()
+    (root / "a.png").write_bytes(photograph(0))
+    before = beside(tmp_path, tmp_path / "nowhere")
+    done = door(f"source.root={root.name}", f"out={out.name}", "n_jobs=1")
+    if done.code == 0:
+        assert [(row["source"], row["status"]) for row in table(out)] == [("a.png", "ok")]
+        assert beside(tmp_path, out) == before
+    else:
+        assert (done.code, done.out, len(done.err.strip("\n").split("\n"))) == (2, "", 1)
+        assert beside(tmp_path, tmp_path / "nowhere") == before
+
+
+@pytest.mark.parametrize("mark", ["'", '"'])
+def test_a_folder_named_in_quotes_is_the_one_without_them(mark: str, door: Door, tmp_path: Path) -> None:
+    (tmp_path / "a b").mkdir()
+    (tmp_path / "a b" / "a.png").write_bytes(photograph(0))
+    done = door(f"source.root={mark}a b{mark}", f"out={mark}c d{mark}", "n_jobs=1")
+    assert (done.code, len(table(tmp_path / "c d"))) == (0, 1)
+
+
+# Names that nobody thought of -----------------------------------------------------------------------------------------
+
+HARD_TEXT = st.text(st.characters(exclude_characters="\0/", exclude_categories=["Cs"]))
+HARD_BYTES = st.binary().map(lambda raw: raw.translate(None, b"\0/"))
+TROUBLE = st.lists(
+    st.sampled_from(["=", "+", "-", "@", "%", "%2", "%0A", "\n", "\r", "\t", ",", '"', "é", "e\u0301", "."])
+)
+PARTS = st.one_of(HARD_TEXT.map(str.encode), HARD_BYTES, TROUBLE.map("".join).map(str.encode))
+PATHS = st.lists(PARTS, min_size=1, max_size=3).map(b"/".join).map(os.fsdecode)
+
+
+def check_spelling(path: str) -> None:
+    """One name: harmless, one line, in a CSV too, and found again to the byte."""
+    name = encode_name(path)
+    assert decode_name(name) == path
+    assert not name.startswith(FORMULA_STARTS)
+    assert not UNSEEN.search(name)
+    stream = io.StringIO(newline="")
+    csv.writer(stream, lineterminator="\n").writerow([name, "x"])
+    line = stream.getvalue().encode("utf-8").decode("utf-8")
+    assert len(line.splitlines()) == 1
+    assert list(csv.reader([line], strict=True)) == [[name, "x"]]
+    assert json.loads(json.dumps(name)) == name
+
+
+@given(PATHS)
+@settings(max_examples=200, deadline=None)
+def test_any_name_is_spelled_harmlessly_and_found_again(path: str) -> None:
+    check_spelling(path)
+
+
+@pytest.mark.slow
+@given(PATHS)
+@settings(max_examples=10_000, deadline=None)
+def test_ten_thousand_names_are_spelled_harmlessly_and_found_again(path: str) -> None:
+    check_spelling(path)
+
+
+@given(PATHS, PATHS)
+@settings(max_examples=100, deadline=None)
+def test_two_names_never_share_a_spelling(one: str, other: str) -> None:
+    assert (encode_name(one) == encode_name(other)) == (one == other)
+
+
+@given(PATHS)
+@settings(max_examples=100, deadline=None)
+def test_a_spelling_is_never_taken_for_another_name(path: str) -> None:
+    name = encode_name(path)
+    assert decode_name(encode_name(name)) == name
+
+
+@pytest.fixture(scope="module")
+def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[bytes], Path]]:
+    """Return a function that makes an empty folder with one file of a name in it."""
+    top = tmp_path_factory.mktemp("playground")
+    count = iter(range(10**6))
+
+    def played(name: bytes) -> Path:
+        folder = top / str(next(count))
+        folder.mkdir()
+        Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(name)
+        return folder
+
+    yield played
+
+
+@given(PARTS.map(lambda raw: raw[:255]).filter(lambda raw: raw not in (b"", b".", b"..")))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_file_of_any_name_is_listed_and_read(playground: Callable[[bytes], Path], name: bytes) -> None:
+    root = playground(name)
+    (source,) = list_folder(str(root), ["*"], True, None).sources
+    found_again = Source(0, source.name, decode_name(source.name), source.size_bytes)
+    assert read_bytes(str(root), found_again) == name
