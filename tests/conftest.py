@@ -197,7 +197,7 @@ def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
     """Return a function that calls the command line's `main` in this process, in ``tmp_path``: quicker than `cli`."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
-    before = signal.getsignal(signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def called(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["gen-dataset", *map(str, arguments)])
@@ -209,4 +209,5 @@ def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         return Done(code, *capfd.readouterr())
 
     yield called
-    signal.signal(signal.SIGTERM, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)

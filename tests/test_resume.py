@@ -119,29 +119,6 @@ def test_a_run_killed_ten_times_ends_as_if_undisturbed(
     assert_whole(out)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_a_run_killed_at_any_time_ends_as_if_undisturbed(
-    seed: int, make: Make, tree_hash: Hash, tmp_path: Path
-) -> None:
-    """The moments are random from the start of the process on, imports included, and again until it is done."""
-    moment = random.Random(seed)
-    source, out, kills = fill(tmp_path / "p", 400), tmp_path / "ds", 0
-    while not (out / "dataset.json").exists():
-        with running(f"source.root={source}", ONE, "n_jobs=2", cwd=tmp_path) as process:
-            try:
-                assert process.wait(moment.uniform(0.5, 2.5)) == 0
-            except subprocess.TimeoutExpired:
-                kill_group(process)
-                kills += 1
-        assert kills < 100
-    assert kills > 0
-    make(source, out, ONE)  # sweeps what a kill after the last rename may have left
-    make(source, tmp_path / "undisturbed", ONE)
-    assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
-    assert_whole(out)
-
-
 class Killed(BaseException):
     """The machine stopped here."""
 

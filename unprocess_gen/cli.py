@@ -102,6 +102,9 @@ def main() -> int:
         return 130
     except Terminated:
         return 143
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)  # all is said: a late signal ends us at once, without a traceback
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

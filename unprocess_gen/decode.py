@@ -20,8 +20,9 @@ colour profiles, and only where they are asked for.
   What is done here afterwards stays under that peak.
 * Damage: libjpeg and libtiff fill in for data that are broken, return a picture and tell stderr. So stderr (file
   descriptor 2, of the whole process, under a lock) goes into a file while a picture is decoded, 30 microseconds; what
-  tells of damage is a refusal, anything else is passed on. libjpeg tells the first trouble of a file only, and bit rot
-  that still decodes as Huffman codes is told by nobody but a hash recorded earlier.
+  tells of damage is a refusal, anything else is passed on. libjpeg tells the first trouble of a file only, so whatever
+  it says is damage: a strange JFIF version may hide a lost half. Bit rot that still decodes as Huffman codes, and
+  damage within a lossy WebP, is told by nobody but a hash recorded earlier.
 """
 
 from __future__ import annotations
@@ -46,11 +47,19 @@ ICC_CHOICES = ("ignore", "refuse")
 SRGB_TOLERANCE = 2
 """Codes (of 255) that a profile may move a colour by and still count as sRGB; real sRGB profiles move 1."""
 
+DECODE_PEAK = 8
+"""Samples a pixel that must fit into memory before a failed decode is put down to the file; decoding peaks at 6."""
+
 CV2_MAX_PIXELS = 2**30
 """OpenCV refuses more, unless an environment variable says otherwise."""
 
-# What libjpeg and libtiff say when they fill in for data that are missing or broken, and go on.
-_DAMAGE = re.compile(rb"premature end|bad Huffman code|[Ii]nconsistent progression|Unsupported marker|TIFF_Error")
+# What libjpeg (all of its warnings but one: a few bytes before the end marker, as some cameras write) and libtiff say
+# when they fill in for data that are missing or broken, and go on.
+_DAMAGE = re.compile(
+    rb"[Pp]remature end|Corrupt JPEG data(?!: \d{1,2} extraneous bytes before marker 0xd9)|bad Huffman code"
+    rb"|[Ii]nconsistent progression|Invalid SOS parameters|unknown JFIF revision|Unknown Adobe color"
+    rb"|Unsupported marker|JPEGLib:|Improper JPEG strip/tile size|PackBitsDecode: Discarding|TIFF_Error"
+)
 _DECODING = threading.Lock()
 
 _UNCHANGED = cv2.IMREAD_UNCHANGED
@@ -151,6 +160,8 @@ def _pixels(data: bytes, header: Header) -> Srgb:
     """The pixels as stored, ``[height, width, 3]``, R, G, B."""
     flags = _flags(header)
     decoded, said = _imdecode(tiff_without_orientation(data) if header.format == "tiff" else data, flags)
+    if decoded is None:
+        _check_memory(header)
     if decoded is None or _DAMAGE.search(said):
         complaint = " ".join(said.decode(errors="replace").split())[:200] or "it gives no reason"
         raise SourceError("corrupt", f"OpenCV cannot decode the {header.format} data whole: {complaint}")
@@ -183,6 +194,11 @@ def _imdecode(data: bytes | bytearray, flags: int) -> tuple[Srgb | None, bytes]:
             os.close(stderr)
         spool.seek(0)
         return decoded, spool.read()
+
+
+def _check_memory(header: Header) -> None:
+    """MemoryError where there is none for these pixels: codecs tell of that in many ways, or not at all."""
+    np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
 
 
 def _check_array(decoded: Srgb, header: Header) -> None:

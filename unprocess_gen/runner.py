@@ -22,7 +22,7 @@ import threading
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -34,7 +34,7 @@ from tqdm import tqdm
 
 from unprocess_gen import selftest
 from unprocess_gen.config import Config, dataset_yaml, source_kind
-from unprocess_gen.errors import SourceError
+from unprocess_gen.errors import MachineError, SourceError
 from unprocess_gen.manifest import Row, failed_row, key_text, ok_row, row_json
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
@@ -120,7 +120,10 @@ def generate(config: Config) -> Summary:
                     print(f"gen-dataset: the self-test failed: {made.self_test}; going on as told", file=sys.stderr)
                 progress.advance(made.rows)
         seconds = time.monotonic() - started
-        failed, sites = tally(workspace.all_rows(len(tasks), given_up))
+        try:
+            failed, sites = tally(workspace.all_rows(len(tasks), given_up))
+        except OSError as error:
+            raise machine_error(error, workspace.out) from error
         facts = workspace.finish(
             len(tasks),
             given_up,
@@ -227,14 +230,20 @@ def make_shard(bench: Bench, task: Task) -> Made:
     try:
         with ShardWriter(path) as writer:
             rows = tuple(_make_rows(bench, task, writer))
-        _busy_path(bench, task).unlink()
+        _busy_path(bench, task).unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
             return Made(task.shard, str(path), writer.bytes, writer.sha256, rows, self_test=failed)
         path.unlink()
         return Made(task.shard, None, 0, None, rows)
+    except MemoryError as error:
+        if os.getpid() != bench.coordinator_pid:
+            os._exit(1)  # as if the kernel had ended us: the shard is tried again with nobody beside it
+        name = next((one.name for one in task.sources if str(one.index) == _read_busy(bench, task)), "")
+        raise MachineError(f"{name}: out of memory; what is committed is kept, run again to go on") from error
     except OSError as error:
         for left in (path, _busy_path(bench, task)):
-            left.unlink(missing_ok=True)
+            with suppress(OSError):
+                left.unlink()
         raise machine_error(error, Path(bench.tmp)) from error
 
 
@@ -248,6 +257,10 @@ def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -
     try:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
+        if error.reason == "unreadable" and source.reason is None and not _is_there(config, source):
+            raise MachineError(
+                f"source {source.name} is gone since it was listed; what is committed is kept, run again with it back"
+            ) from error
         return failed_row(source, error.sha256, shard, config.seed, error.reason)
     plan = plan_image(config, sha256, source.occurrence)
     pair = make_pair(photograph.srgb, plan)
@@ -255,6 +268,10 @@ def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -
     row = ok_row(source, sha256, photograph.orientation, shard, plan, pair, digests)
     writer.add(key_text(source.index), pair, row_json(row))
     return row
+
+
+def _is_there(config: Config, source: Source) -> bool:
+    return Path(config.source.root or "", source.path).exists()
 
 
 def _settle(coordinator_pid: int) -> None:

@@ -16,6 +16,7 @@ killed at, a shard in place has its rows, and all else is made again to the same
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import itertools
@@ -145,14 +146,16 @@ class Workspace:
             self.work.mkdir(exist_ok=True)
             self.rows.mkdir(exist_ok=True)
             shutil.rmtree(self.tmp, ignore_errors=True)
-            self.tmp.mkdir()
+            self.tmp.mkdir(exist_ok=True)  # a worker that outlives a killed run for a moment may have kept it
             if not listing.exists():
-                self._write(listing, json.dumps([[source.name, source.size_bytes] for source in sources]))
+                self._write(listing, json.dumps([[one.name, one.size_bytes, one.sha256] for one in sources]))
             if not (self.out / "config.yaml").exists():
                 self._write(self.out / "config.yaml", self.config_yaml)
             self.shards.mkdir(exist_ok=True)  # after config.yaml, by which a later run knows the folder for ours
             self._refuse_foreign_shards()
         except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise machine_error(error, self.out) from error
             raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
 
     def _refuse_foreign_shards(self) -> None:
@@ -171,7 +174,8 @@ class Workspace:
         if not (self.out / "config.yaml").exists():
             raise DamageError(f"{self.out}/config.yaml: is missing from a finished dataset; remove {self.out}")
         self._same_settings()
-        known = {str(row["source"]): row["source_bytes"] for row in read_rows(self.out / "manifest.csv")}
+        rows = read_rows(self.out / "manifest.csv")
+        known = {str(row["source"]): (row["source_bytes"], row["source_sha256"]) for row in rows}
         self._same_sources(known, sources)
         facts = read_dataset(self.out / "dataset.json")
         for entry in facts["shards"]:
@@ -193,14 +197,19 @@ class Workspace:
             )
 
     def _same_sources(self, known: dict[str, Any], sources: Sequence[Source]) -> None:
-        found = {source.name: source.size_bytes for source in sources}
+        found = {source.name: (source.size_bytes, source.sha256) for source in sources}
         differing = [
             *(f"{name} is new" for name in found if name not in known),
             *(f"{name} is gone" for name in known if name not in found),
             *(
-                f"{name} has {found[name]} bytes, had {known[name]}"
+                f"{name} has {found[name][0]} bytes, had {known[name][0]}"
                 for name in found
-                if name in known and found[name] != known[name]
+                if name in known and found[name][0] != known[name][0]
+            ),
+            *(
+                f"{name} has other bytes than it had"
+                for name, (size, sha256) in found.items()
+                if name in known and size == known[name][0] and sha256 and known[name][1] not in (None, "", sha256)
             ),
         ]
         if differing:
@@ -298,7 +307,7 @@ class Workspace:
 
 def _read_listing(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        return {name: (size, sha256) for name, size, sha256 in json.loads(path.read_text(encoding="utf-8"))}
     except (ValueError, TypeError) as error:
         raise DamageError(f"{path}: cannot be read ({one_line(error)}); remove the folder and start again") from error
 
