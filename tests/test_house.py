@@ -14,6 +14,7 @@ HOUSE = Path(unprocess_gen.__file__).parent
 FLOORS = (
     {"errors", "records"},
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
+    {"poisson"},
     {
         *("config", "decode", "effects", "fused", "manifest", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
