@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +83,15 @@ def test_a_kernel_that_computes_otherwise_is_found(kernel: str, monkeypatch: pyt
         failed = selftest.failures()
 
     assert any("the golden" in one for one in failed)
+
+
+def test_a_fused_multiply_add_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fused_at_once(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+        out[:] = [float(Fraction(a) ** 2 + Fraction(b)) for a, b in zip(x, y, strict=True)]
+
+    monkeypatch.setattr(selftest, "_product_and_sum", fused_at_once)
+
+    assert "a kernel multiplies and adds in one rounding" in selftest.failures()
 
 
 def nudged(kernel: Callable[..., None]) -> Callable[..., None]:

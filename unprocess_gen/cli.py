@@ -85,8 +85,16 @@ class Terminated(BaseException):
     """SIGTERM arrived."""
 
 
+OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
+"""OpenCV refuses pictures above these limits where the environment sets them; ours is `source.max_pixels`."""
+
+
 def main() -> int:
     """Run ``gen-dataset`` with the arguments of this process; return the exit code."""
+    for limit in OPENCV_LIMITS:
+        os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and workers inherit it
+    if sys.stderr is None:  # closed by the caller; what codecs say is read from there
+        sys.stderr = os.fdopen(os.dup2(os.open(os.devnull, os.O_WRONLY), 2), "w")
     signal.signal(signal.SIGTERM, _terminate)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -4,7 +4,7 @@ Everything that is not a whole, opaque, still photograph in RGB or gray is refus
 that can be told there (`headers`); no file that was cut is ever half decoded. Pillow does what we could not do better,
 colour profiles, and only where they are asked for.
 
-**What OpenCV does** (4.12 and 5.0 agree in all of it), and what is done about it:
+**What OpenCV does** (4.13 and 5.0 agree in all of it; 4.12 says nothing of broken TIFF data), and what is done:
 
 * Orientation: JPEG, PNG and WebP stay as stored under ``IMREAD_IGNORE_ORIENTATION``. TIFFs of 8 bits are turned
   whatever the flags say, those of 16 bits under some. So tag 274 is set to 1 in a copy, and we turn.
@@ -41,6 +41,9 @@ import numpy as np
 from unprocess_gen.errors import SourceError
 from unprocess_gen.headers import Header, max_side, png_transparent_gray, probe, tiff_without_orientation
 from unprocess_gen.records import Photograph, Srgb
+
+# libtiff's complaints go through OpenCV's log, which OPENCV_LOG_LEVEL could silence.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_WARNING)
 
 ICC_CHOICES = ("ignore", "refuse")
 

@@ -1,0 +1,256 @@
+r"""``gen-dataset`` in a process that also tells what it computed with; `test_everywhere` runs it under many settings.
+
+    python tests/everywhere.py FACTS.json [gen-dataset's arguments]    make a dataset, then write the facts
+    python tests/everywhere.py FACTS.json --code                       compile the kernels and run none of them
+
+The facts come from the process that did the work, so that a setting which a library ignores is not taken for a proof.
+
+**Another processor, by emulation**: an optional job. QEMU's user mode computes in software, as IEEE 754 says. On a
+Debian machine of another kind, beside this package's wheel, a folder of photographs and this script, for 64-bit Arm:
+
+    apt-get download qemu-user-static; dpkg -x qemu-user-static_*.deb host
+    mkdir -p apt/lists/partial apt/archives/partial; touch apt/status
+    for_arm() { apt-get -o APT::Architecture=arm64 -o APT::Architectures=arm64 -o Dir::State="$PWD/apt" \
+                    -o Dir::State::status="$PWD/apt/status" -o Dir::Cache="$PWD/apt" "$@"; }
+    for_arm update; for_arm -dy --no-install-recommends install python3-minimal libpython3-stdlib libstdc++6 libgomp1
+    for package in apt/archives/*.deb; do dpkg -x "$package" arm; done
+    pip install --target site --no-deps antlr4-python3-runtime==4.9.3
+    pip install --target site --no-deps --only-binary :all: --python-version 3.11 --platform manylinux_2_28_aarch64 \
+        --platform manylinux_2_27_aarch64 --platform manylinux2014_aarch64 unprocess_gen-*.whl hydra-core==1.3.* \
+        omegaconf==2.3.* packaging pyyaml numpy numba llvmlite opencv-python-headless joblib cloudpickle tqdm xxhash
+    host/usr/bin/qemu-aarch64-static -L arm -E PYTHONPATH="$PWD/site" -E NUMBA_CACHE_DIR="$PWD/kernels" \
+        arm/usr/bin/python3.11 everywhere.py arm.json source.root=photos n_jobs=1 out=ds-arm
+
+Shards, manifest.csv, config.yaml and ``doubles`` in the facts come out as here. With eleven small photographs that took
+85 seconds, most of them for compiling (20 under ``NUMBA_DISABLE_JIT=1``). An old x86-64, to every library at once, is
+one line: ``host/usr/bin/qemu-x86_64-static -cpu Nehalem .venv/bin/python everywhere.py …``, 70 seconds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+
+from unprocess_gen import cli, fused, poisson
+from unprocess_gen.config import Config, GainsConfig, NoiseConfig
+from unprocess_gen.pair import make_pair
+from unprocess_gen.plan import plan_image
+from unprocess_gen.tables import normal_table
+
+KERNELS = {
+    f"{room}.{name}": value
+    for room, module in sorted(sys.modules.items())
+    if room.startswith("unprocess_gen.")
+    for name, value in vars(module).items()
+    if hasattr(value, "targetoptions") and value.__module__ == room
+}
+"""Every compiled function of the package."""
+
+FUSED = re.compile(r"\b(?:v?fn?m(?:add|sub|acc|sac|la|ls|ad|sb)|x[sv]n?m(?:add|sub))\w*")
+"""Instructions that multiply and add with one rounding: x86, Arm, RISC-V, Power."""
+
+GUESSED = re.compile(r"\b(?:v?r(?:sqrt|cp)|fr(?:sqrt|ecp)|xv?r(?:sqrt)?e|vfr(?:sqrt7|ec7))\w*")
+"""Instructions that give a reciprocal or a square root to a few digits."""
+
+TARGETS = {
+    "Arm": ("aarch64-unknown-linux-gnu", "neoverse-v1"),
+    "RISC-V": ("riscv64-unknown-linux-gnu", "sifive-p670"),
+}
+"""Processors that can fuse, as LLVM names them."""
+
+
+# What a process computes with -----------------------------------------------------------------------------------------
+
+
+def facts(given: str) -> dict[str, Any]:
+    import cv2  # reads its settings when it is first imported, which is up to the run
+
+    from unprocess_gen import runner
+
+    features = np._core._multiarray_umath.__cpu_features__
+    return {
+        "package": str(Path(cli.__file__).parent),
+        "versions": {name: version(name) for name in runner.PACKAGES},
+        "optimize": sys.flags.optimize,
+        "numpy": [name for name in np._core._multiarray_umath.__cpu_dispatch__ if features[name]],
+        "opencv": [one[1:] for one in cv2.getCPUFeaturesLine().split() if one[0] == "*" and one[-1] != "?"],
+        "ipp": cv2.ipp.useIPP(),
+        "product": product(),
+        "libm": digest(repr([function(k / 999) for k in range(1, 999) for function in LIBM]).encode()),
+        "kernels": kernels(),
+        "doubles": [given, doubles()],
+    }
+
+
+def listen() -> Any:
+    """Have whatever the outer kernel is given from now on hashed, to the last bit; what it fills comes last."""
+    kernel, heard = fused._pair, hashlib.sha256()
+
+    def told(*arguments: Any) -> None:
+        for argument in arguments[:-3]:
+            for one in argument if isinstance(argument, tuple) else (argument,):
+                heard.update(np.asarray(one).tobytes())
+        kernel(*arguments)
+
+    fused._pair = told
+    return heard
+
+
+LIBM: tuple[Callable[[float], float], ...] = (math.sin, math.asin, math.exp, math.log, lambda x: x**2.2)
+
+
+def digest(*parts: Any) -> str:
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part)
+    return found.hexdigest()
+
+
+def product() -> str:
+    """A matrix product, which is nobody's promise: it tells libraries for linear algebra apart."""
+    matrix = np.random.default_rng(0).random((50, 50))
+    return digest(matrix @ matrix)
+
+
+def kernels() -> dict[str, Any]:
+    """How the kernels came to be, and a digest of their machine code where they were compiled just now."""
+    loaded = sum(sum(one.stats.cache_hits.values()) for one in KERNELS.values())
+    code = "" if loaded else "".join(asm for one in KERNELS.values() for asm in one.inspect_asm().values())
+    return {
+        "loaded": loaded,
+        "compiled": sum(len(one.overloads) for one in KERNELS.values()) - loaded,
+        "code": digest(code.encode()) if code else None,
+        "ymm": "ymm" in code,
+    }
+
+
+# Doubles before they are rounded --------------------------------------------------------------------------------------
+
+
+def doubles() -> str:
+    """A digest of what the kernels compute before anything is rounded to a DN, where one bit in the last place shows.
+
+    A frame would show it once in 10^12 sites. The noisy frame is not seen before it is rounded, so it gets signals that
+    make it end half-way between two DN.
+    """
+    count = fused.CHUNK
+    n = np.arange(count)
+    tally = np.zeros(6, dtype=np.int64)
+    codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
+    products = (np.arange(1, 9 * 256 + 1) / 1999.0).reshape(3, 3, 256)
+    camera, gray, unrounded, normals = (np.empty(count) for _ in range(4))
+    bits, words = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
+    clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
+
+    fused._camera(codes, products[0], products[1], camera)
+    fused._light_by_gray(codes, products, np.array([0, 1]), np.array([0.37, 0.8, 0.47]), 0.9, gray)
+    signal, gains = n / 999.0, np.full(count, 0.37)
+    fused._clean_frame(signal, gains, 1 - gains, 0.9, (240.0, 3855.0, 4095.0), unrounded, clean, tally)
+    key = (np.uint64(1), np.uint64(2))
+    fused._words(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
+    fused._normals(words, tuple(normal_table()[:, i].copy() for i in range(3)), bits, normals)
+    half_way = (n % 9 + 0.5) - 50.0 * normals
+    fused._noisy_frame(half_way, normals, 0.0, (0.0, 2500.0), (0.0, 4095.0), noisy, tally)
+    return digest(camera, gray, unrounded, clean, normals, noisy, tally)
+
+
+# Machine code ---------------------------------------------------------------------------------------------------------
+
+
+def code() -> dict[str, Any]:
+    """What stands in the kernels' code: as Numba made it for this target, and as LLVM makes it for others.
+
+    Beside each stands the same about a loop that is free to fuse, to show that the target can and that it would be
+    seen. Nothing of it runs, so a target may be a processor that this machine is not.
+    """
+    free = numba.njit(fastmath=True)(multiply_and_add)
+    free.compile((numba.float64[::1],) * 3)
+    compile_kernels()
+    kernels = [one for one in KERNELS.values() if one.signatures]
+    asm, free_asm = ("".join(code for one in of for code in one.inspect_asm().values()) for of in (kernels, [free]))
+    ir, free_ir = ([code for one in of for code in one.inspect_llvm().values()] for of in (kernels, [free]))
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    return {
+        "not compiled": [name for name, one in KERNELS.items() if not one.signatures],
+        "instructions": {
+            "Numba's own": [instructions(asm), instructions(free_asm)],
+            **{
+                name: [instructions(assembly(one, *target)) for one in (ir, free_ir)]
+                for name, target in TARGETS.items()
+            },
+        },
+        "liberties": [liberties("".join(one)) for one in (ir, free_ir)],
+        "called": sorted(set(re.findall(r"call [^@\n]*double>? @([\w.]+)", "".join(ir)))),
+    }
+
+
+def compile_kernels() -> None:
+    """Compile the outer kernels, and with them all others, for what they are called with; call none."""
+    kernel, noise = fused._pair, NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.9, 38.1)
+    config = Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise)
+    fused._pair = lambda *arguments: kernel.compile(tuple(map(numba.typeof, arguments)))
+    make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan_image(config, "0" * 64))
+    words, doubles = np.zeros(1, dtype=np.uint64), np.zeros(1)
+    poisson.draw.compile(tuple(map(numba.typeof, (words, doubles, doubles, poisson.poisson_tables(), doubles))))
+
+
+def multiply_and_add(x: Any, y: Any, out: Any) -> None:
+    for i in range(out.size):
+        out[i] += math.sqrt(x[i]) * y[i]
+
+
+def assembly(modules: list[str], triple: str, cpu: str) -> str | None:
+    """LLVM's code for another processor; None where this LLVM was built without it."""
+    try:
+        machine = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, opt=3)
+    except RuntimeError:
+        return None
+    ir = "\f".join(modules)
+    ir = re.sub(r"target triple = .*", f'target triple = "{triple}"', ir)
+    ir = re.sub(r"target datalayout = .*", f'target datalayout = "{machine.target_data}"', ir)
+    ir = re.sub(r"(?:tail )?call i8 @llvm\.x86\.atomic.*", "add i8 0, 0", ir)  # a counter of references
+    return "".join(machine.emit_assembly(llvm.parse_assembly(one)) for one in ir.split("\f"))
+
+
+def instructions(asm: str | None) -> dict[str, list[str]] | None:
+    if asm is None:
+        return None
+    return {"fused": sorted(set(FUSED.findall(asm))), "guessed": sorted(set(GUESSED.findall(asm)))}
+
+
+def liberties(ir: str) -> list[str]:
+    """The flags on arithmetic that allow another result than IEEE 754's."""
+    operations = re.findall(r"= (?:\w+ )?(?:f(?:add|sub|mul|div|neg|rem)|call) (.*)", ir)
+    return sorted({word for rest in operations for word in rest.split(" ")[:9] if word in LIBERTIES})
+
+
+LIBERTIES = {"fast", "nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
+
+
+def main(facts_path: str, *arguments: str) -> int:
+    told: dict[str, Any]
+    if arguments == ("--code",):
+        exit_code, told = 0, code()
+    else:
+        sys.argv[1:] = arguments
+        heard = listen()
+        exit_code = cli.main()
+        told = facts(heard.hexdigest())
+    Path(facts_path).write_text(json.dumps(told), encoding="utf-8")
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
