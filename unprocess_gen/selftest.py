@@ -2,9 +2,10 @@
 
 Four proofs, from the ground up: the exact tables have their published digests; Philox gives Random123's known answers;
 a product and a sum in a kernel are rounded one after the other, not at once; and a small picture becomes the very pair
-that it became on every machine before, through the same compiled kernels that make the dataset. A compiler, a library or a processor that rounds otherwise shows up here, not in data that somebody trained
-on for a week. The golden pair covers the 8-bit kernel, both branches of the highlights, every pattern phase and both
-ends of the sensor; the 16-bit curves are held to their digests when they are first read.
+that it became on every machine before, through the same compiled kernels that make the dataset. A compiler, a library
+or a processor that rounds otherwise shows up here, not in data that somebody trained on for a week. The golden pair
+covers the 8-bit kernel, both branches of the highlights, every pattern phase and both ends of the sensor; the 16-bit
+curves are held to their digests when they are first read.
 """
 
 from __future__ import annotations
