@@ -439,7 +439,7 @@ def test_a_full_disk_ends_the_run_with_5_and_one_line_within_five_seconds(
     n_jobs: int, photographs: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path, empty_disk: Disk
 ) -> None:
     out = empty_disk.folder / "ds"
-    empty_disk.remount("size=100k")
+    empty_disk.remount("size=200k")  # room for some shards, more than two workers can have waiting to be committed
     with running(f"source.root={photographs}", f"out={out}", ONE, f"n_jobs={n_jobs}", cwd=tmp_path) as process:
         said, err = process.communicate(timeout=30)
         seconds = time.time() - (out / "shards").stat().st_mtime  # since the last shard that found room

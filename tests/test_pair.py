@@ -171,3 +171,29 @@ def test_the_pixels_are_left_untouched(plan: Plan, scene: np.ndarray) -> None:
 def test_other_arrays_are_refused(plan: Plan, form: object, wrong: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r"expected uint8 or uint16 \[H, W, 3\]"):
         form(wrong, plan)  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(("black", "white", "rounded"), [(240, 4095, 2168), (241, 4092, 2166)])
+@pytest.mark.parametrize("make", [make_pair, reference_pair])
+def test_a_value_half_way_between_two_dn_goes_to_the_even_one(
+    plan: Plan, make: object, black: int, white: int, rounded: int
+) -> None:
+    """White at half the light: 240 + 3855 / 2 = 2167.5 and 241 + 3851 / 2 = 2166.5."""
+    half = replace(plan, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=0.5, highlight="none", a_dn=0.0, b_dn2=0.0)
+    white_patch = np.full((4, 6, 3), 255, dtype=np.uint8)
+
+    pair = make(white_patch, replace(half, black_level_dn=black, white_level_dn=white))  # type: ignore[operator]
+
+    assert set(pair.clean.ravel()) == set(pair.noisy.ravel()) == {rounded}
+
+
+@pytest.mark.parametrize("make", [make_pair, reference_pair])
+def test_noise_far_beyond_16_bits_is_clipped_and_never_wraps(plan: Plan, make: object) -> None:
+    """The greatest variance that settings allow: a deviation of 3e7 DN, half of it below and half above the sensor."""
+    gray = np.full((32, 64, 3), 128, dtype=np.uint8)
+    wide = replace(plan, bits=16, black_level_dn=4096, white_level_dn=65535, a_dn=0.0, b_dn2=1e15)
+
+    noisy = make(gray, wide).noisy  # type: ignore[operator]
+
+    assert np.isin(noisy, [0, 65535]).mean() > 0.99
+    assert abs(float((noisy == 65535).mean()) - 0.5) <= 0.06
