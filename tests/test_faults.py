@@ -57,7 +57,7 @@ def own_lines(err: str) -> list[str]:
 
 def wait_for_the_end(leader: int) -> None:
     """Wait until every process of a run is gone, three seconds at most."""
-    wait_for(lambda: not session(leader), seconds=3)
+    wait_for(lambda: not session(leader), seconds=10)  # one that still imports has no watch yet
 
 
 def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,7 +114,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_undisturbed_when_run_again(
     whom: str, kills: int, photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: Hash,
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    """After a kill of the coordinator alone its workers are gone within three seconds."""
+    """After a kill of the coordinator alone its workers are gone within ten seconds, in one where a core is free."""
     draw, hits, unfinished = random.Random(whom), 0, 0
     for kill in range(kills):
         out = tmp_path / str(kill) / "ds"
