@@ -125,13 +125,14 @@ def test_a_mix_is_the_exactly_normalised_product_of_the_exact_mix(mix: tuple[flo
 
 
 @given(weights())
-def test_the_grid_moves_no_entry_by_more_than_two_units_of_the_largest(mix: tuple[float, ...]) -> None:
+def test_the_grid_moves_no_entry_by_more_than_three_units_of_the_largest(mix: tuple[float, ...]) -> None:
+    """Half a step of the grid and the roundings of a quotient for two entries; the largest takes up what they leave."""
     product = colour.multiply(colour.mix(tuple(CAMERAS.values()), mix), RGB2XYZ)
     for plain, found in zip(rows(product), rows(colour.normalise_rows(product)), strict=True):
         total = sum(Fraction(entry) for entry in plain)
         largest = max(abs(entry) for entry in found)
         for entry, unit in zip(plain, found, strict=True):
-            assert abs(Fraction(unit) - Fraction(entry) / total) <= 2 * Fraction(1, 2**52) * Fraction(largest)
+            assert abs(Fraction(unit) - Fraction(entry) / total) <= 3 * Fraction(1, 2**52) * Fraction(largest)
 
 
 def test_a_product_by_hand() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from moments import FALSE_ALARM, bernstein
 
 from unprocess_gen import streams
-from unprocess_gen.streams import parameter_uniforms, philox4x32, purpose, stream_key, words
+from unprocess_gen.streams import body_key, parameter_uniforms, philox4x32, purpose, stream_key, words
 
 KEY = 0x0123456789ABCDEF
 SHA = hashlib.sha256(b"a photograph").hexdigest()
@@ -102,7 +102,10 @@ def test_an_empty_tile_has_no_words() -> None:
 
 
 def test_the_streams_numbers_are_those_of_every_dataset_ever_made() -> None:
-    assert streams.STREAMS == {"parameters": 0, "heteroscedastic": 1}
+    assert streams.STREAMS == {
+        "parameters": 0, "heteroscedastic": 1, "prnu": 2, "shot": 3, "dark_current": 4, "hot_pixels": 5, "read": 6,
+        "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10,
+    }  # fmt: skip
     assert len(set(streams.STREAMS.values())) == len(streams.STREAMS)
 
 
@@ -147,7 +150,7 @@ def test_a_level_or_draw_that_would_spill_into_its_neighbour_is_refused(level: i
 
 def test_an_unknown_stream_is_refused() -> None:
     with pytest.raises(KeyError):
-        purpose("shot")
+        purpose("thunder")
 
 
 # Keys -----------------------------------------------------------------------------------------------------------------
@@ -156,6 +159,16 @@ def test_an_unknown_stream_is_refused() -> None:
 def test_a_key_is_what_it_was_in_every_dataset_ever_made() -> None:
     name = f"unprocess_gen stream 1\0{7}\0{SHA}\0{2}".encode()
     assert stream_key(7, SHA, 2) == int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "big")
+
+
+def test_a_bodys_key_is_what_it_was_in_every_dataset_ever_made() -> None:
+    name = f"unprocess_gen body 1\0{7}\0sony_a7s2\0{2}".encode()
+    assert body_key(7, "sony_a7s2", "2") == int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "big")
+
+
+def test_a_bodys_key_changes_with_the_seed_the_profile_and_the_unit() -> None:
+    keys = {body_key(*one) for one in ((7, "a", "2"), (8, "a", "2"), (7, "b", "2"), (7, "a", "3"))}
+    assert len(keys) == 4
 
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 1000))

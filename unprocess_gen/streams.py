@@ -1,9 +1,10 @@
 """Named, counted random streams: a random value is a pure function of what it is for.
 
-Every noise value depends on (seed, image, effect, frame, draw, level, y, x) and on nothing else, so no worker, order,
-crop, tile or skipped effect can move another one. Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as
-1, 2, 3", SC 2011) makes that cheap: it is a keyed scrambling of a 128-bit counter. Its 64-bit key is hashed from the
-seed and the image; the rest stands in the four 32-bit words of the counter:
+Every noise value depends on (seed, image, effect, frame, draw, level, y, x) and on nothing else (a fixed pattern on
+(seed, profile, sensor unit, effect, y, x)), so no worker, order, crop, tile or skipped effect can move another one.
+Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) makes that cheap: it is a keyed
+scrambling of a 128-bit counter. Its 64-bit key is hashed from the seed and the image, or the camera body; the rest
+stands in the four 32-bit words of the counter:
 
     word 0   x // 64 * 16 + x % 16      one counter serves the four pixels x, x + 16, x + 32, x + 48 of a block of 64
     word 1   y
@@ -24,7 +25,19 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-STREAMS = {"parameters": 0, "heteroscedastic": 1}
+STREAMS = {
+    "parameters": 0,
+    "heteroscedastic": 1,
+    "prnu": 2,
+    "shot": 3,
+    "dark_current": 4,
+    "hot_pixels": 5,
+    "read": 6,
+    "row": 7,
+    "column": 8,
+    "dead_pixels": 9,
+    "dequantize": 10,
+}
 """What randomness is for. The numbers are part of every dataset ever made: add, never renumber."""
 
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
@@ -43,6 +56,12 @@ def stream_key(seed: int, source_sha256: str, occurrence: int = 0) -> int:
     in the listing: adding or dropping other files moves nothing.
     """
     name = f"unprocess_gen stream 1\0{seed}\0{source_sha256}\0{occurrence}"
+    return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
+
+
+def body_key(seed: int, profile: str, unit: str) -> int:
+    """Return the 64-bit key of a camera body's fixed patterns: the same for every frame that this body takes."""
+    name = f"unprocess_gen body 1\0{seed}\0{profile}\0{unit}"
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
@@ -91,13 +110,13 @@ def words(
     return np.asarray(np.choose(chosen, outputs), dtype=np.uint32)
 
 
-def parameter_uniforms(key: int, count: int) -> list[float]:
+def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:
     """Return ``count`` uniforms in (0, 1) with 52 bits each, (k + ½)·2**-52, for the parameters of one image.
 
     Parameter n is counter (0, n) of the stream ``parameters``: its number is its name, so add, never renumber.
     """
     zero = np.zeros(count, dtype=np.uint64)
-    counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("parameters")), zero)
+    counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("parameters", level)), zero)
     high, low, _, _ = philox4x32(counter, key)
     bits = [(int(h) << 20) | (int(w) >> 12) for h, w in zip(high, low, strict=True)]
     return [(k + 0.5) * 2.0**-52 for k in bits]

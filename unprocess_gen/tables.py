@@ -20,7 +20,7 @@ import hashlib
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal, localcontext
 from pathlib import Path
 from statistics import NormalDist
@@ -195,7 +195,7 @@ def _frozen(table: Float, expected: str | None) -> Float:
     return table
 
 
-# --------------------------------------------------------------------------------------------------------- normals
+# ----------------------------------------------------------------------------------------------- inverse-CDF tables
 
 
 def normal_quantile(p: Decimal) -> Decimal:
@@ -233,6 +233,84 @@ NODES = (0.5 - math.sqrt(3) / 4, 0.5, 0.5 + math.sqrt(3) / 4)
 """Chebyshev's nodes of a segment: the quadratic through them has nearly the least possible error."""
 
 
+@functools.lru_cache(maxsize=64)
+def tukey_table(shape: float) -> Float:
+    """Return the quadratics of Tukey's lambda distribution with variance 1, float64 ``[1024, 3]`` as `normal_table`.
+
+    Its quantile function is ((1 - p)**shape - p**shape) / shape for the tail probability p, ln((1 - p) / p) for shape 0
+    (the logistic law); the variance is finite for a shape above -1/2, and ValueError is raised for others. Computed in
+    `decimal`, so that any shape gives the same table everywhere; 0.2 s.
+    """
+    if not -0.5 < shape < 10:
+        raise ValueError(f"the shape is {shape}, expected a number above -0.5, and below 10")
+    rows = []
+    with localcontext() as context:
+        context.prec = DIGITS
+        std = tukey_std(shape)
+        for octave in range(OCTAVES):
+            for segment in range(SEGMENTS):
+                nodes = (1 + (segment + Decimal(node)) / SEGMENTS for node in NODES)
+                tails = (node * Decimal(2) ** (octave - 33) for node in nodes)
+                rows.append(_through([float(tukey_quantile(tail, shape) / std) for tail in tails]))
+    table = np.array(rows)
+    table.flags.writeable = False
+    return table
+
+
+def tukey_quantile(tail: Decimal, shape: float) -> Decimal:
+    """Return how far out a tail probability lies, in units of the scale, in the current decimal context."""
+    if abs(shape) < LOGISTIC:
+        return ((1 - tail) / tail).ln()
+    power = Decimal(shape)
+    return ((power * (1 - tail).ln()).exp() - (power * tail.ln()).exp()) / power
+
+
+def tukey_std(shape: float) -> Decimal:
+    """Return the standard deviation of Tukey's lambda distribution of scale 1, in the current decimal context.
+
+    √(2 / λ² · (1 / (1 + 2λ) - Γ(λ + 1)² / Γ(2λ + 2))), π / √3 at 0 (Joiner and Rosenblatt, JASA 1971).
+    """
+    if abs(shape) < LOGISTIC:
+        return PI / Decimal(3).sqrt()
+    power = Decimal(shape)
+    beta = (2 * _log_gamma(power + 1) - _log_gamma(2 * power + 2)).exp()
+    return (2 / power**2 * (1 / (1 + 2 * power) - beta)).sqrt()
+
+
+LOGISTIC = 1e-12
+"""A shape this near 0 is taken for 0: the laws differ by less than a double can tell."""
+
+_BERNOULLI = ((1, 6), (-1, 30), (1, 42), (-1, 30), (5, 66), (-691, 2730), (7, 6), (-3617, 510), (43867, 798))
+_SHIFT = 60
+
+
+def _log_gamma(x: Decimal) -> Decimal:
+    """Return ln Γ(x), x > 0, by Stirling's series at x + 60, whose ninth term is below 1e-30."""
+    product = Decimal(1)
+    for step in range(_SHIFT):
+        product *= x + step
+    far = x + _SHIFT
+    series = (far - Decimal("0.5")) * far.ln() - far + (2 * PI).ln() / 2
+    for n, (top, bottom) in enumerate(_BERNOULLI, start=1):
+        series += Decimal(top) / bottom / (2 * n * (2 * n - 1)) / far ** (2 * n - 1)
+    return series - product.ln()
+
+
+@functools.lru_cache(maxsize=1)
+def exponential_levels() -> Float:
+    """Return 1024 equally likely values of an exponential law of mean 1, float64 ``[1024]``, rising.
+
+    The logarithms at the middles of equal probabilities, divided by their mean.
+    """
+    with localcontext() as context:
+        context.prec = DIGITS
+        levels = [-((1023 - step + Decimal("0.5")) / 1024).ln() for step in range(1024)]
+        mean = sum(levels, Decimal(0)) / 1024
+        table = np.array([float(level / mean) for level in levels])
+    table.flags.writeable = False
+    return table
+
+
 @functools.lru_cache(maxsize=1)
 def _normal_table() -> Float:
     rows = [_quadratic(octave, segment) for octave in range(OCTAVES) for segment in range(SEGMENTS)]
@@ -242,8 +320,13 @@ def _normal_table() -> Float:
 
 def _quadratic(octave: int, segment: int) -> tuple[float, float, float]:
     quantile = NormalDist().inv_cdf
+    z = [-quantile(math.ldexp(1 + segment / SEGMENTS + node / SEGMENTS, octave - 33)) for node in NODES]
+    return _through(z)
+
+
+def _through(z: Sequence[float]) -> tuple[float, float, float]:
+    """Return the quadratic in the position within a segment that has the values z at `NODES`."""
     t = [node / SEGMENTS for node in NODES]
-    z = [-quantile(math.ldexp(1 + segment / SEGMENTS + at, octave - 33)) for at in t]
     slope01, slope12 = (z[1] - z[0]) / (t[1] - t[0]), (z[2] - z[1]) / (t[2] - t[1])
     c2 = (slope12 - slope01) / (t[2] - t[0])
     c1 = slope01 - c2 * (t[0] + t[1])
