@@ -38,7 +38,7 @@ def fixed_plan() -> Plan:
 
 def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
     tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
-    values = ok_row(Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""))
+    values = ok_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""))
     row = {name: str(value) for name, value in values.items()}
     rng = np.random.default_rng(0)
 

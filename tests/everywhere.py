@@ -34,6 +34,7 @@ import math
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -42,10 +43,8 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 
-from unprocess_gen import cli, fused, poisson
-from unprocess_gen.config import Config, GainsConfig, NoiseConfig
+from unprocess_gen import cli, fused, poisson, selftest
 from unprocess_gen.pair import make_pair
-from unprocess_gen.plan import plan_image
 from unprocess_gen.tables import normal_table
 
 KERNELS = {
@@ -149,20 +148,29 @@ def doubles() -> str:
     tally = np.zeros(6, dtype=np.int64)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
     products = (np.arange(1, 9 * 256 + 1) / 1999.0).reshape(3, 3, 256)
-    camera, gray, unrounded, normals = (np.empty(count) for _ in range(4))
+    camera, gray, lit, unrounded, normals, counts, digitised = (np.empty(count) for _ in range(7))
     bits, words = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
     clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
     fused._camera(codes, products[0], products[1], camera)
     fused._light_by_gray(codes, products, np.array([0, 1]), np.array([0.37, 0.8, 0.47]), 0.9, gray)
     signal, gains = n / 999.0, np.full(count, 0.37)
-    fused._clean_frame(signal, gains, 1 - gains, 0.9, (240.0, 3855.0, 4095.0), unrounded, clean, tally)
-    key = (np.uint64(1), np.uint64(2))
+    plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
+    scene = fused._scene(plan, np.arange(256) / 255.0, (1, count), (0, 0))
+    fused._light(signal, gains, 1 - gains, scene, lit)
+    fused._clean_frame(lit, scene, unrounded, clean, tally)
+    key = fused._key(2**33 + 1, 5, 6, 7)
     fused._words(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
     fused._normals(words, tuple(normal_table()[:, i].copy() for i in range(3)), bits, normals)
+    fused._words(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
+    poisson.draw(words, 10.0 ** (n % 10 - 1.0), normals, poisson.poisson_tables(), counts)
+    body = fused._body(plan, (1, count), (0, 0))
+    fused._digitise(counts, normals, body, 0, body.columns_dn, gains, 64.0, digitised)
+    level = replace(selftest.GOLDEN_PLAN, a_dn=0.0, b_dn2=2500.0)
     half_way = (n % 9 + 0.5) - 50.0 * normals
-    fused._noisy_frame(half_way, normals, 0.0, (0.0, 2500.0), (0.0, 4095.0), noisy, tally)
-    return digest(camera, gray, unrounded, clean, normals, noisy, tally)
+    still = fused._scene(level, np.arange(256) / 255.0, (1, count), (0, 0))
+    fused._noisy_frame(half_way, normals, still, (0.0, 4095.0), noisy, tally)
+    return digest(camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, noisy, tally)
 
 
 # Machine code ---------------------------------------------------------------------------------------------------------
@@ -198,12 +206,19 @@ def code() -> dict[str, Any]:
 
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
-    kernel, noise = fused._pair, NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.9, 38.1)
-    config = Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise)
-    fused._pair = lambda *arguments: kernel.compile(tuple(map(numba.typeof, arguments)))
-    make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan_image(config, "0" * 64))
+    for name in ("_pair", "_physical_pair", "_responses"):
+        setattr(fused, name, compiler(getattr(fused, name)))
+    for plan in selftest.GOLDEN_PLANS.values():
+        make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan)
+    three = (numba.float64[::1],) * 3
+    selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint64), np.zeros(1)
     poisson.draw.compile(tuple(map(numba.typeof, (words, doubles, doubles, poisson.poisson_tables(), doubles))))
+
+
+def compiler(kernel: Any) -> Callable[..., None]:
+    """What compiles a kernel for the arguments that it is called with, and does not run it."""
+    return lambda *arguments: kernel.compile(tuple(map(numba.typeof, arguments))) and None
 
 
 def multiply_and_add(x: Any, y: Any, out: Any) -> None:

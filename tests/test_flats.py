@@ -37,8 +37,9 @@ WIDTH, ROWS = 1024, 128
 SITES = WIDTH * ROWS
 """Pixels of one level in one frame."""
 
+NOISE = sorted((Path(__file__).parents[1] / "conf" / "noise").glob("*.yaml"))
 OPTIONS = {
-    **{path.stem: () for path in sorted((Path(__file__).parents[1] / "conf" / "noise").glob("*.yaml"))},
+    **{path.stem: () for path in NOISE if "branches:" not in path.read_text(encoding="utf-8")},
     "heteroscedastic": ("noise.a=0.05", "noise.b=0.02"),  # standard deviations from 0.14 DN
 }
 LINEAR = ("camera=identity", "gains=unity", "isp=linear")
@@ -55,6 +56,11 @@ def flats() -> np.ndarray:
     """All levels below each other, `ROWS` rows each."""
     levels = np.repeat(np.array(CODES, dtype=np.uint16), ROWS)
     return np.ascontiguousarray(np.broadcast_to(levels[:, None, None], (len(levels), WIDTH, 3)))
+
+
+def with_noise(plan: Plan, a: float, b: float) -> Plan:
+    """The plan with noise of variance a·(x - black) + b."""
+    return dataclasses.replace(plan, a_dn=a, b_dn2=b, effects=("heteroscedastic", "quantise"))
 
 
 def clean_value(plan: Plan, code: int) -> float:
@@ -163,7 +169,7 @@ def test_they_are_on_every_sensor(settings: Settings, sensor: str) -> None:
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.01), (0.0, 0.09), (0.0, 0.25), (0.002, 0.0), (1.0, 0.0), (0.0, 1e6)])
 def test_they_are_for_noise_far_below_and_far_above_a_dn(settings: Settings, a: float, b: float) -> None:
-    plan = dataclasses.replace(plan_of(settings, "none"), a_dn=a, b_dn2=b)
+    plan = with_noise(plan_of(settings, "none"), a, b)
     assert misfits(plan, histograms(plan, 1)) == []
 
 
@@ -206,7 +212,7 @@ WRONG: dict[str, Law] = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_wrong_law_does_not_fit(settings: Settings, wrong: str) -> None:
-    plan = dataclasses.replace(plan_of(settings, "none"), a_dn=3.0, b_dn2=0.5)
+    plan = with_noise(plan_of(settings, "none"), 3.0, 0.5)
     assert misfits(plan, histograms(plan, 1), WRONG[wrong]) != []
 
 
@@ -314,9 +320,8 @@ def transfer(settings: Settings, a: float, b: float, rounding: float) -> list[fl
     roundings have a negative excess), so the variance of its square is below 2·variance². What the roundings are not
     uniform and independent by is below e^(-2pi²s²)·(2/pi² + 4s²), with s the least deviation, and 1/12/257².
     """
-    plan = dataclasses.replace(
-        plan_of(settings, "none"), a_dn=a, b_dn2=b, black_level_dn=256, white_level_dn=256 + SPAN
-    )
+    plan = dataclasses.replace(plan_of(settings, "none"), black_level_dn=256, white_level_dn=256 + SPAN)
+    plan = with_noise(plan, a, b)
     codes = np.arange(65535, dtype=np.uint16)
     rows = 64
     pair = make_pair(np.ascontiguousarray(np.broadcast_to(codes[None, :, None], (rows, 65535, 3))), plan)

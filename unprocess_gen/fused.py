@@ -18,14 +18,21 @@ outer loop and rows in the inner (5.7 in all).
 
 from __future__ import annotations
 
+import functools
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen import effects
 from unprocess_gen.bayer import tile
 from unprocess_gen.compiled import kernel
+from unprocess_gen.poisson import Tables as PoissonTables
+from unprocess_gen.poisson import draw as draw_counts
+from unprocess_gen.poisson import poisson_tables
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
-from unprocess_gen.tables import SEGMENTS
+from unprocess_gen.tables import SEGMENTS, exponential_levels, normal_table
 
 CHUNK = 1024
 """Pixels worked on at a time: six buffers of 8 kB."""
@@ -44,114 +51,148 @@ _POSITION_MASK = np.uint64(2 ** (52 - SEGMENT_BITS) - 1)
 _FIRST_ROW = np.uint64(1023 << SEGMENT_BITS)
 _ROUND = 1.5 * 2.0**52
 
+PRNU, SHOT, DARK, HOT, DEAD, HETEROSCEDASTIC = (
+    np.uint64(purpose(stream))
+    for stream in ("prnu", "shot", "dark_current", "hot_pixels", "dead_pixels", "heteroscedastic")
+)
+HOT_STEP = np.uint64(purpose("hot_pixels", draw=1))
+
 
 def make_pair(
     srgb: Srgb,
     plan: Plan,
     curve: Float,
-    quantiles: Float,
     limits_dn: tuple[float, float],
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
-    """Make a pair; arguments as in `pair.make_pair`, with the curve of the source's codes, the normal table and the
-    lowest and highest DN of the noisy frame.
+    """Make a pair; arguments as in `pair.make_pair`, with the curve of the source's codes, and the lowest and highest
+    DN of the noisy frame.
     """
     clean = np.empty(srgb.shape[:2], dtype=np.uint16)
     noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
+    counts = np.zeros(6, dtype=np.int64)
+    scene = _scene(plan, curve, srgb.shape, origin)
+    frames = (clean, noisy, counts)
+    key = _key(plan.stream_key, plan.level, plan.draw, plan.frame)
+    if plan.physics is None and plan.noise_law == "gaussian":
+        quantiles = _columns(normal_table())
+        _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, quantiles, *frames)
+    else:
+        body = _body(plan, srgb.shape, origin)
+        tables, normal = poisson_tables(), _columns(normal_table())
+        _physical_pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, body, tables, normal, *frames)
+    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+
+
+class _Scene(NamedTuple):
+    """What the clean frame is made with: small arrays and numbers, as the kernels take them."""
+
+    products: Float  # [c, j, k]: matrix entry (c, j) times the curve at code k
+    sites: NDArray[np.int64]  # [2, 2]: the channel of each site
+    gains: Float
+    headroom: Float  # the highlight term, where it applies at all; "gray_mean" has a function of its own
+    by_gray: bool
+    threshold: float
+    exposure: float
+    brightest: float
+    levels_dn: tuple[float, float, float]  # black, white less black, white
+    pinned_dn: float  # saturated sites are pinned to it; infinity: they are not
+    noise: tuple[float, float]  # variance line
+
+
+def _scene(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int, int]) -> _Scene:
     gains = np.array(plan.inverse_gains)
     ccm = np.array(plan.rgb2cam).reshape(3, 3)
-    black_dn = float(plan.black_level_dn)
-    counts = np.zeros(6, dtype=np.int64)
-    _pair(
-        np.ascontiguousarray(srgb),
+    black_dn, white_dn = float(plan.black_level_dn), float(plan.white_level_dn)
+    return _Scene(
         ccm[:, :, None] * curve,
         np.array(tile(plan.pattern, origin)),
         gains,
-        # The highlight term, where it applies at all; "gray_mean" has a function of its own.
         np.maximum(1 - gains, 0) if plan.highlight == "per_channel" else np.zeros(3),
         plan.highlight == "gray_mean",
         plan.highlight_threshold,
-        (black_dn, float(plan.white_level_dn - plan.black_level_dn), float(plan.white_level_dn)),
-        (plan.a_dn, plan.b_dn2),
-        limits_dn,
-        (np.uint64(plan.stream_key & 0xFFFFFFFF), np.uint64(plan.stream_key >> 32)),
-        np.uint64(purpose("heteroscedastic")),
-        origin,
-        (quantiles[:, 0].copy(), quantiles[:, 1].copy(), quantiles[:, 2].copy()),
-        clean,
-        noisy,
-        counts,
+        plan.exposure,
+        plan.brightest,
+        (black_dn, float(plan.white_level_dn - plan.black_level_dn), white_dn),
+        plan.brightest_dn if plan.saturated == "pinned" else np.inf,
+        plan.variance_line,
     )
-    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+
+
+Key = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
+"""The two words of a Philox key, then what level and draw, and the frame, put into the counter."""
+
+
+def _key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Key:
+    return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
+
+
+def _columns(table: Float) -> tuple[Float, Float, Float]:
+    """Return the three columns of a table of quadratics, each in one piece."""
+    return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
 
 
 @kernel
 def _pair(
     srgb: Srgb,
-    products: Float,
-    sites: NDArray[np.int64],
-    gains: Float,
-    headroom: Float,
-    by_gray: bool,
-    threshold: float,
-    levels_dn: tuple[float, float, float],
-    noise: tuple[float, float],
+    scene: _Scene,
+    key: Key,
     limits_dn: tuple[float, float],
-    key: tuple[np.uint64, np.uint64],
-    purpose_word: np.uint64,
     origin: tuple[int, int],
     quantiles: tuple[Float, Float, Float],
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill ``clean``, ``noisy`` and ``counts``; ``products[c, k]`` is ccm[c, k] times the curve."""
+    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a two-parameter profile."""
     height, width = clean.shape
     signal = np.empty(CHUNK)
     unrounded = np.empty(CHUNK)
     words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
     normals = np.empty(CHUNK + BLOCK)
     bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    site_gains = np.empty((2, CHUNK))
-    site_headroom = np.empty((2, CHUNK))
-    for y in range(2):
-        for x in range(CHUNK):
-            site_gains[y, x] = 1.0 if by_gray else gains[sites[y, x & 1]]  # by gray, they are inverted already
-            site_headroom[y, x] = headroom[sites[y, x & 1]]
-
+    site_gains, site_headroom = _by_site(scene)
     for y in range(height):
-        site = sites[y & 1]
         for start in range(0, width, CHUNK):
             length = min(CHUNK, width - start)
             first_block = (origin[1] + start) // BLOCK
             offset = (origin[1] + start) % BLOCK
             blocks = (offset + length + BLOCK - 1) // BLOCK
-            row = srgb[y, start : start + length]
-            if by_gray:
-                _light_by_gray(row, products, site, gains, threshold, signal)
-            else:
-                _camera(row, products[site[0]], products[site[1]], signal)
-            _clean_frame(
-                signal[:length],
-                site_gains[y & 1],
-                site_headroom[y & 1],
-                threshold,
-                levels_dn,
-                unrounded,
-                clean[y, start : start + length],
-                counts,
-            )
-            _words(key, first_block, blocks, np.uint64(origin[0] + y), purpose_word, words)
+            _signal(srgb[y, start : start + length], scene, y, signal)
+            _light(signal[:length], site_gains[y & 1], site_headroom[y & 1], scene, signal)
+            _clean_frame(signal[:length], scene, unrounded, clean[y, start : start + length], counts)
+            _words(key, first_block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, words)
             _normals(words[: blocks * BLOCK], quantiles, bits, normals)
             _noisy_frame(
                 unrounded[:length],
                 normals[offset : offset + length],
-                levels_dn[0],
-                noise,
+                scene,
                 limits_dn,
                 noisy[y, start : start + length],
                 counts,
             )
+
+
+@kernel
+def _by_site(scene: _Scene) -> tuple[Float, Float]:
+    """Return gains and headroom for each pixel of an even and of an odd row, so that loops over them vectorise."""
+    gains = np.empty((2, CHUNK))
+    headroom = np.empty((2, CHUNK))
+    for y in range(2):
+        for x in range(CHUNK):
+            gains[y, x] = 1.0 if scene.by_gray else scene.gains[scene.sites[y, x & 1]]  # by gray: inverted already
+            headroom[y, x] = scene.headroom[scene.sites[y, x & 1]]
+    return gains, headroom
+
+
+@kernel
+def _signal(row: Srgb, scene: _Scene, y: int, out: Float) -> None:
+    """Linearise and apply the matrix; by gray, invert the gains too."""
+    site = scene.sites[y & 1]
+    if scene.by_gray:
+        _light_by_gray(row, scene.products, site, scene.gains, scene.threshold, out)
+    else:
+        _camera(row, scene.products[site[0]], scene.products[site[1]], out)
 
 
 @kernel
@@ -188,7 +229,7 @@ def _light_by_gray(
 
 @kernel
 def _words(
-    key: tuple[np.uint64, np.uint64],
+    key: Key,
     first_block: int,
     blocks: int,
     y: np.uint64,
@@ -200,8 +241,8 @@ def _words(
         counter = np.uint64((first_block + block) * LANES)
         at = block * BLOCK
         for lane in range(LANES):
-            c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word, np.uint64(0)
-            k0, k1 = key
+            c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word | key[2], key[3]
+            k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
                 p0 = _M0 * c0
                 p1 = _M1 * c2
@@ -243,26 +284,26 @@ def _normals(
 
 
 @kernel
-def _clean_frame(
-    signal: Float,
-    gains: Float,
-    headroom: Float,
-    threshold: float,
-    levels_dn: tuple[float, float, float],
-    unrounded: Float,
-    clean: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Invert the gains, highlights kept by channel (or not, where ``headroom`` is 0); clip, go to DN, round."""
-    black, span, white = levels_dn
-    below, above, saturated = 0, 0, 0
+def _light(signal: Float, gains: Float, headroom: Float, scene: _Scene, out: Float) -> None:
+    """Invert the gains, highlights kept by channel (or not, where ``headroom`` is 0), and darken the scene."""
+    threshold, exposure = scene.threshold, scene.exposure
+    limit = np.inf if exposure == 1.0 else 1.0  # what the photograph shows as white is white before it is darkened
     for x in range(signal.shape[0]):
         i = signal[x]
         m = max(i - threshold, 0.0) / (1.0 - threshold)
-        light = i * gains[x] + i * (m * m) * headroom[x]
-        below += light < 0.0
-        above += light > 1.0
-        dn = min(max(light, 0.0), 1.0) * span + black
+        out[x] = min(i * gains[x] + i * (m * m) * headroom[x], limit) * exposure
+
+
+@kernel
+def _clean_frame(light: Float, scene: _Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+    """Clip, go to DN, round."""
+    black, span, white = scene.levels_dn
+    brightest = scene.brightest
+    below, above, saturated = 0, 0, 0
+    for x in range(light.shape[0]):
+        below += light[x] < 0.0
+        above += light[x] > brightest
+        dn = min(max(light[x], 0.0), brightest) * span + black
         rounded = (dn + _ROUND) - _ROUND
         saturated += rounded == white
         clean[x] = np.uint16(np.int32(rounded))
@@ -276,21 +317,348 @@ def _clean_frame(
 def _noisy_frame(
     unrounded: Float,
     normals: Float,
-    black: float,
-    noise: tuple[float, float],
+    scene: _Scene,
     limits_dn: tuple[float, float],
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
     """Add the noise to the clean frame before rounding; round half to even, clip, cast."""
-    a, b = noise
+    a, b = scene.noise
+    black, pinned = scene.levels_dn[0], scene.pinned_dn
     low, high = limits_dn
     below, above, still = 0, 0, 0
     for x in range(unrounded.shape[0]):
         dn = unrounded[x]
         variance = max(a * (dn - black) + b, 0.0)
         still += variance == 0.0
-        rounded = (dn + np.sqrt(variance) * normals[x] + _ROUND) - _ROUND
+        noisy_dn = dn + np.sqrt(variance) * normals[x]
+        noisy_dn = pinned if dn >= pinned else noisy_dn
+        rounded = (noisy_dn + _ROUND) - _ROUND
+        below += rounded < low
+        above += rounded > high
+        noisy[x] = np.uint16(np.int32(min(max(rounded, low), high)))
+    counts[2] += below
+    counts[3] += above
+    counts[5] += still
+
+
+# -------------------------------------------------------------------------------------------- the physical effects
+
+
+class _Body(NamedTuple):
+    """What the noisy frame of a physical profile is made with; a number that leaves its effect out is said."""
+
+    dn_per_e: float
+    response: NDArray[np.float32]  # [H, W]; [1, 1] where the effect is off
+    responds: bool
+    averaged: bool  # whether the clean frame has the fixed patterns too
+    shot: bool
+    dark: bool
+    dark_e: float
+    removed_e: float
+    hot_below: np.uint64  # a pixel whose word lies below is hot; 0: none is
+    hot_e: float
+    levels: Float
+    full_well_e: float  # infinity: off
+    read_std_dn: float  # 0: off
+    quantiles: tuple[Float, Float, Float]
+    rows_dn: Float  # [H]
+    columns_dn: Float  # [W]
+    errors_dn: Float  # [2, 2]
+    dead_below: np.uint64
+    read_purpose: np.uint64
+    key: Key
+
+
+def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
+    """Gather the numbers of the effects that are simulated; of a two-parameter profile's Poisson form as well."""
+    physics = plan.physics
+    if physics is None:
+        a_dn, b_dn2 = plan.variance_line
+        return _Body(
+            a_dn or 1.0, np.ones((1, 1), np.float32), False, False, a_dn > 0, False, 0.0, 0.0, np.uint64(0), 0.0,
+            exponential_levels(), np.inf, float(np.sqrt(max(b_dn2, 0.0))), _columns(normal_table()),
+            np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, 2)), np.uint64(0), HETEROSCEDASTIC, _key(0),
+        )  # fmt: skip
+    on = frozenset(plan.effects)
+    return _Body(
+        dn_per_e=physics.dn_per_e,
+        response=(
+            body_response(physics.body_key, physics.prnu_std, shape[0], shape[1], origin)
+            if "prnu" in on
+            else np.ones((1, 1), np.float32)
+        ),
+        responds="prnu" in on,
+        averaged=plan.averaged,
+        shot="shot" in on,
+        dark="dark_current" in on,
+        dark_e=physics.dark_e,
+        removed_e=physics.dark_e if physics.dark_offset == "removed" else 0.0,
+        hot_below=share_limit(physics.hot_pixel_share) if "hot_pixels" in on else np.uint64(0),
+        hot_e=physics.hot_pixel_e,
+        levels=exponential_levels(),
+        full_well_e=physics.full_well_e if "full_well" in on else np.inf,
+        read_std_dn=physics.read_std_dn if "read" in on else 0.0,
+        quantiles=_columns(effects.read_table(physics)),
+        rows_dn=effects.row(plan, shape[0], origin[0]) if "row" in on else np.zeros(shape[0]),
+        columns_dn=effects.column(physics, shape[1], origin[1]) if "column" in on else np.zeros(shape[1]),
+        errors_dn=effects.black_error(physics, (2, 2), origin) if "black_error" in on else np.zeros((2, 2)),
+        dead_below=share_limit(physics.dead_pixel_share) if "dead_pixels" in on else np.uint64(0),
+        read_purpose=np.uint64(purpose("read")),
+        key=_key(physics.body_key),
+    )
+
+
+def share_limit(share: float) -> np.uint64:
+    """Return the word below which a share of all words lies (`effects.is_among`)."""
+    return np.uint64(int(share * 2**32))
+
+
+@functools.lru_cache(maxsize=1)
+def body_response(
+    body_key: int, prnu_std: float, height: int, width: int, origin: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Return `effects.response`, kept for the next frame of the same body."""
+    response = np.empty((height, width), dtype=np.float32)
+    _responses(_key(body_key), prnu_std, origin, _columns(normal_table()), response)
+    return response
+
+
+@kernel
+def _responses(
+    key: Key,
+    prnu_std: float,
+    origin: tuple[int, int],
+    quantiles: tuple[Float, Float, Float],
+    out: NDArray[np.float32],
+) -> None:
+    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    normals = np.empty(CHUNK + BLOCK)
+    for y in range(out.shape[0]):
+        for start in range(0, out.shape[1], CHUNK):
+            length = min(CHUNK, out.shape[1] - start)
+            place = (origin[0] + y, origin[1] + start)
+            offset = _stream(key, place, PRNU, length, words)
+            _normals(words[: offset + length], quantiles, bits, normals)
+            for x in range(length):
+                out[y, start + x] = np.float32(max(1 + prnu_std * normals[offset + x], 0.0))
+
+
+@kernel
+def _stream(
+    key: Key,
+    place: tuple[int, int],
+    purpose_word: np.uint64,
+    length: int,
+    words: NDArray[np.uint64],
+) -> int:
+    """Fill ``words`` with those of a run of pixels from ``place`` on, and return where in it the first one stands."""
+    offset = place[1] % BLOCK
+    blocks = (offset + length + BLOCK - 1) // BLOCK
+    _words(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
+    return int(offset)
+
+
+@kernel
+def _physical_pair(
+    srgb: Srgb,
+    scene: _Scene,
+    key: Key,
+    limits_dn: tuple[float, float],
+    origin: tuple[int, int],
+    body: _Body,
+    tables: PoissonTables,
+    normal: tuple[Float, Float, Float],
+    clean: Raw,
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a physical profile: `effects.physical`, row by row."""
+    height, width = clean.shape
+    light = np.empty(CHUNK)
+    unrounded = np.empty(CHUNK)
+    electrons = np.empty(CHUNK)
+    added = np.empty(CHUNK)
+    drawn = np.empty(CHUNK)  # counts may not lie where their means do
+    fixed = np.empty(CHUNK)
+    noisy_dn = np.empty(CHUNK)
+    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    kept = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    normals = np.empty(CHUNK + BLOCK)
+    site_gains, site_headroom = _by_site(scene)
+    black = scene.levels_dn[0]
+    errors = np.empty((2, CHUNK))
+    for y in range(2):
+        for x in range(CHUNK):
+            errors[y, x] = body.errors_dn[y, x & 1]
+    for y in range(height):
+        for start in range(0, width, CHUNK):
+            n = min(CHUNK, width - start)
+            place = (origin[0] + y, origin[1] + start)
+            _signal(srgb[y, start : start + n], scene, y, light)
+            _light(light[:n], site_gains[y & 1], site_headroom[y & 1], scene, light)
+            if body.responds and body.averaged:
+                for x in range(n):
+                    light[x] = light[x] * body.response[y, start + x]
+            saturated = counts[4]
+            _clean_frame(light[:n], scene, unrounded, clean[y, start : start + n], counts)
+
+            for x in range(n):
+                electrons[x] = (unrounded[x] - black) / body.dn_per_e
+            if body.responds and not body.averaged:
+                for x in range(n):
+                    electrons[x] = electrons[x] * body.response[y, start + x]
+            if body.shot:
+                offset = _stream(key, place, SHOT, n, words)
+                _counts(words, offset, n, electrons, tables, normal, kept, bits, normals, drawn)
+                electrons, drawn = drawn, electrons
+            if body.dark:
+                offset = _stream(key, place, DARK, n, words)
+                added[:n] = body.dark_e
+                _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
+                for x in range(n):
+                    electrons[x] = electrons[x] + (drawn[x] - body.removed_e)
+            if body.hot_below:
+                hot = _hot_means(body, place, n, words, kept, added)
+                for x in range(n):
+                    fixed[x] = added[x] * body.dn_per_e
+                if hot:
+                    offset = _stream(key, place, HOT, n, words)
+                    _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
+                    for x in range(n):
+                        electrons[x] = electrons[x] + drawn[x]
+            offset = 0
+            if body.read_std_dn > 0.0:
+                offset = _stream(key, place, body.read_purpose, n, words)
+                _normals(words[: offset + n], body.quantiles, bits, normals)
+            else:
+                normals[:n] = 0.0
+            _digitise(
+                electrons[:n], normals[offset : offset + n], body, y, body.columns_dn[start : start + n],
+                errors[y & 1], black, noisy_dn,
+            )  # fmt: skip
+            if body.averaged:
+                _average(unrounded[:n], fixed, body, y, start, limits_dn, scene, clean[y, start : start + n])
+            if body.dead_below:
+                offset = _stream(body.key, place, DEAD, n, words)
+                for x in range(n):
+                    if words[offset + x] < body.dead_below:
+                        noisy_dn[x] = 0.0
+                        if body.averaged:
+                            clean[y, start + x] = np.uint16(np.int32(limits_dn[0]))
+            _read_out(unrounded[:n], noisy_dn, scene, limits_dn, noisy[y, start : start + n], counts)
+            if body.averaged:
+                counts[4] = saturated + _saturated(clean[y, start : start + n], scene.levels_dn[2])
+
+
+@kernel
+def _counts(
+    words: NDArray[np.uint64],
+    offset: int,
+    n: int,
+    rates: Float,
+    tables: PoissonTables,
+    normal: tuple[Float, Float, Float],
+    kept: NDArray[np.uint64],
+    bits: NDArray[np.uint64],
+    normals: Float,
+    out: Float,
+) -> None:
+    """Fill ``out`` with Poisson counts of the mean ``rates``; the words are needed beside the normals made of them."""
+    for x in range(n):
+        kept[x] = words[offset + x]
+    _normals(words[: offset + n], normal, bits, normals)
+    draw_counts(kept[:n], rates[:n], normals[offset : offset + n], tables, out[:n])
+
+
+@kernel
+def _hot_means(
+    body: _Body,
+    place: tuple[int, int],
+    n: int,
+    words: NDArray[np.uint64],
+    kept: NDArray[np.uint64],
+    out: Float,
+) -> int:
+    """Fill ``out`` with the mean excess of each pixel, as `effects.hot_pixel_means`; return how many are hot."""
+    offset = _stream(body.key, place, HOT, n, words)
+    hot = 0
+    for x in range(n):
+        out[x] = 1.0 if words[offset + x] < body.hot_below else 0.0
+        hot += words[offset + x] < body.hot_below
+    if hot:
+        _stream(body.key, place, HOT_STEP, n, kept)
+        for x in range(n):
+            if out[x] > 0.0:
+                out[x] = body.hot_e * body.levels[kept[offset + x] >> np.uint64(22)]
+    return hot
+
+
+@kernel
+def _digitise(
+    electrons: Float,
+    normals: Float,
+    body: _Body,
+    y: int,
+    columns_dn: Float,
+    errors_dn: Float,
+    black: float,
+    out: Float,
+) -> None:
+    """Go from electrons to DN, and add what is added there."""
+    full_well_e, dn_per_e, read_std_dn, row_dn = body.full_well_e, body.dn_per_e, body.read_std_dn, body.rows_dn[y]
+    for x in range(electrons.shape[0]):
+        dn = min(electrons[x], full_well_e) * dn_per_e + black
+        out[x] = (dn + read_std_dn * normals[x]) + ((row_dn + columns_dn[x]) + errors_dn[x])
+
+
+@kernel
+def _average(
+    unrounded: Float,
+    fixed: Float,
+    body: _Body,
+    y: int,
+    start: int,
+    limits_dn: tuple[float, float],
+    scene: _Scene,
+    clean: Raw,
+) -> None:
+    """Round the clean frame anew, with what an average of many frames keeps of the body."""
+    low, high = limits_dn
+    for x in range(unrounded.shape[0]):
+        dn = unrounded[x] + fixed[x] if body.hot_below else unrounded[x]
+        dn = dn + ((0.0 + body.columns_dn[start + x]) + body.errors_dn[y & 1, (start + x) & 1])
+        clean[x] = np.uint16(np.int32(min(max((dn + _ROUND) - _ROUND, low), high)))
+
+
+@kernel
+def _saturated(clean: Raw, white: float) -> int:
+    count = 0
+    for x in range(clean.shape[0]):
+        count += clean[x] == white
+    return count
+
+
+@kernel
+def _read_out(
+    unrounded: Float,
+    noisy_dn: Float,
+    scene: _Scene,
+    limits_dn: tuple[float, float],
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Pin what is saturated, if so asked; round half to even, clip, cast."""
+    a, b = scene.noise
+    black, pinned = scene.levels_dn[0], scene.pinned_dn
+    low, high = limits_dn
+    below, above, still = 0, 0, 0
+    for x in range(unrounded.shape[0]):
+        still += max(a * (unrounded[x] - black) + b, 0.0) == 0.0
+        dn = pinned if unrounded[x] >= pinned else noisy_dn[x]
+        rounded = (dn + _ROUND) - _ROUND
         below += rounded < low
         above += rounded > high
         noisy[x] = np.uint16(np.int32(min(max(rounded, low), high)))

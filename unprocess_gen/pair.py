@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen import fused
-from unprocess_gen.effects import heteroscedastic, noise_variance
+from unprocess_gen import effects, fused
 from unprocess_gen.records import Counts, Pair, Plan, Srgb
 from unprocess_gen.sensor import noisy_limits, quantise, to_dn
-from unprocess_gen.tables import linear_table, normal_table
-from unprocess_gen.unprocess import unprocess
+from unprocess_gen.tables import linear_table
+from unprocess_gen.unprocess import dequantise, unprocess
 
 
 def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
@@ -24,31 +23,47 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     the full pair, single pixels included. Raises ValueError for other types and shapes.
     """
     _check(srgb)
+    srgb = _dequantised(srgb, plan, origin)
     curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    return fused.make_pair(srgb, plan, curve, normal_table(), limits_dn, origin)
+    return fused.make_pair(srgb, plan, curve, limits_dn, origin)
 
 
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
-    """Make the same pair by the readable forms: Algorithm 1, the noise, the sensor's rounding."""
+    """Make the same pair by the readable forms: Algorithm 1, the scene's exposure, the noise, the sensor's rounding."""
     _check(srgb)
+    srgb = _dequantised(srgb, plan, origin)
     light = unprocess(srgb, plan, origin)
-    clean_dn = to_dn(light, plan.black_level_dn, plan.white_level_dn)
-    noisy_dn = heteroscedastic(clean_dn, plan, origin)
+    if plan.exposure != 1:  # what the photograph shows as white is white before it is darkened
+        light = np.minimum(light, 1) * plan.exposure
+    if plan.averaged:
+        light = effects.respond(light, plan, origin)
+    clean_dn = to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest)
+    noisy_dn = effects.noisy(clean_dn, plan, origin)
+    if plan.saturated == "pinned":
+        noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
+    averaged_dn = effects.average(clean_dn, plan, origin) if plan.averaged else clean_dn
 
     low, high = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    clean = quantise(clean_dn, plan.black_level_dn, plan.white_level_dn)
+    lowest, highest = (low, high) if plan.averaged else (plan.black_level_dn, plan.white_level_dn)
+    clean = quantise(averaged_dn, lowest, highest)
     noisy = quantise(noisy_dn, low, high)
 
     counts = Counts(
         clean_clipped_low=int((light < 0).sum()),
-        clean_clipped_high=int((light > 1).sum()),
+        clean_clipped_high=int((light > plan.brightest).sum()),
         noisy_clipped_low=int((np.rint(noisy_dn) < low).sum()),
         noisy_clipped_high=int((np.rint(noisy_dn) > high).sum()),
         saturated=int((clean == plan.white_level_dn).sum()),
-        zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
+        zero_variance=int((effects.noise_variance(clean_dn, plan) == 0).sum()),
     )
     return Pair(clean, noisy, counts)
+
+
+def _dequantised(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
+    if plan.dequantize == "off" or srgb.dtype != np.uint8:
+        return srgb
+    return dequantise(srgb, plan, linear_table(plan.tone, plan.gamma, 256), origin)
 
 
 def _check(srgb: Srgb) -> None:

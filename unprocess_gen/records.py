@@ -20,7 +20,9 @@ class Source:
     to the source folder as the operating system spells it (undecodable bytes as surrogate escapes), or the name of a
     synthetic scene. ``size_bytes`` is None where there is no file to read (``reason`` then says why), and 0
     for a scene. Files that share a size were hashed beforehand (``sha256``) and identical ones numbered
-    (``occurrence``).
+    (``occurrence``). Where folders are clips, ``clip`` is the folder's name as ``name`` spells it, ``frame`` the number
+    of the frame in it, and ``clip_sha256`` with ``clip_occurrence`` stands for the whole clip: the digest of its first
+    frame, and the number of clips before it that begin with the same.
     """
 
     index: int
@@ -30,6 +32,16 @@ class Source:
     reason: str | None = None
     occurrence: int = 0
     sha256: str | None = None
+    clip: str = "none"
+    frame: int = 0
+    clip_sha256: str | None = None
+    clip_occurrence: int = 0
+
+    def stream_identity(self, sha256: str) -> tuple[str, int]:
+        """Return the digest and the number that the streams are keyed by: the clip's, or those of the photograph."""
+        if self.clip_sha256 is not None:
+            return self.clip_sha256, self.clip_occurrence
+        return sha256, self.occurrence
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +53,79 @@ class Photograph:
 
 
 @dataclass(frozen=True, slots=True)
+class Facts:
+    """What a plan may know of the pixels: whole numbers, the same on every machine.
+
+    ``dark_code`` and ``bright_code`` are the lowest and the highest code (of ``codes`` possible ones) in any channel,
+    ``middle_code`` the median of a regular sample of the green one.
+    """
+
+    width: int
+    height: int
+    codes: int
+    dark_code: int
+    middle_code: int
+    bright_code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Physics:
+    """What a physical profile and a scene say of one frame, on the sensor in use; 0 where there is no such number.
+
+    ``dn_per_e``: the system gain K. ``prnu_std``: relative, of the
+    pixels' responses. ``dark_e``: mean dark current of the exposure, electrons. ``hot_pixel_share``, ``hot_pixel_e``:
+    share of pixels that are hot, and the mean of their exponentially distributed excess, electrons in the exposure.
+    ``full_well_e``: electrons a pixel holds. ``read_law``: ``gaussian`` or ``tukey``, of shape ``read_shape``;
+    ``read_std_dn``: its standard deviation, whatever the law. ``row_std_dn``, ``column_std_dn``: of a row's offset in a
+    frame, of a column's in a body. ``black_error_dn``: offset of the mean black in the four sites of the 2x2 pattern,
+    in reading order. ``dead_pixel_share``: share of pixels that read 0. ``body_key``: key of the fixed patterns of the
+    camera body ``sensor_unit``.
+    """
+
+    iso: float
+    exposure_s: float
+    temperature_c: float
+    dn_per_e: float
+    prnu_std: float
+    dark_e: float
+    dark_offset: str
+    hot_pixel_share: float
+    hot_pixel_e: float
+    full_well_e: float
+    read_law: str
+    read_shape: float
+    read_std_dn: float
+    row_std_dn: float
+    column_std_dn: float
+    black_error_dn: tuple[float, float, float, float]
+    dead_pixel_share: float
+    sensor_unit: str
+    body_key: int
+    fixed_pattern_in_clean: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
     """Everything that decides a pair besides its pixels: what a manifest row holds, as numbers.
 
-    Drawn once (`plan.plan_image`) or read back from a row (`manifest.plan_of`). ``weights`` are those of the mixed
-    cameras in the order of `colour.CAMERAS`; ``rgb2cam`` is row-major and its rows sum to 1; ``red_gain`` and
-    ``blue_gain`` are forward gains, ``inverse_rgb_gain`` an inverse one; ``a_dn`` (DN) and ``b_dn2`` (DN²) are slope
-    and intercept of the noise variance above black; ``stream_key`` is the key of the image's random streams.
+    Drawn once (`plan.plan_image`) or read back from a row (`manifest.plan_of`). ``downscale`` is the side of the
+    squares of source pixels that were averaged, ``dequantize`` says whether 8-bit codes are dithered,
+    ``exposure_ratio`` what the scene is darkened by. ``weights`` are those of the mixed cameras in the order of
+    `colour.CAMERAS`; ``rgb2cam`` is row-major and its rows sum to 1; ``red_gain`` and ``blue_gain`` are forward gains,
+    ``inverse_rgb_gain`` an inverse one; ``a_dn`` (DN) and ``b_dn2`` (DN²) are slope and intercept of the noise variance
+    above black; ``stream_key`` is the key of the image's random streams. ``noise_law`` says whether a two-parameter
+    profile's noise is ``gaussian`` or ``poisson``; ``saturated`` says what the noisy frame is where the clean one is
+    saturated: ``noisy``, or ``pinned`` to white. ``physics`` is None for the two-parameter profiles, whose one effect
+    is ``heteroscedastic``. ``level``, ``draw`` and ``frame`` number the noise levels of one clean frame, the draws at
+    one level, and the frames of a clip: each has values of its own in every stream.
     """
 
     seed: int
     stream_key: int
+    downscale: int
+    dequantize: str
+    scene: str
+    exposure_ratio: float
     camera: str
     weights: tuple[float, float, float, float]
     rgb2cam: tuple[float, float, float, float, float, float, float, float, float]
@@ -67,13 +141,49 @@ class Plan:
     black_level_dn: int
     white_level_dn: int
     sensor_clip: str
+    saturated: str
     noise: str
+    noise_law: str
     a_dn: float
     b_dn2: float
     effects: tuple[str, ...]
     skipped: tuple[str, ...]
     accuracy: str
     methods: tuple[str, ...]
+    physics: Physics | None = None
+    level: int = 0
+    draw: int = 0
+    frame: int = 0
+
+    @property
+    def exposure(self) -> float:
+        """What the light of the scene is multiplied by."""
+        return 1 / self.exposure_ratio
+
+    @property
+    def averaged(self) -> bool:
+        """Whether the clean frame shares the body's fixed patterns, as an average of many frames does."""
+        return self.physics is not None and self.physics.fixed_pattern_in_clean
+
+    @property
+    def variance_line(self) -> tuple[float, float]:
+        """Slope (DN) and intercept (DN²) of the variance above black, of the effects that are simulated."""
+        if "heteroscedastic" in self.effects:
+            return self.a_dn, self.b_dn2
+        return self.a_dn if "shot" in self.effects else 0.0, self.b_dn2 if "read" in self.effects else 0.0
+
+    @property
+    def brightest_dn(self) -> float:
+        """`brightest` in DN, unrounded."""
+        return self.brightest * float(self.white_level_dn - self.black_level_dn) + float(self.black_level_dn)
+
+    @property
+    def brightest(self) -> float:
+        """The light at which the clean frame saturates: white, or the full well where that is reached before."""
+        if self.physics is None or "full_well" not in self.effects:
+            return 1.0
+        span_dn = self.white_level_dn - self.black_level_dn
+        return min(1.0, self.physics.full_well_e * self.physics.dn_per_e / span_dn)
 
     @property
     def inverse_gains(self) -> tuple[float, float, float]:

@@ -18,8 +18,9 @@ import numpy as np
 
 from unprocess_gen import fused
 from unprocess_gen.compiled import kernel
+from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import MachineError
-from unprocess_gen.records import Float, Plan, Srgb
+from unprocess_gen.records import Float, Physics, Plan, Srgb
 from unprocess_gen.shards import array_xxh3
 from unprocess_gen.streams import philox4x32
 from unprocess_gen.tables import linear_table, normal_table
@@ -38,6 +39,10 @@ KNOWN_ANSWERS = (
 GOLDEN_PLAN = Plan(
     seed=0,
     stream_key=0x0123456789ABCDEF,
+    downscale=1,
+    dequantize="off",
+    scene="daylight",
+    exposure_ratio=1.0,
     camera="custom",
     weights=(0.0, 0.0, 0.0, 0.0),
     rgb2cam=(0.5625, 0.3125, 0.125, 0.125, 0.75, 0.125, 0.03125, 0.21875, 0.75),
@@ -53,7 +58,9 @@ GOLDEN_PLAN = Plan(
     black_level_dn=64,
     white_level_dn=1023,
     sensor_clip="sensor",
+    saturated="noisy",
     noise="imx385_iso25600",
+    noise_law="gaussian",
     a_dn=55.0,
     b_dn2=2500.0,
     effects=("heteroscedastic",),
@@ -61,31 +68,66 @@ GOLDEN_PLAN = Plan(
     accuracy="exact",
     methods=(),
 )
+GOLDEN_PHYSICS = Physics(
+    iso=3200.0,
+    exposure_s=0.1,
+    temperature_c=30.0,
+    dn_per_e=4.0,
+    prnu_std=0.01,
+    dark_e=3.0,
+    dark_offset="removed",
+    hot_pixel_share=0.02,
+    hot_pixel_e=40.0,
+    full_well_e=300.0,
+    read_law="tukey",
+    read_shape=-0.1,
+    read_std_dn=6.0,
+    row_std_dn=2.0,
+    column_std_dn=1.0,
+    black_error_dn=(0.5, -0.25, 0.125, 1.0),
+    dead_pixel_share=0.01,
+    sensor_unit="0",
+    body_key=0xFEDCBA9876543210,
+    fixed_pattern_in_clean=False,
+)
+GOLDEN_PLANS = {
+    "per_channel": GOLDEN_PLAN,
+    "gray_mean": replace(GOLDEN_PLAN, highlight="gray_mean"),
+    "physical": replace(
+        GOLDEN_PLAN, physics=GOLDEN_PHYSICS, effects=EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3
+    ),
+}
 GOLDEN = {
-    # highlight: XXH3-128 of the clean and of the noisy frame
+    # XXH3-128 of the clean and of the noisy frame
     "per_channel": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
     "gray_mean": ("b4c0b18f1bbccbf881c82b00455253e9", "16f26b70e50c70f03babed405092f5b2"),
+    "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
+PHYSICAL = ("physical",)
+"""What only a run of a physical profile tests: it takes seconds to compile where it never was."""
 
 
-def check(way_out: str = "") -> None:
-    """Raise MachineError, with every proof that failed, where this process computes differently."""
-    if failures():
+def check(physical: bool, way_out: str = "") -> None:
+    """Raise MachineError, with every proof that failed, where this process computes differently.
+
+    ``physical`` says whether the kernels of physical profiles are needed, and so tested too.
+    """
+    if failures(physical):
         raise MachineError(
-            f"the self-test failed: {'; '.join(failures())}; this machine computes differently from others: try other "
-            f"versions of numpy and numba{way_out}"
+            f"the self-test failed: {'; '.join(failures(physical))}; this machine computes differently from others: "
+            f"try other versions of numpy and numba{way_out}"
         )
 
 
-@functools.lru_cache(maxsize=1)
-def failures() -> tuple[str, ...]:
+@functools.lru_cache(maxsize=2)
+def failures(physical: bool) -> tuple[str, ...]:
     """Return each proof that failed, in words; once in a process."""
-    return tuple(_failures())
+    return tuple(_failures(physical))
 
 
-def _failures() -> Iterator[str]:
+def _failures(physical: bool) -> Iterator[str]:
     try:
-        curve, quantiles = linear_table("smoothstep", 2.2, 256), normal_table()
+        curve, _ = linear_table("smoothstep", 2.2, 256), normal_table()
     except MachineError as error:
         yield str(error)
         return
@@ -97,12 +139,13 @@ def _failures() -> Iterator[str]:
     _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), rest)
     if rest.any():
         yield "a kernel multiplies and adds in one rounding"
-    for highlight, wanted in GOLDEN.items():
-        plan = replace(GOLDEN_PLAN, highlight=highlight)
-        pair = fused.make_pair(golden_picture(), plan, curve, quantiles, (0.0, 1023.0), (1, 57))
-        for name, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), wanted, strict=True):
+    for name, wanted in GOLDEN.items():
+        if name in PHYSICAL and not physical:
+            continue
+        pair = fused.make_pair(golden_picture(), GOLDEN_PLANS[name], curve, (0.0, 1023.0), (1, 57))
+        for which, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), wanted, strict=True):
             if (found := array_xxh3(frame)) != digest:
-                yield f"the golden {name} frame ({highlight}) is {found}, expected {digest}"
+                yield f"the golden {which} frame ({name}) is {found}, expected {digest}"
 
 
 @kernel

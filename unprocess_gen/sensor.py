@@ -11,9 +11,9 @@ import numpy as np
 from unprocess_gen.records import Float, Raw
 
 
-def to_dn(light: Float, black_level_dn: int, white_level_dn: int) -> Float:
-    """Clip light to [0, 1] and map it to [black, white], unrounded, ``[H, W]`` float64."""
-    return np.clip(light, 0, 1) * float(white_level_dn - black_level_dn) + float(black_level_dn)
+def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0) -> Float:
+    """Clip light to [0, brightest] and map 0 and 1 to black and white, unrounded, ``[H, W]`` float64."""
+    return np.clip(light, 0, brightest) * float(white_level_dn - black_level_dn) + float(black_level_dn)
 
 
 def noisy_limits(bits: int, black_level_dn: int, clip: str) -> tuple[float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from unprocess_gen.bayer import mosaic
 from unprocess_gen.records import Float, Plan, Srgb
+from unprocess_gen.streams import words
 
 
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
@@ -22,6 +23,20 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float
     Arguments as for `camera_light`; ``origin`` places a cut-out in the full frame, for the Bayer phase.
     """
     return mosaic(camera_light(srgb, plan), plan.pattern, origin)
+
+
+def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
+    """Return 8-bit codes as 16-bit ones, moved by up to half a code at random, ``[H, W, 3]``.
+
+    So that 256 codes do not become 256 levels of raw. Codes 0 and 255, and those whose light (``curve``, 256 entries)
+    lies above the highlight threshold, are not moved: there half a code is hundreds of DN. The offset is one of the 257
+    whole sixteen-bit codes about the middle, from the stream ``dequantize``, channel by channel.
+    """
+    size = (srgb.shape[0], srgb.shape[1])
+    channels = [words(plan.stream_key, "dequantize", size, origin=origin, draw=channel) for channel in range(3)]
+    offsets = (np.stack(channels, axis=-1).astype(np.uint64) * np.uint64(257) >> np.uint64(32)).astype(np.int32) - 128
+    kept = (srgb == 0) | (srgb == 255) | (curve[srgb] > plan.highlight_threshold)
+    return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
 
 def camera_light(srgb: Srgb, plan: Plan) -> Float:
