@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from conftest import fill
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.forecast import SAMPLE, forecast, spread, text
 from unprocess_gen.records import Source
@@ -104,3 +106,12 @@ def test_a_negative_b_without_slope_can_be_told(settings: Settings, tmp_path: Pa
     overrides = ("noise.a=0", "noise.b=-5", "noise.negative_variance=clip")
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", *overrides)
     assert "b_dn2 -5" in text(config, forecast(config, 1, True))
+
+
+def test_of_a_physical_profile_every_effect_is_told_with_its_reason(settings: Settings, tmp_path: Path) -> None:
+    config = settings("noise=sony_a7s2", "scene=night", f"source.root={fill(tmp_path / 'p', 2)}")
+    told = text(config, forecast(config, 1, True))
+    assert "scene     night: ISO 6400" in told
+    assert "noise     sony_a7s2: " in told
+    for effect in EFFECTS:
+        assert re.search(rf"^{effect} .* [0-2] of 2 +[\d.]+ +\S", told, re.MULTILINE), effect

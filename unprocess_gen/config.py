@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from decimal import Decimal
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Optional
@@ -40,6 +41,9 @@ class SourceConfig:
     max_pixels: int = 2**26
     max_failed: int = 0
     icc: str = "ignore"
+    clips: bool = False
+    downscale: int = 1
+    dequantize: str = "off"
 
 
 @dataclass
@@ -72,18 +76,45 @@ class IspConfig:
 
 @dataclass
 class SensorConfig:
-    """Bits, levels (DN), Bayer pattern, and how noisy frames are clipped."""
+    """Bits, levels (DN), Bayer pattern, how noisy frames are clipped and saturated, and which camera bodies there are.
+
+    ``units``: ``image``, a body of its own for every image, or a number of bodies to draw from.
+    """
 
     bits: int = 12
     black_level_dn: int = 240
     white_level_dn: int = 4095
     pattern: str = "RGGB"
     clip: str = "sensor"
+    saturated: str = "noisy"
+    dark_offset: str = "removed"
+    units: Any = "image"
+
+
+@dataclass
+class BranchConfig:
+    """What a physical profile says in one range of ISO; see `FORMS` for what stands where a number depends on ISO."""
+
+    iso: list[float] = field(default_factory=list)
+    dn_per_e: Any = None
+    read_law: str = "gaussian"
+    read_shape: Any = 0.0
+    read_std_dn: Any = None
+    row_std_dn: Any = None
+    column_std_dn: Any = None
+    black_error_dn: Any = None
 
 
 @dataclass
 class NoiseConfig:
-    """Variance a·x + b (numbers or laws) in ``units``, with the levels (DN) it was calibrated at."""
+    """A noise profile, in ``units``, with the levels (DN) it was calibrated at.
+
+    ``levels``: several noise levels of one clean frame, a list of ISOs or of ``{a, b}``, or how many to draw;
+    ``draws``: how many noisy frames at each.
+
+    Either variance a·x + b (numbers or laws), or a physical one: ``branches`` by ISO, and what does not depend on it.
+    ``assumed`` names the numbers that no source gives; they stay off unless their effect is switched on by name.
+    """
 
     name: str = "none"
     units: Optional[str] = None
@@ -94,6 +125,58 @@ class NoiseConfig:
     a: Any = None
     b: Any = None
     negative_variance: str = "refuse"
+    law: str = "gaussian"
+    iso: Any = None
+    levels: Any = None
+    draws: int = 1
+    branches: list[BranchConfig] = field(default_factory=list)
+    prnu_std: Optional[float] = None
+    dark_e_per_s: Optional[float] = None
+    dark_reference_c: float = 25.0
+    dark_doubling_c: float = 7.0
+    hot_pixel_share: Optional[float] = None
+    hot_pixel_e_per_s: Optional[float] = None
+    dead_pixel_share: Optional[float] = None
+    full_well_e: Optional[float] = None
+    assumed: list[str] = field(default_factory=list)
+
+
+@dataclass
+class SceneConfig:
+    """What a physical profile needs to know of the scene: numbers or laws; exposure_ratio darkens it."""
+
+    name: str = "daylight"
+    iso: Any = 100
+    exposure_s: Any = 0.001
+    temperature_c: Any = 25
+    exposure_ratio: Any = 1
+
+
+@dataclass
+class EffectsConfig:
+    """Which effects are simulated: auto, on or off; a named one wins over ``all``."""
+
+    all: str = "auto"
+    tolerance: float = 0.1
+    heteroscedastic: Optional[str] = None
+    prnu: Optional[str] = None
+    shot: Optional[str] = None
+    dark_current: Optional[str] = None
+    hot_pixels: Optional[str] = None
+    full_well: Optional[str] = None
+    read: Optional[str] = None
+    row: Optional[str] = None
+    column: Optional[str] = None
+    black_error: Optional[str] = None
+    dead_pixels: Optional[str] = None
+    quantise: Optional[str] = None
+
+
+@dataclass
+class CleanConfig:
+    """What the clean frame shares with the noisy one beyond the rule."""
+
+    includes_fixed_pattern: bool = False
 
 
 @dataclass
@@ -114,6 +197,9 @@ class Config:
     isp: IspConfig = field(default_factory=IspConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    effects: EffectsConfig = field(default_factory=EffectsConfig)
+    clean: CleanConfig = field(default_factory=CleanConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     seed: int = 0
     out: str = "ds"
@@ -168,6 +254,7 @@ LAW_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
     "truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _truncated),
     "inverse_truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _truncated),
     "log_linear_in_a": (("slope", "intercept", "standard deviation"), _line),
+    "choice": (("value", "…"), lambda *values: None if values else "expected a value at least"),
 }
 """The laws a parameter can be drawn from: their numbers, and what must hold between them (None: all is well)."""
 
@@ -181,7 +268,7 @@ def law(key: str, value: Any, allowed: tuple[str, ...]) -> Law:
         raise ConfigError(f"{key}={_text(value)}: expected a finite number or a law: {forms}")
     kind, numbers = str(value[0]), value[1:]
     names, rule = LAW_NUMBERS[kind]
-    if len(numbers) != len(names) or not all(_is_number(number) for number in numbers):
+    if (len(numbers) != len(names) and kind != "choice") or not all(_is_number(number) for number in numbers):
         raise ConfigError(f"{key}={_text(value)}: expected finite numbers: [{kind}, {', '.join(names)}]")
     complaint = rule(*numbers)
     if complaint:
@@ -191,8 +278,8 @@ def law(key: str, value: Any, allowed: tuple[str, ...]) -> Law:
 
 def lowest(drawn: Law) -> float:
     """Return a value that no draw of the law lies below."""
-    if drawn.kind == "constant":
-        return drawn.numbers[0]
+    if drawn.kind in ("constant", "choice"):
+        return min(drawn.numbers)
     if drawn.kind == "truncated_normal":
         return drawn.numbers[2]
     if drawn.kind == "inverse_truncated_normal":
@@ -202,6 +289,8 @@ def lowest(drawn: Law) -> float:
 
 def highest(drawn: Law) -> float:
     """Return a value that no draw of the law lies above."""
+    if drawn.kind == "choice":
+        return max(drawn.numbers)
     if drawn.kind == "inverse_truncated_normal":
         return 1 / drawn.numbers[2] if drawn.numbers[2] > 0 else math.inf
     return math.inf if drawn.kind == "log_linear_in_a" else drawn.numbers[-1]
@@ -261,9 +350,18 @@ def check(config: Config) -> None:
     if config.isp.gamma != "srgb" and not (_is_number(config.isp.gamma) and 0.1 <= config.isp.gamma <= 10):
         raise ConfigError(f"isp.gamma={_text(config.isp.gamma)}: expected a number from 0.1 to 10, or srgb")
     _check_sensor(config.sensor)
-    _check_noise(config.noise)
+    _check_scene(config.scene)
+    for noise in noise_levels(config.noise):
+        _check_noise(noise, config.scene)
+    _check_levels(config)
+    _check_effects(config)
     _one_of("output.layout", config.output.layout, ("webdataset",))
     _in_range("output.pairs_per_shard", config.output.pairs_per_shard, 1, MAX_PAIRS_PER_SHARD)
+
+
+def dequantizing(source: SourceConfig) -> str:
+    """Return ``off`` or ``dither``."""
+    return YAML_SWITCHES.get(source.dequantize, source.dequantize)
 
 
 def _check_source(source: SourceConfig) -> None:
@@ -273,10 +371,14 @@ def _check_source(source: SourceConfig) -> None:
         raise ConfigError(f"source.root={source.root}: no such folder; null stands for the built-in scenes")
     if not source.include:
         raise ConfigError("source.include=[]: expected at least one pattern such as '*.jpg'")
+    if source.clips and source.root is None:
+        raise ConfigError("source.clips=true: the built-in scenes are no clips; give source.root=…")
     if source.limit is not None:
         _in_range("source.limit", source.limit, 1, 10**9, " or null")
     _in_range("source.max_pixels", source.max_pixels, 1, 2**40)
     _in_range("source.max_failed", source.max_failed, 0, 10**9)
+    _in_range("source.downscale", source.downscale, 1, 64)
+    _one_of("source.dequantize", dequantizing(source), ("off", "dither"))
     _one_of("source.icc", source.icc, ("ignore", "refuse"))
     if source.icc == "refuse" and find_spec("PIL") is None:
         raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
@@ -317,14 +419,82 @@ def _check_sensor(sensor: SensorConfig) -> None:
     if sensor.clip == "none":
         raise ConfigError("sensor.clip=none: needs float output, and output.layout=webdataset writes uint16")
     _one_of("sensor.clip", sensor.clip, ("sensor", "black"))
+    _one_of("sensor.saturated", sensor.saturated, ("noisy", "pinned"))
+    _one_of("sensor.dark_offset", sensor.dark_offset, ("removed", "kept"))
+    if sensor.units != "image" and not (_is_whole(sensor.units) and 1 <= sensor.units <= 10**6):
+        raise ConfigError(f"sensor.units={_text(sensor.units)}: expected image, or a number of bodies, 1 to 1000000")
 
 
-def _check_noise(noise: NoiseConfig) -> None:
+MOST_LEVELS = 100
+"""Levels, and draws at each: two digits in a key."""
+
+
+def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
+    """Return the profile of each noise level; ConfigError where ``noise.levels`` is no list and no number of levels."""
+    levels = 1 if noise.levels is None else noise.levels
+    if _is_whole(levels) and 1 <= levels <= MOST_LEVELS:
+        return (noise,) * levels
+    if not isinstance(levels, list) or not 1 <= len(levels) <= MOST_LEVELS:
+        raise ConfigError(
+            f"noise.levels={_text(levels)}: expected how many, 1 to {MOST_LEVELS}, or a list of ISOs or {{a, b}}"
+        )
+    return tuple(_level(noise, level) for level in levels)
+
+
+def _level(noise: NoiseConfig, level: Any) -> NoiseConfig:
+    if is_physical(noise) and _is_number(level):
+        return dataclasses.replace(noise, iso=level)
+    if not is_physical(noise) and isinstance(level, dict) and level.keys() == {"a", "b"}:
+        return dataclasses.replace(noise, a=level["a"], b=level["b"])
+    wanted = "an ISO" if is_physical(noise) else "{a: …, b: …}"
+    raise ConfigError(f"noise.levels: {_text(level)}: expected {wanted} for noise={noise.name}")
+
+
+def _check_levels(config: Config) -> None:
+    noise = config.noise
+    _in_range("noise.draws", noise.draws, 1, MOST_LEVELS)
+    if len(noise_levels(noise)) == 1:
+        return
+    if noise.full_well_e is not None:
+        raise ConfigError(
+            f"noise.levels={_text(noise.levels)}: with noise.full_well_e the clean frame depends on the ISO"
+        )
+    if config.clean.includes_fixed_pattern:
+        raise ConfigError(
+            "clean.includes_fixed_pattern=true: the fixed pattern depends on the ISO; leave noise.levels out"
+        )
+
+
+def uses_physics(noise: NoiseConfig) -> bool:
+    """Whether pairs are made by the kernels of the physical effects: counts of electrons, not Gaussian noise alone."""
+    return is_physical(noise) or noise.law == "poisson"
+
+
+def is_physical(noise: NoiseConfig) -> bool:
+    """Whether a profile speaks of electrons, not of a variance with two numbers."""
+    return bool(noise.branches)
+
+
+def _check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
     _check_name("noise.name", noise.name)
     _one_of("noise.units", noise.units, ("dn", "normalized"))
     _one_of("noise.black", noise.black, ("subtracted", "included"))
     _one_of("noise.negative_variance", noise.negative_variance, ("refuse", "clip"))
+    _one_of("noise.law", noise.law, ("gaussian", "poisson"))
+    if is_physical(noise):
+        if noise.law != "gaussian":
+            raise ConfigError(
+                f"noise.law={noise.law}: is of profiles with two numbers; noise={noise.name} draws electrons"
+            )
+        _check_physical(noise, scene)
+        return
+    if noise.iso is not None:
+        raise ConfigError(
+            f"noise.iso={_text(noise.iso)}: noise={noise.name} holds for one ISO; choose a physical profile"
+        )
     _, b = noise_laws(noise)
+    if noise.law == "poisson" and (noise.black == "included" or lowest(b) < 0):
+        raise ConfigError("noise.law=poisson: needs the black level subtracted and b of 0 or more")
     if noise.units == "normalized":
         if noise.black == "included":
             raise ConfigError("noise.black=included: normalized units have black at 0, so it must be subtracted")
@@ -336,6 +506,206 @@ def _check_noise(noise: NoiseConfig) -> None:
         raise ConfigError(
             f"noise.b={_text(noise.b)}: the variance at black is {lowest(b) + offset:.6g}, below 0; "
             "say noise.negative_variance=clip if max(0, variance) is meant"
+        )
+
+
+ISO_LAWS = ("uniform", "log_uniform", "choice")
+
+
+def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
+    """Return what a physical profile says at an ISO; None where it says nothing."""
+    return next((branch for branch in noise.branches if branch.iso[0] <= iso <= branch.iso[1]), None)
+
+
+def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
+    for key in ("a", "b"):
+        if getattr(noise, key) is not None:
+            raise ConfigError(
+                f"noise.{key}={_text(getattr(noise, key))}: noise={noise.name} is a physical profile; set iso"
+            )
+    if noise.units != "dn" or noise.black != "subtracted":
+        raise ConfigError(f"noise.units={noise.units}: a physical profile is in dn, with the black level subtracted")
+    _check_calibration(noise)
+    for number, branch in enumerate(noise.branches):
+        _check_branch(f"noise.branches[{number}]", branch)
+        _check_gain(f"noise.branches[{number}].dn_per_e", noise, branch)
+    for key, low, high in RATES:
+        value = getattr(noise, key)
+        if value is not None and not (math.isfinite(value) and low <= value <= high):
+            raise ConfigError(f"noise.{key}={value}: expected {low:g} to {high:g}")
+    for name in noise.assumed:
+        _one_of("noise.assumed", name, tuple(key for key, _, _ in RATES))
+    _check_iso(noise, scene)
+    _check_electrons(noise, scene)
+
+
+RATES = (
+    ("prnu_std", 0.0, 0.5),
+    ("dark_e_per_s", 0.0, 1e6),
+    ("dark_reference_c", -273.0, 200.0),
+    ("dark_doubling_c", 0.1, 100.0),
+    ("hot_pixel_share", 0.0, 1.0),
+    ("hot_pixel_e_per_s", 0.0, 1e6),
+    ("dead_pixel_share", 0.0, 1.0),
+    ("full_well_e", 1.0, 1e9),
+)
+"""Numbers of a physical profile that do not depend on ISO, and what they can be at all (chosen, far beyond sensors)."""
+
+FORM_NUMBERS = {"per_iso": (1, 2), "root": (1, 3), "line": (3, 3), "scale_line": (3, 3)}
+"""The forms of `physics.FORMS`, and how many numbers each takes."""
+
+
+def _check_branch(key: str, branch: BranchConfig) -> None:
+    if len(branch.iso) != 2 or not 0 < branch.iso[0] <= branch.iso[1] <= 1e7:
+        raise ConfigError(f"{key}.iso={_text(branch.iso)}: expected the lowest and the highest ISO, [100, 6400]")
+    _one_of(f"{key}.read_law", branch.read_law, ("gaussian", "tukey"))
+    _check_form(f"{key}.dn_per_e", branch.dn_per_e, ("per_iso",))
+    _check_form(f"{key}.read_std_dn", branch.read_std_dn, ("root", "line", "scale_line"))
+    for name in ("row_std_dn", "column_std_dn"):
+        if getattr(branch, name) is not None:
+            _check_form(f"{key}.{name}", getattr(branch, name), ("root", "line"))
+    shape = law(f"{key}.read_shape", branch.read_shape, ("choice",))
+    if not (lowest(shape) > -0.5 and highest(shape) < 10):
+        raise ConfigError(
+            f"{key}.read_shape={_text(branch.read_shape)}: Tukey's law has a variance for shapes above -0.5 only"
+        )
+    _check_black_error(f"{key}.black_error_dn", branch.black_error_dn)
+
+
+MAX_ELECTRONS = 1e9
+"""Counts are exact up to this mean (`poisson`), which no pixel holds."""
+
+
+def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
+    """Refuse heat that sets free more electrons than can be counted."""
+    seconds = highest(law("scene.exposure_s", scene.exposure_s, ISO_LAWS))
+    celsius = highest(law("scene.temperature_c", scene.temperature_c, ISO_LAWS))
+    for key in ("dark_e_per_s", "hot_pixel_e_per_s"):
+        rate = Decimal((getattr(noise, key) or 0.0) * seconds)
+        doublings = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)
+        most = (Decimal(MAX_ELECTRONS) / 8).ln()  # a hot pixel has up to 8 times the mean
+        if rate > 0 and rate.ln() + doublings * Decimal(2).ln() > most:
+            raise ConfigError(
+                f"noise.{key}={getattr(noise, key)}: more than {MAX_ELECTRONS:g} electrons in {seconds:g} s at "
+                f"{celsius:g} degrees Celsius"
+            )
+
+
+def _check_gain(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
+    """Refuse a gain of 0, and one so small that white is more electrons than can be counted."""
+    assert noise.white_level_dn is not None and noise.black_level_dn is not None
+    gain = branch.dn_per_e
+    if isinstance(gain, list):
+        gain = gain[1] * branch.iso[0] + (gain[2] if len(gain) > 2 else 0.0)
+    if not gain * MAX_ELECTRONS >= noise.white_level_dn - noise.black_level_dn:
+        raise ConfigError(f"{key}={_text(branch.dn_per_e)}: expected a gain above 0, at which white is countable")
+
+
+def _check_form(key: str, value: Any, allowed: tuple[str, ...]) -> None:
+    if _is_number(value) and value >= 0:
+        return
+    form, numbers = (value[0], value[1:]) if isinstance(value, list) and value else (None, [])
+    if form not in allowed:
+        raise ConfigError(f"{key}={_text(value)}: expected a number of 0 or more, or a form: {', '.join(allowed)}")
+    fewest, most = FORM_NUMBERS[form]
+    if not (fewest <= len(numbers) <= most and all(_is_number(number) and abs(number) <= 1e9 for number in numbers)):
+        raise ConfigError(f"{key}={_text(value)}: {form} takes {fewest} to {most} finite numbers")
+    if form in ("per_iso", "root") and (numbers[0] < 0 or min(numbers) < 0):
+        raise ConfigError(f"{key}={_text(value)}: expected numbers of 0 or more")
+
+
+def _check_black_error(key: str, value: Any) -> None:
+    if value is None or _is_number(value):
+        return
+    by_iso = isinstance(value, list) and bool(value) and value[0] == "by_log_iso"
+    rows = value[1:] if by_iso else [value]
+    if not rows or not all(isinstance(row, list) and len(row) == 4 and all(map(_is_number, row)) for row in rows):
+        raise ConfigError(
+            f"{key}={_text(value)[:60]}: expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"
+        )
+
+
+def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
+    """Refuse an ISO at which nothing was calibrated, whether it is named, drawn or comes with the scene."""
+    key, value = ("scene.iso", scene.iso) if noise.iso is None else ("noise.iso", noise.iso)
+    drawn = law(key, value, ISO_LAWS)
+    ends = drawn.numbers
+    inside = all(branch_of(noise, iso) is not None for iso in ends)
+    if inside and drawn.kind not in ("constant", "choice"):
+        inside = any(branch.iso[0] <= min(ends) and max(ends) <= branch.iso[1] for branch in noise.branches)
+    if not inside:
+        ranges = ", ".join(
+            f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in (b.iso for b in noise.branches)
+        )
+        way = "" if noise.iso is not None else f" (that of scene={scene.name}); give noise.iso=…"
+        raise ConfigError(f"{key}={_text(value)}: noise={noise.name} is calibrated for ISO {ranges}{way}")
+
+
+def _check_scene(scene: SceneConfig) -> None:
+    _check_name("scene.name", scene.name)
+    for key, low, high in (("exposure_s", 1e-7, 1e5), ("temperature_c", -100.0, 150.0), ("exposure_ratio", 1e-3, 1e6)):
+        drawn = law(f"scene.{key}", getattr(scene, key), ISO_LAWS)
+        if not low <= lowest(drawn) <= highest(drawn) <= high:
+            raise ConfigError(f"scene.{key}={_text(getattr(scene, key))}: expected {low:g} to {high:g}")
+
+
+EFFECT_NUMBERS = {
+    "prnu": ("prnu_std",),
+    "dark_current": ("dark_e_per_s",),
+    "hot_pixels": ("hot_pixel_share", "hot_pixel_e_per_s"),
+    "full_well": ("full_well_e",),
+    "dead_pixels": ("dead_pixel_share",),
+}
+"""The numbers of a profile that an effect cannot do without."""
+
+BRANCH_NUMBERS = {"row": "row_std_dn", "column": "column_std_dn", "black_error": "black_error_dn"}
+"""The same, of those that depend on ISO."""
+
+
+def lacks(noise: NoiseConfig, effect: str) -> str | None:
+    """Return a number that a physical profile would have to give for an effect and does not; None if all is there."""
+    missing = (key for key in EFFECT_NUMBERS.get(effect, ()) if getattr(noise, key) is None)
+    if effect in BRANCH_NUMBERS and any(getattr(branch, BRANCH_NUMBERS[effect]) is None for branch in noise.branches):
+        return BRANCH_NUMBERS[effect]
+    return next(missing, None)
+
+
+def effect_switch(effects: EffectsConfig, effect: str) -> str:
+    """Return auto, on or off for an effect: what is said of it by name, else what ``all`` says."""
+    said = getattr(effects, effect) or effects.all
+    return YAML_SWITCHES.get(said, said)
+
+
+def _check_effects(config: Config) -> None:
+    effects = config.effects
+    _one_of("effects.all", YAML_SWITCHES.get(effects.all, effects.all), SWITCHES)
+    if not 0 < effects.tolerance <= 10:
+        raise ConfigError(f"effects.tolerance={effects.tolerance}: expected more than 0, up to 10")
+    if effects.quantise is not None and effect_switch(effects, "quantise") == "off":
+        raise ConfigError("effects.quantise=off: integer output is always rounded and clipped")
+    for effect in (one.name for one in dataclasses.fields(effects) if one.name not in ("all", "tolerance")):
+        switch = getattr(effects, effect)
+        if switch is None:
+            continue
+        _one_of(f"effects.{effect}", YAML_SWITCHES.get(switch, switch), SWITCHES)
+        if effect_switch(effects, effect) == "on" and effect != "quantise":
+            _check_switched_on(config, effect)
+
+
+SWITCHES = ("auto", "on", "off")
+YAML_SWITCHES = {"True": "on", "False": "off"}
+"""What YAML makes of an unquoted on and off in a file."""
+
+
+def _check_switched_on(config: Config, effect: str) -> None:
+    noise = config.noise
+    if (effect == "heteroscedastic") == is_physical(noise):
+        offers = "the physical effects" if is_physical(noise) else "heteroscedastic only"
+        raise ConfigError(f"effects.{effect}=on: noise={noise.name} offers {offers}")
+    number = lacks(noise, effect)
+    if number is not None:
+        raise ConfigError(
+            f"effects.{effect}=on: noise={noise.name} gives no {number}; set noise.{number}, or leave it off"
         )
 
 
@@ -374,6 +744,10 @@ def _in_range(key: str, value: int, low: int, high: int, remark: str = "") -> No
         raise ConfigError(f"{key}={value}: expected {low} to {high}{remark}")
 
 
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -390,6 +764,15 @@ NOT_DATA = {"": ("out", "n_jobs", "self_test"), "source": ("root", "max_failed")
 """Keys that do not decide a dataset's bytes, by group; its ``config.yaml`` leaves them out."""
 
 
+NUMBERS_OR_LAWS = {
+    "gains": ("red", "blue", "inverse_rgb"),
+    "noise": ("a", "b", "iso"),
+    "isp": ("gamma",),
+    "scene": ("iso", "exposure_s", "temperature_c", "exposure_ratio"),
+}
+"""Keys whose numbers can be spelled in two ways, 1 and 1.0."""
+
+
 def source_kind(config: Config) -> str:
     """Return ``folder`` or ``synthetic``: derived, so that a dataset remembers which it was."""
     return "synthetic" if config.source.root is None else "folder"
@@ -402,7 +785,7 @@ def dataset_yaml(config: Config) -> str:
     settings["source"] = {"kind": source_kind(config)} | {
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
-    for group, keys in {"gains": ("red", "blue", "inverse_rgb"), "noise": ("a", "b"), "isp": ("gamma",)}.items():
+    for group, keys in NUMBERS_OR_LAWS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 

@@ -15,27 +15,32 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config import Config
+from unprocess_gen.config import Config, is_physical
 from unprocess_gen.errors import SourceError
 from unprocess_gen.manifest import json_size
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
-from unprocess_gen.plan import plan_image
+from unprocess_gen.plan import plan_image, plan_pairs, plan_with_reasons
+from unprocess_gen.planner import COST_NS, Prediction, facts_of
 from unprocess_gen.records import Plan, Source
-from unprocess_gen.shards import array_xxh3, pair_bytes, shard_bytes
+from unprocess_gen.shards import array_xxh3, image_bytes, shard_bytes
 
 SAMPLE = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What one photograph would give: the bytes of its pair (0 where it fails), the time, its plan or the reason."""
+    """What one photograph would give: the bytes of its pair (0 where it fails), the time, its plan or the reason.
+
+    ``predictions``: what was decided about each effect of a physical profile, and why.
+    """
 
     source: Source
     bytes: int
     seconds: float
     plan: Plan | None
     reason: str | None
+    predictions: tuple[Prediction, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,19 +93,24 @@ def look(config: Config, source: Source) -> Look:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
         return Look(source, 0, time.perf_counter() - started, None, error.reason)
-    plan = plan_image(config, sha256, source.occurrence)
-    pair = make_pair(photograph.srgb, plan)
-    for frame in (pair.clean, pair.noisy):
-        array_xxh3(frame)
-        hashlib.sha256(frame.data)
+    identity, facts = source.stream_identity(sha256), facts_of(photograph.srgb)
+    plans = plan_pairs(config, *identity, facts, source.frame)
+    for plan in plans:
+        pair = make_pair(photograph.srgb, plan)
+        for frame in (pair.clean, pair.noisy) if plan is plans[0] else (pair.noisy,):
+            array_xxh3(frame)
+            hashlib.sha256(frame.data)
     height, width = pair.clean.shape
-    size = pair_bytes(width, height, json_size(source.name))
-    return Look(source, size, time.perf_counter() - started, plan, None)
+    size = image_bytes(width, height, json_size(source.name, len(plans)), len(plans))
+    seconds = time.perf_counter() - started
+    _, predictions = plan_with_reasons(config, *identity, facts)
+    return Look(source, size, seconds, plans[0], None, predictions)
 
 
 def _warm_up(config: Config) -> None:
     """Have the machine code ready, so that its compilation is not taken for the price of an image."""
-    make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan_image(config, "0" * 64))
+    srgb = np.zeros((2, 2, 3), dtype=np.uint8)
+    make_pair(srgb, plan_image(config, "0" * 64, facts=facts_of(srgb)))
 
 
 def _existing(path: Path) -> Path:
@@ -149,6 +159,8 @@ def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
     plans = [one.plan for one in looks if one.plan is not None]
     if not plans:
         return []
+    if is_physical(config.noise):
+        return [*_physical(config, plans), *_table([one.predictions for one in looks if one.plan is not None])]
     sensor, noise, first = config.sensor, config.noise, plans[0]
     profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
     lines = [
@@ -168,12 +180,47 @@ def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
 
 
 EFFECT_REASONS = {
-    "heteroscedastic": "on; shot and read noise as one Gaussian, variance = a_dn·(x - black) + b_dn2",
+    "heteroscedastic": "on; shot and read noise in one, variance = a_dn·(x - black) + b_dn2",
     "quantise": "on; integer output is always rounded and clipped",
 }
 """Why each effect of a two-parameter profile is simulated."""
 
 
-def _span(values: list[float]) -> str:
-    low, high = min(values), max(values)
-    return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+def _span(values: list[float], digits: int = 6) -> str:
+    low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _physical(config: Config, plans: list[Plan]) -> list[str]:
+    """Return what a physical profile and the scene say of the photographs read."""
+    sensor, noise = config.sensor, config.noise
+    assert noise.white_level_dn is not None and noise.black_level_dn is not None
+    physics = [plan.physics for plan in plans if plan.physics is not None]
+    laws = sorted({one.read_law if one.read_law == "gaussian" else "Tukey's law" for one in physics})
+    scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
+    lines = [
+        f"scene     {plans[0].scene}: ISO {_span([one.iso for one in physics])}, "
+        f"{_span([one.exposure_s for one in physics])} s, {_span([one.temperature_c for one in physics])} °C, "
+        f"light divided by {_span([plan.exposure_ratio for plan in plans], 4)}",
+        f"noise     {noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
+        f"on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}) times {scale:.6g}",
+        f"          there K {_span([one.dn_per_e for one in physics], 4)} DN per electron, "
+        f"read noise of deviation {_span([one.read_std_dn for one in physics], 4)} DN ({', '.join(laws)})",
+    ]
+    if noise.assumed:
+        lines.append(f"          assumed, no source gives them: {', '.join(noise.assumed)}")
+    return lines
+
+
+def _table(predictions: list[tuple[Prediction, ...]]) -> list[str]:
+    """Return a line for each effect: of the photograph where it shows best, and how often it is simulated."""
+    lines = ["effect         predicted DN  in the       hidden by DN  simulated  ns/pixel  why"]
+    for of_effect in zip(*predictions, strict=True):
+        best = max(of_effect, key=lambda one: (one.simulated, one.ratio, one.outliers))
+        simulated = f"{sum(one.simulated for one in of_effect)} of {len(of_effect)}"
+        cost = f"{COST_NS[best.effect]:.1f}"
+        lines.append(
+            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:11}  {best.hidden_dn:12.3g}  "
+            f"{simulated:9}  {cost:>8}  {best.why}"
+        )
+    return lines

@@ -1,45 +1,114 @@
 """The plan of an image: every parameter, drawn once. After this nothing is random; all is a function of (pixels, plan).
 
 Draws come from the image's own stream ``parameters`` (`streams`), a counter for each name in `PARAMETERS`, so a draw
-that is not needed moves no other. What needs an exponential, a logarithm or a quantile is computed in `decimal` and
-rounded once, since no libm gives the same last bit everywhere; that costs up to a millisecond an image.
+that is not needed moves no other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from decimal import Decimal, localcontext
+from dataclasses import replace
 
 from unprocess_gen import colour
-from unprocess_gen.config import CameraConfig, Config, gain_laws, noise_laws
-from unprocess_gen.records import Law, Plan
+from unprocess_gen.config import (
+    CameraConfig,
+    Config,
+    dequantizing,
+    effect_switch,
+    gain_laws,
+    is_physical,
+    law,
+    noise_laws,
+    noise_levels,
+)
+from unprocess_gen.draws import draw
+from unprocess_gen.physics import LAWS, plan_physics
+from unprocess_gen.planner import Prediction, decide, light_of
+from unprocess_gen.records import Facts, Plan
 from unprocess_gen.sensor import noise_in_dn
 from unprocess_gen.streams import parameter_uniforms, stream_key
-from unprocess_gen.tables import DIGITS, normal_cdf, normal_quantile
 
-PARAMETERS = ("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b")
+PARAMETERS = (
+    *("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b"),
+    *("iso", "exposure_s", "temperature_c", "exposure_ratio", "read_shape", "read_std", "row_std", "column_std"),
+    "sensor_unit",
+)
 """The number of each draw in the image's stream. Part of every dataset ever made: append, never reorder."""
+
+NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std")
+"""Those that every noise level draws for itself."""
 
 METHODS = ("curve:exact_table", "pair:fused_float64", "normal:inverse_cdf_table")
 """How the stages are computed; the row names them."""
 
 
-def plan_image(config: Config, source_sha256: str, occurrence: int = 0) -> Plan:
+def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None) -> Plan:
     """Draw every parameter of one image.
 
     ``source_sha256`` is the hex digest of the source's bytes and ``occurrence`` the number of identical files before
-    it; together with ``config.seed`` they decide all draws. ``config`` has passed `config.check`.
+    it; together with ``config.seed`` they decide all draws. What the effects of a physical profile are judged by are
+    the ``facts`` of the pixels (`planner.facts_of`). ``config`` has passed `config.check`.
     """
+    return plan_with_reasons(config, source_sha256, occurrence, facts)[0]
+
+
+def plan_pairs(
+    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, frame: int = 0
+) -> tuple[Plan, ...]:
+    """Return the plans of all pairs of one image, level by level and draw by draw: one clean frame, many noisy ones.
+
+    Of a frame of a clip, ``source_sha256`` and ``occurrence`` are the clip's, so that all of its frames share their
+    draws, and ``frame`` is its number, so that they do not share their noise.
+    """
+    levels = range(len(noise_levels(config.noise)))
+    plans = (plan_with_reasons(config, source_sha256, occurrence, facts, level)[0] for level in levels)
+    return tuple(replace(plan, draw=draw, frame=frame) for plan in plans for draw in range(config.noise.draws))
+
+
+def plan_with_reasons(
+    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, level: int = 0
+) -> tuple[Plan, tuple[Prediction, ...]]:
+    """Return the plan of one noise level, and what was predicted of every effect of a physical profile."""
     key = stream_key(config.seed, source_sha256, occurrence)
     uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
+    at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), level), strict=True))
+    uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
+    config = replace(config, noise=noise_levels(config.noise)[level])
+    plan = _plan(config, key, uniforms, level)
+    if not is_physical(config.noise):
+        return plan, ()
+    if facts is None:
+        raise ValueError("a physical profile needs the facts of the pixels")
+    physics = plan_physics(config, uniforms, key)
+    span_dn = float(plan.white_level_dn - plan.black_level_dn)
+    light = light_of(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    predictions = decide(config, physics, facts, light)
+    return (
+        replace(
+            plan,
+            physics=physics,
+            a_dn=physics.dn_per_e,
+            b_dn2=physics.read_std_dn * physics.read_std_dn,
+            effects=tuple(one.effect for one in predictions if one.simulated),
+            skipped=tuple(f"{one.effect}: {one.reason}" for one in predictions if not one.simulated),
+        ),
+        predictions,
+    )
+
+
+def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> Plan:
+    """Return the plan without what a physical profile adds."""
     camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
     red, blue, inverse_rgb = gain_laws(config.gains)
-    a_dn, b_dn2 = plan_noise(config, uniforms)
+    a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
     span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
-    effects, skipped = plan_effects(config.noise.name, a_dn, b_dn2, span_dn)
+    effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
     return Plan(
         seed=config.seed,
         stream_key=key,
+        downscale=config.source.downscale,
+        dequantize=dequantizing(config.source),
+        scene=config.scene.name,
+        exposure_ratio=draw(law("scene.exposure_ratio", config.scene.exposure_ratio, LAWS), uniforms["exposure_ratio"]),
         camera=camera,
         weights=weights,
         rgb2cam=rgb2cam,
@@ -55,13 +124,16 @@ def plan_image(config: Config, source_sha256: str, occurrence: int = 0) -> Plan:
         black_level_dn=config.sensor.black_level_dn,
         white_level_dn=config.sensor.white_level_dn,
         sensor_clip=config.sensor.clip,
+        saturated=config.sensor.saturated,
         noise=config.noise.name,
+        noise_law=config.noise.law,
         a_dn=a_dn,
         b_dn2=b_dn2,
         effects=effects,
         skipped=skipped,
         accuracy="exact",
         methods=METHODS,
+        level=level,
     )
 
 
@@ -111,68 +183,14 @@ def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float
     )
 
 
-def plan_effects(noise: str, a_dn: float, b_dn2: float, span_dn: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the effects that are simulated, in order, and those skipped, each with its reason.
+def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the effects of a two-parameter profile that are simulated, in order, and those skipped, with the reason.
 
     ``span_dn`` is white less black: where the variance is nowhere above 0 in it, there is no noise to simulate.
     """
+    noise = config.noise.name
+    if effect_switch(config.effects, "heteroscedastic") == "off":
+        return ("quantise",), ("heteroscedastic: switched off",)
     if a_dn * span_dn + b_dn2 <= 0:
         return ("quantise",), (f"heteroscedastic: noise={noise} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})",)
     return ("heteroscedastic", "quantise"), ()
-
-
-# ------------------------------------------------------------------------------------------------------------ draws
-
-
-def draw(law: Law, uniform: float, a: float = 0.0) -> float:
-    """Return the value of a law at a uniform in (0, 1); ``a`` is what ``log_linear_in_a`` depends on."""
-    return LAWS[law.kind](uniform, a, *law.numbers)
-
-
-def _constant(u: float, a: float, value: float) -> float:
-    return value
-
-
-def _uniform(u: float, a: float, low: float, high: float) -> float:
-    return low + u * (high - low)
-
-
-def _log_uniform(u: float, a: float, low: float, high: float) -> float:
-    with localcontext(prec=DIGITS):
-        bottom, top = Decimal(low).ln(), Decimal(high).ln()
-        return float((bottom + Decimal(u) * (top - bottom)).exp())
-
-
-def _truncated(u: float, mean: float, std: float, low: float, high: float) -> Decimal:
-    """A normal draw that lies in [low, high]: the quantile of a uniform between their probabilities."""
-    bottom, top = (normal_cdf((Decimal(limit) - Decimal(mean)) / Decimal(std)) for limit in (low, high))
-    value = Decimal(mean) + Decimal(std) * normal_quantile(bottom + Decimal(u) * (top - bottom))
-    return min(max(value, Decimal(low)), Decimal(high))
-
-
-def _truncated_normal(u: float, a: float, mean: float, std: float, low: float, high: float) -> float:
-    with localcontext(prec=DIGITS):
-        return float(_truncated(u, mean, std, low, high))
-
-
-def _inverse_truncated_normal(u: float, a: float, mean: float, std: float, low: float, high: float) -> float:
-    with localcontext(prec=DIGITS):
-        return float(1 / _truncated(u, mean, std, low, high))
-
-
-def _log_linear_in_a(u: float, a: float, slope: float, intercept: float, std: float) -> float:
-    """ln b = slope · ln a + intercept + std · n (Brooks et al. 2019, random_noise_levels(); natural logarithms)."""
-    with localcontext(prec=DIGITS):
-        line = Decimal(slope) * Decimal(a).ln() + Decimal(intercept)
-        return float((line + Decimal(std) * normal_quantile(Decimal(u))).exp())
-
-
-LAWS: dict[str, Callable[..., float]] = {
-    "constant": _constant,
-    "uniform": _uniform,
-    "log_uniform": _log_uniform,
-    "truncated_normal": _truncated_normal,
-    "inverse_truncated_normal": _inverse_truncated_normal,
-    "log_linear_in_a": _log_linear_in_a,
-}
-"""What each law does with a uniform in (0, 1)."""

@@ -1,0 +1,432 @@
+"""The numbers of a physical profile on the sensor in use, against mpmath and the sources' own formulas."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from statistics import NormalDist
+from typing import Any
+
+import mpmath
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.config import BranchConfig, Config, check
+from unprocess_gen.errors import ConfigError
+from unprocess_gen.physics import number, plan_physics
+from unprocess_gen.plan import PARAMETERS, plan_image
+from unprocess_gen.records import Facts, Physics
+
+Settings = Callable[..., Config]
+
+MIDDLE = dict.fromkeys(PARAMETERS, 0.5)
+FACTS = Facts(64, 48, 256, 0, 128, 255)
+
+SAME_SENSOR = {
+    "imx385": (12, 240, 4095),
+    "sony_a7s2": (14, 512, 16383),
+    "nikon_d850": (14, 400, 16383),
+    "canon_5d4": (14, 512, 16383),
+    "canon_70d": (14, 2048, 15000),
+    "canon_700d": (14, 2048, 15000),
+    "oppo_reno10x": (10, 64, 1023),
+}
+"""Bits, black and white level that each profile was calibrated at: there its DN are the sensor's."""
+
+
+def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: str) -> Config:
+    bits, black, white = SAME_SENSOR[noise]
+    config = settings(f"noise={noise}", f"noise.iso={iso}", *overrides)
+    sensor = replace(config.sensor, bits=bits, black_level_dn=black, white_level_dn=white)
+    config = replace(config, sensor=sensor)
+    check(config)
+    return config
+
+
+def physics(config: Config, key: int = 0, **uniforms: float) -> Physics:
+    return plan_physics(config, MIDDLE | uniforms, key)
+
+
+def close(value: float, expected: Any, rel: float = 1e-15) -> bool:
+    return bool(mpmath.almosteq(mpmath.mpf(value), expected, rel_eps=rel, abs_eps=0))
+
+
+def tukey_std(shape: float) -> Any:
+    """The deviation of Tukey's law of scale 1, by integrating its squared quantiles."""
+    with mpmath.workdps(40):
+        if shape == 0:
+            return mpmath.pi / mpmath.sqrt(3)
+        power = mpmath.mpf(shape)
+        return mpmath.sqrt(2 / power**2 * (1 / (1 + 2 * power) - mpmath.beta(power + 1, power + 1)))
+
+
+# The forms ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [0, 3, 2.5])
+def test_a_number_is_itself(value: float) -> None:
+    assert number(value, iso=800) == value
+
+
+def test_a_number_that_is_not_given_is_0() -> None:
+    assert number(None, iso=800) == 0
+
+
+@given(iso=st.floats(1, 1e6), slope=st.floats(1e-6, 10), intercept=st.floats(0, 10))
+def test_per_iso_is_a_line_in_iso(iso: float, slope: float, intercept: float) -> None:
+    with mpmath.workdps(40):
+        assert close(number(["per_iso", slope], iso=iso), mpmath.mpf(slope) * iso)
+        expected = mpmath.mpf(slope) * iso + intercept
+        assert close(number(["per_iso", slope, intercept], iso=iso), expected)
+
+
+@given(iso=st.floats(1, 1e6), numbers=st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=3))
+def test_a_root_is_the_deviation_of_a_variance_that_is_a_polynomial(iso: float, numbers: list[float]) -> None:
+    with mpmath.workdps(40):
+        variance = sum(mpmath.mpf(one) * mpmath.mpf(iso) ** power for power, one in enumerate(numbers))
+        assert close(number(["root", *numbers], iso=iso), mpmath.sqrt(variance))
+
+
+uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) * 2.0**-52)
+
+
+@given(gain=st.floats(1e-4, 100), slope=st.floats(-2, 2), intercept=st.floats(-3, 3), std=st.floats(0, 1), u=uniforms)
+def test_a_line_is_straight_in_the_logarithms_with_a_normal_scatter(
+    gain: float, slope: float, intercept: float, std: float, u: float
+) -> None:
+    with mpmath.workdps(40):
+        normal = mpmath.sqrt(2) * mpmath.erfinv(2 * mpmath.mpf(u) - 1)
+        expected = mpmath.exp(slope * mpmath.log(gain) + intercept + std * normal)
+        assert close(number(["line", slope, intercept, std], iso=100, gain=gain, uniform=u), expected)
+
+
+@given(gain=st.floats(1e-4, 100), shape=st.floats(-0.4, 2).filter(lambda one: abs(one) > 1e-3))
+def test_a_scale_line_is_a_line_times_the_deviation_of_its_law(gain: float, shape: float) -> None:
+    with mpmath.workdps(40):
+        expected = mpmath.exp(mpmath.mpf(0.5) * mpmath.log(gain) + mpmath.mpf(0.25)) * tukey_std(shape)
+        assert close(number(["scale_line", 0.5, 0.25, 0], iso=100, gain=gain, shape=shape), expected)
+
+
+def test_the_scatter_of_a_line_is_lognormal_in_its_uniform() -> None:
+    """Equal steps of probability; the logarithm is the normal quantile times the deviation."""
+    for k in range(1, 200):
+        value = number(["line", 0, 1, 0.3], iso=100, gain=5.0, uniform=k / 200)
+        assert math.isclose((math.log(value) - 1) / 0.3, NormalDist().inv_cdf(k / 200), abs_tol=1e-9)
+
+
+def test_black_errors_of_a_table_share_the_range_of_ln_iso(settings: Settings) -> None:
+    config = on_its_own_sensor(settings, "nikon_d850", 100)
+    table = [[float(row), 0.0, 0.0, -float(row)] for row in range(6)]
+    branch = replace(config.noise.branches[0], iso=[100, 6400], black_error_dn=["by_log_iso", *table])
+    config = replace(config, noise=replace(config.noise, branches=[branch]))
+    for iso in (100, 150, 199, 201, 399, 401, 1599, 1601, 3199, 3201, 6400):
+        config.noise.iso = iso
+        row = min(int(math.log2(iso / 100)), 5)
+        assert physics(config).black_error_dn == (row, 0.0, 0.0, -row)
+
+
+def test_a_table_for_a_single_iso_gives_its_first_row(settings: Settings) -> None:
+    config = on_its_own_sensor(settings, "imx385", 1600)
+    branch = replace(config.noise.branches[0], black_error_dn=["by_log_iso", [1.0, 2.0, 3.0, 4.0], [0.0] * 4])
+    config = replace(config, noise=replace(config.noise, branches=[branch]))
+    assert physics(config).black_error_dn == (1.0, 2.0, 3.0, 4.0)
+
+
+# The profiles that are shipped ----------------------------------------------------------------------------------------
+
+
+def line_of(form: list[Any], gain: Any, shape: float | None = None) -> Any:
+    """What a line comes to at the middle of its scatter."""
+    with mpmath.workdps(40):
+        value = mpmath.exp(mpmath.mpf(form[1]) * mpmath.log(gain) + form[2])
+        return value if shape is None else value * tukey_std(shape)
+
+
+@pytest.mark.parametrize(
+    ("iso", "slope", "read", "row"),
+    [
+        (100, 0.000939161, (0.462105, 0.565715), (0.527536, -0.5917)),
+        (1600, 9.563e-4, (0.740, 0.862), (0.788, -0.342)),
+        (2000, 9.563e-4, (0.749, -0.123), (0.629, -1.510)),
+        (12800, 9.563e-4, (0.749, -0.123), (0.629, -1.510)),
+    ],
+)
+def test_sony_a7s2_on_either_side_of_its_dual_gain(
+    settings: Settings, iso: int, slope: float, read: tuple[float, float], row: tuple[float, float]
+) -> None:
+    made = physics(on_its_own_sensor(settings, "sony_a7s2", iso))
+    with mpmath.workdps(40):
+        gain = mpmath.mpf(slope) * iso
+        assert close(made.dn_per_e, gain)
+        assert made.read_shape == -0.0857  # the middle one of 18
+        assert close(made.read_std_dn, line_of(["", *read], gain, -0.0857))
+        assert close(made.row_std_dn, line_of(["", *row], gain))
+
+
+def test_the_dual_gain_of_sony_a7s2_lowers_the_read_noise_at_its_step(settings: Settings) -> None:
+    below, above = (physics(on_its_own_sensor(settings, "sony_a7s2", iso)) for iso in (1600, 2000))
+    assert above.dn_per_e > below.dn_per_e
+    assert above.read_std_dn < 0.5 * below.read_std_dn
+
+
+@pytest.mark.parametrize(
+    ("noise", "least_gain"),
+    [("nikon_d850", 0.00415039), ("canon_5d4", 0.0021819), ("canon_70d", 0.00407497), ("canon_700d", 0.00447629)],
+)
+@pytest.mark.parametrize("iso", [100, 400, 1234, 6400])
+def test_the_profiles_of_eld(settings: Settings, noise: str, least_gain: float, iso: int) -> None:
+    """K = Kmin · ISO / 100, Kmin in DN per electron at ISO 1 here; each line at the middle of its scatter."""
+    config = on_its_own_sensor(settings, noise, iso)
+    branch, made = config.noise.branches[0], physics(config)
+    with mpmath.workdps(40):
+        gain = mpmath.mpf(least_gain) * iso
+        shape = branch.read_shape[1:][(len(branch.read_shape) - 1) // 2]
+        assert close(made.dn_per_e, gain)
+        assert made.read_shape == shape
+        assert close(made.read_std_dn, line_of(branch.read_std_dn, gain, shape))
+        assert close(made.row_std_dn, line_of(branch.row_std_dn, gain))
+    table = branch.black_error_dn[1:]
+    row = table[min(int(math.log(iso / 100) / math.log(64) * len(table)), len(table) - 1)]
+    assert made.black_error_dn == tuple(row)
+
+
+@pytest.mark.parametrize("iso", [100, 800, 6400])
+def test_the_polynomials_of_pmrid(settings: Settings, iso: int) -> None:
+    """run_benchmark.py: K = 0.0005995267·ISO + 0.00868861; Sigma = 7.11772e-7·ISO² + 6.514934e-4·ISO + 0.11492713."""
+    made = physics(on_its_own_sensor(settings, "oppo_reno10x", iso))
+    with mpmath.workdps(40):
+        assert close(made.dn_per_e, mpmath.mpf(0.0005995267) * iso + mpmath.mpf(0.00868861))
+        sigma = mpmath.mpf(7.11772e-7) * iso**2 + mpmath.mpf(6.514934e-4) * iso + mpmath.mpf(0.11492713)
+        assert close(made.read_std_dn, mpmath.sqrt(sigma))
+    assert (made.read_law, made.row_std_dn, made.black_error_dn) == ("gaussian", 0.0, (0.0,) * 4)
+
+
+@pytest.mark.parametrize(
+    ("iso", "a", "b", "error"),
+    [
+        (1600, 3.513262, 11.917691, -1.127),
+        (3200, 6.955588, 38.117816, -1.695),
+        (6400, 13.486051, 130.818508, -3.259),
+        (12800, 26.585953, 484.53979, -6.681),
+        (25600, 52.032536, 1819.818657, -12.669),
+    ],
+)
+def test_imx385_has_the_gain_and_the_read_variance_of_crvd(
+    settings: Settings, iso: int, a: float, b: float, error: float
+) -> None:
+    made = physics(on_its_own_sensor(settings, "imx385", iso))
+    assert made.dn_per_e == a
+    assert close(made.read_std_dn, mpmath.sqrt(b))
+    assert close(made.row_std_dn, line_of(["", 0.9337, -2.1969], mpmath.mpf(a)))
+    assert made.black_error_dn == (error,) * 4
+    two = settings(f"noise=imx385_iso{iso}").noise
+    assert (two.a, two.b) == (a, b)
+
+
+@pytest.mark.parametrize("noise", SAME_SENSOR)
+def test_numbers_of_a_profile_go_to_another_sensor_by_the_ratio_of_their_ranges(settings: Settings, noise: str) -> None:
+    iso = 1600
+    _, black, white = SAME_SENSOR[noise]
+    own, here = physics(on_its_own_sensor(settings, noise, iso)), physics(settings(f"noise={noise}", "noise.iso=1600"))
+    scale = (4095 - 240) / (white - black)
+    for name in ("dn_per_e", "read_std_dn", "row_std_dn"):
+        assert getattr(here, name) == getattr(own, name) * scale
+    assert here.black_error_dn == tuple(error * scale for error in own.black_error_dn)
+    electrons = (
+        "prnu_std",
+        "dark_e",
+        "hot_pixel_share",
+        "hot_pixel_e",
+        "full_well_e",
+        "dead_pixel_share",
+        "read_shape",
+    )
+    assert all(getattr(here, name) == getattr(own, name) for name in electrons)
+
+
+# What is drawn --------------------------------------------------------------------------------------------------------
+
+
+def test_each_number_is_drawn_from_its_own_uniform(settings: Settings) -> None:
+    config = on_its_own_sensor(settings, "canon_70d", 800)
+    config.scene.exposure_s, config.scene.temperature_c = ["log_uniform", 0.01, 1.0], ["uniform", 10, 30]
+    middle = physics(config)
+    moves = {
+        "read_std": {"read_std_dn"},
+        "row_std": {"row_std_dn"},
+        "read_shape": {"read_shape", "read_std_dn"},
+        "exposure_s": {"exposure_s", "dark_e", "hot_pixel_e"},
+        "temperature_c": {"temperature_c", "dark_e", "hot_pixel_e"},
+        "iso": set(),
+        "column_std": set(),
+    }
+    for uniform, moved in moves.items():
+        other = physics(config, **{uniform: 0.9})
+        fields = Physics.__dataclass_fields__
+        assert {name for name in fields if getattr(other, name) != getattr(middle, name)} == moved, uniform
+
+
+def test_a_shape_is_each_of_the_choices_as_often(settings: Settings) -> None:
+    config = on_its_own_sensor(settings, "sony_a7s2", 800)
+    shapes = config.noise.branches[1].read_shape[1:]
+    drawn = [physics(config, read_shape=(k + 0.5) / len(shapes)).read_shape for k in range(len(shapes))]
+    assert drawn == shapes
+
+
+@pytest.mark.parametrize(
+    ("law", "uniform", "iso"),
+    [
+        ("3200", 0.3, 3200.0),
+        ("[choice,400,800,1600]", 0.1, 400.0),
+        ("[choice,400,800,1600]", 0.99, 1600.0),
+        ("[uniform,400,1200]", 0.25, 600.0),
+        ("[log_uniform,400,1600]", 0.5, 800.0),
+    ],
+)
+def test_iso_is_drawn_from_its_law(settings: Settings, law: str, uniform: float, iso: float) -> None:
+    config = settings("noise=sony_a7s2", f"noise.iso={law}")
+    check(config)
+    assert math.isclose(physics(config, iso=uniform).iso, iso, rel_tol=1e-15)
+
+
+def test_the_isos_of_a_dataset_are_those_of_its_law(settings: Settings) -> None:
+    config = settings("noise=oppo_reno10x", "noise.iso=[log_uniform,100,6400]")
+    check(config)
+    isos = sorted(
+        plan.physics.iso
+        for n in range(200)
+        if (plan := plan_image(config, f"{n:064x}", facts=FACTS)).physics is not None
+    )
+    assert 100 <= isos[0] < 130
+    assert 5000 < isos[-1] <= 6400
+    assert 500 < isos[100] < 1300
+
+
+@pytest.mark.parametrize(("celsius", "times"), [(25, 1.0), (32, 2.0), (39, 4.0), (18, 0.5), (28.5, math.sqrt(2))])
+def test_dark_current_doubles_every_so_many_degrees(settings: Settings, celsius: float, times: float) -> None:
+    made = physics(settings("noise=imx385", "noise.iso=1600", f"scene.temperature_c={celsius}", "scene.exposure_s=4"))
+    assert math.isclose(made.dark_e, 4 * times, rel_tol=1e-15)
+    assert math.isclose(made.hot_pixel_e, 200 * times, rel_tol=1e-15)
+
+
+@pytest.mark.parametrize("doubling", [5.0, 8.0])
+def test_the_doubling_is_the_profiles_own(settings: Settings, doubling: float) -> None:
+    overrides = (f"noise.dark_doubling_c={doubling}", "noise.dark_reference_c=20", "scene.temperature_c=45")
+    made = physics(settings("noise=imx385", "noise.iso=1600", "scene.exposure_s=1", *overrides))
+    assert close(made.dark_e, mpmath.mpf(2) ** (25 / mpmath.mpf(doubling)))
+
+
+def test_every_image_has_a_body_of_its_own_by_default(settings: Settings) -> None:
+    config = settings("noise=imx385", "noise.iso=1600")
+    bodies = {physics(config, key).body_key for key in range(50)}
+    assert len(bodies) == 50
+    assert physics(config, 7) == physics(config, 7)
+
+
+def test_a_number_of_bodies_is_shared_by_all_images(settings: Settings) -> None:
+    config = settings("noise=imx385", "noise.iso=1600", "sensor.units=3")
+    made = [physics(config, key, sensor_unit=(key + 0.5) / 30) for key in range(30)]
+    assert [one.sensor_unit for one in made] == [str(key // 10) for key in range(30)]
+    assert len({one.body_key for one in made}) == 3
+    assert len({(one.sensor_unit, one.body_key) for one in made}) == 3
+
+
+def test_a_body_is_the_same_at_every_iso_and_another_with_another_seed_or_camera(settings: Settings) -> None:
+    config = settings("noise=canon_70d", "noise.iso=1600", "sensor.units=1")
+    body = physics(config).body_key
+    assert physics(replace(config, noise=replace(config.noise, iso=100))).body_key == body
+    assert physics(replace(config, seed=1)).body_key != body
+    assert physics(settings("noise=canon_700d", "noise.iso=1600", "sensor.units=1")).body_key != body
+
+
+# What is refused ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ("noise=imx385", "scene=daylight"),
+            "scene.iso=100: noise=imx385 is calibrated for ISO 1600, 3200, 6400, 12800, 25600 (that of "
+            "scene=daylight); give noise.iso=…",
+        ),
+        (
+            ("noise=sony_a7s2", "noise.iso=1800"),
+            "noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 200, 200 to 1600, 2000 to 12800",
+        ),
+        (("noise=sony_a7s2", "noise.iso=[uniform,1000,3000]"), "noise.iso=[uniform, 1000, 3000]: noise=sony_a7s2 is"),
+        (("noise=imx385", "noise.iso=[uniform,1600,3200]"), "noise.iso=[uniform, 1600, 3200]: noise=imx385 is"),
+        (("noise=imx385", "noise.iso=[choice,1600,100]"), "noise.iso=[choice, 1600, 100]: noise=imx385 is calibrated"),
+        (("noise=nikon_d850", "noise.iso=99"), "noise.iso=99: noise=nikon_d850 is calibrated for ISO 100 to 6400"),
+        (("noise=imx385_iso3200", "noise.iso=1600"), "noise.iso=1600: noise=imx385_iso3200 holds for one ISO"),
+        (("noise=nikon_d850", "noise.a=1"), "noise.a=1: noise=nikon_d850 is a physical profile; set iso"),
+        (("noise=nikon_d850", "noise.b=1"), "noise.b=1: noise=nikon_d850 is a physical profile; set iso"),
+        (("noise=nikon_d850", "effects.quantise=off"), "effects.quantise=off: integer output is always rounded"),
+        (("noise=nikon_d850", "effects.tolerance=0"), "effects.tolerance=0.0: expected more than 0, up to 10"),
+        (("noise=nikon_d850", "effects.shot=maybe"), "effects.shot=maybe: expected one of auto, on, off"),
+        (("noise=nikon_d850", "effects.heteroscedastic=on"), "noise=nikon_d850 offers the physical effects"),
+        (("noise=imx385_iso3200", "effects.shot=on"), "noise=imx385_iso3200 offers heteroscedastic only"),
+        (("noise=nikon_d850", "noise.dark_e_per_s=-1"), "noise.dark_e_per_s=-1.0: expected 0 to 1e+06"),
+        (("noise=nikon_d850", "noise.hot_pixel_share=1.5"), "noise.hot_pixel_share=1.5: expected 0 to 1"),
+        (("noise=nikon_d850", "noise.assumed=[gain]"), "noise.assumed=gain: expected one of prnu_std, "),
+        (("noise=nikon_d850", "sensor.units=0"), "sensor.units=0: expected image, or a number of bodies"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(
+    settings: Settings, overrides: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        check(settings(*overrides))
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_effect_that_does_not_exist_is_refused_at_the_door(cli: Callable[..., Any]) -> None:
+    done = cli("noise=nikon_d850", "effects.foo=on")
+    assert done.returncode == 2
+    assert "foo" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"read_std_dn": ["cubic", 1]},
+            "branches[0].read_std_dn=[cubic, 1]: expected a number of 0 or more, or a form",
+        ),
+        ({"read_std_dn": ["per_iso", 1]}, "or a form: root, line, scale_line"),
+        ({"read_std_dn": ["line", 1, 2]}, "line takes 3 to 3 finite numbers"),
+        ({"read_std_dn": ["root"]}, "root takes 1 to 3 finite numbers"),
+        ({"read_std_dn": ["root", -1]}, "expected numbers of 0 or more"),
+        ({"read_std_dn": -1}, "branches[0].read_std_dn=-1: expected a number of 0 or more"),
+        ({"read_std_dn": None}, "branches[0].read_std_dn=null: expected a number of 0 or more"),
+        ({"row_std_dn": ["scale_line", 1, 2, 0]}, "branches[0].row_std_dn=[scale_line, 1, 2, 0]: expected a number"),
+        ({"dn_per_e": ["per_iso", 1, 2, 3]}, "per_iso takes 1 to 2 finite numbers"),
+        ({"dn_per_e": 0}, "branches[0].dn_per_e=0: expected a gain above 0"),
+        ({"read_shape": -0.5}, "branches[0].read_shape=-0.5: Tukey's law has a variance for shapes above -0.5 only"),
+        ({"read_shape": ["choice", 0.1, -0.6]}, "Tukey's law has a variance for shapes above -0.5 only"),
+        ({"read_law": "cauchy"}, "branches[0].read_law=cauchy: expected one of gaussian, tukey"),
+        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
+        ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
+        ({"iso": [800, 100]}, "branches[0].iso=[800, 100]: expected the lowest and the highest ISO"),
+    ],
+)
+def test_a_branch_that_cannot_be_meant_is_refused(settings: Settings, change: dict[str, Any], message: str) -> None:
+    config = settings("noise=nikon_d850")
+    branch = replace(config.noise.branches[0], **change)
+    config = replace(config, noise=replace(config.noise, branches=[branch, *config.noise.branches[1:]]))
+    with pytest.raises(ConfigError) as refused:
+        check(config)
+    assert message in str(refused.value)
+
+
+def test_a_branch_without_optional_numbers_has_none_of_their_effects(settings: Settings) -> None:
+    config = settings("noise=nikon_d850", "noise.iso=100")
+    branch = BranchConfig(iso=[100, 100], dn_per_e=1.0, read_std_dn=2.0)
+    config = replace(config, noise=replace(config.noise, branches=[branch], prnu_std=None, dark_e_per_s=None))
+    check(config)
+    made = physics(config)
+    assert (made.row_std_dn, made.column_std_dn, made.black_error_dn) == (0.0, 0.0, (0.0,) * 4)
+    assert (made.prnu_std, made.dark_e, made.full_well_e, made.read_shape) == (0.0, 0.0, 0.0, 0.0)
