@@ -52,7 +52,7 @@ def undisturbed(photographs: Path, make: Make, tree_hash: Hash) -> str:
 
 def own_lines(err: str) -> list[str]:
     """Return the lines of stderr but progress, and what loky's own tracker process may say."""
-    return [line for line in err.splitlines() if "pairs/s" not in line and not any(p in line for p in LOKY_TRACKER)]
+    return [line for line in err.splitlines() if "images/s" not in line and not any(p in line for p in LOKY_TRACKER)]
 
 
 def wait_for_the_end(leader: int) -> None:

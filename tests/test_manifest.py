@@ -6,8 +6,9 @@ import dataclasses
 import io
 import json
 import math
+import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unprocess_gen.config import RATES
+from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import REASONS, DamageError
 from unprocess_gen.manifest import (
     COLUMNS,
@@ -31,8 +34,9 @@ from unprocess_gen.manifest import (
     row_json,
     write_rows,
 )
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Counts, Pair, Plan, Source
+from unprocess_gen.plan import METHODS, plan_image, plan_with_reasons
+from unprocess_gen.planner import STATISTICS
+from unprocess_gen.records import Counts, Facts, Pair, Physics, Plan, Source
 
 CONTRACT = [
     "key",
@@ -88,14 +92,26 @@ CONTRACT = [
 ]
 
 SHA256 = "ab" * 32
+FACTS = Facts(width=3, height=2, codes=256, dark_code=3, middle_code=90, bright_code=250)
 SOURCE = Source(3, "a, b.png", "a, b.png", 1234)
 PAIR = Pair(np.zeros((2, 3), np.uint16), np.zeros((2, 3), np.uint16), Counts(1, 2, 3, 4, 5, 6))
 PLAN = Plan(
-    seed=0, stream_key=0x1F, camera="convex", weights=(0.1, 0.2, 0.3, 0.4), rgb2cam=(0.6, 0.3, 0.1) * 3, red_gain=2.0,
+    seed=0, stream_key=0x1F, downscale=1, dequantize="off", scene="daylight", exposure_ratio=1.0, camera="convex",
+    weights=(0.1, 0.2, 0.3, 0.4), rgb2cam=(0.6, 0.3, 0.1) * 3, red_gain=2.0,
     blue_gain=1.7, inverse_rgb_gain=0.8, tone="smoothstep", gamma=2.2, highlight="per_channel", highlight_threshold=0.9,
-    pattern="RGGB", bits=12, black_level_dn=240, white_level_dn=4095, sensor_clip="sensor", noise="imx385_iso3200",
-    a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"), skipped=(), accuracy="exact", methods=("a:b", "c:d"),
+    pattern="RGGB", bits=12, black_level_dn=240, white_level_dn=4095, sensor_clip="sensor", saturated="noisy",
+    noise="imx385_iso3200", noise_law="gaussian", a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"),
+    skipped=(), accuracy="exact", methods=("a:b", "c:d"),
 )  # fmt: skip
+PHYSICS = Physics(
+    iso=800.0, exposure_s=0.02, temperature_c=25.0, dn_per_e=1.5, prnu_std=0.005, dark_e=0.02, dark_offset="removed",
+    hot_pixel_share=1e-5, hot_pixel_e=1.0, full_well_e=0.0, read_law="tukey", read_shape=-0.1, read_std_dn=3.0,
+    row_std_dn=0.5, column_std_dn=0.25, black_error_dn=(0.1, -0.2, 0.3, -0.4), dead_pixel_share=1e-6,
+    sensor_unit="000000000000001f", body_key=0xF1, fixed_pattern_in_clean=True,
+)  # fmt: skip
+PHYSICAL = dataclasses.replace(
+    PLAN, effects=("prnu", "shot", "read", "quantise"), skipped=("row: hidden",), physics=PHYSICS
+)
 
 
 def csv_text(rows: Iterable[Row]) -> str:
@@ -105,7 +121,7 @@ def csv_text(rows: Iterable[Row]) -> str:
 
 
 def row_of(plan: Plan = PLAN, source: Source = SOURCE) -> Row:
-    return ok_row(source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32))
+    return ok_row(key_text(source.index), source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32))
 
 
 def through_csv(rows: list[Row], folder: Path) -> list[Row]:
@@ -117,10 +133,40 @@ def through_csv(rows: list[Row], folder: Path) -> list[Row]:
 finite = st.floats(allow_nan=False, allow_infinity=False)
 count = st.integers(0, 2**40)
 word = st.text(st.characters(codec="ascii", categories=["Ll", "Nd"]), min_size=1, max_size=9)
+physics = st.builds(
+    Physics,
+    iso=finite,
+    exposure_s=finite,
+    temperature_c=finite,
+    dn_per_e=finite,
+    prnu_std=finite,
+    dark_e=finite,
+    dark_offset=st.sampled_from(["removed", "kept"]),
+    hot_pixel_share=finite,
+    hot_pixel_e=finite,
+    full_well_e=finite,
+    read_law=st.sampled_from(["gaussian", "tukey"]),
+    read_shape=finite,
+    read_std_dn=finite,
+    row_std_dn=finite,
+    column_std_dn=finite,
+    black_error_dn=st.tuples(*[finite] * 4),
+    dead_pixel_share=finite,
+    sensor_unit=st.integers(0, 2**64 - 1).map("{:016x}".format) | st.integers(0, 10**6).map(str),
+    body_key=st.integers(0, 2**64 - 1),
+    fixed_pattern_in_clean=st.booleans(),
+)
 plans = st.builds(
     Plan,
     seed=st.integers(0, 2**63 - 1),
     stream_key=st.integers(0, 2**64 - 1),
+    downscale=st.integers(1, 64),
+    dequantize=st.sampled_from(["off", "dither"]),
+    level=st.integers(0, 99),
+    draw=st.integers(0, 99),
+    frame=st.integers(0, 10**9),
+    scene=word,
+    exposure_ratio=finite,
     camera=word,
     weights=st.tuples(*[finite] * 4),
     rgb2cam=st.tuples(*[finite] * 9),
@@ -136,13 +182,16 @@ plans = st.builds(
     black_level_dn=st.integers(0, 65534),
     white_level_dn=st.integers(1, 65535),
     sensor_clip=st.sampled_from(["sensor", "black"]),
+    saturated=st.sampled_from(["noisy", "pinned"]),
     noise=word,
+    noise_law=st.sampled_from(["gaussian", "poisson"]),
     a_dn=finite,
     b_dn2=finite,
     effects=st.lists(word, max_size=3).map(tuple),
     skipped=st.lists(word, max_size=3).map(tuple),
     accuracy=word,
     methods=st.lists(word, max_size=3).map(tuple),
+    physics=st.none() | physics,
 )
 names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40)
 
@@ -163,9 +212,10 @@ def test_every_column_says_what_it_means() -> None:
 
 
 def test_every_value_of_a_row_has_the_type_of_its_column() -> None:
-    row = row_of()
-    assert list(row) == list(NAMES)
-    assert_typed(row)
+    for plan in (PLAN, PHYSICAL):
+        row = row_of(plan)
+        assert list(row) == list(NAMES)
+        assert_typed(row)
 
 
 def assert_typed(row: Row) -> None:
@@ -175,7 +225,13 @@ def assert_typed(row: Row) -> None:
 
 
 def test_no_value_of_a_pair_is_none() -> None:
-    assert None not in row_of().values()
+    assert None not in row_of(PLAN).values()
+    assert None not in row_of(PHYSICAL).values()
+
+
+def test_physical_columns_of_another_profile_are_0_or_none() -> None:
+    values = {name: row_of(PLAN)[name] for name in PHYSICAL_NAMES}
+    assert values == {column.name: "none" if column.type is str else 0 for column in COLUMNS if column.name in values}
 
 
 @pytest.mark.parametrize(("gamma", "value"), [(2.2, 2.2), (1.0, 1), ("srgb", "srgb")])
@@ -213,7 +269,7 @@ def test_a_row_read_back_from_csv_holds_the_same_plan_to_the_last_bit(
 
 @given(plans)
 def test_a_row_read_back_from_json_holds_the_same_plan(plan: Plan) -> None:
-    assert repr(plan_of(json.loads(row_json(row_of(plan))))) == repr(plan)
+    assert repr(plan_of(json.loads(row_json([row_of(plan)])))) == repr(plan)
 
 
 @given(plan=plans)
@@ -235,10 +291,30 @@ def test_real_plans_come_back(settings: Callable[..., Any], tmp_path: Path) -> N
             assert plan_of(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
+@pytest.mark.parametrize("noise", ["sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x"])
+def test_real_physical_plans_come_back(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
+    for scene in ("daylight", "night"):
+        plan = plan_image(settings(f"noise={noise}", f"scene={scene}"), SHA256, facts=FACTS)
+        assert plan.physics is not None
+        assert plan_of(through_csv([row_of(plan)], tmp_path)[0]) == plan
+
+
 @pytest.mark.parametrize("name", [name for name in NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}])
 def test_a_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
         plan_of({**row_of(), name: None})
+
+
+PHYSICAL_NAMES = NAMES[NAMES.index("iso") : NAMES.index("level")]
+NUMBERED = ("level", "draw", "frame", "downscale", "dequantize")
+
+
+@pytest.mark.parametrize(
+    "name", [*("scene", "exposure_ratio", "saturated_as", "noise_law"), *PHYSICAL_NAMES, *NUMBERED]
+)
+def test_a_physical_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
+    with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
+        plan_of({**row_of(PHYSICAL), name: None})
 
 
 @pytest.mark.parametrize(
@@ -316,17 +392,17 @@ def test_a_manifest_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
 
 @given(plans, names)
 def test_json_takes_the_bytes_that_the_name_alone_decides(plan: Plan, name: str) -> None:
-    assert len(row_json(row_of(plan, dataclasses.replace(SOURCE, name=name)))) == json_size(name)
+    assert len(row_json([row_of(plan, dataclasses.replace(SOURCE, name=name))])) == json_size(name)
 
 
 def test_json_is_typed() -> None:
-    loaded = json.loads(row_json(row_of()))
+    loaded = json.loads(row_json([row_of()]))
     assert loaded == dict(row_of())
     assert_typed(loaded)
 
 
 def test_json_is_ascii_and_one_line() -> None:
-    content = row_json(row_of(PLAN, dataclasses.replace(SOURCE, name="été \U0001f308.png")))
+    content = row_json([row_of(PLAN, dataclasses.replace(SOURCE, name="été \U0001f308.png"))])
     assert content.isascii()
     assert content.index(b"\n") == len(content) - 1
 
@@ -335,41 +411,89 @@ LONGEST = -sys.float_info.min
 """A double whose spelling takes 24 characters, the most there are."""
 
 
-def longest_row() -> Row:
-    """The longest row that settings can lead to."""
+LONGEST_NAME = "n" * 100
+"""What a camera, a scene or a noise profile may be called at most (`test_config` refuses longer ones)."""
+
+
+def widened(reason: str) -> str:
+    """A prediction's reason with the widest numbers and the longest statistic in it."""
+    reason = re.sub(r"(?<![\w.])\d[\d.]*(e[+-]?\d+)?", f"{1.23456e-300:g}", reason)
+    return re.sub(f"in the ({'|'.join(STATISTICS)})", f"in the {max(STATISTICS, key=len)}", reason)
+
+
+def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
+    """The longest thing the planner says of each effect of a profile, of all that it has to say: what it predicts,
+    that it is switched off, that a number is assumed, that a profile with the longest name gives none.
+    """
+    lacking = settings("noise=oppo_reno10x", "effects.tolerance=1.23456")
+    for key in ("prnu_std", "dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s", "dead_pixel_share"):
+        setattr(lacking.noise, key, None)
+    half = settings("noise=oppo_reno10x")
+    half.noise.hot_pixel_e_per_s = None  # another number that is missing, with a longer name
+    lacking.noise.name = half.noise.name = LONGEST_NAME
+    all_given = settings("noise=nikon_d850", "noise.full_well_e=1e5", "noise.assumed=[]")
+    all_given.noise.branches[0].column_std_dn = 1.0
+    assumed = settings("noise=nikon_d850")
+    assumed.noise.assumed = [key for key, _, _ in RATES]
+    for config in (lacking, half, all_given, assumed):
+        config.noise.iso = 3200
+    found: dict[str, list[str]] = {effect: [] for effect in EFFECTS}
+    for config in (lacking, half, all_given, assumed, settings("noise=nikon_d850", "effects.all=off")):
+        for one in plan_with_reasons(config, SHA256, facts=FACTS)[1]:
+            found[one.effect].append(widened(one.reason))
+    return {effect: max(reasons, key=len) for effect, reasons in found.items()}
+
+
+def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
+    """The longest rows that settings can lead to, of a profile of two numbers and of a physical one: the longest
+    spelling in every column, each effect named twice, as simulated and as skipped for the longest reason.
+    """
     assert len(repr(LONGEST)) == 24
-    methods = ("curve:exact_table", "pair:fused_float64", "normal:inverse_cdf_table")
     plan = dataclasses.replace(
-        PLAN, seed=2**63 - 1, stream_key=2**64 - 1, camera="olympus_em10", weights=(LONGEST,) * 4,
-        rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST, gamma=2.2250738585072014,
-        highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535, noise="imx385_iso3200_rvdd",
-        a_dn=LONGEST, b_dn2=LONGEST, methods=methods,
-        skipped=(f"heteroscedastic: noise=imx385_iso3200_rvdd has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),
+        PLAN, seed=2**63 - 1, stream_key=2**64 - 1, scene=LONGEST_NAME, exposure_ratio=LONGEST, camera=LONGEST_NAME,
+        weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
+        gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
+        saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, methods=METHODS,
+        effects=("heteroscedastic", "quantise"),
+        skipped=(f"heteroscedastic: noise={LONGEST_NAME} has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),
     )  # fmt: skip
+    numbers = {field.name: LONGEST for field in dataclasses.fields(Physics) if field.type == "float"}
+    physics = dataclasses.replace(
+        PHYSICS, **numbers, dark_offset="removed", read_law="gaussian", black_error_dn=(LONGEST,) * 4,
+        sensor_unit="f" * 16, body_key=2**64 - 1,
+    )  # fmt: skip
+    skipped = tuple(f"{effect}: {reason}" for effect, reason in longest_reasons(settings).items())
+    physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics)
     pair = Pair(PAIR.clean, PAIR.noisy, Counts(*[2**40] * 6))
-    row = ok_row(Source(10**9, "", "", 2**30), SHA256, 8, 10**9, plan, pair, ("1" * 32, "2" * 32))
-    return {**row, "width": 2**40, "height": 2**40}
+    for one in (plan, physical):
+        row = ok_row(
+            "1000000000-l99d99", Source(10**9, "", "", 2**30), SHA256, 8, 10**9, one, pair, ("1" * 32, "2" * 32)
+        )
+        yield {**row, "width": 2**40, "height": 2**40}
 
 
-def test_the_room_for_json_suffices_for_the_longest_row() -> None:
-    text = json.dumps(dict(longest_row()), separators=(",", ":"))
-    assert len(text) + 64 < JSON_BYTES
-    assert len(row_json(longest_row())) == json_size("")
+def test_the_room_for_json_suffices_for_the_longest_rows(settings: Callable[..., Any]) -> None:
+    for row in longest_rows(settings):
+        text = json.dumps(dict(row), separators=(",", ":"))
+        assert len(text) + 64 < JSON_BYTES
+        assert len(row_json([row])) == json_size("")
 
 
 def test_a_row_that_does_not_fit_its_room_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"row 00000003 takes .* bytes as JSON, more than the"):
-        row_json({**row_of(), "noise": "x" * 4000})
+        row_json([{**row_of(), "noise": "x" * JSON_BYTES}])
 
 
 @given(st.integers(0, 3000))
 def test_json_size_fills_whole_blocks_of_tar(length: int) -> None:
     assert json_size("x" * length) % 512 == 0
-    assert json_size("x" * length) >= JSON_BYTES + length + 2
+    assert json_size("x" * length) >= JSON_BYTES + 2 * (length + 2)
 
 
 def test_no_number_in_json_is_lost_to_nan(settings: Callable[..., Any]) -> None:
-    loaded = json.loads(row_json(row_of(plan_image(settings(), SHA256))), parse_constant=lambda text: pytest.fail(text))
+    loaded = json.loads(
+        row_json([row_of(plan_image(settings(), SHA256))]), parse_constant=lambda text: pytest.fail(text)
+    )
     assert all(math.isfinite(value) for value in loaded.values() if isinstance(value, float))
 
 

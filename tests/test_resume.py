@@ -235,7 +235,7 @@ def test_a_committed_shard_that_is_not_whole_is_made_again(
 
 def test_progress_begins_where_the_earlier_run_ended(begun: Path, make: Make, capfd: Any) -> None:
     make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
-    assert "gen-dataset: 6/6 pairs" in capfd.readouterr().err
+    assert "gen-dataset: 6/6 images" in capfd.readouterr().err
 
 
 @pytest.fixture
@@ -528,9 +528,8 @@ def run_with_deaths(cli: Cli, folder: Path, deaths: int) -> subprocess.Completed
     (folder / "site").mkdir()
     (folder / "site/sitecustomize.py").write_text(DEADLY)
     (folder / "deaths").write_text(str(deaths))
-    return cli(
-        *TWELVE, PYTHONPATH=str(folder / "site"), DEATHS=str(folder / "deaths"), KILLER=str(folder / "p/009.png")
-    )
+    path = os.pathsep.join([str(folder / "site"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return cli(*TWELVE, PYTHONPATH=path, DEATHS=str(folder / "deaths"), KILLER=str(folder / "p/009.png"))
 
 
 @pytest.fixture(scope="module")
@@ -555,7 +554,7 @@ def test_a_photograph_that_kills_twice_is_given_up_and_tried_again_by_the_next_r
     twelve_undisturbed: str, cli: Cli, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
     done = run_with_deaths(cli, tmp_path, deaths=2)
-    lines = [line for line in done.stderr.splitlines() if "pairs/s" not in line]
+    lines = [line for line in done.stderr.splitlines() if "images/s" not in line]
     assert (done.returncode, lines) == (3, ["gen-dataset: 009.png: its worker died twice; run again to retry it"])
     rows = list(read_rows(tmp_path / "ds/manifest.csv"))
     assert [row["reason"] for row in rows] == [""] * 8 + ["worker_died"] * 4
@@ -589,7 +588,7 @@ def test_a_file_that_cannot_be_written_ends_the_run_with_5_and_a_rerun_finishes_
         check=False,
     )
     assert (done.returncode, done.stdout) == (5, ""), done.stderr
-    lines = [line for line in done.stderr.splitlines() if "pairs/s" not in line]
+    lines = [line for line in done.stderr.splitlines() if "images/s" not in line]
     assert len(lines) == 1
     assert "File too large" in lines[0] and "bytes free" in lines[0]
     assert committed(tmp_path / "ds") == 3

@@ -456,7 +456,7 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(
     make(photos, tmp_path / "ds")
     out, err = capfd.readouterr()
     assert out == ""
-    assert re.fullmatch(r"gen-dataset: 13/13 pairs, [\d.]+ pairs/s, 0 failed, 0 s left\n", err)
+    assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)
 
 
 def test_the_summary_adds_up_the_manifests_counts(dataset: Path) -> None:

@@ -26,14 +26,21 @@ from unprocess_gen.shards import (
     Member,
     ShardWriter,
     array_xxh3,
+    image_bytes,
     map_array,
-    pair_bytes,
     read_index,
     shard_bytes,
     shard_name,
 )
 
 COUNTS = Counts(0, 0, 0, 0, 0, 0)
+
+
+def add(writer: ShardWriter, key: str, one: Pair, row_json: bytes) -> None:
+    """Append an image with one noisy frame."""
+    writer.add_frame(key, "clean.npy", one.clean)
+    writer.add_frame(key, "noisy.npy", one.noisy)
+    writer.add_rows(key, row_json)
 
 
 def pair(height: int, width: int, seed: int = 0) -> Pair:
@@ -49,7 +56,7 @@ def read_json(path: Path, name: str) -> dict:
 def written(path: Path, *pairs: Pair, json_bytes: int = 512) -> ShardWriter:
     with ShardWriter(path) as writer:
         for i, one in enumerate(pairs):
-            writer.add(f"{i:08d}", one, json.dumps({"key": i}).encode().ljust(json_bytes))
+            add(writer, f"{i:08d}", one, json.dumps({"key": i}).encode().ljust(json_bytes))
     return writer
 
 
@@ -120,12 +127,12 @@ SIZES = [(1, 1), (1, 2), (2, 1), (3, 5), (16, 16), (17, 31), (1, 191), (1, 193),
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_the_bytes_of_a_pair_are_told_exactly(height: int, width: int, tmp_path: Path) -> None:
     writer = written(tmp_path / "a.tar", pair(height, width), json_bytes=700)
-    assert shard_bytes([pair_bytes(width, height, 700)]) == writer.bytes
+    assert shard_bytes([image_bytes(width, height, 700)]) == writer.bytes
 
 
 def test_the_bytes_of_a_shard_are_told_exactly(tmp_path: Path) -> None:
     writer = written(tmp_path / "a.tar", *(pair(height, width) for height, width in SIZES))
-    assert shard_bytes([pair_bytes(width, height, 512) for height, width in SIZES]) == writer.bytes
+    assert shard_bytes([image_bytes(width, height, 512) for height, width in SIZES]) == writer.bytes
 
 
 def test_no_pair_is_no_bytes() -> None:
@@ -134,8 +141,8 @@ def test_no_pair_is_no_bytes() -> None:
 
 @given(width=st.integers(1, 10**6), height=st.integers(1, 10**6))
 def test_arrays_start_where_eight_bytes_do(width: int, height: int) -> None:
-    assert (pair_bytes(width, height, 512) - 4 * width * height) > 0
-    assert pair_bytes(width, height, 512) % 512 == 0
+    assert (image_bytes(width, height, 512) - 4 * width * height) > 0
+    assert image_bytes(width, height, 512) % 512 == 0
 
 
 @pytest.mark.parametrize(
@@ -163,7 +170,7 @@ def test_a_file_that_exists_is_not_written_over(tmp_path: Path) -> None:
 
 def test_an_error_leaves_no_end_of_archive(tmp_path: Path) -> None:
     with pytest.raises(KeyError), ShardWriter(tmp_path / "a.tar") as writer:
-        writer.add("00000000", pair(2, 2), b"{}")
+        add(writer, "00000000", pair(2, 2), b"{}")
         raise KeyError
     with pytest.raises(DamageError, match="not a whole shard"):
         read_index(tmp_path / "a.tar")
@@ -188,7 +195,7 @@ def test_a_file_that_takes_little_at_a_time_gets_all_of_it(tmp_path: Path) -> No
     with ShardWriter(tmp_path / "b.tar") as writer:
         writer._file.close()
         writer._file = trickle = Trickle(10**6)  # type: ignore[assignment]
-        writer.add("00000000", pair(5, 7), json.dumps({"key": 0}).encode().ljust(512))
+        add(writer, "00000000", pair(5, 7), json.dumps({"key": 0}).encode().ljust(512))
     assert writer.sha256 == whole.sha256 == hashlib.sha256(trickle.content).hexdigest()
 
 
@@ -196,7 +203,7 @@ def test_a_file_that_takes_no_more_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="takes no more bytes") as error, ShardWriter(tmp_path / "b.tar") as writer:
         writer._file.close()
         writer._file = Trickle(100)  # type: ignore[assignment]
-        writer.add("00000000", pair(5, 7), b"{}")
+        add(writer, "00000000", pair(5, 7), b"{}")
     assert error.value.errno == errno.EIO
 
 

@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from unprocess_gen.colour import matrix
 from unprocess_gen.errors import DamageError
-from unprocess_gen.records import Pair, Plan, Source
+from unprocess_gen.records import Pair, Physics, Plan, Source
 from unprocess_gen.tables import gamma_text
 
 Value = str | int | float | None
@@ -96,14 +97,51 @@ COLUMNS = (
     Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping"),
     Column("saturated", int, "clean sites at the white level"),
     Column("zero_variance", int, "sites to which the noise law gives no variance"),
+    Column("scene", str, "what the scene was taken for"),
+    Column("exposure_ratio", float, "what the scene was darkened by"),
+    Column("saturated_as", str, "what noisy sites are where the clean ones are saturated: noisy, or pinned to white"),
+    Column("noise_law", str, "of a two-parameter profile: gaussian or poisson"),
+    Column(
+        "iso", float, "ISO of a physical profile; this and all columns to its right are 0 or none for other profiles"
+    ),
+    Column("exposure_s", float, "exposure time, seconds"),
+    Column("temperature_c", float, "of the sensor, degrees Celsius"),
+    Column("dn_per_e", float, "system gain K, DN per electron"),
+    Column("prnu_std", float, "relative deviation of the pixels' responses"),
+    Column("dark_e", float, "mean dark current of the exposure, electrons"),
+    Column("dark_offset", str, "whether its mean was removed or kept"),
+    Column("hot_pixel_share", float, "share of pixels that are hot"),
+    Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure, electrons"),
+    Column("full_well_e", float, "electrons that a pixel holds; 0: not known"),
+    Column("read_law", str, "gaussian or tukey"),
+    Column("read_shape", float, "shape of Tukey's lambda law"),
+    Column("read_std_dn", float, "deviation of the read noise, DN"),
+    Column("row_std_dn", float, "deviation of a row's offset, DN"),
+    Column("column_std_dn", float, "deviation of a column's offset, DN"),
+    *(
+        Column(f"black_error_dn_{i}{j}", float, "error of the black level at row, column of the 2x2 sites, DN")
+        for i in range(2)
+        for j in range(2)
+    ),
+    Column("dead_pixel_share", float, "share of pixels that read 0"),
+    Column("sensor_unit", str, "the camera body"),
+    Column("body_key", str, "key of the body's fixed patterns, 16 hex digits"),
+    Column("fixed_pattern_in_clean", int, "1 where the clean frame has the fixed patterns too"),
+    Column("level", int, "number of the noise level"),
+    Column("draw", int, "number of the draw at this level"),
+    Column("frame", int, "number of the frame in its clip"),
+    Column("clip", str, "the clip"),
+    Column("downscale", int, "side of the squares of source pixels that were averaged"),
+    Column("dequantize", str, "whether 8-bit codes were dithered: off or dither"),
 )
 NAMES = tuple(column.name for column in COLUMNS)
 
-JSON_BYTES = 2560
-"""Room for a row without its source's name: the longest numbers in every column take 2,150 bytes."""
+JSON_BYTES = 5632
+"""Room for a row without its source's name: the longest numbers and reasons in every column take less."""
 
 
-KEY = re.compile(r"\d{8,}")
+KEY = re.compile(r"(\d{8,})(-l\d\dd\d\d)?")
+"""A row's key: the source index, and level and draw where an image has several pairs."""
 
 
 def key_text(index: int) -> str:
@@ -111,8 +149,30 @@ def key_text(index: int) -> str:
     return f"{index:08d}"
 
 
+def pair_key(index: int, plan: Plan, several: bool) -> str:
+    """Return the key of a row: that of its source, and the level and draw where the image has ``several`` pairs."""
+    return f"{key_text(index)}-l{plan.level:02d}d{plan.draw:02d}" if several else key_text(index)
+
+
+def image_key(row: Row) -> str:
+    """Return the key of a row's image: that of its members in the shard."""
+    return str(row["key"]).partition("-")[0]
+
+
+def images(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    """Yield the rows of one image together, in order."""
+    return (list(some) for _, some in itertools.groupby(rows, key=image_key))
+
+
 def ok_row(
-    source: Source, sha256: str, orientation: int, shard: int, plan: Plan, pair: Pair, digests: tuple[str, str]
+    key: str,
+    source: Source,
+    sha256: str,
+    orientation: int,
+    shard: int,
+    plan: Plan,
+    pair: Pair,
+    digests: tuple[str, str],
 ) -> Row:
     """Return the row of a pair; ``digests`` are the XXH3-128 of clean and noisy."""
     height, width = pair.clean.shape
@@ -152,8 +212,33 @@ def ok_row(
         "noisy_clipped_high": pair.counts.noisy_clipped_high,
         "saturated": pair.counts.saturated,
         "zero_variance": pair.counts.zero_variance,
+        "scene": plan.scene,
+        "exposure_ratio": plan.exposure_ratio,
+        "saturated_as": plan.saturated,
+        "noise_law": plan.noise_law,
+        **_physics_values(plan.physics),
+        "level": plan.level,
+        "draw": plan.draw,
+        "frame": plan.frame,
+        "clip": source.clip,
+        "downscale": plan.downscale,
+        "dequantize": plan.dequantize,
     }
-    return _row(source, sha256, shard, plan.seed, values)
+    return _row(source, sha256, shard, plan.seed, values | {"key": key})
+
+
+def _physics_values(physics: Physics | None) -> dict[str, Value]:
+    if physics is None:
+        return {
+            column.name: "none" if column.type is str else column.type("0")
+            for column in COLUMNS[_PHYSICS_FROM:_PHYSICS_TO]
+        }
+    return {
+        **{name: getattr(physics, name) for name in _PHYSICS},
+        **dict(zip(_BLACK_ERRORS, physics.black_error_dn, strict=True)),
+        "body_key": f"{physics.body_key:016x}",
+        "fixed_pattern_in_clean": int(physics.fixed_pattern_in_clean),
+    }
 
 
 def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str) -> Row:
@@ -163,6 +248,13 @@ def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason
 
 _WEIGHTS = tuple(name for name in NAMES if name.startswith("w_"))
 _MATRIX = tuple(name for name in NAMES if name.startswith("rgb2cam_"))
+_PHYSICS_FROM, _PHYSICS_TO = NAMES.index("iso"), NAMES.index("level")
+_BLACK_ERRORS = tuple(name for name in NAMES if name.startswith("black_error_dn_"))
+_PHYSICS = tuple(
+    field.name
+    for field in fields(Physics)
+    if field.name not in ("black_error_dn", "body_key", "fixed_pattern_in_clean")
+)
 
 
 def _row(source: Source, sha256: str | None, shard: int, seed: int, values: dict[str, Value]) -> Row:
@@ -188,6 +280,10 @@ def plan_of(row: Row) -> Plan:
         return Plan(
             seed=_int(row, "seed"),
             stream_key=int(_str(row, "stream_key"), 16),
+            downscale=_int(row, "downscale"),
+            dequantize=_str(row, "dequantize"),
+            scene=_str(row, "scene"),
+            exposure_ratio=_float(row, "exposure_ratio"),
             camera=_str(row, "camera"),
             weights=(w0, w1, w2, w3),
             rgb2cam=matrix([_float(row, name) for name in _MATRIX]),
@@ -203,16 +299,36 @@ def plan_of(row: Row) -> Plan:
             black_level_dn=_int(row, "black_level_dn"),
             white_level_dn=_int(row, "white_level_dn"),
             sensor_clip=_str(row, "sensor_clip"),
+            saturated=_str(row, "saturated_as"),
             noise=_str(row, "noise"),
+            noise_law=_str(row, "noise_law"),
             a_dn=_float(row, "a_dn"),
             b_dn2=_float(row, "b_dn2"),
             effects=_list(row, "effects"),
             skipped=_list(row, "skipped"),
             accuracy=_str(row, "accuracy"),
             methods=_list(row, "methods"),
+            physics=_physics_of(row),
+            level=_int(row, "level"),
+            draw=_int(row, "draw"),
+            frame=_int(row, "frame"),
         )
     except (TypeError, ValueError) as error:
         raise DamageError(f"row {row.get('key')}: not a plan ({error})") from error
+
+
+def _physics_of(row: Row) -> Physics | None:
+    if row["read_law"] == "none":
+        return None
+    texts = ("dark_offset", "read_law", "sensor_unit")
+    e0, e1, e2, e3 = (_float(row, name) for name in _BLACK_ERRORS)
+    values: dict[str, Any] = {name: (_str if name in texts else _float)(row, name) for name in _PHYSICS}
+    return Physics(
+        **values,
+        black_error_dn=(e0, e1, e2, e3),
+        body_key=int(_str(row, "body_key"), 16),
+        fixed_pattern_in_clean=bool(_int(row, "fixed_pattern_in_clean")),
+    )
 
 
 def _float(row: Row, name: str) -> float:
@@ -325,15 +441,28 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
 # ------------------------------------------------------------------------------------------------------------ JSON
 
 
-def json_size(source_name: str) -> int:
-    """Return the bytes of a row's JSON in the shard, padding included: a function of the source's name alone."""
-    return -(-(JSON_BYTES + len(json.dumps(source_name))) // 512) * 512
+def json_size(source_name: str, pairs: int = 1) -> int:
+    """Return the bytes of an image's JSON in the shard, padding included: its source's name and its pairs decide."""
+    named = 2 * len(json.dumps(source_name))  # its clip is named by a part of it
+    return -(-(JSON_BYTES + named) * pairs // 512) * 512
 
 
-def row_json(row: Row) -> bytes:
-    """Return the row as typed JSON, padded with blanks to `json_size`."""
-    text = json.dumps(dict(row), separators=(",", ":")).encode("ascii")
-    size = json_size(str(row["source"]))
+OTHERS = "others"
+"""The key under which an image's JSON holds the rows of its pairs but the first."""
+
+
+def row_json(rows: Sequence[Row]) -> bytes:
+    """Return an image's rows as typed JSON: the first one, and the others in a list; padded to `json_size`."""
+    first, others = dict(rows[0]), [dict(row) for row in rows[1:]]
+    content = first | {OTHERS: others} if others else first
+    text = json.dumps(content, separators=(",", ":")).encode("ascii")
+    size = json_size(str(first["source"]), len(rows))
     if len(text) >= size:
-        raise ValueError(f"row {row['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
+        raise ValueError(f"row {first['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
     return text.ljust(size - 1) + b"\n"
+
+
+def rows_of_json(content: dict[str, Any]) -> list[Row]:
+    """Return the rows that an image's JSON holds."""
+    others = content.pop(OTHERS, [])
+    return [content, *others]

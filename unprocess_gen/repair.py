@@ -20,19 +20,28 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from unprocess_gen import selftest
 from unprocess_gen.config import Config, dataset_yaml, read_dataset_yaml, source_kind
 from unprocess_gen.errors import ConfigError, DamageError, SourceError, UnprocessGenError
-from unprocess_gen.manifest import Row, failed_row, key_text, readable_rows, row_json, write_rows
+from unprocess_gen.manifest import (
+    Row,
+    failed_row,
+    image_key,
+    images,
+    key_text,
+    readable_rows,
+    rows_of_json,
+    write_rows,
+)
 from unprocess_gen.photographs import list_photographs, load
-from unprocess_gen.records import Counts, Pair, Source
+from unprocess_gen.records import Raw, Source
 from unprocess_gen.runner import Bench, Task, make_shard, shard_tasks, tally
-from unprocess_gen.shards import ShardWriter, check_members, rows_inside, salvage, shard_name
-from unprocess_gen.verify import expected, file_sha256, make_again, rows_by_shard
+from unprocess_gen.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
+from unprocess_gen.verify import expected, file_sha256, make_again, noisy_member_of, rows_by_shard, uses_physics
 from unprocess_gen.workspace import (
     Made,
     Workspace,
@@ -66,7 +75,6 @@ def repair(folder: Path, root: str | None) -> Iterator[Step]:
     ConfigError where sources are needed and ``root`` is not given, MachineError where nothing can be written or this
     machine computes differently.
     """
-    selftest.check()
     with Workspace(folder, "") as workspace:
         workspace.hold()
         try:
@@ -245,8 +253,12 @@ def _kept_rows(folder: Path, facts: Facts) -> Iterator[Row]:
         if row["status"] == "failed":
             failures.setdefault(row["shard"], []).append(row)
     for number, entry in enumerate(facts["shards"]):
-        inside = rows_inside(folder / entry["file"]) if entry["file"] and _is_sound(folder, entry) else []
+        inside = _rows_inside(folder / entry["file"]) if entry["file"] and _is_sound(folder, entry) else []
         yield from sorted([*inside, *failures.get(number, [])], key=lambda row: str(row["key"]))
+
+
+def _rows_inside(shard: Path) -> list[Row]:
+    return [row for content in json_inside(shard) for row in rows_of_json(content)]
 
 
 def _remade_rows(folder: Path, facts: Facts, config: Config, aside: Path) -> Iterator[Row]:
@@ -257,9 +269,10 @@ def _remade_rows(folder: Path, facts: Facts, config: Config, aside: Path) -> Ite
         if entry.get("provisional"):
             yield from (failed_row(one, None, task.shard, config.seed, "worker_died") for one in task.sources)
         elif _is_sound(folder, entry):
-            inside = {row["key"]: row for row in (rows_inside(folder / entry["file"]) if entry["file"] else ())}
+            found = images(_rows_inside(folder / entry["file"]) if entry["file"] else ())
+            inside = {image_key(some[0]): some for some in found}
             for source in task.sources:
-                yield inside.get(key_text(source.index)) or _failure(config, task, source)
+                yield from inside.get(key_text(source.index)) or [_failure(config, task, source)]
         else:
             made = make_shard(bench, task)
             if made.path is not None and made.sha256 == entry["sha256"]:
@@ -287,17 +300,15 @@ def _failure(config: Config, task: Task, source: Source) -> Row:
 def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, aside: Path) -> Iterator[Step]:
     """Mend a shard, pair by pair; what hinders it becomes a step, so that the others are mended all the same."""
     path = folder / "shards" / shard_name(number)
-    pairs = [expected(row) for row in rows]
-    if not rows or (path.is_file() and not any(check_members(path, pairs))):
+    wanted = expected(rows)
+    if not rows or (path.is_file() and not any(check_members(path, wanted))):
         return
     part = aside / path.name
     kept = 0
     try:
         with ShardWriter(part) as writer:
-            for row, frames in zip(rows, salvage(path, pairs), strict=True):
-                kept += frames is not None
-                pair = make_again(row, root) if frames is None else Pair(*frames, _counts(row))
-                writer.add(str(row["key"]), pair, row_json(row))
+            for image, some, frames in zip(wanted, images(rows), salvage(path, wanted), strict=True):
+                kept += _mend_image(writer, image, some, frames, root)
     except UnprocessGenError as error:
         part.unlink()
         yield Step(f"shards/{path.name}", f"cannot be mended: {error}", mended=False)
@@ -308,8 +319,20 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, asi
     yield Step(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs made again, the others kept")
 
 
-def _counts(row: Row) -> Counts:
-    return Counts(*(int(row[field.name] or 0) for field in fields(Counts)))
+def _mend_image(
+    writer: ShardWriter, image: Expected, rows: Sequence[Row], kept: dict[str, Raw], root: str | None
+) -> int:
+    """Append an image, its frames kept or made again; return how many of its pairs were kept."""
+    whole = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]
+    for row in rows:
+        selftest.check(uses_physics(row))
+    made = {str(row["key"]): make_again(row, root) for row in rows if row not in whole}
+    writer.add_frame(image.key, CLEAN, kept[CLEAN] if CLEAN in kept else made[str(rows[0]["key"])].clean)
+    for row in rows:
+        member = noisy_member_of(row)
+        writer.add_frame(image.key, member, kept[member] if row in whole else made[str(row["key"])].noisy)
+    writer.add_rows(image.key, image.json)
+    return len(whole)
 
 
 def _set_aside(folder: Path, names: set[str]) -> Iterator[Step]:
@@ -336,12 +359,12 @@ def _dataset(folder: Path, text: str, rows: dict[int, list[Row]], config: Config
     """Write ``dataset.json`` again from all that it stands for; the same bytes, if its own digest can be met."""
     path = folder / "dataset.json"
     old = _readable(path)
-    failed, sites = tally(row for number in sorted(rows) for row in rows[number])
+    pairs, failed, sites = tally(row for number in sorted(rows) for row in rows[number])
     known = dataset_facts(
         text,
         file_sha256(folder / "manifest.csv"),
         [_entry(folder, number, rows[number], old) for number in sorted(rows)],
-        {"pairs": sum(map(len, rows.values())) - sum(failed.values()), "failed": failed, "sites": sites},
+        {"pairs": pairs, "failed": failed, "sites": sites},
     )
     digest = old.pop("dataset_sha256", None)
     same = dataset_text(old | known)

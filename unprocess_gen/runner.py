@@ -33,14 +33,15 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen import selftest
-from unprocess_gen.config import Config, dataset_yaml, source_kind
+from unprocess_gen.config import Config, dataset_yaml, source_kind, uses_physics
 from unprocess_gen.errors import MachineError, SourceError
-from unprocess_gen.manifest import Row, failed_row, key_text, ok_row, row_json
+from unprocess_gen.manifest import Row, failed_row, images, key_text, ok_row, pair_key, row_json
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
-from unprocess_gen.plan import plan_image
+from unprocess_gen.plan import plan_pairs
+from unprocess_gen.planner import facts_of
 from unprocess_gen.records import Counts, Source
-from unprocess_gen.shards import ShardWriter, array_xxh3, shard_name
+from unprocess_gen.shards import CLEAN, ShardWriter, array_xxh3, noisy_member, shard_name
 from unprocess_gen.workspace import Made, Workspace, machine_error
 
 PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
@@ -121,14 +122,14 @@ def generate(config: Config) -> Summary:
                 progress.advance(made.rows)
         seconds = time.monotonic() - started
         try:
-            failed, sites = tally(workspace.all_rows(len(tasks), given_up))
+            pairs, failed, sites = tally(workspace.all_rows(len(tasks), given_up))
         except OSError as error:
             raise machine_error(error, workspace.out) from error
         facts = workspace.finish(
             len(tasks),
             given_up,
             {
-                "pairs": len(listing.sources) - sum(failed.values()),
+                "pairs": pairs,
                 "failed": failed,
                 "sites": sites,
                 "not_matched": listing.not_matched,
@@ -250,10 +251,11 @@ def make_shard(bench: Bench, task: Task) -> Made:
 def _make_rows(bench: Bench, task: Task, writer: ShardWriter) -> Iterator[Row]:
     for source in task.sources:
         _busy_path(bench, task).write_text(str(source.index))
-        yield _make_row(bench.config, task.shard, source, writer)
+        yield from make_image(bench.config, task.shard, source, writer)
 
 
-def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -> Row:
+def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) -> list[Row]:
+    """Append one image's clean frame, all of its noisy ones and their rows to a shard; return the rows."""
     try:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
@@ -261,13 +263,21 @@ def _make_row(config: Config, shard: int, source: Source, writer: ShardWriter) -
             raise MachineError(
                 f"source {source.name} is gone since it was listed; what is committed is kept, run again with it back"
             ) from error
-        return failed_row(source, error.sha256, shard, config.seed, error.reason)
-    plan = plan_image(config, sha256, source.occurrence)
-    pair = make_pair(photograph.srgb, plan)
-    digests = array_xxh3(pair.clean), array_xxh3(pair.noisy)
-    row = ok_row(source, sha256, photograph.orientation, shard, plan, pair, digests)
-    writer.add(key_text(source.index), pair, row_json(row))
-    return row
+        return [failed_row(source, error.sha256, shard, config.seed, error.reason)]
+    key = key_text(source.index)
+    rows: list[Row] = []
+    plans = plan_pairs(config, *source.stream_identity(sha256), facts_of(photograph.srgb), source.frame)
+    for plan in plans:
+        pair = make_pair(photograph.srgb, plan)
+        if not rows:
+            clean_xxh3 = array_xxh3(pair.clean)
+            writer.add_frame(key, CLEAN, pair.clean)
+        writer.add_frame(key, noisy_member(plan.level, plan.draw), pair.noisy)
+        row_key = pair_key(source.index, plan, several=len(plans) > 1)
+        digests = clean_xxh3, array_xxh3(pair.noisy)
+        rows.append(ok_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests))
+    writer.add_rows(key, row_json(rows))
+    return rows
 
 
 def _is_there(config: Config, source: Source) -> bool:
@@ -286,9 +296,10 @@ def _settle(coordinator_pid: int) -> None:
 
 def _self_test(config: Config) -> str | None:
     """Return what is wrong with this process, None where nothing is; MachineError unless told to go on."""
+    physical = uses_physics(config.noise)
     if config.self_test == "stop":
-        selftest.check(", or say self_test=go_on")
-    return "; ".join(selftest.failures()) or None
+        selftest.check(physical, ", or say self_test=go_on")
+    return "; ".join(selftest.failures(physical)) or None
 
 
 WATCHDOG = "unprocess_gen watchdog"
@@ -304,14 +315,14 @@ def _end_with_parent(coordinator_pid: int) -> None:
 
 
 class Progress:
-    """A bar over pairs on a terminal, a plain line every few seconds elsewhere; both on stderr."""
+    """A bar over images on a terminal, a plain line every few seconds elsewhere; both on stderr."""
 
     def __init__(self, total: int, done: int) -> None:
         self._failed = 0
         self._total, self._done, self._first = total, done, done
         self._started = self._last_line = time.monotonic()
         terminal = sys.stderr.isatty()
-        self._bar = tqdm(total=total, initial=done, unit="pair", file=sys.stderr, disable=not terminal)
+        self._bar = tqdm(total=total, initial=done, unit="image", file=sys.stderr, disable=not terminal)
         self._plain = not terminal
 
     def __enter__(self) -> Progress:
@@ -321,8 +332,8 @@ class Progress:
         self._bar.close()
 
     def advance(self, rows: Iterable[Row]) -> None:
-        """Count the rows of a committed shard."""
-        statuses = [row["status"] for row in rows]
+        """Count the images of a committed shard."""
+        statuses = [some[0]["status"] for some in images(rows)]
         self._failed += statuses.count("failed")
         self._done += len(statuses)
         self._bar.set_postfix(failed=self._failed, refresh=False)
@@ -333,7 +344,7 @@ class Progress:
             rate = (self._done - self._first) / max(now - self._started, 1e-9)
             left = (self._total - self._done) / rate
             print(
-                f"gen-dataset: {self._done}/{self._total} pairs, {rate:.1f} pairs/s, {self._failed} failed, "
+                f"gen-dataset: {self._done}/{self._total} images, {rate:.1f} images/s, {self._failed} failed, "
                 f"{left:.0f} s left",
                 file=sys.stderr,
                 flush=True,
@@ -343,18 +354,20 @@ class Progress:
 COUNTS = tuple(field.name for field in fields(Counts))
 
 
-def tally(rows: Iterable[Row]) -> tuple[dict[str, int], dict[str, int]]:
-    """Return how many rows failed, by reason, and how many sites of the others met which limit."""
+def tally(rows: Iterable[Row]) -> tuple[int, dict[str, int], dict[str, int]]:
+    """Return the pairs, how many rows failed, by reason, and how many sites of the pairs met which limit."""
+    pairs = 0
     reasons: dict[str, int] = {}
     sites = dict.fromkeys(("all", *COUNTS), 0)
     for row in rows:
         if row["status"] != "ok":
             reasons[str(row["reason"])] = reasons.get(str(row["reason"]), 0) + 1
             continue
+        pairs += 1
         sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
         for name in COUNTS:
             sites[name] += int(row[name] or 0)
-    return dict(sorted(reasons.items())), sites
+    return pairs, dict(sorted(reasons.items())), sites
 
 
 def machine() -> dict[str, Any]:

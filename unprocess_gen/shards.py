@@ -1,9 +1,10 @@
 """Shards: uncompressed tar files in the WebDataset layout, whose bytes depend on nothing but their members.
 
-Members of one image stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 ``[H, W]``), ``KEY.json``. Headers
-are USTAR with time, owner and mode fixed. Writing goes straight from the arrays to the file while SHA-256 runs along
-(0.5 ns a byte together), reading maps just the bytes of one array into memory, found through an index of
-offsets that is read from the tar headers: nothing is ever unpacked.
+Members of one image stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 ``[H, W]``), the noisy frames of
+other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with time, owner and mode fixed.
+Writing goes straight from the arrays to the file while SHA-256 runs along (0.5 ns a byte together), reading maps just
+the bytes of one array into memory, found through an index of offsets that is read from the tar headers: nothing is ever
+unpacked.
 """
 
 from __future__ import annotations
@@ -24,11 +25,16 @@ import numpy as np
 import xxhash
 
 from unprocess_gen.errors import DamageError
-from unprocess_gen.records import Pair, Raw
+from unprocess_gen.records import Raw
 
 RECORD = 512
 END = b"\0" * (2 * RECORD)
-MEMBERS = ("clean.npy", "noisy.npy", "json")
+CLEAN, ROW = "clean.npy", "json"
+
+
+def noisy_member(level: int, draw: int) -> str:
+    """Return the member that holds a noisy frame: the first is ``noisy.npy``, others say their level and draw."""
+    return f"noisy.l{level:02d}d{draw:02d}.npy" if level or draw else "noisy.npy"
 
 
 def shard_name(number: int) -> str:
@@ -61,10 +67,10 @@ def _padding(size: int) -> int:
     return -size % RECORD
 
 
-def pair_bytes(width: int, height: int, json_bytes: int) -> int:
-    """Return the bytes that one pair takes in its shard, tar framing included."""
+def image_bytes(width: int, height: int, json_bytes: int, pairs: int = 1) -> int:
+    """Return the bytes that one image and its noisy frames take in a shard, tar framing included."""
     array = len(_npy_header((height, width))) + 2 * width * height
-    return sum(RECORD + size + _padding(size) for size in (array, array, json_bytes))
+    return sum(RECORD + size + _padding(size) for size in (*[array] * (1 + pairs), json_bytes))
 
 
 def shard_bytes(pairs: list[int]) -> int:
@@ -98,12 +104,14 @@ class ShardWriter:
         """Hex digest of what was written so far."""
         return self._hash.hexdigest()
 
-    def add(self, key: str, pair: Pair, row_json: bytes) -> None:
-        """Append the three members of one image."""
-        for name, array in zip(MEMBERS, (pair.clean, pair.noisy), strict=False):
-            header = _npy_header(array.shape)
-            self._member(f"{key}.{name}", len(header) + array.nbytes, header, _little_endian(array).data)
-        self._member(f"{key}.{MEMBERS[2]}", len(row_json), row_json)
+    def add_frame(self, key: str, member: str, frame: Raw) -> None:
+        """Append a frame of an image."""
+        header = _npy_header(frame.shape)
+        self._member(f"{key}.{member}", len(header) + frame.nbytes, header, _little_endian(frame).data)
+
+    def add_rows(self, key: str, row_json: bytes) -> None:
+        """Append the rows of an image, after its frames."""
+        self._member(f"{key}.{ROW}", len(row_json), row_json)
 
     def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
         for part in (_tar_header(name, size), *parts, b"\0" * _padding(size)):
@@ -166,62 +174,61 @@ def map_array(path: Path, member: Member, shape: tuple[int, int]) -> Raw:
 
 
 class Expected(NamedTuple):
-    """What a shard must hold of one pair: the arrays' shape and XXH3-128, and the row's JSON to the byte."""
+    """What a shard must hold of one image: the frames' shape, members and XXH3-128, and the JSON to the byte."""
 
     key: str
     width: int
     height: int
-    clean_xxh3: str
-    noisy_xxh3: str
+    frames: tuple[tuple[str, str], ...]
     json: bytes
 
 
 PIECE = 2**20
 
 
-def check_members(path: Path, pairs: Sequence[Expected]) -> Iterator[tuple[str, str, str]]:
+def check_members(path: Path, images: Sequence[Expected]) -> Iterator[tuple[str, str, str]]:
     """Yield (key, member, what is wrong) for every member that is not as expected, and for what follows the last.
 
     Tar headers, npy headers, JSON and padding are held to the byte, arrays to their digest, so that a shard without a
     complaint has just the bytes it was written with.
     """
     with path.open("rb") as stream:
-        for pair in pairs:
-            head = _npy_header((pair.height, pair.width))
-            size = len(head) + 2 * pair.width * pair.height
-            for member, digest in zip(MEMBERS, (pair.clean_xxh3, pair.noisy_xxh3), strict=False):
-                found = [*_check_bytes(stream, _tar_header(f"{pair.key}.{member}", size), "tar header")]
+        for image in images:
+            head = _npy_header((image.height, image.width))
+            size = len(head) + 2 * image.width * image.height
+            for member, digest in image.frames:
+                found = [*_check_bytes(stream, _tar_header(f"{image.key}.{member}", size), "tar header")]
                 found += _check_bytes(stream, head, "npy header")
                 found += _check_digest(stream, size - len(head), digest)
                 found += _check_bytes(stream, b"\0" * _padding(size), "padding")
-                yield from ((pair.key, member, what) for what in found)
-            header = _tar_header(f"{pair.key}.{MEMBERS[2]}", len(pair.json))
-            whole = header + pair.json + b"\0" * _padding(len(pair.json))
-            yield from ((pair.key, MEMBERS[2], what) for what in _check_bytes(stream, whole, "member"))
+                yield from ((image.key, member, what) for what in found)
+            header = _tar_header(f"{image.key}.{ROW}", len(image.json))
+            whole = header + image.json + b"\0" * _padding(len(image.json))
+            yield from ((image.key, ROW, what) for what in _check_bytes(stream, whole, "member"))
         rest = stream.read(len(END) + 1)
         if rest != END:
             yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"
 
 
-def salvage(path: Path, pairs: Sequence[Expected]) -> Iterator[tuple[Raw, Raw] | None]:
-    """Yield for each pair its frames, where both lie at their place in a damaged shard and fit their digests."""
+def salvage(path: Path, images: Sequence[Expected]) -> Iterator[dict[str, Raw]]:
+    """Yield for each image those frames, by member, that lie at their place in a damaged shard, whole."""
     content = np.memmap(path, np.uint8, "r") if path.is_file() and path.stat().st_size else np.empty(0, np.uint8)
     at = 0
-    for pair in pairs:
-        size = 2 * pair.width * pair.height
-        head = len(_npy_header((pair.height, pair.width)))
-        frames = []
-        for digest in (pair.clean_xxh3, pair.noisy_xxh3):
+    for image in images:
+        size = 2 * image.width * image.height
+        head = len(_npy_header((image.height, image.width)))
+        frames = {}
+        for member, digest in image.frames:
             frame = content[at + RECORD + head :][:size]
             at += RECORD + head + size + _padding(head + size)
             if len(frame) == size and xxhash.xxh3_128_hexdigest(frame.data) == digest:
-                frames.append(frame.view("<u2").reshape(pair.height, pair.width))
-        at += RECORD + len(pair.json) + _padding(len(pair.json))
-        yield (frames[0], frames[1]) if len(frames) == 2 else None
+                frames[member] = frame.view("<u2").reshape(image.height, image.width)
+        at += RECORD + len(image.json) + _padding(len(image.json))
+        yield frames
 
 
-def rows_inside(path: Path) -> list[dict[str, Any]]:
-    """Return the rows that a sound shard holds as JSON, in its order."""
+def json_inside(path: Path) -> list[dict[str, Any]]:
+    """Return what the JSON members of a sound shard hold, in its order."""
     index = read_index(path)
     with path.open("rb") as stream:
         rows = []

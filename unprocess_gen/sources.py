@@ -156,6 +156,36 @@ def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     )
 
 
+def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
+    """Takes each folder for a clip, and its files for frames 0, 1, … in listing order.
+
+    Of each clip the first file is read: its digest stands for the clip, so that other clips that come or go
+    move nothing. One that cannot be read is stood for by the digest of its name.
+    """
+    clips: dict[str, list[Source]] = {}
+    for source in sources:
+        clips.setdefault(source.name.rpartition("/")[0] or ".", []).append(source)
+    seen: Counter[str] = Counter()
+    placed: dict[int, Source] = {}
+    for clip, frames in clips.items():
+        digest = _digest(root, frames[0])
+        for frame, source in enumerate(frames):
+            placed[source.index] = replace(
+                source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest]
+            )
+        seen[digest] += 1
+    return tuple(placed[source.index] for source in sources)
+
+
+def _digest(root: str, source: Source) -> str:
+    if source.sha256 is not None:
+        return source.sha256
+    try:
+        return hashlib.sha256(read_bytes(root, source)).hexdigest()
+    except SourceError:
+        return hashlib.sha256(source.name.encode()).hexdigest()
+
+
 def _check_root(root: str) -> None:
     try:
         mode = Path(root).stat().st_mode

@@ -24,11 +24,11 @@ import numpy as np
 from unprocess_gen import selftest
 from unprocess_gen.config import SourceConfig
 from unprocess_gen.errors import ConfigError, DamageError, MachineError, SourceError
-from unprocess_gen.manifest import Row, located_rows, plan_of, read_row, read_rows, row_json
+from unprocess_gen.manifest import Row, image_key, images, located_rows, plan_of, read_row, read_rows, row_json
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import load, source_of
 from unprocess_gen.records import Pair
-from unprocess_gen.shards import Expected, array_xxh3, check_members, shard_name
+from unprocess_gen.shards import CLEAN, Expected, array_xxh3, check_members, noisy_member, shard_name
 from unprocess_gen.workspace import read_dataset
 
 NO_LIMIT = 2**40
@@ -117,8 +117,7 @@ def _check_shards(
 
 
 def _check_members(path: Path, rows: Iterable[Row]) -> Iterator[Damage]:
-    pairs = [expected(row) for row in rows if row["status"] == "ok"]
-    for key, member, what in check_members(path, pairs):
+    for key, member, what in check_members(path, expected(rows)):
         yield Damage(f"shards/{path.name}", what, key, member)
 
 
@@ -127,13 +126,22 @@ def _check_sha256(path: Path, entry: dict[str, Any] | None) -> Iterator[Damage]:
         yield Damage(f"shards/{path.name}", f"its SHA-256 is {found}, dataset.json says {entry['sha256']}")
 
 
-def expected(row: Row) -> Expected:
-    """Return what a row says of its pair's members; DamageError where a value is missing."""
-    width, height = row["width"], row["height"]
+def expected(rows: Iterable[Row]) -> list[Expected]:
+    """Return what rows say of the members of each of their images; DamageError where a value is missing."""
+    return [_expected(some) for some in images(row for row in rows if row["status"] == "ok")]
+
+
+def _expected(rows: Sequence[Row]) -> Expected:
+    width, height = rows[0]["width"], rows[0]["height"]
     if not isinstance(width, int) or not isinstance(height, int):
-        raise DamageError(f"row {row['key']}: width and height are {width} and {height}")
-    digests = str(row["clean_xxh3"]), str(row["noisy_xxh3"])
-    return Expected(str(row["key"]), width, height, *digests, row_json(row))
+        raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
+    noisy = tuple((noisy_member_of(row), str(row["noisy_xxh3"])) for row in rows)
+    return Expected(image_key(rows[0]), width, height, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
+
+
+def noisy_member_of(row: Row) -> str:
+    """Return the member that holds a row's noisy frame."""
+    return noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
 
 
 def file_sha256(path: Path) -> str:
@@ -192,13 +200,20 @@ def _range(rows: str | None) -> tuple[int, int | None]:
 
 
 def _with_keys(manifest: Path, keys: Sequence[str]) -> Iterator[Row]:
+    wanted = set(keys)
     missing = set(keys)
     for row in read_rows(manifest):
-        if row["key"] in missing:
-            missing.discard(str(row["key"]))
+        named = {str(row["key"]), image_key(row)} & wanted  # an image's own key stands for all of its pairs
+        if named:
+            missing -= named
             yield row
     if missing:
         raise ConfigError(f"--keys {min(missing)}: {manifest} has no such key")
+
+
+def uses_physics(row: Row) -> bool:
+    """Whether a row's pair is made by the kernels of the physical effects."""
+    return row["read_law"] != "none" or row["noise_law"] == "poisson"
 
 
 def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[Replayed]:
@@ -208,10 +223,10 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
     passed over. Raises ConfigError where a row needs a folder and there is none, MachineError where this machine
     computes differently (`selftest`).
     """
-    selftest.check()
     for row in rows:
         if row["status"] != "ok":
             continue
+        selftest.check(uses_physics(row))
         scene = row["source_bytes"] == 0
         if root is None and not scene:
             raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
@@ -238,7 +253,9 @@ def make_again(row: Row, root: str | None) -> Pair:
 
 def _make(row: Row, root: str | None) -> Pair:
     try:
-        sha256, photograph = load(SourceConfig(root=root, max_pixels=NO_LIMIT), source_of(row))
+        sha256, photograph = load(
+            SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1)), source_of(row)
+        )
     except SourceError as error:
         sha256 = error.sha256 or str(row["source_sha256"])
         raise DamageError(_changed(sha256, row) or f"its source cannot be used ({error})") from error
