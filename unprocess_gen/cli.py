@@ -39,27 +39,37 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset plan [overrides] [--all]         what would be made; writes nothing
   gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
   gen-dataset verify DIR --repair              … and make again what is damaged, to the same bytes
+  gen-dataset verify DIR --noise [--to PNG]    … and fit the noise in its arrays against its rows
   gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
                                                make rows again and compare, or write their arrays
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
 
 Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
-  source   root, include, recursive, limit, max_pixels, max_failed, icc
+  source   root, include, recursive, limit, max_pixels, max_failed, icc, clips, downscale,
+           dequantize
   camera   convex choice sony_a7r olympus_em10 sony_rx100 nexus_6p identity custom
   gains    brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
   isp      smoothstep_gamma22 gamma22 srgb linear
   sensor   imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit
   noise    imx385_iso1600 … imx385_iso25600 imx385_iso3200_rvdd brooks2019 heteroscedastic none
+           physical, for the ISO of the scene or of noise.iso: imx385 sony_a7s2 nikon_d850
+           canon_5d4 canon_70d canon_700d oppo_reno10x
+           several frames of one clean frame: noise.levels, noise.draws
+  scene    daylight indoor low_light night video_night long_exposure
+  effects  all (auto, on, off), tolerance, and each effect by name
+  clean    includes_fixed_pattern
   output   webdataset
 and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on).
 
-  --cfg job           print the settings and stop      --config-dir DIR   add a folder of your own options
+  --cfg job           print the settings and stop
+  --config-dir DIR    add a folder of your own options
   -m, --multirun      sweep over comma-separated values
   -sc install=bash    tab completion: eval "$(gen-dataset -sc install=bash)"; zsh and fish too
   --version, --help, --hydra-help
 
 Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 finished with failed images · 4 damage found
-            5 the machine failed (disk full) · 11 another run holds the output · 130, 143 stopped by a signal
+            5 the machine failed (disk full) · 11 another run holds the output
+            130, 143 stopped by a signal
 """
 
 ANY = ("…",)
@@ -199,7 +209,7 @@ def _plan(config: Config, read_all: bool) -> tuple[int, None]:
 
 
 AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
-VERIFY_KEYS = {"source.root": str, "--regenerate": int}
+VERIFY_KEYS = {"source.root": str, "--regenerate": int, "--to": str}
 REPLAY_KEYS = {"source.root": str, "--rows": str, "--keys": str, "--to": str}
 
 
@@ -249,12 +259,12 @@ def _values(verb: str, known: Mapping[str, Callable[[str], Any]], arguments: Seq
 
 
 def verify(arguments: list[str]) -> int:
-    """``gen-dataset verify DIR [--regenerate N] [--repair] [source.root=…]``: check every byte, mend what is wrong."""
+    """``gen-dataset verify DIR [--regenerate N] [--repair] [--noise] …``: check every byte, mend, fit the noise."""
     from unprocess_gen import repair
     from unprocess_gen import verify as room
 
-    mend = "--repair" in arguments
-    arguments = [argument for argument in arguments if argument != "--repair"]
+    mend, noise = "--repair" in arguments, "--noise" in arguments
+    arguments = [argument for argument in arguments if argument not in ("--repair", "--noise")]
 
     if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
         raise ConfigError("verify: expected the folder of a dataset")
@@ -264,15 +274,34 @@ def verify(arguments: list[str]) -> int:
         for step in repair.repair(folder, room.source_root(folder / "manifest.csv", chosen.get("source.root"))):
             print(step, file=sys.stdout if step.mended else sys.stderr)
         damages = _told(folder, room.verify(folder))
-    manifest, count = folder / "manifest.csv", chosen.get("--regenerate", 0)
+    manifest, count, again = folder / "manifest.csv", chosen.get("--regenerate", 0), 0
     if count and not damages:
         root = room.source_root(manifest, chosen.get("source.root"))
-        replayed = room.replay(room.spread(manifest, count), root)
+        replayed = list(room.replay(room.spread(manifest, count), root))
+        again = len(replayed)
         damages += _told(folder, (f"{one.key} ({one.source}): {one.complaint}" for one in replayed if one.complaint))
+    if noise and not damages:
+        damages += _check_noise(folder, chosen.get("--to"))
     if damages:
         return 4
-    print(f"{folder} is whole" + (f"; {count} pairs were made again, bit for bit" if count else ""))
+    print(f"{folder} is whole" + (f"; {again} pairs were made again, bit for bit" if again else ""))
     return 0
+
+
+def _check_noise(folder: Path, to: str | None) -> list[str]:
+    """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
+    from unprocess_gen import transfer
+
+    found = list(transfer.fits(folder))
+    if not found:
+        print(f"{folder}: no pair has sites enough to fit its noise")
+        return []
+    worst = max(found, key=lambda one: one.deviation)
+    print(f"noise of {len(found)} pairs fitted (a, b with 95 % intervals); the farthest from its row: {worst}")
+    if to is not None:
+        transfer.draw(found, Path(to))
+        print(f"drawn in {to}")
+    return _told(folder, (f"noise of {one}" for one in found if one.deviation > transfer.ALARM))
 
 
 def _told(folder: Path, damages: Iterable[object]) -> list[str]:
