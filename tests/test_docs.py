@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from unprocess_gen.cli import HELP, VERBS
-from unprocess_gen.config import Config
+from unprocess_gen.config import RATES, BranchConfig, Config
 from unprocess_gen.errors import REASONS
 from unprocess_gen.manifest import COLUMNS
+from unprocess_gen.physics import FORMS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -41,14 +42,23 @@ def test_every_option_is_in_the_readme(group: str, option: str) -> None:
 KEYS = [
     (group.name, field.name)
     for group in dataclasses.fields(Config)
-    if group.name in ("source", "gains", "isp", "sensor")
+    if group.name in ("source", "gains", "isp", "sensor", "scene", "effects", "clean")
     for field in dataclasses.fields(getattr(Config(), group.name))
+    if (group.name, field.name) != ("scene", "name")
+]
+KEYS += [("noise", key) for key, _, _ in RATES] + [
+    ("noise", field.name) for field in dataclasses.fields(BranchConfig) if field.name != "iso"
 ]
 
 
 @pytest.mark.parametrize(("group", "key"), KEYS)
 def test_every_key_of_a_group_is_in_the_readme(group: str, key: str) -> None:
     assert f"`{key}`" in README
+
+
+@pytest.mark.parametrize("form", [*FORMS, "by_log_iso"])
+def test_every_form_of_a_physical_profile_is_in_the_readme(form: str) -> None:
+    assert f"[{form}, " in README
 
 
 @pytest.mark.parametrize("reason", REASONS)

@@ -16,11 +16,12 @@ FLOORS = (
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
     {"poisson"},
     {
-        *("config", "decode", "effects", "fused", "manifest", "process"),
+        *("config", "decode", "draws", "effects", "manifest", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
     },
+    {"fused", "physics", "planner"},
     {"pair", "photographs", "plan", "reader", "selftest", "workspace"},
-    {"forecast", "runner", "sweep", "verify"},
+    {"forecast", "runner", "sweep", "transfer", "verify"},
     {"repair"},
     {"cli"},
 )

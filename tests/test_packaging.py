@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import sysconfig
@@ -16,8 +17,15 @@ ROOT = Path(__file__).parents[1]
 OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
 
 
-def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False)
+def run(*command: str | Path, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env=os.environ | env,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +72,9 @@ def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
 
 
 def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path: Path) -> None:
-    where = run(installed / "python", "-c", "import unprocess_gen; print(unprocess_gen.__file__)", cwd=tmp_path)
-    done = run(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path)
+    code = "import unprocess_gen; print(unprocess_gen.__file__)"
+    where = run(installed / "python", "-c", code, cwd=tmp_path, PYTHONPATH="")
+    done = run(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path, PYTHONPATH="")
 
     assert Path(where.stdout.strip()).is_relative_to(installed.parent)
     assert done.returncode == 0, done.stderr

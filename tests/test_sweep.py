@@ -77,7 +77,7 @@ def test_a_job_that_fails_stops_no_other_and_the_worst_code_is_returned(
 
 def test_the_error_of_a_job_is_one_line_that_names_it(door: Door, source: Path) -> None:
     done = door("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
-    errors = [line for line in done.err.splitlines() if "pairs/s" not in line]
+    errors = [line for line in done.err.splitlines() if "images/s" not in line]
     assert errors == ["gen-dataset: gains.red=0: gains.red=0: a gain must be above 0, from 0.001 to 1000"]
 
 
