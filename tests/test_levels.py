@@ -78,6 +78,12 @@ def test_the_pairs_of_an_image_share_all_but_the_noise(many: Path) -> None:
         assert all(one == shared[0] for one in shared)
 
 
+def test_the_end_of_a_run_counts_pairs(door: Door) -> None:
+    said = door("source.limit=1", "noise.levels=2", "noise.draws=2", "noise=brooks2019", "n_jobs=1").out
+    assert said.startswith("ds: 4 pairs in 1 shards")
+    assert "; 4 of 4 made now, " in said
+
+
 def test_each_level_draws_its_own_noise_and_the_draws_of_a_level_share_it(many: Path) -> None:
     levels = {(row["level"], row["a_dn"], row["b_dn2"]) for row in rows(many) if row["source"] == "large.png"}
     assert len(levels) == 3

@@ -108,7 +108,7 @@ def generate(config: Config) -> Summary:
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         bench = Bench(config, str(workspace.tmp), os.getpid())
         given_up: dict[int, Made] = {}
-        warned = False
+        warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
             for made in run_tasks(bench, todo, n_jobs):
                 if made.killer is None:
@@ -119,6 +119,7 @@ def generate(config: Config) -> Summary:
                 if made.self_test and not warned:
                     warned = True
                     print(f"gen-dataset: the self-test failed: {made.self_test}; going on as told", file=sys.stderr)
+                rows_made += len(made.rows)
                 progress.advance(made.rows)
         seconds = time.monotonic() - started
         try:
@@ -139,7 +140,7 @@ def generate(config: Config) -> Summary:
                 "versions": {package: version(package) for package in PACKAGES},
             },
         )
-    return _summary(Path(config.out), facts, made=sum(len(task.sources) for task in todo), started=started)
+    return _summary(Path(config.out), facts, made=rows_made, started=started)
 
 
 def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[Task]:
