@@ -75,7 +75,8 @@ def test_a_philox_with_another_constant_is_found(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("kernel", ["_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray"])
 def test_a_kernel_that_computes_otherwise_is_found(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The kernels run as plain Python here, one of them nudged."""
-    for name in ("_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray", "_signal", "_pair"):
+    callers = ("_stream", "_signal", "_pair")
+    for name in ("_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray", *callers):
         monkeypatch.setattr(fused, name, getattr(fused, name).py_func)
     monkeypatch.setattr(fused, kernel, nudged(getattr(fused, kernel)))
     with np.errstate(over="ignore"):

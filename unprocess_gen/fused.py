@@ -155,14 +155,11 @@ def _pair(
     for y in range(height):
         for start in range(0, width, CHUNK):
             length = min(CHUNK, width - start)
-            first_block = (origin[1] + start) // BLOCK
-            offset = (origin[1] + start) % BLOCK
-            blocks = (offset + length + BLOCK - 1) // BLOCK
             _signal(srgb[y, start : start + length], scene, y, signal)
             _light(signal[:length], site_gains[y & 1], site_headroom[y & 1], scene, signal)
             _clean_frame(signal[:length], scene, unrounded, clean[y, start : start + length], counts)
-            _words(key, first_block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, words)
-            _normals(words[: blocks * BLOCK], quantiles, bits, normals)
+            offset = _stream(key, (origin[0] + y, origin[1] + start), HETEROSCEDASTIC, length, words)
+            _normals(words[: offset + length], quantiles, bits, normals)
             _noisy_frame(
                 unrounded[:length],
                 normals[offset : offset + length],
@@ -259,6 +256,21 @@ def _words(
 
 
 @kernel
+def _stream(
+    key: Key,
+    place: tuple[int, int],
+    purpose_word: np.uint64,
+    length: int,
+    words: NDArray[np.uint64],
+) -> int:
+    """Fill ``words`` with those of a run of pixels from ``place`` on, and return where in it the first one stands."""
+    offset = place[1] % BLOCK
+    blocks = (offset + length + BLOCK - 1) // BLOCK
+    _words(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
+    return int(offset)
+
+
+@kernel
 def _normals(
     words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
 ) -> None:
@@ -322,18 +334,33 @@ def _noisy_frame(
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """Add the noise to the clean frame before rounding; round half to even, clip, cast."""
+    """Add the noise to the clean frame before rounding, and read it out; overwrites the normals with the sum."""
+    a, b = scene.noise
+    black = scene.levels_dn[0]
+    for x in range(unrounded.shape[0]):
+        dn = unrounded[x]
+        normals[x] = dn + np.sqrt(max(a * (dn - black) + b, 0.0)) * normals[x]
+    _read_out(unrounded, normals, scene, limits_dn, noisy, counts)
+
+
+@kernel
+def _read_out(
+    unrounded: Float,
+    noisy_dn: Float,
+    scene: _Scene,
+    limits_dn: tuple[float, float],
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Pin what is saturated, if so asked; round half to even, clip, cast."""
     a, b = scene.noise
     black, pinned = scene.levels_dn[0], scene.pinned_dn
     low, high = limits_dn
     below, above, still = 0, 0, 0
     for x in range(unrounded.shape[0]):
-        dn = unrounded[x]
-        variance = max(a * (dn - black) + b, 0.0)
-        still += variance == 0.0
-        noisy_dn = dn + np.sqrt(variance) * normals[x]
-        noisy_dn = pinned if dn >= pinned else noisy_dn
-        rounded = (noisy_dn + _ROUND) - _ROUND
+        still += max(a * (unrounded[x] - black) + b, 0.0) == 0.0
+        dn = pinned if unrounded[x] >= pinned else noisy_dn[x]
+        rounded = (dn + _ROUND) - _ROUND
         below += rounded < low
         above += rounded > high
         noisy[x] = np.uint16(np.int32(min(max(rounded, low), high)))
@@ -443,21 +470,6 @@ def _responses(
             _normals(words[: offset + length], quantiles, bits, normals)
             for x in range(length):
                 out[y, start + x] = np.float32(max(1 + prnu_std * normals[offset + x], 0.0))
-
-
-@kernel
-def _stream(
-    key: Key,
-    place: tuple[int, int],
-    purpose_word: np.uint64,
-    length: int,
-    words: NDArray[np.uint64],
-) -> int:
-    """Fill ``words`` with those of a run of pixels from ``place`` on, and return where in it the first one stands."""
-    offset = place[1] % BLOCK
-    blocks = (offset + length + BLOCK - 1) // BLOCK
-    _words(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
-    return int(offset)
 
 
 @kernel
@@ -639,29 +651,3 @@ def _saturated(clean: Raw, white: float) -> int:
     for x in range(clean.shape[0]):
         count += clean[x] == white
     return count
-
-
-@kernel
-def _read_out(
-    unrounded: Float,
-    noisy_dn: Float,
-    scene: _Scene,
-    limits_dn: tuple[float, float],
-    noisy: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Pin what is saturated, if so asked; round half to even, clip, cast."""
-    a, b = scene.noise
-    black, pinned = scene.levels_dn[0], scene.pinned_dn
-    low, high = limits_dn
-    below, above, still = 0, 0, 0
-    for x in range(unrounded.shape[0]):
-        still += max(a * (unrounded[x] - black) + b, 0.0) == 0.0
-        dn = pinned if unrounded[x] >= pinned else noisy_dn[x]
-        rounded = (dn + _ROUND) - _ROUND
-        below += rounded < low
-        above += rounded > high
-        noisy[x] = np.uint16(np.int32(min(max(rounded, low), high)))
-    counts[2] += below
-    counts[3] += above
-    counts[5] += still
