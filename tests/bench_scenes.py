@@ -26,7 +26,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from unprocess_gen import effects, fused, planner
+from unprocess_gen import effects, electrons, planner
 from unprocess_gen.cli import conf_dir
 from unprocess_gen.config import Config, check
 from unprocess_gen.decode import decode
@@ -108,7 +108,7 @@ def omission(srgb: Srgb, everything: Plan, auto: Plan) -> dict[str, Float]:
 
 def nanoseconds(srgb: Srgb, plan: Plan) -> float:
     """One pair of a body that was not seen before, nanoseconds of processor time a pixel."""
-    fused.body_response.cache_clear()
+    electrons.body_response.cache_clear()
     started = time.thread_time()
     make_pair(srgb, plan)
     return (time.thread_time() - started) * 1e9 / (srgb.shape[0] * srgb.shape[1])

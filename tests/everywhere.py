@@ -43,7 +43,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 
-from unprocess_gen import cli, fused, poisson, selftest
+from unprocess_gen import cli, electrons, fused, poisson, selftest
 from unprocess_gen.pair import make_pair
 from unprocess_gen.tables import normal_table
 
@@ -152,24 +152,24 @@ def doubles() -> str:
     bits, words = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
     clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
-    fused._camera(codes, products[0], products[1], camera)
-    fused._light_by_gray(codes, products, np.array([0, 1]), np.array([0.37, 0.8, 0.47]), 0.9, gray)
+    fused._fill_camera(codes, products[0], products[1], camera)
+    fused._fill_light_by_gray(codes, products, np.array([0, 1]), np.array([0.37, 0.8, 0.47]), 0.9, gray)
     signal, gains = n / 999.0, np.full(count, 0.37)
     plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
-    scene = fused._scene(plan, np.arange(256) / 255.0, (1, count), (0, 0))
-    fused._light(signal, gains, 1 - gains, scene, lit)
-    fused._clean_frame(lit, scene, unrounded, clean, tally)
-    key = fused._key(2**33 + 1, 5, 6, 7)
-    fused._words(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
-    fused._normals(words, tuple(normal_table()[:, i].copy() for i in range(3)), bits, normals)
-    fused._words(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
+    scene = fused.scene_of(plan, np.arange(256) / 255.0, (1, count), (0, 0))
+    fused.fill_light(signal, gains, 1 - gains, scene, lit)
+    fused.fill_clean(lit, scene, unrounded, clean, tally)
+    key = fused.key_words(2**33 + 1, 5, 6, 7)
+    fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
+    fused.fill_normals(words, tuple(normal_table()[:, i].copy() for i in range(3)), bits, normals)
+    fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
     poisson.draw(words, 10.0 ** (n % 10 - 1.0), normals, poisson.poisson_tables(), counts)
-    body = fused._body(plan, (1, count), (0, 0))
-    fused._digitise(counts, normals, body, 0, body.columns_dn, gains, 64.0, digitised)
+    body = electrons._body(plan, (1, count), (0, 0))
+    electrons._digitise(counts, normals, body, 0, body.columns_dn, gains, 64.0, digitised)
     level = replace(selftest.GOLDEN_PLAN, a_dn=0.0, b_dn2=2500.0)
     half_way = (n % 9 + 0.5) - 50.0 * normals
-    still = fused._scene(level, np.arange(256) / 255.0, (1, count), (0, 0))
-    fused._noisy_frame(half_way, normals, still, (0.0, 4095.0), noisy, tally)
+    still = fused.scene_of(level, np.arange(256) / 255.0, (1, count), (0, 0))
+    fused._fill_noisy(half_way, normals, still, (0.0, 4095.0), noisy, tally)
     return digest(camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, noisy, tally)
 
 
@@ -206,8 +206,8 @@ def code() -> dict[str, Any]:
 
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
-    for name in ("_pair", "_physical_pair", "_responses"):
-        setattr(fused, name, compiler(getattr(fused, name)))
+    for room, name in ((fused, "_pair"), (electrons, "_physical_pair"), (electrons, "_responses")):
+        setattr(room, name, compiler(getattr(room, name)))
     for plan in selftest.GOLDEN_PLANS.values():
         make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan)
     three = (numba.float64[::1],) * 3

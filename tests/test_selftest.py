@@ -72,11 +72,13 @@ def test_a_philox_with_another_constant_is_found(monkeypatch: pytest.MonkeyPatch
     assert "Philox of 00000000 is not Random123's" in selftest.failures(physical=False)
 
 
-@pytest.mark.parametrize("kernel", ["_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray"])
+KERNELS = ("_fill_blocks", "fill_normals", "fill_clean", "_fill_noisy", "_fill_camera", "_fill_light_by_gray")
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_a_kernel_that_computes_otherwise_is_found(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The kernels run as plain Python here, one of them nudged."""
-    callers = ("_stream", "_signal", "_pair")
-    for name in ("_words", "_normals", "_clean_frame", "_noisy_frame", "_camera", "_light_by_gray", *callers):
+    for name in (*KERNELS, "fill_words", "fill_signal", "_pair"):
         monkeypatch.setattr(fused, name, getattr(fused, name).py_func)
     monkeypatch.setattr(fused, kernel, nudged(getattr(fused, kernel)))
     with np.errstate(over="ignore"):

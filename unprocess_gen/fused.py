@@ -1,4 +1,4 @@
-"""The fast form of a pair: one pass over the photograph, one channel a site, no full-resolution RGB in between.
+"""The fast form of a pair whose noise is one normal a site: one pass, one channel a site, no full-resolution RGB.
 
 Must give the DN of `pair.reference_pair` everywhere, on every machine. Hence Numba without fastmath (no reordering, no
 fused multiply-add), float64, only + - × ÷ √, comparisons, integers and table look-ups, and each formula in the
@@ -18,21 +18,16 @@ outer loop and rows in the inner (5.7 in all).
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen import effects
 from unprocess_gen.bayer import tile
 from unprocess_gen.compiled import kernel
-from unprocess_gen.poisson import Tables as PoissonTables
-from unprocess_gen.poisson import draw as draw_counts
-from unprocess_gen.poisson import poisson_tables
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
-from unprocess_gen.tables import SEGMENTS, exponential_levels, normal_table
+from unprocess_gen.tables import SEGMENTS, normal_table
 
 CHUNK = 1024
 """Pixels worked on at a time: six buffers of 8 kB."""
@@ -49,13 +44,9 @@ _ONE_BITS = np.uint64(0x3FF0000000000000)
 _POSITION_BITS = np.uint64(52 - SEGMENT_BITS)
 _POSITION_MASK = np.uint64(2 ** (52 - SEGMENT_BITS) - 1)
 _FIRST_ROW = np.uint64(1023 << SEGMENT_BITS)
-_ROUND = 1.5 * 2.0**52
+ROUND = 1.5 * 2.0**52
 
-PRNU, SHOT, DARK, HOT, DEAD, HETEROSCEDASTIC = (
-    np.uint64(purpose(stream))
-    for stream in ("prnu", "shot", "dark_current", "hot_pixels", "dead_pixels", "heteroscedastic")
-)
-HOT_STEP = np.uint64(purpose("hot_pixels", draw=1))
+HETEROSCEDASTIC = np.uint64(purpose("heteroscedastic"))
 
 
 def make_pair(
@@ -65,26 +56,22 @@ def make_pair(
     limits_dn: tuple[float, float],
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
-    """Make a pair; arguments as in `pair.make_pair`, with the curve of the source's codes, and the lowest and highest
-    DN of the noisy frame.
+    """Make a pair of a two-parameter profile with normal noise.
+
+    Arguments as for `pair.make_pair`, with the curve of the source's codes, and the lowest and highest DN of the noisy
+    frame.
     """
     clean = np.empty(srgb.shape[:2], dtype=np.uint16)
     noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
     counts = np.zeros(6, dtype=np.int64)
-    scene = _scene(plan, curve, srgb.shape, origin)
+    scene = scene_of(plan, curve, srgb.shape, origin)
     frames = (clean, noisy, counts)
-    key = _key(plan.stream_key, plan.level, plan.draw, plan.frame)
-    if plan.physics is None and plan.noise_law == "gaussian":
-        quantiles = _columns(normal_table())
-        _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, quantiles, *frames)
-    else:
-        body = _body(plan, srgb.shape, origin)
-        tables, normal = poisson_tables(), _columns(normal_table())
-        _physical_pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, body, tables, normal, *frames)
+    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
+    _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, columns(normal_table()), *frames)
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
-class _Scene(NamedTuple):
+class Scene(NamedTuple):
     """What the clean frame is made with: small arrays and numbers, as the kernels take them."""
 
     products: Float  # [c, j, k]: matrix entry (c, j) times the curve at code k
@@ -100,11 +87,12 @@ class _Scene(NamedTuple):
     noise: tuple[float, float]  # variance line
 
 
-def _scene(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int, int]) -> _Scene:
+def scene_of(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int, int]) -> Scene:
+    """Gather what the clean frame of a plan is made with; ``curve`` is that of the source's codes."""
     gains = np.array(plan.inverse_gains)
     ccm = np.array(plan.rgb2cam).reshape(3, 3)
     black_dn, white_dn = float(plan.black_level_dn), float(plan.white_level_dn)
-    return _Scene(
+    return Scene(
         ccm[:, :, None] * curve,
         np.array(tile(plan.pattern, origin)),
         gains,
@@ -123,11 +111,12 @@ Key = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 """The two words of a Philox key, then what level and draw, and the frame, put into the counter."""
 
 
-def _key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Key:
+def key_words(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Key:
+    """Return the words of a stream's key and counter, as the kernels take them."""
     return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
 
 
-def _columns(table: Float) -> tuple[Float, Float, Float]:
+def columns(table: Float) -> tuple[Float, Float, Float]:
     """Return the three columns of a table of quadratics, each in one piece."""
     return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
 
@@ -135,7 +124,7 @@ def _columns(table: Float) -> tuple[Float, Float, Float]:
 @kernel
 def _pair(
     srgb: Srgb,
-    scene: _Scene,
+    scene: Scene,
     key: Key,
     limits_dn: tuple[float, float],
     origin: tuple[int, int],
@@ -151,16 +140,16 @@ def _pair(
     words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
     normals = np.empty(CHUNK + BLOCK)
     bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    site_gains, site_headroom = _by_site(scene)
+    site_gains, site_headroom = by_site(scene)
     for y in range(height):
         for start in range(0, width, CHUNK):
             length = min(CHUNK, width - start)
-            _signal(srgb[y, start : start + length], scene, y, signal)
-            _light(signal[:length], site_gains[y & 1], site_headroom[y & 1], scene, signal)
-            _clean_frame(signal[:length], scene, unrounded, clean[y, start : start + length], counts)
-            offset = _stream(key, (origin[0] + y, origin[1] + start), HETEROSCEDASTIC, length, words)
-            _normals(words[: offset + length], quantiles, bits, normals)
-            _noisy_frame(
+            fill_signal(srgb[y, start : start + length], scene, y, signal)
+            fill_light(signal[:length], site_gains[y & 1], site_headroom[y & 1], scene, signal)
+            fill_clean(signal[:length], scene, unrounded, clean[y, start : start + length], counts)
+            offset = fill_words(key, (origin[0] + y, origin[1] + start), HETEROSCEDASTIC, length, words)
+            fill_normals(words[: offset + length], quantiles, bits, normals)
+            _fill_noisy(
                 unrounded[:length],
                 normals[offset : offset + length],
                 scene,
@@ -171,7 +160,7 @@ def _pair(
 
 
 @kernel
-def _by_site(scene: _Scene) -> tuple[Float, Float]:
+def by_site(scene: Scene) -> tuple[Float, Float]:
     """Return gains and headroom for each pixel of an even and of an odd row, so that loops over them vectorise."""
     gains = np.empty((2, CHUNK))
     headroom = np.empty((2, CHUNK))
@@ -183,17 +172,17 @@ def _by_site(scene: _Scene) -> tuple[Float, Float]:
 
 
 @kernel
-def _signal(row: Srgb, scene: _Scene, y: int, out: Float) -> None:
+def fill_signal(row: Srgb, scene: Scene, y: int, out: Float) -> None:
     """Linearise and apply the matrix; by gray, invert the gains too."""
     site = scene.sites[y & 1]
     if scene.by_gray:
-        _light_by_gray(row, scene.products, site, scene.gains, scene.threshold, out)
+        _fill_light_by_gray(row, scene.products, site, scene.gains, scene.threshold, out)
     else:
-        _camera(row, scene.products[site[0]], scene.products[site[1]], out)
+        _fill_camera(row, scene.products[site[0]], scene.products[site[1]], out)
 
 
 @kernel
-def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
+def _fill_camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
     """Linearise and apply the matrix, for the one channel that each site keeps."""
     e0, e1, e2 = even[0], even[1], even[2]
     o0, o1, o2 = odd[0], odd[1], odd[2]
@@ -208,7 +197,7 @@ def _camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
 
 
 @kernel
-def _light_by_gray(
+def _fill_light_by_gray(
     row: Srgb, products: Float, site: NDArray[np.int64], gains: Float, threshold: float, out: Float
 ) -> None:
     """Linearise, apply the matrix and invert the gains, highlights kept by the mean of the three channels."""
@@ -225,7 +214,7 @@ def _light_by_gray(
 
 
 @kernel
-def _words(
+def _fill_blocks(
     key: Key,
     first_block: int,
     blocks: int,
@@ -256,7 +245,7 @@ def _words(
 
 
 @kernel
-def _stream(
+def fill_words(
     key: Key,
     place: tuple[int, int],
     purpose_word: np.uint64,
@@ -266,12 +255,12 @@ def _stream(
     """Fill ``words`` with those of a run of pixels from ``place`` on, and return where in it the first one stands."""
     offset = place[1] % BLOCK
     blocks = (offset + length + BLOCK - 1) // BLOCK
-    _words(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
+    _fill_blocks(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
     return int(offset)
 
 
 @kernel
-def _normals(
+def fill_normals(
     words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
 ) -> None:
     """Normals by inverse CDF, as `effects.normals`; overwrites the low bits of ``words``."""
@@ -296,7 +285,7 @@ def _normals(
 
 
 @kernel
-def _light(signal: Float, gains: Float, headroom: Float, scene: _Scene, out: Float) -> None:
+def fill_light(signal: Float, gains: Float, headroom: Float, scene: Scene, out: Float) -> None:
     """Invert the gains, highlights kept by channel (or not, where ``headroom`` is 0), and darken the scene."""
     threshold, exposure = scene.threshold, scene.exposure
     limit = np.inf if exposure == 1.0 else 1.0  # what the photograph shows as white is white before it is darkened
@@ -307,7 +296,7 @@ def _light(signal: Float, gains: Float, headroom: Float, scene: _Scene, out: Flo
 
 
 @kernel
-def _clean_frame(light: Float, scene: _Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+def fill_clean(light: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
     """Clip, go to DN, round."""
     black, span, white = scene.levels_dn
     brightest = scene.brightest
@@ -316,7 +305,7 @@ def _clean_frame(light: Float, scene: _Scene, unrounded: Float, clean: Raw, coun
         below += light[x] < 0.0
         above += light[x] > brightest
         dn = min(max(light[x], 0.0), brightest) * span + black
-        rounded = (dn + _ROUND) - _ROUND
+        rounded = (dn + ROUND) - ROUND
         saturated += rounded == white
         clean[x] = np.uint16(np.int32(rounded))
         unrounded[x] = dn
@@ -326,10 +315,10 @@ def _clean_frame(light: Float, scene: _Scene, unrounded: Float, clean: Raw, coun
 
 
 @kernel
-def _noisy_frame(
+def _fill_noisy(
     unrounded: Float,
     normals: Float,
-    scene: _Scene,
+    scene: Scene,
     limits_dn: tuple[float, float],
     noisy: Raw,
     counts: NDArray[np.int64],
@@ -340,14 +329,14 @@ def _noisy_frame(
     for x in range(unrounded.shape[0]):
         dn = unrounded[x]
         normals[x] = dn + np.sqrt(max(a * (dn - black) + b, 0.0)) * normals[x]
-    _read_out(unrounded, normals, scene, limits_dn, noisy, counts)
+    read_out(unrounded, normals, scene, limits_dn, noisy, counts)
 
 
 @kernel
-def _read_out(
+def read_out(
     unrounded: Float,
     noisy_dn: Float,
-    scene: _Scene,
+    scene: Scene,
     limits_dn: tuple[float, float],
     noisy: Raw,
     counts: NDArray[np.int64],
@@ -360,294 +349,10 @@ def _read_out(
     for x in range(unrounded.shape[0]):
         still += max(a * (unrounded[x] - black) + b, 0.0) == 0.0
         dn = pinned if unrounded[x] >= pinned else noisy_dn[x]
-        rounded = (dn + _ROUND) - _ROUND
+        rounded = (dn + ROUND) - ROUND
         below += rounded < low
         above += rounded > high
         noisy[x] = np.uint16(np.int32(min(max(rounded, low), high)))
     counts[2] += below
     counts[3] += above
     counts[5] += still
-
-
-# -------------------------------------------------------------------------------------------- the physical effects
-
-
-class _Body(NamedTuple):
-    """What the noisy frame of a physical profile is made with; a number that leaves its effect out is said."""
-
-    dn_per_e: float
-    response: NDArray[np.float32]  # [H, W]; [1, 1] where the effect is off
-    responds: bool
-    averaged: bool  # whether the clean frame has the fixed patterns too
-    shot: bool
-    dark: bool
-    dark_e: float
-    removed_e: float
-    hot_below: np.uint64  # a pixel whose word lies below is hot; 0: none is
-    hot_e: float
-    levels: Float
-    full_well_e: float  # infinity: off
-    read_std_dn: float  # 0: off
-    quantiles: tuple[Float, Float, Float]
-    rows_dn: Float  # [H]
-    columns_dn: Float  # [W]
-    errors_dn: Float  # [2, 2]
-    dead_below: np.uint64
-    read_purpose: np.uint64
-    key: Key
-
-
-def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
-    """Gather the numbers of the effects that are simulated; of a two-parameter profile's Poisson form as well."""
-    physics = plan.physics
-    if physics is None:
-        a_dn, b_dn2 = plan.variance_line
-        return _Body(
-            a_dn or 1.0, np.ones((1, 1), np.float32), False, False, a_dn > 0, False, 0.0, 0.0, np.uint64(0), 0.0,
-            exponential_levels(), np.inf, float(np.sqrt(max(b_dn2, 0.0))), _columns(normal_table()),
-            np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, 2)), np.uint64(0), HETEROSCEDASTIC, _key(0),
-        )  # fmt: skip
-    on = frozenset(plan.effects)
-    return _Body(
-        dn_per_e=physics.dn_per_e,
-        response=(
-            body_response(physics.body_key, physics.prnu_std, shape[0], shape[1], origin)
-            if "prnu" in on
-            else np.ones((1, 1), np.float32)
-        ),
-        responds="prnu" in on,
-        averaged=plan.averaged,
-        shot="shot" in on,
-        dark="dark_current" in on,
-        dark_e=physics.dark_e,
-        removed_e=physics.dark_e if physics.dark_offset == "removed" else 0.0,
-        hot_below=share_limit(physics.hot_pixel_share) if "hot_pixels" in on else np.uint64(0),
-        hot_e=physics.hot_pixel_e,
-        levels=exponential_levels(),
-        full_well_e=physics.full_well_e if "full_well" in on else np.inf,
-        read_std_dn=physics.read_std_dn if "read" in on else 0.0,
-        quantiles=_columns(effects.read_table(physics)),
-        rows_dn=effects.row(plan, shape[0], origin[0]) if "row" in on else np.zeros(shape[0]),
-        columns_dn=effects.column(physics, shape[1], origin[1]) if "column" in on else np.zeros(shape[1]),
-        errors_dn=effects.black_error(physics, (2, 2), origin) if "black_error" in on else np.zeros((2, 2)),
-        dead_below=share_limit(physics.dead_pixel_share) if "dead_pixels" in on else np.uint64(0),
-        read_purpose=np.uint64(purpose("read")),
-        key=_key(physics.body_key),
-    )
-
-
-def share_limit(share: float) -> np.uint64:
-    """Return the word below which a share of all words lies (`effects.is_among`)."""
-    return np.uint64(int(share * 2**32))
-
-
-@functools.lru_cache(maxsize=1)
-def body_response(
-    body_key: int, prnu_std: float, height: int, width: int, origin: tuple[int, int]
-) -> NDArray[np.float32]:
-    """Return `effects.response`, kept for the next frame of the same body."""
-    response = np.empty((height, width), dtype=np.float32)
-    _responses(_key(body_key), prnu_std, origin, _columns(normal_table()), response)
-    return response
-
-
-@kernel
-def _responses(
-    key: Key,
-    prnu_std: float,
-    origin: tuple[int, int],
-    quantiles: tuple[Float, Float, Float],
-    out: NDArray[np.float32],
-) -> None:
-    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    normals = np.empty(CHUNK + BLOCK)
-    for y in range(out.shape[0]):
-        for start in range(0, out.shape[1], CHUNK):
-            length = min(CHUNK, out.shape[1] - start)
-            place = (origin[0] + y, origin[1] + start)
-            offset = _stream(key, place, PRNU, length, words)
-            _normals(words[: offset + length], quantiles, bits, normals)
-            for x in range(length):
-                out[y, start + x] = np.float32(max(1 + prnu_std * normals[offset + x], 0.0))
-
-
-@kernel
-def _physical_pair(
-    srgb: Srgb,
-    scene: _Scene,
-    key: Key,
-    limits_dn: tuple[float, float],
-    origin: tuple[int, int],
-    body: _Body,
-    tables: PoissonTables,
-    normal: tuple[Float, Float, Float],
-    clean: Raw,
-    noisy: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a physical profile: `effects.physical`, row by row."""
-    height, width = clean.shape
-    light = np.empty(CHUNK)
-    unrounded = np.empty(CHUNK)
-    electrons = np.empty(CHUNK)
-    added = np.empty(CHUNK)
-    drawn = np.empty(CHUNK)  # counts may not lie where their means do
-    fixed = np.empty(CHUNK)
-    noisy_dn = np.empty(CHUNK)
-    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    kept = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    normals = np.empty(CHUNK + BLOCK)
-    site_gains, site_headroom = _by_site(scene)
-    black = scene.levels_dn[0]
-    errors = np.empty((2, CHUNK))
-    for y in range(2):
-        for x in range(CHUNK):
-            errors[y, x] = body.errors_dn[y, x & 1]
-    for y in range(height):
-        for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
-            place = (origin[0] + y, origin[1] + start)
-            _signal(srgb[y, start : start + n], scene, y, light)
-            _light(light[:n], site_gains[y & 1], site_headroom[y & 1], scene, light)
-            if body.responds and body.averaged:
-                for x in range(n):
-                    light[x] = light[x] * body.response[y, start + x]
-            saturated = counts[4]
-            _clean_frame(light[:n], scene, unrounded, clean[y, start : start + n], counts)
-
-            for x in range(n):
-                electrons[x] = (unrounded[x] - black) / body.dn_per_e
-            if body.responds and not body.averaged:
-                for x in range(n):
-                    electrons[x] = electrons[x] * body.response[y, start + x]
-            if body.shot:
-                offset = _stream(key, place, SHOT, n, words)
-                _counts(words, offset, n, electrons, tables, normal, kept, bits, normals, drawn)
-                electrons, drawn = drawn, electrons
-            if body.dark:
-                offset = _stream(key, place, DARK, n, words)
-                added[:n] = body.dark_e
-                _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
-                for x in range(n):
-                    electrons[x] = electrons[x] + (drawn[x] - body.removed_e)
-            if body.hot_below:
-                hot = _hot_means(body, place, n, words, kept, added)
-                for x in range(n):
-                    fixed[x] = added[x] * body.dn_per_e
-                if hot:
-                    offset = _stream(key, place, HOT, n, words)
-                    _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
-                    for x in range(n):
-                        electrons[x] = electrons[x] + drawn[x]
-            offset = 0
-            if body.read_std_dn > 0.0:
-                offset = _stream(key, place, body.read_purpose, n, words)
-                _normals(words[: offset + n], body.quantiles, bits, normals)
-            else:
-                normals[:n] = 0.0
-            _digitise(
-                electrons[:n], normals[offset : offset + n], body, y, body.columns_dn[start : start + n],
-                errors[y & 1], black, noisy_dn,
-            )  # fmt: skip
-            if body.averaged:
-                _average(unrounded[:n], fixed, body, y, start, limits_dn, scene, clean[y, start : start + n])
-            if body.dead_below:
-                offset = _stream(body.key, place, DEAD, n, words)
-                for x in range(n):
-                    if words[offset + x] < body.dead_below:
-                        noisy_dn[x] = 0.0
-                        if body.averaged:
-                            clean[y, start + x] = np.uint16(np.int32(limits_dn[0]))
-            _read_out(unrounded[:n], noisy_dn, scene, limits_dn, noisy[y, start : start + n], counts)
-            if body.averaged:
-                counts[4] = saturated + _saturated(clean[y, start : start + n], scene.levels_dn[2])
-
-
-@kernel
-def _counts(
-    words: NDArray[np.uint64],
-    offset: int,
-    n: int,
-    rates: Float,
-    tables: PoissonTables,
-    normal: tuple[Float, Float, Float],
-    kept: NDArray[np.uint64],
-    bits: NDArray[np.uint64],
-    normals: Float,
-    out: Float,
-) -> None:
-    """Fill ``out`` with Poisson counts of the mean ``rates``; the words are needed beside the normals made of them."""
-    for x in range(n):
-        kept[x] = words[offset + x]
-    _normals(words[: offset + n], normal, bits, normals)
-    draw_counts(kept[:n], rates[:n], normals[offset : offset + n], tables, out[:n])
-
-
-@kernel
-def _hot_means(
-    body: _Body,
-    place: tuple[int, int],
-    n: int,
-    words: NDArray[np.uint64],
-    kept: NDArray[np.uint64],
-    out: Float,
-) -> int:
-    """Fill ``out`` with the mean excess of each pixel, as `effects.hot_pixel_means`; return how many are hot."""
-    offset = _stream(body.key, place, HOT, n, words)
-    hot = 0
-    for x in range(n):
-        out[x] = 1.0 if words[offset + x] < body.hot_below else 0.0
-        hot += words[offset + x] < body.hot_below
-    if hot:
-        _stream(body.key, place, HOT_STEP, n, kept)
-        for x in range(n):
-            if out[x] > 0.0:
-                out[x] = body.hot_e * body.levels[kept[offset + x] >> np.uint64(22)]
-    return hot
-
-
-@kernel
-def _digitise(
-    electrons: Float,
-    normals: Float,
-    body: _Body,
-    y: int,
-    columns_dn: Float,
-    errors_dn: Float,
-    black: float,
-    out: Float,
-) -> None:
-    """Go from electrons to DN, and add what is added there."""
-    full_well_e, dn_per_e, read_std_dn, row_dn = body.full_well_e, body.dn_per_e, body.read_std_dn, body.rows_dn[y]
-    for x in range(electrons.shape[0]):
-        dn = min(electrons[x], full_well_e) * dn_per_e + black
-        out[x] = (dn + read_std_dn * normals[x]) + ((row_dn + columns_dn[x]) + errors_dn[x])
-
-
-@kernel
-def _average(
-    unrounded: Float,
-    fixed: Float,
-    body: _Body,
-    y: int,
-    start: int,
-    limits_dn: tuple[float, float],
-    scene: _Scene,
-    clean: Raw,
-) -> None:
-    """Round the clean frame anew, with what an average of many frames keeps of the body."""
-    low, high = limits_dn
-    for x in range(unrounded.shape[0]):
-        dn = unrounded[x] + fixed[x] if body.hot_below else unrounded[x]
-        dn = dn + ((0.0 + body.columns_dn[start + x]) + body.errors_dn[y & 1, (start + x) & 1])
-        clean[x] = np.uint16(np.int32(min(max((dn + _ROUND) - _ROUND, low), high)))
-
-
-@kernel
-def _saturated(clean: Raw, white: float) -> int:
-    count = 0
-    for x in range(clean.shape[0]):
-        count += clean[x] == white
-    return count

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen import effects, fused
+from unprocess_gen import effects, electrons, fused
 from unprocess_gen.records import Counts, Pair, Plan, Srgb
 from unprocess_gen.sensor import noisy_limits, quantise, to_dn
 from unprocess_gen.tables import linear_table
@@ -26,7 +26,8 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     srgb = _dequantised(srgb, plan, origin)
     curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    return fused.make_pair(srgb, plan, curve, limits_dn, origin)
+    maker = electrons.make_pair if plan.counts_electrons else fused.make_pair
+    return maker(srgb, plan, curve, limits_dn, origin)
 
 
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:

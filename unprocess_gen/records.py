@@ -161,6 +161,11 @@ class Plan:
         return 1 / self.exposure_ratio
 
     @property
+    def counts_electrons(self) -> bool:
+        """Whether the noise is made of counts of electrons, not of one normal a site."""
+        return self.physics is not None or self.noise_law == "poisson"
+
+    @property
     def averaged(self) -> bool:
         """Whether the clean frame shares the body's fixed patterns, as an average of many frames does."""
         return self.physics is not None and self.physics.fixed_pattern_in_clean

@@ -1,0 +1,344 @@
+"""The fast form of a pair whose noise is made in electrons, effect by effect: `fused`'s passes with `effects.physical`.
+
+Must give the DN of `pair.reference_pair` everywhere, by the same means as `fused`, of which the clean frame, the words,
+the normals and the read-out are. Of a body that is seen again the response pattern is kept.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen import effects
+from unprocess_gen.compiled import kernel
+from unprocess_gen.fused import (
+    CHUNK,
+    HETEROSCEDASTIC,
+    ROUND,
+    Key,
+    Scene,
+    by_site,
+    columns,
+    fill_clean,
+    fill_light,
+    fill_normals,
+    fill_signal,
+    fill_words,
+    key_words,
+    read_out,
+    scene_of,
+)
+from unprocess_gen.poisson import Tables as PoissonTables
+from unprocess_gen.poisson import draw as draw_counts
+from unprocess_gen.poisson import poisson_tables
+from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
+from unprocess_gen.streams import BLOCK, purpose
+from unprocess_gen.tables import exponential_levels, normal_table
+
+PRNU, SHOT, DARK, HOT, DEAD = (
+    np.uint64(purpose(stream)) for stream in ("prnu", "shot", "dark_current", "hot_pixels", "dead_pixels")
+)
+HOT_STEP = np.uint64(purpose("hot_pixels", draw=1))
+
+
+def make_pair(
+    srgb: Srgb,
+    plan: Plan,
+    curve: Float,
+    limits_dn: tuple[float, float],
+    origin: tuple[int, int] = (0, 0),
+) -> Pair:
+    """Make a pair of a physical profile, or of a two-parameter one by counts; arguments as for `fused.make_pair`."""
+    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
+    noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
+    counts = np.zeros(6, dtype=np.int64)
+    scene = scene_of(plan, curve, srgb.shape, origin)
+    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
+    body, tables, normal = _body(plan, srgb.shape, origin), poisson_tables(), columns(normal_table())
+    pixels = np.ascontiguousarray(srgb)
+    _physical_pair(pixels, scene, key, limits_dn, origin, body, tables, normal, clean, noisy, counts)
+    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+
+
+class _Body(NamedTuple):
+    """What the noisy frame of a physical profile is made with; a number that leaves its effect out is said."""
+
+    dn_per_e: float
+    response: NDArray[np.float32]  # [H, W]; [1, 1] where the effect is off
+    responds: bool
+    averaged: bool  # whether the clean frame has the fixed patterns too
+    shot: bool
+    dark: bool
+    dark_e: float
+    removed_e: float
+    hot_below: np.uint64  # a pixel whose word lies below is hot; 0: none is
+    hot_e: float
+    levels: Float
+    full_well_e: float  # infinity: off
+    read_std_dn: float  # 0: off
+    quantiles: tuple[Float, Float, Float]
+    rows_dn: Float  # [H]
+    columns_dn: Float  # [W]
+    errors_dn: Float  # [2, 2]
+    dead_below: np.uint64
+    read_purpose: np.uint64
+    key: Key
+
+
+def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
+    """Gather the numbers of the effects that are simulated; of a two-parameter profile's Poisson form as well."""
+    physics = plan.physics
+    if physics is None:
+        a_dn, b_dn2 = plan.variance_line
+        return _Body(
+            a_dn or 1.0, np.ones((1, 1), np.float32), False, False, a_dn > 0, False, 0.0, 0.0, np.uint64(0), 0.0,
+            exponential_levels(), np.inf, float(np.sqrt(max(b_dn2, 0.0))), columns(normal_table()),
+            np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, 2)), np.uint64(0), HETEROSCEDASTIC, key_words(0),
+        )  # fmt: skip
+    on = frozenset(plan.effects)
+    return _Body(
+        dn_per_e=physics.dn_per_e,
+        response=(
+            body_response(physics.body_key, physics.prnu_std, shape[0], shape[1], origin)
+            if "prnu" in on
+            else np.ones((1, 1), np.float32)
+        ),
+        responds="prnu" in on,
+        averaged=plan.averaged,
+        shot="shot" in on,
+        dark="dark_current" in on,
+        dark_e=physics.dark_e,
+        removed_e=physics.dark_e if physics.dark_offset == "removed" else 0.0,
+        hot_below=share_limit(physics.hot_pixel_share) if "hot_pixels" in on else np.uint64(0),
+        hot_e=physics.hot_pixel_e,
+        levels=exponential_levels(),
+        full_well_e=physics.full_well_e if "full_well" in on else np.inf,
+        read_std_dn=physics.read_std_dn if "read" in on else 0.0,
+        quantiles=columns(effects.read_table(physics)),
+        rows_dn=effects.row(plan, shape[0], origin[0]) if "row" in on else np.zeros(shape[0]),
+        columns_dn=effects.column(physics, shape[1], origin[1]) if "column" in on else np.zeros(shape[1]),
+        errors_dn=effects.black_error(physics, (2, 2), origin) if "black_error" in on else np.zeros((2, 2)),
+        dead_below=share_limit(physics.dead_pixel_share) if "dead_pixels" in on else np.uint64(0),
+        read_purpose=np.uint64(purpose("read")),
+        key=key_words(physics.body_key),
+    )
+
+
+def share_limit(share: float) -> np.uint64:
+    """Return the word below which a share of all words lies (`effects.is_among`)."""
+    return np.uint64(int(share * 2**32))
+
+
+@functools.lru_cache(maxsize=1)
+def body_response(
+    body_key: int, prnu_std: float, height: int, width: int, origin: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Return `effects.response`, kept for the next frame of the same body."""
+    response = np.empty((height, width), dtype=np.float32)
+    _responses(key_words(body_key), prnu_std, origin, columns(normal_table()), response)
+    return response
+
+
+@kernel
+def _responses(
+    key: Key,
+    prnu_std: float,
+    origin: tuple[int, int],
+    quantiles: tuple[Float, Float, Float],
+    out: NDArray[np.float32],
+) -> None:
+    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    normals = np.empty(CHUNK + BLOCK)
+    for y in range(out.shape[0]):
+        for start in range(0, out.shape[1], CHUNK):
+            length = min(CHUNK, out.shape[1] - start)
+            place = (origin[0] + y, origin[1] + start)
+            offset = fill_words(key, place, PRNU, length, words)
+            fill_normals(words[: offset + length], quantiles, bits, normals)
+            for x in range(length):
+                out[y, start + x] = np.float32(max(1 + prnu_std * normals[offset + x], 0.0))
+
+
+@kernel
+def _physical_pair(
+    srgb: Srgb,
+    scene: Scene,
+    key: Key,
+    limits_dn: tuple[float, float],
+    origin: tuple[int, int],
+    body: _Body,
+    tables: PoissonTables,
+    normal: tuple[Float, Float, Float],
+    clean: Raw,
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a physical profile: `effects.physical`, row by row."""
+    height, width = clean.shape
+    light = np.empty(CHUNK)
+    unrounded = np.empty(CHUNK)
+    electrons = np.empty(CHUNK)
+    added = np.empty(CHUNK)
+    drawn = np.empty(CHUNK)  # counts may not lie where their means do
+    fixed = np.empty(CHUNK)
+    noisy_dn = np.empty(CHUNK)
+    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    kept = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    normals = np.empty(CHUNK + BLOCK)
+    site_gains, site_headroom = by_site(scene)
+    black = scene.levels_dn[0]
+    errors = np.empty((2, CHUNK))
+    for y in range(2):
+        for x in range(CHUNK):
+            errors[y, x] = body.errors_dn[y, x & 1]
+    for y in range(height):
+        for start in range(0, width, CHUNK):
+            n = min(CHUNK, width - start)
+            place = (origin[0] + y, origin[1] + start)
+            fill_signal(srgb[y, start : start + n], scene, y, light)
+            fill_light(light[:n], site_gains[y & 1], site_headroom[y & 1], scene, light)
+            if body.responds and body.averaged:
+                for x in range(n):
+                    light[x] = light[x] * body.response[y, start + x]
+            saturated = counts[4]
+            fill_clean(light[:n], scene, unrounded, clean[y, start : start + n], counts)
+
+            for x in range(n):
+                electrons[x] = (unrounded[x] - black) / body.dn_per_e
+            if body.responds and not body.averaged:
+                for x in range(n):
+                    electrons[x] = electrons[x] * body.response[y, start + x]
+            if body.shot:
+                offset = fill_words(key, place, SHOT, n, words)
+                _counts(words, offset, n, electrons, tables, normal, kept, bits, normals, drawn)
+                electrons, drawn = drawn, electrons
+            if body.dark:
+                offset = fill_words(key, place, DARK, n, words)
+                added[:n] = body.dark_e
+                _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
+                for x in range(n):
+                    electrons[x] = electrons[x] + (drawn[x] - body.removed_e)
+            if body.hot_below:
+                hot = _hot_means(body, place, n, words, kept, added)
+                for x in range(n):
+                    fixed[x] = added[x] * body.dn_per_e
+                if hot:
+                    offset = fill_words(key, place, HOT, n, words)
+                    _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
+                    for x in range(n):
+                        electrons[x] = electrons[x] + drawn[x]
+            offset = 0
+            if body.read_std_dn > 0.0:
+                offset = fill_words(key, place, body.read_purpose, n, words)
+                fill_normals(words[: offset + n], body.quantiles, bits, normals)
+            else:
+                normals[:n] = 0.0
+            _digitise(
+                electrons[:n], normals[offset : offset + n], body, y, body.columns_dn[start : start + n],
+                errors[y & 1], black, noisy_dn,
+            )  # fmt: skip
+            if body.averaged:
+                _average(unrounded[:n], fixed, body, y, start, limits_dn, scene, clean[y, start : start + n])
+            if body.dead_below:
+                offset = fill_words(body.key, place, DEAD, n, words)
+                for x in range(n):
+                    if words[offset + x] < body.dead_below:
+                        noisy_dn[x] = 0.0
+                        if body.averaged:
+                            clean[y, start + x] = np.uint16(np.int32(limits_dn[0]))
+            read_out(unrounded[:n], noisy_dn, scene, limits_dn, noisy[y, start : start + n], counts)
+            if body.averaged:
+                counts[4] = saturated + _saturated(clean[y, start : start + n], scene.levels_dn[2])
+
+
+@kernel
+def _counts(
+    words: NDArray[np.uint64],
+    offset: int,
+    n: int,
+    rates: Float,
+    tables: PoissonTables,
+    normal: tuple[Float, Float, Float],
+    kept: NDArray[np.uint64],
+    bits: NDArray[np.uint64],
+    normals: Float,
+    out: Float,
+) -> None:
+    """Fill ``out`` with Poisson counts of the mean ``rates``; the words are needed beside the normals made of them."""
+    for x in range(n):
+        kept[x] = words[offset + x]
+    fill_normals(words[: offset + n], normal, bits, normals)
+    draw_counts(kept[:n], rates[:n], normals[offset : offset + n], tables, out[:n])
+
+
+@kernel
+def _hot_means(
+    body: _Body,
+    place: tuple[int, int],
+    n: int,
+    words: NDArray[np.uint64],
+    kept: NDArray[np.uint64],
+    out: Float,
+) -> int:
+    """Fill ``out`` with the mean excess of each pixel, as `effects.hot_pixel_means`; return how many are hot."""
+    offset = fill_words(body.key, place, HOT, n, words)
+    hot = 0
+    for x in range(n):
+        out[x] = 1.0 if words[offset + x] < body.hot_below else 0.0
+        hot += words[offset + x] < body.hot_below
+    if hot:
+        fill_words(body.key, place, HOT_STEP, n, kept)
+        for x in range(n):
+            if out[x] > 0.0:
+                out[x] = body.hot_e * body.levels[kept[offset + x] >> np.uint64(22)]
+    return hot
+
+
+@kernel
+def _digitise(
+    electrons: Float,
+    normals: Float,
+    body: _Body,
+    y: int,
+    columns_dn: Float,
+    errors_dn: Float,
+    black: float,
+    out: Float,
+) -> None:
+    """Go from electrons to DN, and add what is added there."""
+    full_well_e, dn_per_e, read_std_dn, row_dn = body.full_well_e, body.dn_per_e, body.read_std_dn, body.rows_dn[y]
+    for x in range(electrons.shape[0]):
+        dn = min(electrons[x], full_well_e) * dn_per_e + black
+        out[x] = (dn + read_std_dn * normals[x]) + ((row_dn + columns_dn[x]) + errors_dn[x])
+
+
+@kernel
+def _average(
+    unrounded: Float,
+    fixed: Float,
+    body: _Body,
+    y: int,
+    start: int,
+    limits_dn: tuple[float, float],
+    scene: Scene,
+    clean: Raw,
+) -> None:
+    """Round the clean frame anew, with what an average of many frames keeps of the body."""
+    low, high = limits_dn
+    for x in range(unrounded.shape[0]):
+        dn = unrounded[x] + fixed[x] if body.hot_below else unrounded[x]
+        dn = dn + ((0.0 + body.columns_dn[start + x]) + body.errors_dn[y & 1, (start + x) & 1])
+        clean[x] = np.uint16(np.int32(min(max((dn + ROUND) - ROUND, low), high)))
+
+
+@kernel
+def _saturated(clean: Raw, white: float) -> int:
+    count = 0
+    for x in range(clean.shape[0]):
+        count += clean[x] == white
+    return count
