@@ -86,16 +86,20 @@ def unrounded(srgb: Srgb, plan: Plan) -> tuple[Float, Float]:
     return clean_dn, effects.noisy(clean_dn, plan)
 
 
-def omission(srgb: Srgb, everything: Plan, auto: Plan) -> dict[str, Float]:
+def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[str, Float]:
     """What ``auto`` leaves out of ``everything``, squared, over the variance that hides it, for each statistic.
 
-    One value for each pixel, row, column and colour plane. What hides is the noise of ``auto`` at the local signal.
+    One value for each pixel, row, column and colour plane of the mean over the ``frames`` of a still clip. What hides
+    is the noise of ``auto`` at the local signal.
     """
-    clean_dn, noisy_dn = unrounded(srgb, auto)
-    left_out = unrounded(srgb, everything)[1] - noisy_dn
+    clean_dn = unrounded(srgb, auto)[0]
+    clips = ([unrounded(srgb, replace(plan, frame=n))[1] for n in range(frames)] for plan in (everything, auto))
+    with_all, with_some = (np.mean(clip, axis=0) for clip in clips)
+    left_out = with_all - with_some
     variance = effects.noise_variance(clean_dn, auto) + 1 / 12
     if auto.physics is not None and "dark_current" in auto.effects:
         variance = variance + auto.physics.dn_per_e**2 * auto.physics.dark_e
+    variance = variance / frames
     height, width = left_out.shape
     planes = [(left_out[y::2, x::2], variance[y::2, x::2]) for y in range(min(height, 2)) for x in range(min(width, 2))]
     return {

@@ -92,7 +92,7 @@ CONTRACT = [
 ]
 
 SHA256 = "ab" * 32
-FACTS = Facts(width=3, height=2, codes=256, dark_code=3, middle_code=90, bright_code=250)
+FACTS = Facts(width=3, height=2, codes=256, dark_code=3, bright_code=250)
 SOURCE = Source(3, "a, b.png", "a, b.png", 1234)
 PAIR = Pair(np.zeros((2, 3), np.uint16), np.zeros((2, 3), np.uint16), Counts(1, 2, 3, 4, 5, 6))
 PLAN = Plan(

@@ -22,7 +22,7 @@ from unprocess_gen.records import Facts, Physics
 Settings = Callable[..., Config]
 
 MIDDLE = dict.fromkeys(PARAMETERS, 0.5)
-FACTS = Facts(64, 48, 256, 0, 128, 255)
+FACTS = Facts(64, 48, 256, 0, 255)
 
 SAME_SENSOR = {
     "imx385": (12, 240, 4095),

@@ -21,7 +21,7 @@ from unprocess_gen.config import Config, check
 from unprocess_gen.effects import EFFECTS, black_error, noise_variance, response
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.plan import plan_image, plan_with_reasons
-from unprocess_gen.planner import STATISTICS, Light, Prediction, decide, facts_of, light_of
+from unprocess_gen.planner import Light, Prediction, decide, facts_of, light_of
 from unprocess_gen.poisson import poisson
 from unprocess_gen.records import Facts, Physics, Plan, Srgb
 from unprocess_gen.sensor import to_dn
@@ -93,7 +93,7 @@ def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset
     """Look that what auto leaves out, of the effects it is free to decide about, is hidden; return in how many."""
     held = 0
     for name, srgb in pictures.items():
-        found: dict[str, list[np.ndarray]] = {statistic: [] for statistic in STATISTICS}
+        found: dict[str, list[np.ndarray]] = {}
         for number in range(frames):
             everything, auto = (switched(config, switch, srgb, number) for switch in ("on", "auto"))
             everything = replace(
@@ -102,14 +102,13 @@ def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset
             if everything.effects == auto.effects:
                 continue
             for statistic, squares in omission(srgb, everything, auto).items():
-                found[statistic].append(squares)
+                found.setdefault(statistic, []).append(squares)
         for statistic, parts in found.items():
-            if parts:
-                squares = np.concatenate(parts)
-                rms = float(np.sqrt(squares.mean()))
-                most = limit(config.effects.tolerance, independent(statistic, squares.size, srgb))
-                assert rms <= most, f"{name}, {statistic}: {rms} of the noise, at most {most}"
-                held += 1
+            squares = np.concatenate(parts)
+            rms = float(np.sqrt(squares.mean()))
+            most = limit(config.effects.tolerance, independent(statistic, squares.size, srgb))
+            assert rms <= most, f"{name}, {statistic}: {rms} of the noise, at most {most}"
+            held += 1
     return held
 
 
@@ -172,7 +171,9 @@ def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
     )
 
 
-def test_the_promise_holds_of_any_sensor(settings: Settings, pictures: dict[str, Srgb]) -> None:
+@pytest.mark.parametrize("frames", [1, 12])
+def test_the_promise_holds_of_any_sensor(settings: Settings, pictures: dict[str, Srgb], frames: int) -> None:
+    """Of single frames, and of the mean over a clip's."""
     config = configured(settings, "noise=nikon_d850", "scene=night", "noise.assumed=[]", "noise.full_well_e=1000")
     rng = np.random.default_rng(5)
     left_out: set[str] = set()
@@ -182,16 +183,16 @@ def test_the_promise_holds_of_any_sensor(settings: Settings, pictures: dict[str,
         plan = replace(switched(config, "on", srgb, number), exposure_ratio=float(10 ** rng.uniform(-0.5, 2.5)))
         assert plan.physics is not None
         plan = of_sensor(plan, sensor(rng, plan.physics))
-        effects = decided(config, plan, srgb)
+        effects = decided(config, plan, srgb, frames)
         left_out |= set(EFFECTS) - set(effects)
-        found: dict[str, list[np.ndarray]] = {statistic: [] for statistic in STATISTICS}
-        for frame in range(4):
-            everything = replace(plan, stream_key=frame, physics=replace(plan.physics, body_key=frame + 1000))
+        found: dict[str, list[np.ndarray]] = {}
+        for body in range(4 if frames == 1 else 2):
+            everything = replace(plan, stream_key=body, physics=replace(plan.physics, body_key=body + 1000))
             auto = replace(everything, effects=effects)
             if "dead_pixels" not in effects:  # counted instead
                 everything = replace(everything, effects=tuple(one for one in EFFECTS if one != "dead_pixels"))
-            for statistic, squares in omission(srgb, everything, auto).items():
-                found[statistic].append(squares)
+            for statistic, squares in omission(srgb, everything, auto, frames).items():
+                found.setdefault(statistic, []).append(squares)
         for statistic, parts in found.items():
             values = np.concatenate(parts)
             most = limit(TOLERANCE, independent(statistic, values.size, srgb))
@@ -205,10 +206,10 @@ def of_sensor(plan: Plan, physics: Physics) -> Plan:
     return replace(plan, physics=physics, a_dn=physics.dn_per_e, b_dn2=b_dn2, effects=EFFECTS)
 
 
-def decided(config: Config, plan: Plan, srgb: Srgb) -> tuple[str, ...]:
+def decided(config: Config, plan: Plan, srgb: Srgb, frames: int = 1) -> tuple[str, ...]:
     """Which effects auto simulates with the numbers of a plan."""
     assert plan.physics is not None
-    facts, span_dn = facts_of(srgb), float(plan.white_level_dn - plan.black_level_dn)
+    facts, span_dn = facts_of(srgb, frames), float(plan.white_level_dn - plan.black_level_dn)
     light = light_of(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
     return chosen(automatic(config), plan.physics, facts, light)
 
@@ -283,7 +284,7 @@ def base(settings: Settings) -> tuple[Config, Physics]:
     return automatic(config), physics
 
 
-FACTS = Facts(768, 512, 256, 10, 100, 255)
+FACTS = Facts(768, 512, 256, 10, 255)
 LIGHT = Light(10.0, 3000.0)
 
 
@@ -313,6 +314,37 @@ def test_an_effect_that_is_called_for_is_simulated_and_no_other(
     on = set(chosen(config, replace(physics, **numbers), FACTS, LIGHT))
     assert effect in on
     assert on - {"read"} == {"shot", "quantise", effect}
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers"),
+    [
+        ("prnu", {"prnu_std": 1e-4}),
+        ("hot_pixels", {"hot_pixel_share": 1e-5, "hot_pixel_e": 0.3}),
+        ("column", {"column_std_dn": 1e-3}),
+        ("black_error", {"black_error_dn": (0.0, 0.0, 1e-3, 0.0)}),
+    ],
+)
+def test_a_pattern_that_a_frame_hides_and_a_clip_shows_is_called_for_in_the_clip(
+    base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
+) -> None:
+    config, physics = base
+    physics = replace(physics, **numbers)
+    assert effect not in chosen(config, physics, FACTS, LIGHT)
+    predictions = decide(config, physics, replace(FACTS, frames=100_000), LIGHT)
+    found = next(one for one in predictions if one.effect == effect)
+    assert found.simulated
+    assert found.statistic.startswith("clip's")
+
+
+def test_what_is_new_in_every_frame_shows_no_better_in_a_clip(base: tuple[Config, Physics]) -> None:
+    config, physics = base
+    physics = replace(physics, row_std_dn=0.01, dark_e=0.01)
+    for one, many in zip(
+        decide(config, physics, FACTS, LIGHT), decide(config, physics, replace(FACTS, frames=100), LIGHT), strict=True
+    ):
+        if one.effect in ("shot", "dark_current", "read", "row"):
+            assert (many.statistic, many.ratio) == (one.statistic, pytest.approx(one.ratio))
 
 
 STRONG = {
@@ -417,13 +449,13 @@ def test_offsets_that_are_left_out_add_up_as_they_are(base: tuple[Config, Physic
 # What a decision depends on -------------------------------------------------------------------------------------------
 
 
-def test_facts_are_the_extremes_of_all_codes_and_the_middle_of_the_green_ones() -> None:
+def test_facts_are_the_extremes_of_all_codes() -> None:
     srgb = np.array([[[9, 7, 3], [250, 8, 8]], [[5, 5, 5], [6, 6, 6]]], dtype=np.uint8)
-    assert facts_of(srgb) == Facts(2, 2, 256, 3, 7, 250)
+    assert facts_of(srgb) == Facts(2, 2, 256, 3, 250)
 
 
 def test_facts_of_a_single_pixel() -> None:
-    assert facts_of(np.array([[[1, 2, 65535]]], dtype=np.uint16)) == Facts(1, 1, 65536, 1, 2, 65535)
+    assert facts_of(np.array([[[1, 2, 65535]]], dtype=np.uint16)) == Facts(1, 1, 65536, 1, 65535)
 
 
 def test_facts_see_a_single_bright_pixel_wherever_it_is() -> None:
@@ -436,11 +468,7 @@ def test_facts_see_a_single_bright_pixel_wherever_it_is() -> None:
 def test_facts_rise_with_the_codes(seed: int, more: int) -> None:
     srgb = np.random.default_rng(seed).integers(0, 200, (9, 11, 3)).astype(np.uint8)
     before, after = facts_of(srgb), facts_of(srgb + np.uint8(more))
-    assert (after.dark_code, after.middle_code, after.bright_code) == (
-        before.dark_code + more,
-        before.middle_code + more,
-        before.bright_code + more,
-    )
+    assert (after.dark_code, after.bright_code) == (before.dark_code + more, before.bright_code + more)
 
 
 @pytest.mark.parametrize("highlight", ["per_channel", "gray_mean", "none"])
@@ -462,7 +490,7 @@ def test_no_site_is_darker_or_brighter_than_the_light_that_is_judged(
 
 def test_light_of_gray_by_hand() -> None:
     curve = linear_table("none", 1, 256)
-    light = light_of(Facts(4, 4, 256, 51, 60, 102), "none", 1, (0.5, 2.0, 0.25), 0.5, 1000.0, IDENTITY)
+    light = light_of(Facts(4, 4, 256, 51, 102), "none", 1, (0.5, 2.0, 0.25), 0.5, 1000.0, IDENTITY)
     assert light == Light(curve[51] * 0.25 * 0.5 * 1000, curve[102] * 2.0 * 0.5 * 1000)
 
 

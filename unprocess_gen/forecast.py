@@ -21,7 +21,7 @@ from unprocess_gen.manifest import json_size
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
 from unprocess_gen.plan import plan_image, plan_pairs, plan_with_reasons
-from unprocess_gen.planner import COST_NS, Prediction, facts_of
+from unprocess_gen.planner import COST_NS, Prediction, facts_for
 from unprocess_gen.records import Plan, Source
 from unprocess_gen.shards import array_xxh3, image_bytes, shard_bytes
 
@@ -93,7 +93,7 @@ def look(config: Config, source: Source) -> Look:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
         return Look(source, 0, time.perf_counter() - started, None, error.reason)
-    identity, facts = source.stream_identity(sha256), facts_of(photograph.srgb)
+    identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *identity, facts, source.frame)
     for plan in plans:
         pair = make_pair(photograph.srgb, plan)
@@ -110,7 +110,7 @@ def look(config: Config, source: Source) -> Look:
 def _warm_up(config: Config) -> None:
     """Have the machine code ready, so that its compilation is not taken for the price of an image."""
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
-    make_pair(srgb, plan_image(config, "0" * 64, facts=facts_of(srgb)))
+    make_pair(srgb, plan_image(config, "0" * 64, facts=facts_for(config, srgb)))
 
 
 def _existing(path: Path) -> Path:
@@ -214,13 +214,13 @@ def _physical(config: Config, plans: list[Plan]) -> list[str]:
 
 def _table(predictions: list[tuple[Prediction, ...]]) -> list[str]:
     """Return a line for each effect: of the photograph where it shows best, and how often it is simulated."""
-    lines = ["effect         predicted DN  in the       hidden by DN  simulated  ns/pixel  why"]
+    lines = ["effect         predicted DN  in the         hidden by DN  simulated  ns/pixel  why"]
     for of_effect in zip(*predictions, strict=True):
         best = max(of_effect, key=lambda one: (one.simulated, one.ratio, one.outliers))
         simulated = f"{sum(one.simulated for one in of_effect)} of {len(of_effect)}"
         cost = f"{COST_NS[best.effect]:.1f}"
         lines.append(
-            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:11}  {best.hidden_dn:12.3g}  "
+            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:13}  {best.hidden_dn:12.3g}  "
             f"{simulated:9}  {cost:>8}  {best.why}"
         )
     return lines

@@ -1,7 +1,8 @@
 """Which effects a scene calls for: what each contributes, what hides it, and the decision, in words with numbers.
 
 An effect is predicted in every statistic it acts on: single pixels, row means, column means, the mean of a colour
-plane; as what differs between them at random, and as an offset that all share. Each prediction is divided by the noise
+plane, each of one frame and of the mean over a clip's frames, where patterns of the body stay and noise does not; as
+what differs between them at random, and as an offset that all share. Each prediction is divided by the noise
 that would hide it there, that of the effects that stay on, at the lowest and at the highest signal that the image can
 have: in between no sum of them is larger. Under ``auto`` effects are left out, from the weakest on, as long as all that
 is left out stays within the tolerance in each statistic; random parts add in quadrature, offsets as they are (the idea
@@ -22,16 +23,19 @@ from decimal import Decimal, localcontext
 import numpy as np
 
 from unprocess_gen import colour
-from unprocess_gen.config import EFFECT_NUMBERS, Config, effect_switch, lacks
+from unprocess_gen.config import EFFECT_NUMBERS, Config, effect_switch, is_physical, lacks
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.records import Facts, Physics, Srgb
 from unprocess_gen.tables import linear_table
 
-SAMPLE_STEP = 4
 CALLED_COUNT = 0.1
 """Rare outliers are simulated where this many are expected in a frame."""
 
-STATISTICS = ("pixel", "row mean", "column mean", "plane mean")
+STATISTICS = (
+    *("pixel", "row mean", "column mean", "plane mean"),
+    *("clip's pixel", "clip's row", "clip's column", "clip's plane"),
+)
+"""Of one frame; then the same of the mean over all frames of a clip. A photograph is a clip of one."""
 
 FIXED = frozenset({"prnu", "hot_pixels", "column", "black_error", "dead_pixels"})
 """Patterns of the body, which a clean frame can have too: nothing but its rounding hides them there."""
@@ -50,12 +54,15 @@ body that was not seen just before. 0.1: less than could be measured.
 """
 
 
-def facts_of(srgb: Srgb) -> Facts:
-    """Return the whole numbers that a plan may know of decoded pixels, ``[H, W, 3]``."""
+def facts_of(srgb: Srgb, frames: int = 1) -> Facts:
+    """Return the whole numbers that a plan may know of decoded pixels, ``[H, W, 3]``, of a clip of ``frames``."""
     height, width = srgb.shape[:2]
-    green = np.sort(srgb[::SAMPLE_STEP, ::SAMPLE_STEP, 1], axis=None)
-    middle = green[(green.size - 1) // 2]
-    return Facts(width, height, int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(middle), int(srgb.max()))
+    return Facts(width, height, int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max()), frames)
+
+
+def facts_for(config: Config, srgb: Srgb, frames: int = 1) -> Facts | None:
+    """Return `facts_of` where the plan asks for them: of a physical profile."""
+    return facts_of(srgb, frames) if is_physical(config.noise) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +167,7 @@ def _said(config: Config, effect: str) -> Said | None:
     return None
 
 
-Sizes = tuple[float, float, float, float]
+Sizes = tuple[float, ...]
 """A value for each of `STATISTICS`."""
 
 
@@ -189,8 +196,9 @@ class Scene:
     @property
     def counts(self) -> Sizes:
         """Return how many sites each statistic is a mean over."""
-        width, height = self.facts.width, self.facts.height
-        return 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
+        width, height, frames = self.facts.width, self.facts.height, float(self.facts.frames)
+        counts = 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
+        return *counts, *(count * frames for count in counts)
 
     def hiding_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
         """Return the variance of a pixel at a signal, DN², of the random effects that are on, but for the effect."""
@@ -215,10 +223,7 @@ class Scene:
             lost_dn = self.lost_in_well(before_well, level_dn, on)
             for at, count in enumerate(self.counts):
                 offsets[at] += lost_dn * math.sqrt(count / hiding)
-        pixel, row, column, plane = (
-            math.sqrt(square + offset * offset) for square, offset in zip(squares, offsets, strict=True)
-        )
-        return pixel, row, column, plane
+        return tuple(math.sqrt(square + offset * offset) for square, offset in zip(squares, offsets, strict=True))
 
     def lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:
         """Return by how much more variance before a full well lowers the mean of what comes out, DN.
@@ -296,18 +301,27 @@ VARIANCES: dict[str, Callable[[Physics, float], float]] = {
 """What hides: the random effects of single pixels, DN² at a signal in DN above black."""
 
 
-def _independent(scene: Scene, variance: float, offset_dn: float = 0.0) -> Size:
-    """Return the size of what differs from pixel to pixel, beside an offset that they share."""
-    pixel, row, column, plane = (variance / count for count in scene.counts)
-    return Size((pixel, row, column, plane), offset_dn)
+def _independent(scene: Scene, variance: float, offset_dn: float = 0.0, fixed_variance: float = 0.0) -> Size:
+    """Return the size of what differs from pixel to pixel, beside an offset that they share.
+
+    ``variance`` is of what is new in every frame, ``fixed_variance`` of what stays.
+    """
+    frames = scene.counts[: len(scene.counts) // 2]
+    return Size(
+        tuple(
+            variance / count + fixed_variance / sites
+            for count, sites in zip(scene.counts, (*frames, *frames), strict=True)
+        ),
+        offset_dn,
+    )
 
 
 def _prnu(scene: Scene, level_dn: float, hiding: float) -> Size:
     """As a change of the shot noise's mean: nearby Poisson counts differ by √(|Δλ| + Δλ²) even at common uniforms."""
     physics = scene.physics
     change_e = physics.prnu_std * level_dn / physics.dn_per_e
-    variance_e = MEAN_ABS_NORMAL * change_e + change_e * change_e
-    return _independent(scene, physics.dn_per_e * physics.dn_per_e * variance_e)
+    squared = physics.dn_per_e * physics.dn_per_e
+    return _independent(scene, squared * MEAN_ABS_NORMAL * change_e, fixed_variance=squared * change_e * change_e)
 
 
 MEAN_ABS_NORMAL = 0.7978845608028654
@@ -328,7 +342,8 @@ def _hot_pixels(scene: Scene, level_dn: float, hiding: float) -> Size:
     """A Poisson count whose mean is exponentially distributed about m has the mean square m + 2m²."""
     physics = scene.physics
     mean_dn = physics.dn_per_e * physics.hot_pixel_e
-    return _inconspicuous(scene, physics.hot_pixel_share, mean_dn, (physics.dn_per_e + 2 * mean_dn) * mean_dn, hiding)
+    mean_square = (physics.dn_per_e + 2 * mean_dn) * mean_dn
+    return _inconspicuous(scene, physics.hot_pixel_share, mean_dn, mean_square, hiding)
 
 
 def _dead_pixels(scene: Scene, level_dn: float, hiding: float) -> Size:
@@ -339,7 +354,8 @@ def _dead_pixels(scene: Scene, level_dn: float, hiding: float) -> Size:
 
 def _inconspicuous(scene: Scene, share: float, mean_dn: float, mean_square: float, hiding: float) -> Size:
     """Return the size of rare pixels as far as they do not stand out: each up to one standard deviation."""
-    return _independent(scene, share * min(mean_square, hiding), share * min(mean_dn, math.sqrt(hiding)))
+    fixed_variance = share * min(mean_square, hiding)
+    return _independent(scene, 0.0, share * min(mean_dn, math.sqrt(hiding)), fixed_variance)
 
 
 def _full_well(scene: Scene, level_dn: float, hiding: float) -> Size:
@@ -367,12 +383,14 @@ def _read(scene: Scene, level_dn: float, hiding: float) -> Size:
 
 def _row(scene: Scene, level_dn: float, hiding: float) -> Size:
     variance, height = scene.physics.row_std_dn * scene.physics.row_std_dn, scene.facts.height
-    return Size((variance, variance, variance / height, variance / max(height // 2, 1)))
+    frame = variance, variance, variance / height, variance / max(height // 2, 1)
+    return Size((*frame, *(one / scene.facts.frames for one in frame)))
 
 
 def _column(scene: Scene, level_dn: float, hiding: float) -> Size:
     variance, width = scene.physics.column_std_dn * scene.physics.column_std_dn, scene.facts.width
-    return Size((variance, variance / width, variance, variance / max(width // 2, 1)))
+    frame = variance, variance / width, variance, variance / max(width // 2, 1)
+    return Size((*frame, *frame))
 
 
 def _black_error(scene: Scene, level_dn: float, hiding: float) -> Size:

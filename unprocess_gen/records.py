@@ -22,7 +22,7 @@ class Source:
     for a scene. Files that share a size were hashed beforehand (``sha256``) and identical ones numbered
     (``occurrence``). Where folders are clips, ``clip`` is the folder's name as ``name`` spells it, ``frame`` the number
     of the frame in it, and ``clip_sha256`` with ``clip_occurrence`` stands for the whole clip: the digest of its first
-    frame, and the number of clips before it that begin with the same.
+    frame, and the number of clips before it that begin with the same; ``frames`` is how many frames it has.
     """
 
     index: int
@@ -36,6 +36,7 @@ class Source:
     frame: int = 0
     clip_sha256: str | None = None
     clip_occurrence: int = 0
+    frames: int = 1
 
     def stream_identity(self, sha256: str) -> tuple[str, int]:
         """Return the digest and the number that the streams are keyed by: the clip's, or those of the photograph."""
@@ -56,16 +57,16 @@ class Photograph:
 class Facts:
     """What a plan may know of the pixels: whole numbers, the same on every machine.
 
-    ``dark_code`` and ``bright_code`` are the lowest and the highest code (of ``codes`` possible ones) in any channel,
-    ``middle_code`` the median of a regular sample of the green one.
+    ``dark_code`` and ``bright_code`` are the lowest and the highest code (of ``codes`` possible ones) in any channel;
+    ``frames`` is how many frames the clip has, 1 for a photograph.
     """
 
     width: int
     height: int
     codes: int
     dark_code: int
-    middle_code: int
     bright_code: int
+    frames: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ from unprocess_gen.manifest import Row, failed_row, images, key_text, ok_row, pa
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load
 from unprocess_gen.plan import plan_pairs
-from unprocess_gen.planner import facts_of
+from unprocess_gen.planner import facts_for
 from unprocess_gen.records import Counts, Source
 from unprocess_gen.shards import CLEAN, ShardWriter, array_xxh3, noisy_member, shard_name
 from unprocess_gen.workspace import Made, Workspace, machine_error
@@ -267,7 +267,8 @@ def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) 
         return [failed_row(source, error.sha256, shard, config.seed, error.reason)]
     key = key_text(source.index)
     rows: list[Row] = []
-    plans = plan_pairs(config, *source.stream_identity(sha256), facts_of(photograph.srgb), source.frame)
+    facts = facts_for(config, photograph.srgb, source.frames)
+    plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
     for plan in plans:
         pair = make_pair(photograph.srgb, plan)
         if not rows:

@@ -171,7 +171,7 @@ def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
         digest = _digest(root, frames[0])
         for frame, source in enumerate(frames):
             placed[source.index] = replace(
-                source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest]
+                source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest], frames=len(frames)
             )
         seen[digest] += 1
     return tuple(placed[source.index] for source in sources)
