@@ -85,6 +85,7 @@ def test_options_are_those_of_the_contract() -> None:
         },
         "scene": {"daylight", "indoor", "long_exposure", "low_light", "night", "video_night"},
         "effects": {"default"},
+        "accuracy": {"reference", "exact", "fast"},
         "output": {"webdataset"},
     }  # fmt: skip
 

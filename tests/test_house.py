@@ -14,7 +14,7 @@ HOUSE = Path(unprocess_gen.__file__).parent
 FLOORS = (
     {"errors", "records"},
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
-    {"poisson"},
+    {"methods", "poisson"},
     {
         *("config", "decode", "draws", "effects", "manifest", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),

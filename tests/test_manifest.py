@@ -34,7 +34,8 @@ from unprocess_gen.manifest import (
     row_json,
     write_rows,
 )
-from unprocess_gen.plan import METHODS, plan_image, plan_with_reasons
+from unprocess_gen.methods import STAGES, of_stage
+from unprocess_gen.plan import plan_image, plan_with_reasons
 from unprocess_gen.planner import STATISTICS
 from unprocess_gen.records import Counts, Facts, Pair, Physics, Plan, Source
 
@@ -453,7 +454,8 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         PLAN, seed=2**63 - 1, stream_key=2**64 - 1, scene=LONGEST_NAME, exposure_ratio=LONGEST, camera=LONGEST_NAME,
         weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
-        saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, methods=METHODS,
+        saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, law_distance=LONGEST,
+        methods=tuple(max((one.spelled for one in of_stage(stage)), key=len) for stage in STAGES),
         effects=("heteroscedastic", "quantise"),
         skipped=(f"heteroscedastic: noise={LONGEST_NAME} has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),
     )  # fmt: skip

@@ -31,7 +31,7 @@ from unprocess_gen.config import Config, branch_of, check
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.manifest import ok_row, plan_of, read_rows, write_rows
 from unprocess_gen.pair import make_pair, reference_pair
-from unprocess_gen.plan import METHODS, plan_image
+from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_of
 from unprocess_gen.records import Physics, Plan, Source, Srgb
 from unprocess_gen.tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
@@ -243,7 +243,7 @@ def made(*on: str, frame: int = 0xF4A3E, **changes: Any) -> Plan:
         rgb2cam=IDENTITY, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=1.0, tone="none", gamma=1.0, highlight="none",
         highlight_threshold=0.9, pattern="RGGB", bits=16, black_level_dn=BLACK, white_level_dn=WHITE,
         sensor_clip="sensor", saturated="noisy", noise="flat", noise_law="gaussian", a_dn=physics.dn_per_e,
-        b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), skipped=(), accuracy="exact", methods=METHODS,
+        b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), skipped=(), accuracy="exact", methods=(),
         physics=physics,
     )  # fmt: skip
 

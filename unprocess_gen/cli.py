@@ -58,6 +58,8 @@ Settings are key=value, in any order. Groups (group=option; their keys are group
   scene    daylight indoor low_light night video_night long_exposure
   effects  all (auto, on, off), tolerance, and each effect by name
   clean    includes_fixed_pattern
+  accuracy exact reference fast or a budget: clean_dn, clean_changed_share, normal_error,
+           law_distance, readable
   output   webdataset
 and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on).
 

@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from unprocess_gen import bayer, colour
 from unprocess_gen.errors import ConfigError
+from unprocess_gen.methods import Budget, choose
 from unprocess_gen.records import Law
 
 
@@ -180,6 +181,18 @@ class CleanConfig:
 
 
 @dataclass
+class AccuracyConfig:
+    """What may be given up for speed: the numbers of `methods.Budget`."""
+
+    name: str = "exact"
+    readable: bool = False
+    clean_dn: float = 0.0
+    clean_changed_share: float = 0.0
+    normal_error: float = 1e-6
+    law_distance: float = 0.0
+
+
+@dataclass
 class OutputConfig:
     """What the dataset is written as."""
 
@@ -200,6 +213,7 @@ class Config:
     scene: SceneConfig = field(default_factory=SceneConfig)
     effects: EffectsConfig = field(default_factory=EffectsConfig)
     clean: CleanConfig = field(default_factory=CleanConfig)
+    accuracy: AccuracyConfig = field(default_factory=AccuracyConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     seed: int = 0
     out: str = "ds"
@@ -355,6 +369,7 @@ def check(config: Config) -> None:
         _check_noise(noise, config.scene)
     _check_levels(config)
     _check_effects(config)
+    _check_accuracy(config)
     _one_of("output.layout", config.output.layout, ("webdataset",))
     _in_range("output.pairs_per_shard", config.output.pairs_per_shard, 1, MAX_PAIRS_PER_SHARD)
 
@@ -690,6 +705,20 @@ def _check_effects(config: Config) -> None:
         _one_of(f"effects.{effect}", YAML_SWITCHES.get(switch, switch), SWITCHES)
         if effect_switch(effects, effect) == "on" and effect != "quantise":
             _check_switched_on(config, effect)
+
+
+def budget(accuracy: AccuracyConfig) -> Budget:
+    """Return the budget that the settings give."""
+    return Budget(**dataclasses.asdict(accuracy))
+
+
+def _check_accuracy(config: Config) -> None:
+    _check_name("accuracy.name", config.accuracy.name)
+    for key in ("clean_dn", "clean_changed_share", "normal_error", "law_distance"):
+        value = getattr(config.accuracy, key)
+        if not (math.isfinite(value) and value >= 0):
+            raise ConfigError(f"accuracy.{key}={value}: expected a number of 0 or more")
+    choose(budget(config.accuracy), uses_physics(config.noise))
 
 
 SWITCHES = ("auto", "on", "off")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from unprocess_gen import effects, electrons, fused
-from unprocess_gen.records import Counts, Pair, Plan, Srgb
+from unprocess_gen.records import Counts, Float, Pair, Plan, Srgb
 from unprocess_gen.sensor import noisy_limits, quantise, to_dn
 from unprocess_gen.tables import linear_table
 from unprocess_gen.unprocess import dequantise, unprocess
@@ -25,6 +25,8 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     _check(srgb)
     srgb = _dequantised(srgb, plan, origin)
     curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
+    if plan.readable:
+        return _reference_pair(srgb, plan, origin, curve)
     limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
     maker = electrons.make_pair if plan.counts_electrons else fused.make_pair
     return maker(srgb, plan, curve, limits_dn, origin)
@@ -33,8 +35,12 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     """Make the same pair by the readable forms: Algorithm 1, the scene's exposure, the noise, the sensor's rounding."""
     _check(srgb)
-    srgb = _dequantised(srgb, plan, origin)
-    light = unprocess(srgb, plan, origin)
+    return _reference_pair(_dequantised(srgb, plan, origin), plan, origin)
+
+
+def _reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None = None) -> Pair:
+    """Go by the formulas of the curve, or by its exact table, which every machine has alike."""
+    light = unprocess(srgb, plan, origin, curve)
     if plan.exposure != 1:  # what the photograph shows as white is white before it is darkened
         light = np.minimum(light, 1) * plan.exposure
     if plan.averaged:

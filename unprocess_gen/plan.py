@@ -12,6 +12,7 @@ from unprocess_gen import colour
 from unprocess_gen.config import (
     CameraConfig,
     Config,
+    budget,
     dequantizing,
     effect_switch,
     gain_laws,
@@ -19,8 +20,10 @@ from unprocess_gen.config import (
     law,
     noise_laws,
     noise_levels,
+    uses_physics,
 )
 from unprocess_gen.draws import draw
+from unprocess_gen.methods import choose
 from unprocess_gen.physics import LAWS, plan_physics
 from unprocess_gen.planner import Prediction, decide, light_of
 from unprocess_gen.records import Facts, Plan
@@ -36,9 +39,6 @@ PARAMETERS = (
 
 NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std")
 """Those that every noise level draws for itself."""
-
-METHODS = ("curve:exact_table", "pair:fused_float64", "normal:inverse_cdf_table")
-"""How the stages are computed; the row names them."""
 
 
 def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None) -> Plan:
@@ -131,8 +131,9 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         b_dn2=b_dn2,
         effects=effects,
         skipped=skipped,
-        accuracy="exact",
-        methods=METHODS,
+        accuracy=config.accuracy.name,
+        methods=choose(budget(config.accuracy), uses_physics(config.noise)),
+        law_distance=config.accuracy.law_distance,
         level=level,
     )
 

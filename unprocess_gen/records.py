@@ -117,8 +117,10 @@ class Plan:
     above black; ``stream_key`` is the key of the image's random streams. ``noise_law`` says whether a two-parameter
     profile's noise is ``gaussian`` or ``poisson``; ``saturated`` says what the noisy frame is where the clean one is
     saturated: ``noisy``, or ``pinned`` to white. ``physics`` is None for the two-parameter profiles, whose one effect
-    is ``heteroscedastic``. ``level``, ``draw`` and ``frame`` number the noise levels of one clean frame, the draws at
-    one level, and the frames of a clip: each has values of its own in every stream.
+    is ``heteroscedastic``. ``accuracy`` names the budget, ``methods`` how each stage is computed (`methods`), and
+    ``law_distance`` is how far from its law counted noise may be drawn. ``level``, ``draw`` and ``frame`` number the
+    noise levels of one clean frame, the draws at one level, and the frames of a clip: each has values of its own in
+    every stream.
     """
 
     seed: int
@@ -151,10 +153,16 @@ class Plan:
     skipped: tuple[str, ...]
     accuracy: str
     methods: tuple[str, ...]
+    law_distance: float = 0.0
     physics: Physics | None = None
     level: int = 0
     draw: int = 0
     frame: int = 0
+
+    @property
+    def readable(self) -> bool:
+        """Whether the readable forms are asked for."""
+        return "colour:numpy_float64" in self.methods
 
     @property
     def exposure(self) -> float:

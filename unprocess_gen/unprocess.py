@@ -3,7 +3,8 @@
 This is the reference: NumPy, float64, one short function a step, in the article's order. It defines the clean frame;
 `fused` must give the same DN everywhere and is what datasets are made with. The curves below call libm, whose last bit
 differs between machines; that never reaches a file, since the fast form reads exact tables (`tables`) instead, and the
-nearest any table value comes to a rounding edge is 6.7e-4 DN (8-bit sources, all five sensors).
+nearest any table value comes to a rounding edge is 6.7e-4 DN (8-bit sources, all five sensors). Given such a table as
+``curve``, the reference makes datasets too (``accuracy=reference``).
 
 Cost: about 200 ns a pixel, fifty times the fast form.
 """
@@ -17,12 +18,12 @@ from unprocess_gen.records import Float, Plan, Srgb
 from unprocess_gen.streams import words
 
 
-def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
+def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: Float | None = None) -> Float:
     """Return the clean mosaic before clipping, ``[H, W]`` float64 with 0 at black and 1 at white.
 
     Arguments as for `camera_light`; ``origin`` places a cut-out in the full frame, for the Bayer phase.
     """
-    return mosaic(camera_light(srgb, plan), plan.pattern, origin)
+    return mosaic(camera_light(srgb, plan, curve), plan.pattern, origin)
 
 
 def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
@@ -39,16 +40,21 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
     return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
 
-def camera_light(srgb: Srgb, plan: Plan) -> Float:
+def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
     """Return what falls on the sensor, before clipping and without the mosaic: ``[H, W, 3]`` float64, 1 at white.
 
-    ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535.
+    ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535. ``curve`` is the linear light of
+    every code; None computes it by the formulas.
     """
-    white = np.float64(np.iinfo(srgb.dtype).max)
-    image = TONES[plan.tone](srgb / white, (white - srgb) / white)
-    image = expand_gamma(image, plan.gamma)
+    image = linear_light(srgb, plan.tone, plan.gamma) if curve is None else curve[srgb]
     image = apply_ccm(image, plan.rgb2cam)
     return invert_gains(image, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
+
+
+def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
+    """Undo the tone curve and the gamma: codes of any shape to light in [0, 1]."""
+    white = np.float64(np.iinfo(srgb.dtype).max)
+    return expand_gamma(TONES[tone](srgb / white, (white - srgb) / white), gamma)
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:

@@ -1,0 +1,194 @@
+"""How a budget of accuracy becomes methods, and what is refused; the statements of each method are proved elsewhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen import synthetic
+from unprocess_gen.config import Config, budget, check
+from unprocess_gen.errors import ConfigError
+from unprocess_gen.methods import METHODS, STAGES, Budget, choose, gaussian_distance, gaussian_from, of_stage
+from unprocess_gen.pair import make_pair, reference_pair
+from unprocess_gen.plan import plan_image
+from unprocess_gen.planner import facts_for
+
+Settings = Callable[..., Config]
+
+EXACT = Budget("exact", False, 0.0, 0.0, 1e-6, 0.0)
+ALL = Budget("anything", False, math.inf, 1.0, math.inf, 1.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    return np.ascontiguousarray(synthetic.scene("gradients-0")[300:324, 400:431])
+
+
+# What is chosen -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tier", ["reference", "exact", "fast"])
+def test_each_tier_has_a_method_for_every_stage(settings: Settings, tier: str) -> None:
+    chosen = choose(budget(settings(f"accuracy={tier}").accuracy), counts_electrons=True)
+
+    assert [one.partition(":")[0] for one in chosen] == list(STAGES)
+
+
+def test_a_budget_for_everything_takes_the_cheapest_of_every_stage() -> None:
+    assert choose(ALL, counts_electrons=True) == tuple(of_stage(stage)[0].spelled for stage in STAGES)
+
+
+@given(
+    dn=st.sampled_from([0.0, 0.5, 1.0, 2.0]),
+    share=st.sampled_from([0.0, 1e-4, 1e-3, 1.0]),
+    normal=st.sampled_from([1.5e-7, 1e-6, 1e-3, 1.0]),
+    distance=st.sampled_from([0.0, 5e-3]),
+)
+def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
+    some = Budget("some", False, dn, share, normal, distance)
+    for spelled in choose(some, counts_electrons=True):
+        stage = spelled.partition(":")[0]
+        methods = of_stage(stage)
+        at = [one.spelled for one in methods].index(spelled)
+        assert methods[at].fits(some)
+        assert not any(one.fits(some) for one in methods[:at])
+
+
+def test_the_exact_tier_gives_no_dn_away() -> None:
+    chosen = set(choose(EXACT, counts_electrons=True))
+
+    assert all(one.clean_dn == 0 and not one.approximates_law for one in METHODS if one.spelled in chosen)
+
+
+def test_noise_that_counts_nothing_has_no_method_for_it() -> None:
+    assert not any(one.startswith("shot:") for one in choose(EXACT, counts_electrons=False))
+
+
+def test_the_reference_reads_like_the_method(settings: Settings) -> None:
+    chosen = choose(budget(settings("accuracy=reference").accuracy), counts_electrons=True)
+
+    assert all(one.readable for one in METHODS if one.spelled in set(chosen))
+
+
+def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
+    own = settings("accuracy.name=mine", "accuracy.normal_error=1e-3").accuracy
+
+    assert "normal:linear_float32" in choose(budget(own), counts_electrons=False)
+    assert "colour:fused_float64" in choose(budget(own), counts_electrons=False)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("accuracy.normal_error=1e-9", "accuracy.normal_error=1e-09: the best that can be had is 1.5e-07 (normal:"),
+        ("accuracy.clean_dn=-1", "accuracy.clean_dn=-1.0: expected a number of 0 or more"),
+        ("accuracy.law_distance=nan", "accuracy.law_distance=nan: expected a number of 0 or more"),
+        ("accuracy.name='a b'", "accuracy.name='a b': expected up to 100 letters"),
+    ],
+)
+def test_an_impossible_budget_is_refused_with_the_best_that_can_be_had(
+    settings: Settings, override: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        check(settings(override))
+
+    assert str(refused.value).startswith(message)
+
+
+@pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=nikon_d850"])
+def test_the_plan_names_the_methods_of_its_tier(settings: Settings, noise: str, scene: np.ndarray) -> None:
+    config = settings(noise, "accuracy=fast")
+    plan = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
+
+    assert (plan.accuracy, plan.law_distance) == ("fast", 5e-3)
+    assert plan.methods == choose(budget(config.accuracy), noise == "noise=nikon_d850")
+
+
+@pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=sony_a7s2"])
+def test_reference_and_exact_give_the_same_pair(settings: Settings, noise: str, scene: np.ndarray) -> None:
+    plans = {}
+    for tier in ("reference", "exact"):
+        config = settings(noise, f"accuracy={tier}")
+        plans[tier] = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
+    readable, fused = (make_pair(scene[:24, :31], plan) for plan in plans.values())
+
+    assert np.array_equal(readable.clean, fused.clean)
+    assert np.array_equal(readable.noisy, fused.noisy)
+    assert readable.counts == fused.counts
+
+
+def test_the_reference_tier_takes_the_curve_from_its_exact_table(
+    settings: Settings, scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The formulas' last bit differs between machines."""
+    plan = plan_image(settings("accuracy=reference"), "ab" * 32)
+    monkeypatch.setattr("unprocess_gen.unprocess.linear_light", None)
+
+    make_pair(scene[:4, :4], plan)
+    with pytest.raises(TypeError):
+        reference_pair(scene[:4, :4], plan)
+
+
+# Gauss for Poisson ----------------------------------------------------------------------------------------------------
+
+
+@given(read_std_e=st.floats(0.0, 30.0), law_distance=st.floats(1e-4, 0.05), rate_e=st.floats(0.0, 1e6))
+def test_the_distance_is_within_the_budget_just_where_it_says(
+    read_std_e: float, law_distance: float, rate_e: float
+) -> None:
+    below, above = gaussian_from(read_std_e, law_distance)
+    within = gaussian_distance(rate_e, read_std_e) <= law_distance
+    near = any(math.isclose(rate_e, edge, rel_tol=1e-9, abs_tol=1e-9) for edge in (below, above))
+
+    assert near or within == (rate_e <= below or rate_e >= above)
+
+
+def test_no_budget_is_counts_everywhere() -> None:
+    assert gaussian_from(3.0, 0.0) == (0.0, math.inf)
+
+
+def test_much_read_noise_hides_the_counts_everywhere() -> None:
+    below, above = gaussian_from(6.0, 5e-3)
+
+    assert below == above
+
+
+@pytest.mark.parametrize(("rate_e", "read_std_e"), [(20.0, 1.0), (50.0, 3.0), (200.0, 2.0), (30.0, 6.0)])
+def test_the_distance_is_the_greatest_difference_of_the_two_distribution_functions(
+    rate_e: float, read_std_e: float
+) -> None:
+    """Against numerical integration of the densities: counts under a normal each, and one normal of their variance."""
+    grid = np.linspace(rate_e - 12 * math.sqrt(rate_e + 36), rate_e + 14 * math.sqrt(rate_e + 36), 40001)
+    counts = np.arange(0, int(rate_e + 20 * math.sqrt(rate_e) + 20))
+    log_shares = counts * math.log(rate_e) - rate_e - np.array([math.lgamma(k + 1) for k in counts])
+
+    def normal(x: np.ndarray, variance: float) -> np.ndarray:
+        return np.asarray(np.exp(-x * x / (2 * variance)) / math.sqrt(2 * math.pi * variance))
+
+    with np.errstate(under="ignore"):  # far from the mean a normal comes to nothing
+        mixture = np.zeros_like(grid)
+        for k, log_share in zip(counts, log_shares, strict=True):
+            mixture += math.exp(log_share) * normal(grid - k, read_std_e**2)
+        alone = normal(grid - rate_e, rate_e + read_std_e**2)
+        distance = float(np.abs(np.cumsum(mixture - alone)).max() * (grid[1] - grid[0]))
+
+    assert gaussian_distance(rate_e, read_std_e) == pytest.approx(distance, rel=0.12)
+
+
+def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
+    """Cheapest first; the readable form last, and there is one."""
+    for stage in STAGES:
+        readable = [one.readable for one in of_stage(stage)]
+        assert readable == sorted(readable)
+        assert any(readable)
+
+
+def test_a_method_is_named_once() -> None:
+    assert len({one.spelled for one in METHODS}) == len(METHODS)
+    assert all(replace(one, meaning="") != one for one in METHODS)

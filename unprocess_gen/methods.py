@@ -1,0 +1,172 @@
+"""How each stage can be computed, what each way is off by, and the first that a budget of accuracy can afford.
+
+A method states its worst error against the reference; the tests prove the statements, exhaustively where the domain is
+finite. Within a stage the methods stand in a fixed order, cheapest first, as measured once: a choice by what a machine
+measures would make the data depend on the machine. `gen-dataset accuracy` measures what the order is worth.
+
+Errors of the clean frame are those of the whole frame with every stage in that precision, since one kernel serves them
+all; those of normals are against the true quantile of their word, in standard deviations, so that the reference has one
+too (the quadratics of `tables.normal_table`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from unprocess_gen.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What may be given up for speed.
+
+    ``readable``: only forms that one can read will do. ``clean_dn``: largest error of a DN of the clean frame, and
+    ``clean_changed_share`` the share of them that may be off at all, at 14 bits. ``normal_error``: of a normal, in
+    standard deviations. ``law_distance``: of the law of shot and read noise together, in total variation.
+    """
+
+    name: str
+    readable: bool
+    clean_dn: float
+    clean_changed_share: float
+    normal_error: float
+    law_distance: float
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One way to compute a stage; its errors are zero where they are not stated."""
+
+    stage: str
+    name: str
+    meaning: str
+    readable: bool = False
+    clean_dn: float = 0.0
+    clean_changed_share: float = 0.0
+    normal_error: float = 0.0
+    approximates_law: bool = False
+
+    @property
+    def spelled(self) -> str:
+        """How a row names it."""
+        return f"{self.stage}:{self.name}"
+
+    def fits(self, budget: Budget) -> bool:
+        """Whether a budget can afford it."""
+        return (
+            (self.readable or not budget.readable)
+            and self.clean_dn <= budget.clean_dn
+            and self.clean_changed_share <= budget.clean_changed_share
+            and self.normal_error <= budget.normal_error
+            and (budget.law_distance > 0 or not self.approximates_law)
+        )
+
+
+FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE = 1.0, 1e-3
+FLOAT64_NORMAL, FLOAT32_NORMAL = 1.5e-7, 1e-3
+
+
+def _float32(stage: str, name: str, meaning: str) -> Method:
+    return Method(stage, name, meaning, clean_dn=FLOAT32_CLEAN_DN, clean_changed_share=FLOAT32_CHANGED_SHARE)
+
+
+METHODS = (
+    _float32("curve", "float32_table", "the exact table, each entry rounded to float32"),
+    Method("curve", "exact_table", "tone and gamma of every code, correctly rounded to float64", readable=True),
+    _float32("colour", "fused_float32", "matrix and gains of the one channel of a site, float32"),
+    Method("colour", "fused_float64", "the same in float64, in the reference's order of operations"),
+    Method("colour", "numpy_float64", "matrix and gains of all three channels, NumPy", readable=True),
+    Method("mosaic", "at_site", "no other channel than the site's is computed"),
+    Method("mosaic", "after_colour", "the site's channel is taken from the three", readable=True),
+    Method("normal", "linear_float32", "inverse CDF, lines between table entries", normal_error=FLOAT32_NORMAL),
+    Method("normal", "quadratic_float64", "inverse CDF, quadratics", normal_error=FLOAT64_NORMAL),
+    Method("normal", "numpy_float64", "the same, NumPy", readable=True, normal_error=FLOAT64_NORMAL),
+    Method("shot", "gaussian_where_near", "a normal where that law is near enough, else counts", approximates_law=True),
+    Method("shot", "inversion", "Poisson counts by inversion, right to 2^-32"),
+    Method("shot", "numpy_inversion", "the same, NumPy", readable=True),
+    Method("effects", "fused_float64", "effects in order, row by row"),
+    Method("effects", "numpy_float64", "effects in order, NumPy", readable=True),
+    _float32("quantise", "fused_float32", "half to even, clipped, of a float32"),
+    Method("quantise", "fused_float64", "half to even, clipped"),
+    Method("quantise", "numpy_float64", "the same, NumPy", readable=True),
+)
+"""Every method, by stage, cheapest first."""
+
+STAGES = tuple(dict.fromkeys(method.stage for method in METHODS))
+
+OF_ELECTRONS = frozenset({"shot"})
+"""Stages that only noise made of counts has."""
+
+
+def choose(budget: Budget, counts_electrons: bool) -> tuple[str, ...]:
+    """Return for each stage the first method that fits, as a row names them; ConfigError where none does."""
+    stages = (stage for stage in STAGES if counts_electrons or stage not in OF_ELECTRONS)
+    return tuple(_first(stage, budget).spelled for stage in stages)
+
+
+def of_stage(stage: str) -> tuple[Method, ...]:
+    """Return the methods of a stage, cheapest first."""
+    return tuple(method for method in METHODS if method.stage == stage)
+
+
+def _first(stage: str, budget: Budget) -> Method:
+    for method in of_stage(stage):
+        if method.fits(budget):
+            return method
+    raise ConfigError(_best(stage, budget))
+
+
+def _best(stage: str, budget: Budget) -> str:
+    """Say what is the best that can be had, of the first number that is asked too much of."""
+    usable = [method for method in of_stage(stage) if method.readable or not budget.readable]
+    for key in ("clean_dn", "clean_changed_share", "normal_error"):
+        best = min(usable, key=lambda method: float(getattr(method, key)))
+        if getattr(best, key) > getattr(budget, key):
+            return (
+                f"accuracy.{key}={getattr(budget, key):g}: the best that can be had is {getattr(best, key):g} "
+                f"({best.spelled})"
+            )
+    raise AssertionError(f"no method of {stage} fits {budget}")
+
+
+# ---------------------------------------------------------------------------------------------- Gauss for Poisson
+
+
+def gaussian_distance(rate_e: float, read_std_e: float) -> float:
+    """Return the distance between Poisson counts of a mean plus normal read noise, and a normal of their variance.
+
+    0.0665 · rate / (rate + read_std²)^1.5, the greatest difference of the two distribution functions by the first term
+    of the Edgeworth expansion: skewness / 6 times the greatest value of (z² - 1) φ(z), that at 0.
+    """
+    variance = rate_e + read_std_e * read_std_e
+    return 0.0665 * (rate_e / variance) / math.sqrt(variance) if variance else 0.0
+
+
+def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]:
+    """Return (r0, r1): at means up to r0 electrons and from r1 on, `gaussian_distance` is at most ``law_distance``.
+
+    It rises up to twice the read noise's variance and falls after it. (0, infinity) for a budget of 0; r0 = r1 where it
+    is within the budget everywhere.
+    """
+    if law_distance <= 0:
+        return 0.0, math.inf
+    peak = 2 * read_std_e * read_std_e
+    if gaussian_distance(peak, read_std_e) <= law_distance and peak:
+        return peak, peak
+    far = max(peak, 1.0)
+    while gaussian_distance(far, read_std_e) > law_distance:
+        far *= 2
+    below = _last_within(0.0, peak, read_std_e, law_distance) if peak else 0.0
+    return below, _last_within(far, peak, read_std_e, law_distance)
+
+
+def _last_within(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
+    """Return a mean within the distance, next to one that is not, between one that is and one that is not."""
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        if gaussian_distance(middle, read_std_e) <= law_distance:
+            inside = middle
+        else:
+            outside = middle
+    return inside
