@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import ConfigError
-from unprocess_gen.forecast import SAMPLE, forecast, spread, text
+from unprocess_gen.forecast import SAMPLE, forecast, text
+from unprocess_gen.photographs import spread
 from unprocess_gen.records import Source
 
 Settings = Callable[..., Any]

@@ -23,8 +23,8 @@ FLOORS = (
     {"electrons"},
     {"pair", "photographs", "plan", "reader", "workspace"},
     {"selftest"},
-    {"forecast", "runner", "sweep", "transfer", "verify"},
-    {"repair"},
+    {"accuracy", "runner", "sweep", "transfer", "verify"},
+    {"forecast", "repair", "report"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}

@@ -12,6 +12,7 @@ import io
 import itertools
 import os
 import re
+import shlex
 import signal
 import sys
 import traceback
@@ -26,7 +27,7 @@ from unprocess_gen.errors import ConfigError, DamageError, UnprocessGenError
 from unprocess_gen.sweep import Job, folder_name, overrides_text, worst, write_table
 
 if TYPE_CHECKING:
-    from unprocess_gen.config import Config
+    from unprocess_gen.config import AccuracyConfig, Config
     from unprocess_gen.runner import Summary
 
 HELP = """\
@@ -37,6 +38,7 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset -m camera=sony_a7r,nexus_6p noise=imx385_iso1600,imx385_iso3200 out=sweep
                                                a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset plan [overrides] [--all]         what would be made; writes nothing
+  gen-dataset accuracy [overrides] out=…       what accuracy costs in time, measured here: a report
   gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
   gen-dataset verify DIR --repair              … and make again what is damaged, to the same bytes
   gen-dataset verify DIR --noise [--to PNG]    … and fit the noise in its arrays against its rows
@@ -204,10 +206,44 @@ def plan(arguments: list[str]) -> int:
 def _plan(config: Config, read_all: bool) -> tuple[int, None]:
     from unprocess_gen import forecast, runner
 
-    told = forecast.forecast(config, runner.effective_jobs(config.n_jobs, 10**6), read_all)
+    told = forecast.forecast(config, runner.effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
     print(f"out       {config.out}")
     print(forecast.text(config, told))
     return 0, None
+
+
+def accuracy(arguments: list[str]) -> int:
+    """``gen-dataset accuracy [overrides]``: measure error and time of every method and tier, and report in ``out``."""
+    return compose(arguments, lambda config: _accuracy(config, shlex.join(["gen-dataset", "accuracy", *arguments])))
+
+
+def _accuracy(config: Config, command: str) -> tuple[int, None]:
+    from unprocess_gen import accuracy as room
+    from unprocess_gen import report
+    from unprocess_gen.config import NoiseConfig, SensorConfig, read_option
+
+    out = Path(config.out)
+    report.check_out(out)
+    noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
+    beside = room.Beside(
+        _tiers(),
+        read_option(noise / "imx385_iso3200.yaml", NoiseConfig),
+        read_option(noise / "sony_a7s2.yaml", NoiseConfig),
+        read_option(sensor / "generic_14bit.yaml", SensorConfig),
+    )
+    found = room.measure(config, beside, command=command)
+    report.write(found, out)
+    print(report.table(found.rows))
+    print(f"{out}: {', '.join(report.FILES)}")
+    return 0, None
+
+
+def _tiers() -> dict[str, AccuracyConfig]:
+    """Return every tier of ``conf/accuracy``, the reference first."""
+    from unprocess_gen.config import AccuracyConfig, read_option
+
+    files = sorted((conf_dir() / "accuracy").glob("*.yaml"), key=lambda path: (path.stem != "reference", path.stem))
+    return {path.stem: read_option(path, AccuracyConfig) for path in files}
 
 
 AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
@@ -332,7 +368,13 @@ def replay(arguments: list[str]) -> int:
     return 4 if different else 0
 
 
-VERBS: dict[str, Callable[[list[str]], int]] = {"plan": plan, "verify": verify, "replay": replay, "again": again}
+VERBS: dict[str, Callable[[list[str]], int]] = {
+    "plan": plan,
+    "accuracy": accuracy,
+    "verify": verify,
+    "replay": replay,
+    "again": again,
+}
 
 # ----------------------------------------------------------------------------------------------------------- Hydra
 

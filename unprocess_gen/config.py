@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Optional
+from typing import Any, Optional, TypeVar
 
 import yaml
 from omegaconf import OmegaConf
@@ -220,6 +220,8 @@ class Config:
     n_jobs: int = -1
     self_test: str = "stop"
 
+
+Option = TypeVar("Option")
 
 CAMERA_LAWS = ("fixed", "convex", "choice", "identity", "custom")
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
@@ -837,6 +839,13 @@ def read_dataset_yaml(path: Path) -> tuple[Config, str]:
         raise ConfigError(f"{path}: not the config.yaml of a dataset ({one_line(error)})") from error
     assert isinstance(config, Config)
     return config, kind
+
+
+def read_option(path: Path, group: type[Option]) -> Option:
+    """Return an option of a group as its file in ``conf/`` has it; ``group`` is the dataclass of the folder."""
+    option = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(group), OmegaConf.load(path)))
+    assert isinstance(option, group)
+    return option
 
 
 def differences(ours: str, theirs: str) -> list[str]:

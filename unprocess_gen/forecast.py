@@ -10,16 +10,18 @@ import hashlib
 import os
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config import Config, is_physical
+from unprocess_gen import accuracy
+from unprocess_gen.config import AccuracyConfig, Config, is_physical
 from unprocess_gen.errors import SourceError
 from unprocess_gen.manifest import json_size
 from unprocess_gen.pair import make_pair
-from unprocess_gen.photographs import list_photographs, load
+from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image, plan_pairs, plan_with_reasons
 from unprocess_gen.planner import COST_NS, Prediction, facts_for
 from unprocess_gen.records import Plan, Source
@@ -45,7 +47,11 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run would make; ``exact`` where every photograph was read."""
+    """What a run would make; ``exact`` where every photograph was read.
+
+    ``prices``: what a pair costs under the chosen accuracy and every tier, nanoseconds a pixel, measured just now;
+    empty where no photograph could be read.
+    """
 
     sources: int
     shards: int
@@ -55,10 +61,13 @@ class Forecast:
     n_jobs: int
     free_bytes: int
     looks: tuple[Look, ...]
+    prices: dict[str, float]
 
 
-def forecast(config: Config, n_jobs: int, read_all: bool) -> Forecast:
-    """Look at the photographs of a run; ``n_jobs`` is what the time is divided by.
+def forecast(
+    config: Config, n_jobs: int, read_all: bool, tiers: Mapping[str, AccuracyConfig] | None = None
+) -> Forecast:
+    """Look at the photographs of a run; ``n_jobs`` is what the time is divided by, ``tiers`` what is priced beside it.
 
     Raises ConfigError as `photographs.list_photographs` does.
     """
@@ -76,14 +85,8 @@ def forecast(config: Config, n_jobs: int, read_all: bool) -> Forecast:
         total = sum(one.bytes for one in looks) * len(sources) // len(looks) + shards * shard_bytes([0])
     seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
     free = shutil.disk_usage(_existing(Path(config.out))).free
-    return Forecast(len(sources), shards, total, exact, seconds, n_jobs, free, looks)
-
-
-def spread(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
-    """Return at most ``count`` sources, evenly spread over the listing."""
-    if len(sources) <= count:
-        return sources
-    return tuple(sources[i * len(sources) // count] for i in range(count))
+    prices = _prices(config, looks, tiers or {})
+    return Forecast(len(sources), shards, total, exact, seconds, n_jobs, free, looks, prices)
 
 
 def look(config: Config, source: Source) -> Look:
@@ -105,6 +108,14 @@ def look(config: Config, source: Source) -> Look:
     seconds = time.perf_counter() - started
     _, predictions = plan_with_reasons(config, *identity, facts)
     return Look(source, size, seconds, plans[0], None, predictions)
+
+
+def _prices(config: Config, looks: tuple[Look, ...], tiers: Mapping[str, AccuracyConfig]) -> dict[str, float]:
+    """Measure what accuracy costs on the first photograph that can be read."""
+    for one in looks:
+        if one.plan is not None:
+            return accuracy.prices(config, dict(tiers), load(config.source, one.source)[1].srgb)
+    return {}
 
 
 def _warm_up(config: Config) -> None:
@@ -132,6 +143,7 @@ def text(config: Config, told: Forecast) -> str:
         f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}, "
         "and what the disk takes to write it",
         *_failures(config, told),
+        *_accuracy(config.accuracy, told.prices),
         *_noise(config, told.looks),
     ]
     return "\n".join(lines)
@@ -146,6 +158,19 @@ def _duration(seconds: float) -> str:
 def _pairs(told: Forecast) -> str:
     failed = sum(one.reason is not None for one in told.looks)
     return str(told.sources - failed) if told.exact else f"{told.sources - failed} at the most"
+
+
+def _accuracy(chosen: AccuracyConfig, prices: dict[str, float]) -> list[str]:
+    """Return what is asked for, and its price beside that of the tiers."""
+    clean = f"clean {chosen.clean_dn:g} DN"
+    if chosen.clean_dn:
+        clean = f"clean within {chosen.clean_dn:g} DN at a share of {chosen.clean_changed_share:g}"
+    laws = f"laws within {chosen.law_distance:g}" if chosen.law_distance else "exact laws"
+    line = f"accuracy  {chosen.name}: {clean}, normals {chosen.normal_error:g} σ, {laws}"
+    if chosen.name not in prices:
+        return [line]
+    others = ", ".join(f"{name} {ns:.3g}" for name, ns in prices.items() if name != chosen.name)
+    return [f"{line}; {prices[chosen.name]:.3g} ns a pixel here" + (f" ({others})" if others else "")]
 
 
 def _failures(config: Config, told: Forecast) -> list[str]:

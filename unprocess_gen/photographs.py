@@ -30,6 +30,13 @@ def list_photographs(config: SourceConfig) -> sources.Listing:
     return sources.Listing(numbered, listing.not_matched, listing.skipped_links)
 
 
+def spread(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
+    """Return at most ``count`` sources, evenly spread over the listing."""
+    if len(sources) <= count:
+        return sources
+    return tuple(sources[i * len(sources) // count] for i in range(count))
+
+
 def source_of(row: Row) -> Source:
     """Return the source that a row was made from."""
     name, size = str(row["source"]), row["source_bytes"]

@@ -1,0 +1,310 @@
+"""What `accuracy` measured, for people: a table, ``accuracy.csv``, ``accuracy.png`` and ``accuracy.html``.
+
+The figure has a panel for whole tiers and one for each stage, error against time; what no other method beats in both
+is joined by a line. An error of 0 has no place on a logarithmic axis, so it stands below a gap, on a line of its own.
+Colours are those of Okabe and Ito, which colour-blind readers can tell apart; every point has its name beside it.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import io
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import fields
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from unprocess_gen.accuracy import REFERENCE, Report, Row
+from unprocess_gen.errors import ConfigError
+from unprocess_gen.methods import STAGES
+from unprocess_gen.workspace import machine_error
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLUMNS = tuple(one.name for one in fields(Row))
+FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
+OF_A_DATASET = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work")
+"""What marks a folder as a dataset, finished or begun, where foreign files would be taken for damage."""
+
+
+def check_out(out: Path) -> None:
+    """Make the folder of a report; ConfigError where it cannot be written, holds a dataset, or nothing can be drawn."""
+    if find_spec("matplotlib") is None:
+        raise ConfigError("accuracy: drawing needs matplotlib; pip install 'unprocess_gen[figures]'")
+    for name in OF_A_DATASET:
+        if (out / name).exists():
+            raise ConfigError(
+                f"out={out}: holds a dataset ({name}), where a report would be damage; choose another out"
+            )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"out={out}: cannot be written ({error.strerror})") from error
+    if not os.access(out, os.W_OK | os.X_OK):
+        raise ConfigError(f"out={out}: cannot be written (Permission denied)")
+
+
+def write(report: Report, out: Path) -> None:
+    """Write the three files, over those of an earlier report; MachineError where that fails."""
+    picture = png(report.rows)
+    contents = (csv_text(report.rows).encode(), picture, page(report, picture).encode())
+    try:
+        for name, content in zip(FILES, contents, strict=True):
+            (out / name).write_bytes(content)
+    except OSError as error:
+        raise machine_error(error, out) from error
+
+
+# -------------------------------------------------------------------------------------------------------- tables
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """Return ``accuracy.csv``; empty where nothing was measured."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in rows:
+        values = (getattr(row, name) for name in COLUMNS)
+        writer.writerow([f"{value:.6g}" if isinstance(value, float) else value for value in values])
+    return text.getvalue()
+
+
+HEADINGS = ("stage", "method", "tiers", "max error", "RMS error", "unit", "changed", "ns a pixel", "of reference")
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """Return a row as people read it, in the order of `HEADINGS`."""
+    return (
+        row.stage,
+        row.method,
+        row.tier,
+        spelled(row.error_max),
+        spelled(row.error_rms),
+        row.error_unit,
+        "–" if row.changed_share is None else _percent(row.changed_share),
+        spelled(row.ns_per_pixel, 3),
+        "–" if row.ratio_to_reference is None else _percent(row.ratio_to_reference),
+    )
+
+
+def spelled(value: float | None, digits: int = 2) -> str:
+    """Return a number to some digits, without an exponent where it is short."""
+    return "–" if value is None else f"{float(f'{value:.{digits}g}'):g}"
+
+
+def _percent(share: float) -> str:
+    return f"{spelled(share * 100)} %"
+
+
+RIGHT = frozenset({3, 4, 6, 7, 8})
+"""Columns of numbers."""
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return the rows as lines for a terminal."""
+    lines = [HEADINGS, *(cells(row) for row in rows)]
+    widths = [max(len(line[at]) for line in lines) for at in range(len(HEADINGS))]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if at in RIGHT else cell.ljust(width)
+            for at, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Return the rows as a Markdown table."""
+    rule = "|".join("--:" if at in RIGHT else "---" for at in range(len(HEADINGS)))
+    lines = [f"| {' | '.join(HEADINGS)} |", f"|{rule}|"]
+    return "\n".join([*lines, *(f"| {' | '.join(cells(row))} |" for row in rows)])
+
+
+# -------------------------------------------------------------------------------------------------------- figure
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Return which points no other beats: none is as good in both numbers and better in one; smaller is better."""
+    return [
+        at for at, (x, y) in enumerate(points) if not any((a <= x and b <= y) and (a < x or b < y) for a, b in points)
+    ]
+
+
+class Panel(NamedTuple):
+    """A panel: which stages it shows, each with its marker, which error (`Row` field), and what it is called."""
+
+    title: str
+    stages: tuple[str, ...]
+    error: str
+    axis: str
+
+
+PANELS = (
+    Panel("whole tiers", ("tier_noisy", "tier_electrons"), "error_rms", "noisy frame, RMS (σ)"),
+    *(Panel(stage, (stage,), "error_rms", "clean frame, RMS (DN)") for stage in ("curve", "colour", "mosaic")),
+    Panel("normal", ("normal",), "error_max", "largest error (σ)"),
+    Panel("shot", ("shot",), "error_max", "distance of the laws"),
+    Panel("effects", ("effects",), "error_rms", "noisy frame, RMS (DN)"),
+    Panel("quantise", ("quantise",), "error_rms", "clean frame, RMS (DN)"),
+)
+assert {stage for panel in PANELS for stage in panel.stages} == {*STAGES, "tier_noisy", "tier_electrons"}
+
+COLOURS = {REFERENCE: "#000000", "exact": "#0072B2", "fast": "#D55E00"}
+OTHER_COLOUR = "#009E73"
+MARKERS = {"tier_noisy": ("o", "two numbers"), "tier_electrons": ("s", "electrons")}
+FRONT = "#999999"
+
+
+def png(rows: Sequence[Row]) -> bytes:
+    """Draw the figure, as the bytes of a PNG."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    style: dict[Any, Any] = {"font.size": 9, "axes.labelsize": 9, "axes.titlesize": 10, "axes.titleweight": "bold"}
+    with rc_context({**style, "axes.spines.right": False, "axes.spines.top": False}):
+        figure = Figure(figsize=(9.6, 8.2), layout="constrained")
+        for panel, axes in zip(PANELS, _grid(figure), strict=True):
+            _draw_panel(panel, axes, rows)
+        figure.supxlabel("time, ns a pixel (one thread)", fontsize=10)
+        content = io.BytesIO()
+        figure.savefig(content, format="png", dpi=100)
+    return content.getvalue()
+
+
+def _grid(figure: Figure) -> list[Axes]:
+    """Return axes for `PANELS`: the tiers' are twice as wide."""
+    grid = figure.add_gridspec(3, 3)
+    others = [(0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]
+    return [figure.add_subplot(grid[0, :2]), *(figure.add_subplot(grid[row, column]) for row, column in others)]
+
+
+def _draw_panel(panel: Panel, axes: Axes, rows: Sequence[Row]) -> None:
+    shown = [row for row in rows if row.stage in panel.stages and None not in (row.ns_per_pixel, _error(panel, row))]
+    axes.set_title(panel.title, loc="left")
+    axes.set_ylabel(panel.axis)
+    if not shown:
+        axes.set_axis_off()
+        return
+    floor = _set_axes(axes, [row.ns_per_pixel or 0.0 for row in shown], [_error(panel, row) or 0.0 for row in shown])
+    for stage in panel.stages:
+        of_stage = [row for row in shown if row.stage == stage]
+        points = [(row.ns_per_pixel or 0.0, max(_error(panel, row) or 0.0, floor)) for row in of_stage]
+        front = sorted(points[at] for at in pareto(points))
+        axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=1.2, zorder=1)
+        for row, point in zip(of_stage, points, strict=True):
+            _draw_point(axes, row, point, at_front=point in front)
+
+
+def _error(panel: Panel, row: Row) -> float | None:
+    value: float | None = getattr(row, panel.error)
+    return value
+
+
+def _set_axes(axes: Axes, ns: Sequence[float], errors: Sequence[float]) -> float:
+    """Set logarithmic axes with room for the names; return where an error of 0 stands."""
+    positive = [error for error in errors if error > 0]
+    lowest = math.floor(math.log10(min(positive))) if positive else 0
+    highest = math.ceil(math.log10(max(positive)) + 0.3) if positive else 0
+    floor = 10.0 ** (lowest - 1)
+    axes.set(xscale="log", yscale="log")
+    axes.set_xlim(min(ns) / 4, max(ns) * 4)
+    axes.set_ylim(floor / 3, 10.0 ** (highest + 0.2) if positive else floor * 10)
+    decades = range(lowest, highest + 1, max(1, -(-(highest - lowest) // 4))) if positive else range(0)
+    zero = [floor] if 0.0 in errors else []
+    axes.set_yticks(zero + [10.0**n for n in decades], ["0"] * len(zero) + [f"$10^{{{n}}}$" for n in decades])
+    axes.set_yticks([], minor=True)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.grid(axis="both", color="#eeeeee", zorder=0)
+    if zero:
+        axes.axhspan(floor / 3, floor * 3, color="#f4f4f4", zorder=0)
+    return floor
+
+
+def _draw_point(axes: Axes, row: Row, point: tuple[float, float], at_front: bool) -> None:
+    marker, kind = MARKERS.get(row.stage, ("o", ""))
+    tier = next((tier for tier in ("exact", "fast", REFERENCE) if tier in row.tier.split()), "")
+    colour = COLOURS.get(tier, OTHER_COLOUR)
+    axes.plot(*point, marker, color=colour, markersize=8, markerfacecolor=colour if at_front else "white", zorder=3)
+    name = f"{row.method}, {kind}" if kind else row.method
+    tiers = "" if kind else f" ({', '.join(row.tier.split())})"
+    text = f"{name}\n{spelled(row.ns_per_pixel, 2)} ns{tiers}"
+    low, high = (math.log(limit) for limit in axes.get_xlim())
+    at = (math.log(point[0]) - low) / (high - low)
+    side = "left" if at < 0.35 else "right" if at > 0.65 else "center"
+    shift = {"left": -6, "right": 6, "center": 0}[side]
+    axes.annotate(
+        text,
+        point,
+        xytext=(shift, 8),
+        textcoords="offset points",
+        ha=side,
+        va="bottom",
+        fontsize=8,
+        color=colour,
+        linespacing=1.1,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------- page
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 1.5rem auto; padding: 0 1rem; color: #222; }
+img { max-width: 100%; height: auto; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; white-space: nowrap; }
+th, td { padding: .2rem .6rem; text-align: left; border-bottom: 1px solid #e4e4e4; }
+td.n, th.n { text-align: right; }
+tr.first td { border-top: 2px solid #999; }
+dt { font-weight: 600; } dd { margin: 0 0 .4rem; overflow-wrap: anywhere; }
+"""
+
+NOTES = (
+    "Errors of curve, colour, mosaic and quantise: the clean frame at 14 bits, DN, all else exact. Of normal: σ, "
+    "against the true quantile. Of shot: the largest difference of distribution functions, with read noise, as "
+    "maximum; on photographs, in σ of shot and read noise, as RMS. Of effects: the noisy frame at 14 bits "
+    "without shot noise, DN.",
+    "Tiers, end to end: tier, the clean frame at 14 bits with noise of two numbers; tier_noisy, its noisy frame in σ; "
+    "tier_electrons, the noisy frame of the physical profile in σ; tier_own, the clean frame of the settings as given.",
+    "Times of curve to mosaic run from the codes to the end of that stage, since the compiled form folds them into "
+    "one; those of shot and effects are what they add to a pair. The last column is a median of ratios within a "
+    "round. A dash: not measured by itself.",
+)
+
+
+def page(report: Report, picture: bytes) -> str:
+    """Return ``accuracy.html``: one file without a script, the figure in it."""
+    facts = "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(text)}</dd>" for name, text in report.facts.items())
+    image = base64.b64encode(picture).decode()
+    notes = "".join(f"<p>{html.escape(note)}</p>" for note in NOTES)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>What accuracy costs</title><style>{STYLE}</style></head><body>\n<h1>What accuracy costs</h1>\n"
+        f'<p><img alt="error against time of every method, by stage" src="data:image/png;base64,{image}"></p>\n'
+        "<p>Filled: nothing else is both faster and nearer. Grey: their front. Errors of 0 stand on a line of "
+        f'their own.</p>\n<div class="wide">{_html_table(report.rows)}</div>\n{notes}\n'
+        f"<h2>How it was measured</h2>\n<dl>{facts}</dl>\n</body></html>\n"
+    )
+
+
+def _html_table(rows: Sequence[Row]) -> str:
+    before = [None, *(row.stage for row in rows)]
+    lines = [_html_line("th", HEADINGS, "")]
+    lines += [
+        _html_line("td", cells(row), ' class="first"' if row.stage != stage else "")
+        for row, stage in zip(rows, before, strict=False)
+    ]
+    return f"<table>{''.join(lines)}</table>"
+
+
+def _html_line(tag: str, texts: Sequence[str], attribute: str) -> str:
+    right = ' class="n"'
+    made = (f"<{tag}{right if at in RIGHT else ''}>{html.escape(text)}</{tag}>" for at, text in enumerate(texts))
+    return f"<tr{attribute}>{''.join(made)}</tr>"
