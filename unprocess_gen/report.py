@@ -147,7 +147,12 @@ class Panel(NamedTuple):
 
 
 PANELS = (
-    Panel("whole tiers", ("tier_noisy", "tier_electrons"), "error_rms", "noisy frame, RMS (σ)"),
+    Panel(
+        "whole tiers, clean and noisy frame",
+        ("tier_noisy", "tier_electrons"),
+        "error_rms",
+        "noisy frame, RMS (σ of its noise)",
+    ),
     *(Panel(stage, (stage,), "error_rms", "clean frame, RMS (DN)") for stage in ("curve", "colour", "mosaic")),
     Panel("normal", ("normal",), "error_max", "largest error (σ)"),
     Panel("shot", ("shot",), "error_max", "distance of the laws"),
@@ -172,6 +177,7 @@ def png(rows: Sequence[Row]) -> bytes:
         figure = Figure(figsize=(9.6, 8.2), layout="constrained")
         for panel, axes in zip(PANELS, _grid(figure), strict=True):
             _draw_panel(panel, axes, rows)
+        _legend(figure, rows)
         figure.supxlabel("time, ns a pixel (one thread)", fontsize=10)
         content = io.BytesIO()
         figure.savefig(content, format="png", dpi=100)
@@ -193,13 +199,30 @@ def _draw_panel(panel: Panel, axes: Axes, rows: Sequence[Row]) -> None:
         axes.set_axis_off()
         return
     floor = _set_axes(axes, [row.ns_per_pixel or 0.0 for row in shown], [_error(panel, row) or 0.0 for row in shown])
+    points = [(row.ns_per_pixel or 0.0, max(_error(panel, row) or 0.0, floor)) for row in shown]
+    at_front: set[int] = set()
     for stage in panel.stages:
-        of_stage = [row for row in shown if row.stage == stage]
-        points = [(row.ns_per_pixel or 0.0, max(_error(panel, row) or 0.0, floor)) for row in of_stage]
-        front = sorted(points[at] for at in pareto(points))
-        axes.plot(*zip(*front, strict=True), color=FRONT, linewidth=1.2, zorder=1)
-        for row, point in zip(of_stage, points, strict=True):
-            _draw_point(axes, row, point, at_front=point in front)
+        of_stage = [at for at, row in enumerate(shown) if row.stage == stage]
+        front = [of_stage[at] for at in pareto([points[at] for at in of_stage])]
+        axes.plot(*zip(*sorted(points[at] for at in front), strict=True), color=FRONT, linewidth=1.2, zorder=1)
+        at_front |= set(front)
+    below = labels_below(points)
+    for at, (row, point) in enumerate(zip(shown, points, strict=True)):
+        _draw_point(axes, row, point, filled=at in at_front, below=below[at])
+
+
+def labels_below(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return which points have their name below, clear of the front's line, which comes from the upper left.
+
+    Of points of about the same error each second one, from the first on; one alone where its error is the least.
+    """
+    below = [False] * len(points)
+    for at, (x, y) in enumerate(points):
+        level = sorted((a, n) for n, (a, b) in enumerate(points) if max(b, y) < 2 * min(b, y))
+        below[at] = level.index((x, at)) % 2 == 0 and (
+            len(level) > 1 or y == min(b for _, b in points) < max(b for _, b in points)
+        )
+    return below
 
 
 def _error(panel: Panel, row: Row) -> float | None:
@@ -209,47 +232,73 @@ def _error(panel: Panel, row: Row) -> float | None:
 
 def _set_axes(axes: Axes, ns: Sequence[float], errors: Sequence[float]) -> float:
     """Set logarithmic axes with room for the names; return where an error of 0 stands."""
-    positive = [error for error in errors if error > 0]
-    lowest = math.floor(math.log10(min(positive))) if positive else 0
-    highest = math.ceil(math.log10(max(positive)) + 0.3) if positive else 0
-    floor = 10.0 ** (lowest - 1)
-    axes.set(xscale="log", yscale="log")
-    axes.set_xlim(min(ns) / 4, max(ns) * 4)
-    axes.set_ylim(floor / 3, 10.0 ** (highest + 0.2) if positive else floor * 10)
+    positive = [math.log10(error) for error in errors if error > 0]
+    lowest = math.floor(min(positive, default=0))
+    highest = math.ceil(max(positive, default=0))
+    zero = [10.0 ** (lowest - 1)] if 0.0 in errors else []
+    bottom, top = (lowest - 1 if zero else lowest), max(positive, default=lowest - 1)
+    room = max(0.3 * (top - bottom), 0.6)
+    axes.set(xscale="log", yscale="log", xlim=_decades(ns), ylim=(10.0 ** (bottom - room), 10.0 ** (top + room)))
     decades = range(lowest, highest + 1, max(1, -(-(highest - lowest) // 4))) if positive else range(0)
-    zero = [floor] if 0.0 in errors else []
     axes.set_yticks(zero + [10.0**n for n in decades], ["0"] * len(zero) + [f"$10^{{{n}}}$" for n in decades])
+    axes.set_ylim(10.0 ** (bottom - room), 10.0 ** (top + room))
     axes.set_yticks([], minor=True)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.grid(axis="both", color="#eeeeee", zorder=0)
-    if zero:
-        axes.axhspan(floor / 3, floor * 3, color="#f4f4f4", zorder=0)
-    return floor
+    axes.xaxis.set_minor_formatter(lambda value, _: "")
+    axes.grid(axis="both", color="#e6e6e6", zorder=0)
+    axes.set_axisbelow(True)
+    if zero and positive:
+        axes.axhspan(10.0 ** (bottom - room), 10.0 ** (bottom + 0.5), color="#f3f3f3", zorder=0)
+    return 10.0 ** (lowest - 1)
 
 
-def _draw_point(axes: Axes, row: Row, point: tuple[float, float], at_front: bool) -> None:
+def _decades(ns: Sequence[float]) -> tuple[float, float]:
+    """Return limits about times: two decades at least, and room for names at the sides."""
+    middle = math.sqrt(min(ns) * max(ns))
+    reach = max(math.sqrt(max(ns) / min(ns)) * 3, 10.0)
+    return middle / reach, middle * reach
+
+
+def _colour(row: Row) -> str:
+    """Return the colour of the nearest tier that takes a method, the reference last."""
+    tiers = row.tier.split()
+    others = [tier for tier in tiers if tier not in COLOURS]
+    return next((COLOURS[tier] for tier in ("exact", "fast") if tier in tiers), OTHER_COLOUR if others else "#000000")
+
+
+def _draw_point(axes: Axes, row: Row, point: tuple[float, float], filled: bool, below: bool) -> None:
     marker, kind = MARKERS.get(row.stage, ("o", ""))
-    tier = next((tier for tier in ("exact", "fast", REFERENCE) if tier in row.tier.split()), "")
-    colour = COLOURS.get(tier, OTHER_COLOUR)
-    axes.plot(*point, marker, color=colour, markersize=8, markerfacecolor=colour if at_front else "white", zorder=3)
-    name = f"{row.method}, {kind}" if kind else row.method
-    tiers = "" if kind else f" ({', '.join(row.tier.split())})"
-    text = f"{name}\n{spelled(row.ns_per_pixel, 2)} ns{tiers}"
+    colour = _colour(row)
+    axes.plot(*point, marker, color=colour, markersize=8, markerfacecolor=colour if filled else "white", zorder=3)
+    name = row.method if kind else row.method.replace("_", " ")
     low, high = (math.log(limit) for limit in axes.get_xlim())
-    at = (math.log(point[0]) - low) / (high - low)
-    side = "left" if at < 0.35 else "right" if at > 0.65 else "center"
-    shift = {"left": -6, "right": 6, "center": 0}[side]
+    at_right = (math.log(point[0]) - low) / (high - low) > 0.55
     axes.annotate(
-        text,
+        f"{name}\n{spelled(row.ns_per_pixel, 2)} ns",
         point,
-        xytext=(shift, 8),
+        xytext=(5 if at_right else -3 if below else 5, -7 if below else 5),
         textcoords="offset points",
-        ha=side,
-        va="bottom",
+        ha="right" if at_right else "left",
+        va="top" if below else "bottom",
         fontsize=8,
         color=colour,
         linespacing=1.1,
     )
+
+
+def _legend(figure: Figure, rows: Sequence[Row]) -> None:
+    """Say above all panels what colours and markers mean."""
+    from matplotlib.lines import Line2D
+
+    def mark(label: str, colour: str, marker: str = "o", filled: bool = True) -> Line2D:
+        face = colour if filled else "white"
+        return Line2D([], [], linestyle="", marker=marker, color=colour, markerfacecolor=face, label=label)
+
+    tiers = [row.method for row in rows if row.stage == "tier"]
+    marks = [mark(tier, COLOURS.get(tier, OTHER_COLOUR)) for tier in tiers]
+    marks += [mark(f"tiers, noise of {kind}", FRONT, marker) for marker, kind in MARKERS.values()]
+    marks.append(mark("something faster is as near", FRONT, filled=False))
+    figure.legend(handles=marks, loc="outside upper left", ncols=len(marks), frameon=False, fontsize=8, handlelength=1)
 
 
 # ---------------------------------------------------------------------------------------------------------- page

@@ -1,0 +1,45 @@
+"""Measure what accuracy costs, and put table and figure into the README: python .readme/draw_accuracy.py [overrides].
+
+`gen-dataset accuracy` with the overrides (source.root=photos), its figure as accuracy.png beside this file, its table
+between the two marks in the README. Takes about a minute; best where nothing else runs.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from unprocess_gen.accuracy import Row
+from unprocess_gen.report import markdown
+
+HERE = Path(__file__).parent
+README = HERE.parent / "README.md"
+TABLE = re.compile(r"(<!-- accuracy: [^>]*-->\n).*?(<!-- end of accuracy -->)", re.DOTALL)
+TEXTS = ("stage", "method", "tier", "error_unit")
+
+
+def row(line: dict[str, str]) -> Row:
+    """Read a line of accuracy.csv back."""
+    return Row(**{name: text if name in TEXTS else float(text) if text else None for name, text in line.items()})
+
+
+def main() -> None:
+    """Measure, then replace table and figure."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "unprocess_gen", "accuracy", *sys.argv[1:], f"out={folder}/report"]
+        subprocess.run(command, check=True)
+        report = Path(folder) / "report"
+        shutil.copy(report / "accuracy.png", HERE / "accuracy.png")
+        with (report / "accuracy.csv").open(newline="", encoding="utf-8") as lines:
+            table = markdown([row(line) for line in csv.DictReader(lines)])
+    text = README.read_text(encoding="utf-8")
+    README.write_text(TABLE.sub(lambda found: found[1] + table + "\n" + found[2], text), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
