@@ -82,11 +82,15 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What every task of a run shares: the settings, where to write aside, and whose run it is."""
+    """What every task of a run shares: the settings, where to write aside, and whose run it is.
+
+    ``core_to_spare``: there are more cores than workers, so that each can have a thread that writes.
+    """
 
     config: Config
     tmp: str
     coordinator_pid: int
+    core_to_spare: bool = False
 
 
 def generate(config: Config) -> Summary:
@@ -106,7 +110,7 @@ def generate(config: Config) -> Summary:
         done = set(workspace.committed(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
         n_jobs = effective_jobs(config.n_jobs, len(todo))
-        bench = Bench(config, str(workspace.tmp), os.getpid())
+        bench = Bench(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < cpu_count())
         given_up: dict[int, Made] = {}
         warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
@@ -230,7 +234,7 @@ def make_shard(bench: Bench, task: Task) -> Made:
     failed = _self_test(bench.config)
     path = Path(bench.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     try:
-        with ShardWriter(path) as writer:
+        with ShardWriter(path, beside=bench.core_to_spare) as writer:
             rows = tuple(_make_rows(bench, task, writer))
         _busy_path(bench, task).unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):

@@ -15,8 +15,11 @@ import io
 import json
 import math
 import mmap
+import os
 import tarfile
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple
@@ -78,15 +81,25 @@ def shard_bytes(pairs: list[int]) -> int:
     return sum(pairs) + len(END) if pairs else 0
 
 
+MOST_UNDERWAY = 2**26
+SYNC_BYTES = 2**25
+"""Synced so often beside the work, so that little is left to sync when a shard is put into place."""
+
+
 class ShardWriter:
     """Write one shard to ``path``, which must not exist; its size and SHA-256 are known on leaving.
 
-    Raises OSError as the file system does; the caller owns the file and what becomes of it.
+    ``beside`` has a thread of its own hash, write and sync, while the caller makes the next frames: worth it where a
+    core is idle. At most `MOST_UNDERWAY` bytes and one part more wait for it; frames given to it must stay as they are.
+    Raises OSError as the file system does, then or with a later call; the caller owns the file and what becomes of it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, beside: bool = False) -> None:
         self._file: BinaryIO = path.open("xb", buffering=0)
         self._hash = hashlib.sha256()
+        self._thread = ThreadPoolExecutor(1, "shard writer") if beside else None
+        self._underway: deque[tuple[int, Future[None]]] = deque()
+        self._unsynced = 0
         self.bytes = 0
 
     def __enter__(self) -> ShardWriter:
@@ -96,12 +109,16 @@ class ShardWriter:
         try:
             if kind is None:
                 self._write(END)
+                self._wait(0)
         finally:
+            if self._thread is not None:
+                self._thread.shutdown(cancel_futures=True)
             self._file.close()
 
     @property
     def sha256(self) -> str:
-        """Hex digest of what was written so far."""
+        """Hex digest of what was written."""
+        self._wait(0)
         return self._hash.hexdigest()
 
     def add_frame(self, key: str, member: str, frame: Raw) -> None:
@@ -119,8 +136,27 @@ class ShardWriter:
 
     def _write(self, content: bytes | memoryview) -> None:
         view = memoryview(content).cast("B")
-        self._hash.update(view)
         self.bytes += len(view)
+        if self._thread is None:
+            self._put(view)
+        else:
+            self._wait(MOST_UNDERWAY)
+            self._underway.append((len(view), self._thread.submit(self._put_and_sync, view)))
+
+    def _wait(self, most: int) -> None:
+        """Wait until no more than so many bytes are underway."""
+        while sum(size for size, _ in self._underway) > most:
+            self._underway.popleft()[1].result()
+
+    def _put_and_sync(self, view: memoryview) -> None:
+        self._put(view)
+        self._unsynced += len(view)
+        if self._unsynced >= SYNC_BYTES:
+            os.fdatasync(self._file.fileno())
+            self._unsynced = 0
+
+    def _put(self, view: memoryview) -> None:
+        self._hash.update(view)
         while view:
             written = self._file.write(view)
             if not written:
