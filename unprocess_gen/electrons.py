@@ -65,13 +65,12 @@ def make_pair(
 
 def make_noisy(
     unrounded: Float, plan: Plan, limits_dn: tuple[float, float], origin: tuple[int, int] = (0, 0)
-) -> tuple[Raw, tuple[int, int, int]]:
+) -> tuple[Raw, NDArray[np.int64]]:
     """Make the noisy frame alone, for one more noise level or draw of a clean frame.
 
     ``unrounded`` is that clean frame before rounding, float64 ``[H, W]`` DN; the other arguments are as for
-    `make_pair`, whose noisy frame this is, to the byte. Returns it with what `Counts` holds of it:
-    ``noisy_clipped_low``, ``noisy_clipped_high`` and ``zero_variance``. ValueError for a plan whose body or level the
-    clean frame depends on.
+    `make_pair`, whose noisy frame this is, to the byte. Returns it and the numbers of `Counts` in their order, of which
+    those of the clean frame are 0. ValueError for a plan whose body or level the clean frame depends on.
     """
     if plan.averaged or "full_well" in plan.effects:
         raise ValueError("a clean frame with fixed patterns or a full well is another at every noise level")
@@ -82,7 +81,7 @@ def make_noisy(
     body, tables, normal = _body(plan, unrounded.shape, origin), poisson_tables(), columns(normal_table())
     frame = np.ascontiguousarray(unrounded)
     _physical_noisy(frame, scene, key, limits_dn, origin, body, tables, normal, noisy, counts)
-    return noisy, (int(counts[2]), int(counts[3]), int(counts[5]))
+    return noisy, counts
 
 
 class _Body(NamedTuple):

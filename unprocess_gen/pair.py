@@ -51,20 +51,21 @@ def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[i
     srgb = _dequantised(srgb, plans[0], origin)
     unrounded, clean, of_clean = fused.unprocess(srgb, plans[0], _curve(srgb, plans[0]), origin)
     for plan in plans:
-        noisy, of_noisy = fused.make_noisy(unrounded, plan, _limits_dn(plan), origin)
+        maker = electrons.make_noisy if plan.counts_electrons else fused.make_noisy
+        noisy, of_noisy = maker(unrounded, plan, _limits_dn(plan), origin)
         yield Pair(clean, noisy, Counts(*(int(count) for count in of_clean + of_noisy)))
 
 
 def _is_made_of_the_clean_frame(plan: Plan) -> bool:
-    """Whether the noisy frame can be made of the unrounded clean one alone; an averaged one has more to it."""
-    return not plan.counts_electrons and not plan.averaged
+    """Whether the noisy frame can be made of the unrounded clean one alone."""
+    return not (plan.readable or plan.averaged or "full_well" in plan.effects)
 
 
 def _of_the_clean_frame(plan: Plan) -> tuple[object, ...]:
     """Return all of a plan that the clean frame depends on."""
     without_noise = replace(
         plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
-        effects=(), skipped=(), accuracy="", methods=(), physics=None, level=0, draw=0, frame=0,
+        effects=(), skipped=(), physics=None, level=0, draw=0, frame=0,
     )  # fmt: skip
     return without_noise, plan.brightest, plan.averaged and (plan.physics, plan.effects)
 
