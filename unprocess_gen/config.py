@@ -33,7 +33,10 @@ from unprocess_gen.records import Law
 
 @dataclass
 class SourceConfig:
-    """Where the photographs come from; ``root`` null stands for the built-in scenes."""
+    """Where the photographs come from; ``root`` null stands for the built-in scenes.
+
+    ``clips``: folders are clips, and so are the files that ``video``'s globs match, which else nothing looks at.
+    """
 
     root: Optional[str] = None
     include: list[str] = field(default_factory=list)
@@ -43,6 +46,7 @@ class SourceConfig:
     max_failed: int = 0
     icc: str = "ignore"
     clips: bool = False
+    video: list[str] = field(default_factory=list)
     downscale: int = 1
     dequantize: str = "off"
 
@@ -384,7 +388,7 @@ def _check_source(source: SourceConfig) -> None:
         raise ConfigError("source.root='': expected a folder; null stands for the built-in scenes")
     if source.root is not None and not Path(source.root).is_dir():
         raise ConfigError(f"source.root={source.root}: no such folder; null stands for the built-in scenes")
-    if not source.include:
+    if not source.include and not (source.clips and source.video):
         raise ConfigError("source.include=[]: expected at least one pattern such as '*.jpg'")
     if source.clips and source.root is None:
         raise ConfigError("source.clips=true: the built-in scenes are no clips; give source.root=…")

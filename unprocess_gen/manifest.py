@@ -244,8 +244,12 @@ def _physics_values(physics: Physics | None) -> dict[str, Value]:
 
 
 def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str) -> Row:
-    """Return the row of a photograph that could not be used; ``sha256`` is None where it could not even be read."""
-    return _row(source, sha256, shard, seed, {"status": "failed", "reason": reason})
+    """Return the row of a photograph that could not be used; ``sha256`` is None where it could not even be read.
+
+    A frame of a video is told by its number alone, so its row has it even then.
+    """
+    place: dict[str, Value] = {"frame": source.frame, "clip": source.clip} if source.is_video else {}
+    return _row(source, sha256, shard, seed, {"status": "failed", "reason": reason, **place})
 
 
 _WEIGHTS = tuple(name for name in NAMES if name.startswith("w_"))
@@ -446,7 +450,7 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
 
 def json_size(source_name: str, pairs: int = 1) -> int:
     """Return the bytes of an image's JSON in the shard, padding included: its source's name and its pairs decide."""
-    named = 2 * len(json.dumps(source_name))  # its clip is named by a part of it
+    named = 2 * len(json.dumps(source_name))  # its clip is named by a part of it, a video's by all of it
     return -(-(JSON_BYTES + named) * pairs // 512) * 512
 
 

@@ -42,9 +42,13 @@ from unprocess_gen.plan import plan_pairs
 from unprocess_gen.planner import facts_for
 from unprocess_gen.records import Counts, Source
 from unprocess_gen.shards import CLEAN, ShardWriter, array_xxh3, noisy_member, shard_name
+from unprocess_gen.video import is_installed
 from unprocess_gen.workspace import Made, Workspace, machine_error
 
-PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
+PACKAGES = (
+    *("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash"),
+    *(("av",) if is_installed() else ()),
+)
 PARENT_POLL_S = 0.5
 PLAIN_LINE_S = 5.0
 """Seconds between progress lines where there is no terminal."""
