@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs, photographs, repair, runner
+from unprocess_gen import RawPairs, photographs, repair, runner, transfer
 from unprocess_gen import patches as room
 from unprocess_gen.config import Config, check, dataset_yaml, read_dataset_yaml
 from unprocess_gen.errors import ConfigError, SourceError
@@ -506,6 +506,15 @@ def test_rows_of_more_than_ten_thousand_patches_keep_their_order(
 def test_a_dataset_of_patches_is_made_again_from_its_config(cut_up: Path, sources: Path, door: Door) -> None:
     done = door("again", cut_up, f"source.root={sources}", "out=ds2", "source.max_failed=1", "n_jobs=1")
     assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {cut_up}, bit for bit")
+
+
+@pytest.mark.parametrize("side", [16, 64])
+def test_the_noise_of_small_patches_is_found_to_be_that_of_their_rows(side: int, make: Make, tmp_path: Path) -> None:
+    """Few sites tell little: the errors have to say so. Of 800 normal deviations the largest lies below 5."""
+    make(None, tmp_path / "ds", "source.limit=2", f"source.patch=[random,{side},400]")
+    found = list(transfer.fits(tmp_path / "ds"))
+    assert len(found) > 300
+    assert max(one.deviation for one in found) < 5
 
 
 # Foretold -------------------------------------------------------------------------------------------------------------
