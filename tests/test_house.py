@@ -16,7 +16,7 @@ FLOORS = (
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
     {"methods", "poisson"},
     {
-        *("config", "decode", "draws", "effects", "manifest", "process"),
+        *("config", "decode", "draws", "effects", "manifest", "patches", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess", "video"),
     },
     {"fused", "physics", "planner"},

@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 from unprocess_gen import bayer, colour
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.methods import Budget, choose
-from unprocess_gen.records import Law
+from unprocess_gen.records import Law, PatchLaw
 
 
 @dataclass
@@ -49,6 +49,7 @@ class SourceConfig:
     video: list[str] = field(default_factory=list)
     downscale: int = 1
     dequantize: str = "off"
+    patch: Any = None
 
 
 @dataclass
@@ -398,9 +399,46 @@ def _check_source(source: SourceConfig) -> None:
     _in_range("source.max_failed", source.max_failed, 0, 10**9)
     _in_range("source.downscale", source.downscale, 1, 64)
     _one_of("source.dequantize", dequantizing(source), ("off", "dither"))
+    patch_law(source)
     _one_of("source.icc", source.icc, ("ignore", "refuse"))
     if source.icc == "refuse" and find_spec("PIL") is None:
         raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
+
+
+MIN_PATCH, MAX_PATCH, MOST_RANDOM_PATCHES = 2, 2**15, 10**4
+"""Sides and strides of patches in pixels, and how many can be asked for at random places: four digits in a key."""
+
+
+def patch_law(source: SourceConfig) -> PatchLaw | None:
+    """Return how images are cut into patches, None where they stay whole; ConfigError where it cannot be meant."""
+    match ["grid", source.patch] if _is_whole(source.patch) else source.patch:
+        case None:
+            return None
+        case ["grid", side] if _is_patch_length(side):
+            return PatchLaw("grid", side, stride=side)
+        case ["grid", side, stride] if _is_patch_length(side) and _is_patch_length(stride):
+            return PatchLaw("grid", side, stride=stride)
+        case ["random", side, count] if _is_patch_length(side) and _is_patch_count(count):
+            return PatchLaw("random", side, count=count)
+    raise ConfigError(
+        f"source.patch={_text(source.patch)}: expected null, a side, [grid, side], [grid, side, stride] or "
+        f"[random, side, count]; side and stride are even, {MIN_PATCH} to {MAX_PATCH} pixels, "
+        f"count is 1 to {MOST_RANDOM_PATCHES}"
+    )
+
+
+def _is_patch_length(value: Any) -> bool:
+    return _is_whole(value) and MIN_PATCH <= value <= MAX_PATCH and value % 2 == 0
+
+
+def _is_patch_count(value: Any) -> bool:
+    return _is_whole(value) and 1 <= value <= MOST_RANDOM_PATCHES
+
+
+def _patch_setting(source: SourceConfig) -> list[Any] | None:
+    """Return ``source.patch`` in the one spelling of ``config.yaml``."""
+    law = patch_law(source)
+    return None if law is None else [law.kind, law.side, law.stride or law.count]
 
 
 def _check_camera(camera: CameraConfig) -> None:
@@ -818,6 +856,7 @@ def dataset_yaml(config: Config) -> str:
     settings["source"] = {"kind": source_kind(config)} | {
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
+    settings["source"]["patch"] = _patch_setting(config.source)
     for group, keys in NUMBERS_OR_LAWS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)

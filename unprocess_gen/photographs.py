@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from unprocess_gen import decode, sources, synthetic
-from unprocess_gen.config import SourceConfig
+from unprocess_gen.config import SourceConfig, patch_law
 from unprocess_gen.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.manifest import Row, image_key
 from unprocess_gen.records import NO_CLIP, Photograph, Source, Srgb
@@ -54,9 +54,19 @@ def source_of(row: Row) -> Source:
 def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
     """Return the SHA-256 of a source's bytes (of a scene's pixels) and its pixels, decoded and downscaled.
 
-    Raises SourceError, with the digest as ``sha256`` where the bytes could be read; MachineError where the file is not
-    the one that was listed.
+    Raises SourceError, with the digest as ``sha256`` where the bytes could be read, also where no patch fits into the
+    pixels; MachineError where the file is not the one that was listed.
     """
+    digest, photograph = _full_frame(config, source)
+    height, width = photograph.srgb.shape[:2]
+    law = patch_law(config)
+    if law is not None and min(height, width) < law.side:
+        text = f"{width} x {height} pixels hold no patch of {law.side} x {law.side} (source.patch)"
+        raise SourceError("unsupported", text, digest)
+    return digest, photograph
+
+
+def _full_frame(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
     digest, photograph = _decoded(config, source)
     if config.downscale == 1:
         return digest, photograph

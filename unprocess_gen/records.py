@@ -64,6 +64,39 @@ class Photograph:
 
 
 @dataclass(frozen=True, slots=True)
+class PatchLaw:
+    """Which patches are cut out of each image, squares of ``side`` pixels.
+
+    ``kind`` is ``grid``, whose corners are ``stride`` pixels apart, or ``random``, ``count`` of them; the number that
+    the other kind has is 0.
+    """
+
+    kind: str
+    side: int
+    stride: int = 0
+    count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A cut-out of a full frame: its number in the image, the row and column of its corner, its size in pixels.
+
+    A whole image is patch 0 at row 0, column 0.
+    """
+
+    number: int
+    y: int
+    x: int
+    height: int
+    width: int
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Row and column of its corner in the full frame."""
+        return self.y, self.x
+
+
+@dataclass(frozen=True, slots=True)
 class Facts:
     """What a plan may know of the pixels: whole numbers, the same on every machine.
 

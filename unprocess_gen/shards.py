@@ -1,10 +1,10 @@
 """Shards: uncompressed tar files in the WebDataset layout, whose bytes depend on nothing but their members.
 
-Members of one image stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 ``[H, W]``), the noisy frames of
-other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with time, owner and mode fixed.
-Writing goes straight from the arrays to the file while SHA-256 runs along (0.5 ns a byte together), reading maps just
-the bytes of one array into memory, found through an index of offsets that is read from the tar headers: nothing is ever
-unpacked.
+Members of one sample, an image or a patch of it, stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16
+``[H, W]``), the noisy frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with
+time, owner and mode fixed. Writing goes straight from the arrays to the file while SHA-256 runs along (0.5 ns a byte
+together), reading maps just the bytes of one array into memory, found through an index of offsets that is read from the
+tar headers: nothing is ever unpacked.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _padding(size: int) -> int:
 
 
 def image_bytes(width: int, height: int, json_bytes: int, pairs: int = 1) -> int:
-    """Return the bytes that one image and its noisy frames take in a shard, tar framing included."""
+    """Return the bytes that one sample and its noisy frames take in a shard, tar framing included."""
     array = len(_npy_header((height, width))) + 2 * width * height
     return sum(RECORD + size + _padding(size) for size in (*[array] * (1 + pairs), json_bytes))
 
@@ -122,12 +122,12 @@ class ShardWriter:
         return self._hash.hexdigest()
 
     def add_frame(self, key: str, member: str, frame: Raw) -> None:
-        """Append a frame of an image."""
+        """Append a frame of a sample."""
         header = _npy_header(frame.shape)
         self._member(f"{key}.{member}", len(header) + frame.nbytes, header, _little_endian(frame).data)
 
     def add_rows(self, key: str, row_json: bytes) -> None:
-        """Append the rows of an image, after its frames."""
+        """Append the rows of a sample, after its frames."""
         self._member(f"{key}.{ROW}", len(row_json), row_json)
 
     def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
@@ -210,7 +210,7 @@ def map_array(path: Path, member: Member, shape: tuple[int, int]) -> Raw:
 
 
 class Expected(NamedTuple):
-    """What a shard must hold of one image: the frames' shape, members and XXH3-128, and the JSON to the byte."""
+    """What a shard must hold of one sample: the frames' shape, members and XXH3-128, and the JSON to the byte."""
 
     key: str
     width: int
