@@ -411,7 +411,9 @@ def test_a_photograph_is_decoded_once_and_only_pixels_of_its_patches_are_made(
     made: list[int] = []
     decode, make_pairs = photographs.decode.decode, runner.make_pairs
     monkeypatch.setattr(photographs.decode, "decode", lambda *a, **b: (decoded.append(1), decode(*a, **b))[1])
-    monkeypatch.setattr(runner, "make_pairs", lambda srgb, *a: (made.append(srgb[..., 0].size), make_pairs(srgb, *a))[1])
+    monkeypatch.setattr(
+        runner, "make_pairs", lambda srgb, *a: (made.append(srgb[..., 0].size), make_pairs(srgb, *a))[1]
+    )
     make(sources, tmp_path / "ds", "source.patch=[random,10,4]")
     assert (len(decoded), made) == (4, [100] * 12)
 
