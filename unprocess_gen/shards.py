@@ -99,6 +99,7 @@ class ShardWriter:
         self._hash = hashlib.sha256()
         self._thread = ThreadPoolExecutor(1, "shard writer") if beside else None
         self._underway: deque[tuple[int, Future[None]]] = deque()
+        self._bytes_underway = 0
         self._unsynced = 0
         self.bytes = 0
 
@@ -109,7 +110,7 @@ class ShardWriter:
         try:
             if kind is None:
                 self._write(END)
-                self._wait(0)
+                self._wait(-1)
         finally:
             if self._thread is not None:
                 self._thread.shutdown(cancel_futures=True)
@@ -118,7 +119,7 @@ class ShardWriter:
     @property
     def sha256(self) -> str:
         """Hex digest of what was written."""
-        self._wait(0)
+        self._wait(-1)
         return self._hash.hexdigest()
 
     def add_frame(self, key: str, member: str, frame: Raw) -> None:
@@ -131,37 +132,41 @@ class ShardWriter:
         self._member(f"{key}.{ROW}", len(row_json), row_json)
 
     def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
-        for part in (_tar_header(name, size), *parts, b"\0" * _padding(size)):
-            self._write(part)
+        self._write(_tar_header(name, size), *parts, b"\0" * _padding(size))
 
-    def _write(self, content: bytes | memoryview) -> None:
-        view = memoryview(content).cast("B")
-        self.bytes += len(view)
+    def _write(self, *parts: bytes | memoryview) -> None:
+        views = [memoryview(part).cast("B") for part in parts]
+        size = sum(map(len, views))
+        self.bytes += size
         if self._thread is None:
-            self._put(view)
+            self._put(views)
         else:
             self._wait(MOST_UNDERWAY)
-            self._underway.append((len(view), self._thread.submit(self._put_and_sync, view)))
+            self._underway.append((size, self._thread.submit(self._put_and_sync, views)))
+            self._bytes_underway += size
 
     def _wait(self, most: int) -> None:
-        """Wait until no more than so many bytes are underway."""
-        while sum(size for size, _ in self._underway) > most:
-            self._underway.popleft()[1].result()
+        """Wait until no more than so many bytes are underway; what failed there is raised here."""
+        while self._underway and (self._bytes_underway > most or self._underway[0][1].done()):
+            size, done = self._underway.popleft()
+            self._bytes_underway -= size
+            done.result()
 
-    def _put_and_sync(self, view: memoryview) -> None:
-        self._put(view)
-        self._unsynced += len(view)
+    def _put_and_sync(self, views: Sequence[memoryview]) -> None:
+        self._put(views)
+        self._unsynced += sum(map(len, views))
         if self._unsynced >= SYNC_BYTES:
             os.fdatasync(self._file.fileno())
             self._unsynced = 0
 
-    def _put(self, view: memoryview) -> None:
-        self._hash.update(view)
-        while view:
-            written = self._file.write(view)
-            if not written:
-                raise OSError(errno.EIO, "the file takes no more bytes", self._file.name)
-            view = view[written:]
+    def _put(self, views: Sequence[memoryview]) -> None:
+        for view in views:
+            self._hash.update(view)
+            while view:
+                written = self._file.write(view)
+                if not written:
+                    raise OSError(errno.EIO, "the file takes no more bytes", self._file.name)
+                view = view[written:]
 
 
 # --------------------------------------------------------------------------------------------------------- reading
