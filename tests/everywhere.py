@@ -44,7 +44,7 @@ import numba
 import numpy as np
 
 from unprocess_gen import cli, electrons, fused, poisson, selftest
-from unprocess_gen.pair import make_pair
+from unprocess_gen.pair import make_pair, make_pairs
 from unprocess_gen.tables import normal_table
 
 KERNELS = {
@@ -206,10 +206,13 @@ def code() -> dict[str, Any]:
 
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
-    for room, name in ((fused, "_pair"), (electrons, "_physical_pair"), (electrons, "_responses")):
+    black = np.zeros((2, 2, 3), dtype=np.uint8)
+    outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"))
+    for room, name in (*outer, (electrons, "_physical_pair"), (electrons, "_responses")):
         setattr(room, name, compiler(getattr(room, name)))
     for plan in selftest.GOLDEN_PLANS.values():
-        make_pair(np.zeros((2, 2, 3), dtype=np.uint8), plan)
+        make_pair(black, plan)
+    list(make_pairs(black, [selftest.GOLDEN_PLAN] * 2))
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint64), np.zeros(1)

@@ -16,8 +16,8 @@ FLOORS = (
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
     {"methods", "poisson"},
     {
-        *("config", "decode", "draws", "effects", "manifest", "process"),
-        *("sensor", "shards", "sources", "synthetic", "unprocess"),
+        *("config", "decode", "draws", "effects", "manifest", "patches", "process"),
+        *("sensor", "shards", "sources", "synthetic", "unprocess", "video"),
     },
     {"fused", "physics", "planner"},
     {"electrons"},
@@ -37,6 +37,7 @@ ONLY_IN = {
     "numba": {"compiled"},
     "cv2": {"decode", "runner"},
     "PIL": {"decode"},
+    "av": {"video"},
     "tarfile": {"shards"},
 }
 """Which rooms may name a tool."""

@@ -29,6 +29,7 @@ from unprocess_gen.manifest import (
     json_size,
     key_text,
     ok_row,
+    patch_of,
     plan_of,
     read_rows,
     row_json,
@@ -37,7 +38,7 @@ from unprocess_gen.manifest import (
 from unprocess_gen.methods import STAGES, of_stage
 from unprocess_gen.plan import plan_image, plan_with_reasons
 from unprocess_gen.planner import STATISTICS
-from unprocess_gen.records import Counts, Facts, Pair, Physics, Plan, Source
+from unprocess_gen.records import Counts, Facts, Pair, Patch, Physics, Plan, Source
 
 CONTRACT = [
     "key",
@@ -104,6 +105,7 @@ PLAN = Plan(
     noise="imx385_iso3200", noise_law="gaussian", a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"),
     skipped=(), accuracy="exact", methods=("a:b", "c:d"),
 )  # fmt: skip
+PATCH = Patch(number=0, y=0, x=0, height=2, width=3)
 PHYSICS = Physics(
     iso=800.0, exposure_s=0.02, temperature_c=25.0, dn_per_e=1.5, prnu_std=0.005, dark_e=0.02, dark_offset="removed",
     hot_pixel_share=1e-5, hot_pixel_e=1.0, full_well_e=0.0, read_law="tukey", read_shape=-0.1, read_std_dn=3.0,
@@ -122,7 +124,7 @@ def csv_text(rows: Iterable[Row]) -> str:
 
 
 def row_of(plan: Plan = PLAN, source: Source = SOURCE) -> Row:
-    return ok_row(key_text(source.index), source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32))
+    return ok_row(key_text(source.index), source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32), PATCH)
 
 
 def through_csv(rows: list[Row], folder: Path) -> list[Row]:
@@ -326,6 +328,12 @@ def test_a_row_with_a_value_of_another_type_is_damage(name: str, value: str) -> 
         plan_of({**row_of(), name: value})
 
 
+@pytest.mark.parametrize("name", ["patch", "patch_y", "patch_x", "height", "width"])
+def test_a_row_without_its_place_in_the_full_frame_is_damage(name: str) -> None:
+    with pytest.raises(DamageError, match=f"row 00000003: not a patch \\({name} is empty"):
+        patch_of({**row_of(), name: None})
+
+
 # CSV ------------------------------------------------------------------------------------------------------------------
 
 
@@ -468,9 +476,9 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics)
     pair = Pair(PAIR.clean, PAIR.noisy, Counts(*[2**40] * 6))
     for one in (plan, physical):
-        row = ok_row(
-            "1000000000-l99d99", Source(10**9, "", "", 2**30), SHA256, 8, 10**9, one, pair, ("1" * 32, "2" * 32)
-        )
+        source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)
+        key = f"1000000000-p{patch.number}-l99d99"
+        row = ok_row(key, source, SHA256, 8, 10**9, one, pair, ("1" * 32, "2" * 32), patch)
         yield {**row, "width": 2**40, "height": 2**40}
 
 

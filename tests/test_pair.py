@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from unprocess_gen import colour, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
-from unprocess_gen.pair import make_pair, reference_pair
+from unprocess_gen.effects import EFFECTS
+from unprocess_gen.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.records import Plan
+from unprocess_gen.selftest import GOLDEN_PHYSICS
 
 SENSORS = {8: (0, 255), 10: (64, 1023), 12: (240, 4095), 14: (1024, 16383), 16: (4096, 65535)}
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
@@ -110,6 +112,89 @@ def test_a_frame_comes_out_pixel_by_pixel(plan: Plan, scene: np.ndarray) -> None
         pixel = make_pair(scene[y : y + 1, x : x + 1], plan, origin=(y, x))
         assert pixel.clean[0, 0] == whole.clean[y, x]
         assert pixel.noisy[0, 0] == whole.noisy[y, x]
+
+
+# Several noise levels of one clean frame ------------------------------------------------------------------------------
+
+NOISES = ((0.5, 2.0), (8.0034, -122.69544), (0.0, 0.0), (80.0, 2e4))
+
+
+def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
+    plans = [replace(plan, level=n, draw=n % 2, a_dn=a, b_dn2=b) for n, (a, b) in enumerate(NOISES)]
+    return [replace(one, **of_every_one) for one in plans]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"saturated": "pinned"},
+        {"highlight": "gray_mean", "sensor_clip": "black"},
+        {"dequantize": "dither"},
+        {"exposure_ratio": 3.0, "frame": 5},
+        {"noise_law": "poisson", "b_dn2": 3.0},
+        {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
+        {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
+    ],
+    ids=lambda options: ",".join(options) or "as it is",
+)
+def test_levels_of_one_clean_frame_are_the_pairs_that_are_made_alone(
+    scene: np.ndarray, plan: Plan, options: dict[str, object]
+) -> None:
+    plans = levels_of(plan, **options)
+
+    pairs = list(make_pairs(scene, plans, origin=(3, 130)))
+
+    assert len(pairs) == len(plans)
+    for one, pair in zip(plans, pairs, strict=True):
+        alone = make_pair(scene, one, origin=(3, 130))
+        np.testing.assert_array_equal(pair.clean, alone.clean)
+        np.testing.assert_array_equal(pair.noisy, alone.noisy)
+        assert pair.counts == alone.counts
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 1025), (3, 1024), (513, 1)])
+def test_levels_are_the_same_for_every_shape_and_sixteen_bits(plan: Plan, shape: tuple[int, int]) -> None:
+    srgb = np.random.Generator(np.random.Philox(key=3)).integers(0, 65536, (*shape, 3)).astype(np.uint16)
+
+    for one, pair in zip(levels_of(plan), make_pairs(srgb, levels_of(plan)), strict=True):
+        np.testing.assert_array_equal(pair.noisy, make_pair(srgb, one).noisy)
+
+
+def test_the_clean_frame_of_several_levels_is_one_array(scene: np.ndarray, plan: Plan) -> None:
+    first, *others = make_pairs(scene, levels_of(plan))
+
+    assert all(other.clean is first.clean for other in others)
+
+
+def test_one_plan_gives_one_pair_and_none_gives_none(scene: np.ndarray, plan: Plan) -> None:
+    (pair,) = make_pairs(scene, [plan])
+
+    np.testing.assert_array_equal(pair.noisy, make_pair(scene, plan).noisy)
+    assert list(make_pairs(scene, [])) == []
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"inverse_rgb_gain": 0.7},
+        {"exposure_ratio": 2.0},
+        {"stream_key": 1},
+        {"pattern": "BGGR"},
+        {"white_level_dn": 4000},
+        {"physics": replace(GOLDEN_PHYSICS, full_well_e=1.0), "effects": EFFECTS},
+        {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
+    ],
+    ids=lambda other: next(iter(other)),
+)
+def test_plans_of_different_clean_frames_are_refused_at_once(
+    scene: np.ndarray, plan: Plan, other: dict[str, object]
+) -> None:
+    with pytest.raises(ValueError, match="do not share the clean frame"):
+        make_pairs(scene, [plan, replace(plan, **other)])  # type: ignore[arg-type]
+
+
+# Limits ---------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bits", SENSORS)

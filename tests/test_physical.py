@@ -24,7 +24,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from moments import REACH, SAMPLER_ERROR, bernstein
 
-from unprocess_gen import effects, synthetic
+from unprocess_gen import effects, electrons, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.colour import IDENTITY
 from unprocess_gen.config import Config, branch_of, check
@@ -34,7 +34,9 @@ from unprocess_gen.pair import make_pair, reference_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_of
 from unprocess_gen.records import Physics, Plan, Source, Srgb
+from unprocess_gen.sensor import noisy_limits, to_dn
 from unprocess_gen.tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
+from unprocess_gen.unprocess import unprocess
 
 Settings = Callable[..., Config]
 SHA256 = "7" * 64
@@ -197,6 +199,50 @@ def test_a_tile_is_the_same_cut_out_of_the_frame(
     tile = make_pair(picture()[cut], plan, origin=(top, left))
     np.testing.assert_array_equal(tile.clean, whole.clean[cut])
     np.testing.assert_array_equal(tile.noisy, whole.noisy[cut])
+
+
+# The noisy frame alone ------------------------------------------------------------------------------------------------
+
+
+def assert_noisy_alone(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> None:
+    """From the unrounded clean frame of the readable forms, with what is counted of the noisy frame."""
+    light = unprocess(srgb, plan, origin)
+    light = light if plan.exposure == 1 else np.minimum(light, 1) * plan.exposure
+    clean_dn = to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest)
+    limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+    noisy, counts = electrons.make_noisy(clean_dn, plan, limits_dn, origin)
+    pair = make_pair(srgb, plan, origin)
+    np.testing.assert_array_equal(noisy, pair.noisy)
+    assert noisy.dtype == pair.noisy.dtype
+    of_pair = pair.counts.noisy_clipped_low, pair.counts.noisy_clipped_high, pair.counts.zero_variance
+    assert tuple(counts) == (0, 0, *of_pair[:2], 0, of_pair[2])
+
+
+WITHOUT_WELL = tuple(effect for effect in EFFECTS if effect != "full_well")
+
+
+@pytest.mark.parametrize("effect", [None, *WITHOUT_WELL])
+def test_the_noisy_frame_alone_is_that_of_the_pair_with_and_without_every_effect(
+    everything: Plan, effect: str | None
+) -> None:
+    plan = replace(everything, level=3, draw=2, frame=1)
+    for on in ([one for one in WITHOUT_WELL if one != effect], [effect] if effect else []):
+        for saturated, clip in itertools.product(["noisy", "pinned"], ["sensor", "black"]):
+            one = replace(plan, effects=tuple(on), saturated=saturated, sensor_clip=clip)
+            assert_noisy_alone(picture(), one, (3, 7))
+
+
+@pytest.mark.parametrize("noise", TWO_NUMBERS)
+def test_the_noisy_frame_alone_is_that_of_the_pair_for_the_poisson_form(settings: Settings, noise: str) -> None:
+    plan = planned(settings, picture(), f"noise={noise}", *TWO_NUMBERS[noise], "noise.law=poisson")
+    assert_noisy_alone(picture(), plan)
+    assert_noisy_alone(np.random.default_rng(6).integers(0, 256, (3, 2049, 3)).astype(np.uint8), plan, (5, 9))
+
+
+def test_a_clean_frame_that_depends_on_the_level_has_no_noisy_frame_alone(everything: Plan) -> None:
+    for plan in (everything, replace(averaged(everything), effects=WITHOUT_WELL)):
+        with pytest.raises(ValueError, match="another at every noise level"):
+            electrons.make_noisy(np.zeros((2, 2)), plan, (0.0, 4095.0))
 
 
 # Replay ---------------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import tarfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import xxhash
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import RawPairs
+from unprocess_gen import RawPairs, shards
 from unprocess_gen.errors import DamageError
 from unprocess_gen.records import Counts, Pair
 from unprocess_gen.shards import (
@@ -205,6 +206,53 @@ def test_a_file_that_takes_no_more_is_an_error(tmp_path: Path) -> None:
         writer._file = Trickle(100)  # type: ignore[assignment]
         add(writer, "00000000", pair(5, 7), b"{}")
     assert error.value.errno == errno.EIO
+
+
+class Slow(Trickle):
+    """A file that is never in a hurry."""
+
+    def write(self, content: Any) -> int:
+        time.sleep(0.001)
+        return super().write(content)
+
+    def fileno(self) -> int:
+        return os.open(os.devnull, os.O_RDONLY)
+
+
+def test_a_thread_beside_writes_the_same_bytes(tmp_path: Path) -> None:
+    alone, beside = tmp_path / "a.tar", tmp_path / "b.tar"
+    writers = []
+    for path, thread in ((alone, False), (beside, True)):
+        with ShardWriter(path, beside=thread) as writer:
+            for key in ("00000000", "00000001", "00000002"):
+                add(writer, key, pair(300, 201), json.dumps({"key": key}).encode().ljust(512))
+        writers.append(writer)
+
+    assert alone.read_bytes() == beside.read_bytes()
+    assert writers[0].bytes == writers[1].bytes == beside.stat().st_size
+    assert writers[0].sha256 == writers[1].sha256 == hashlib.sha256(beside.read_bytes()).hexdigest()
+
+
+def test_what_fails_beside_is_raised_and_leaves_no_thread(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="takes no more bytes"), ShardWriter(tmp_path / "b.tar", beside=True) as writer:
+        writer._file.close()
+        writer._file = Slow(100)  # type: ignore[assignment]
+        add(writer, "00000000", pair(5, 7), b"{}")
+
+    assert not any(thread.name.startswith("shard writer") for thread in threading.enumerate())
+
+
+def test_no_more_than_so_much_waits_to_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shards, "MOST_UNDERWAY", 1000)
+    waited = []
+    with ShardWriter(tmp_path / "b.tar", beside=True) as writer:
+        writer._file.close()
+        writer._file = Slow(10**9)  # type: ignore[assignment]
+        for number in range(20):
+            writer.add_frame(f"{number:08d}", "clean.npy", np.zeros((10, 20), np.uint16))
+            waited.append(writer._bytes_underway)
+
+    assert max(waited) <= 1000 + 1024
 
 
 # Reading --------------------------------------------------------------------------------------------------------------

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 from moments import FALSE_ALARM, bernstein
 
 from unprocess_gen import streams
-from unprocess_gen.streams import body_key, parameter_uniforms, philox4x32, purpose, stream_key, words
+from unprocess_gen.streams import (
+    STREAMS,
+    body_key,
+    parameter_uniforms,
+    patch_words,
+    philox4x32,
+    purpose,
+    stream_key,
+    words,
+)
 
 KEY = 0x0123456789ABCDEF
 SHA = hashlib.sha256(b"a photograph").hexdigest()
@@ -104,7 +113,7 @@ def test_an_empty_tile_has_no_words() -> None:
 def test_the_streams_numbers_are_those_of_every_dataset_ever_made() -> None:
     assert streams.STREAMS == {
         "parameters": 0, "heteroscedastic": 1, "prnu": 2, "shot": 3, "dark_current": 4, "hot_pixels": 5, "read": 6,
-        "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10,
+        "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10, "patch": 11,
     }  # fmt: skip
     assert len(set(streams.STREAMS.values())) == len(streams.STREAMS)
 
@@ -212,6 +221,12 @@ def test_appending_parameters_moves_none(key: int, count: int) -> None:
 def test_parameter_n_is_the_first_52_bits_of_counter_n(key: int, number: int) -> None:
     high, low, _, _ = philox_by_hand((0, number, 0, 0), key)
     assert parameter_uniforms(key, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
+
+
+@given(keys, st.integers(0, 50))
+def test_places_of_patch_n_are_the_first_two_words_of_its_counter(key: int, number: int) -> None:
+    first, second, _, _ = philox_by_hand((0, number, STREAMS["patch"] << 24, 0), key)
+    assert patch_words(key, number + 1)[number] == (first, second)
 
 
 # Statistics -----------------------------------------------------------------------------------------------------------

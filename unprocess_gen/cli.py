@@ -47,8 +47,8 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
 
 Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
-  source   root, include, recursive, limit, max_pixels, max_failed, icc, clips, downscale,
-           dequantize
+  source   root, include, recursive, limit, max_pixels, max_failed, icc, clips, video,
+           downscale, dequantize, patch
   camera   convex choice sony_a7r olympus_em10 sony_rx100 nexus_6p identity custom
   gains    brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
   isp      smoothstep_gamma22 gamma22 srgb linear

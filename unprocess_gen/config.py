@@ -28,12 +28,15 @@ from omegaconf.errors import OmegaConfBaseException
 from unprocess_gen import bayer, colour
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.methods import Budget, choose
-from unprocess_gen.records import Law
+from unprocess_gen.records import Law, PatchLaw
 
 
 @dataclass
 class SourceConfig:
-    """Where the photographs come from; ``root`` null stands for the built-in scenes."""
+    """Where the photographs come from; ``root`` null stands for the built-in scenes.
+
+    ``clips``: folders are clips, and so are the files that ``video``'s globs match, which else nothing looks at.
+    """
 
     root: Optional[str] = None
     include: list[str] = field(default_factory=list)
@@ -43,8 +46,10 @@ class SourceConfig:
     max_failed: int = 0
     icc: str = "ignore"
     clips: bool = False
+    video: list[str] = field(default_factory=list)
     downscale: int = 1
     dequantize: str = "off"
+    patch: Any = None
 
 
 @dataclass
@@ -386,7 +391,7 @@ def _check_source(source: SourceConfig) -> None:
         raise ConfigError("source.root='': expected a folder; null stands for the built-in scenes")
     if source.root is not None and not Path(source.root).is_dir():
         raise ConfigError(f"source.root={source.root}: no such folder; null stands for the built-in scenes")
-    if not source.include:
+    if not source.include and not (source.clips and source.video):
         raise ConfigError("source.include=[]: expected at least one pattern such as '*.jpg'")
     if source.clips and source.root is None:
         raise ConfigError("source.clips=true: the built-in scenes are no clips; give source.root=…")
@@ -396,9 +401,46 @@ def _check_source(source: SourceConfig) -> None:
     _in_range("source.max_failed", source.max_failed, 0, 10**9)
     _in_range("source.downscale", source.downscale, 1, 64)
     _one_of("source.dequantize", dequantizing(source), ("off", "dither"))
+    patch_law(source)
     _one_of("source.icc", source.icc, ("ignore", "refuse"))
     if source.icc == "refuse" and find_spec("PIL") is None:
         raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
+
+
+MIN_PATCH, MAX_PATCH, MOST_RANDOM_PATCHES = 2, 2**15, 10**4
+"""Sides and strides of patches in pixels, and how many can be asked for at random places: four digits in a key."""
+
+
+def patch_law(source: SourceConfig) -> PatchLaw | None:
+    """Return how images are cut into patches, None where they stay whole; ConfigError where it cannot be meant."""
+    match ["grid", source.patch] if _is_whole(source.patch) else source.patch:
+        case None:
+            return None
+        case ["grid", side] if _is_patch_length(side):
+            return PatchLaw("grid", side, stride=side)
+        case ["grid", side, stride] if _is_patch_length(side) and _is_patch_length(stride):
+            return PatchLaw("grid", side, stride=stride)
+        case ["random", side, count] if _is_patch_length(side) and _is_patch_count(count):
+            return PatchLaw("random", side, count=count)
+    raise ConfigError(
+        f"source.patch={_text(source.patch)}: expected null, a side, [grid, side], [grid, side, stride] or "
+        f"[random, side, count]; side and stride are even, {MIN_PATCH} to {MAX_PATCH} pixels, "
+        f"count is 1 to {MOST_RANDOM_PATCHES}"
+    )
+
+
+def _is_patch_length(value: Any) -> bool:
+    return _is_whole(value) and MIN_PATCH <= value <= MAX_PATCH and value % 2 == 0
+
+
+def _is_patch_count(value: Any) -> bool:
+    return _is_whole(value) and 1 <= value <= MOST_RANDOM_PATCHES
+
+
+def _patch_setting(source: SourceConfig) -> list[Any] | None:
+    """Return ``source.patch`` in the one spelling of ``config.yaml``."""
+    law = patch_law(source)
+    return None if law is None else [law.kind, law.side, law.stride or law.count]
 
 
 def _check_camera(camera: CameraConfig) -> None:
@@ -816,6 +858,7 @@ def dataset_yaml(config: Config) -> str:
     settings["source"] = {"kind": source_kind(config)} | {
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
+    settings["source"]["patch"] = _patch_setting(config.source)
     for group, keys in NUMBERS_OR_LAWS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)

@@ -105,7 +105,7 @@ def decode(data: bytes, *, max_pixels: int, icc: str) -> Photograph:
         raise ValueError(f"icc is {icc!r}, expected one of {', '.join(ICC_CHOICES)}")
     header = probe(data)
     _refuse(header, max_pixels, icc)
-    return Photograph(_upright(_pixels(data, header), header.orientation), header.orientation)
+    return Photograph(upright(_pixels(data, header), header.orientation), header.orientation)
 
 
 # The policy -----------------------------------------------------------------------------------------------------------
@@ -231,7 +231,8 @@ def _as_rgb(stored: Srgb) -> Srgb:
     return cast(Srgb, np.ascontiguousarray(stored[..., 2::-1]))
 
 
-def _upright(srgb: Srgb, orientation: int) -> Srgb:
+def upright(srgb: Srgb, orientation: int) -> Srgb:
+    """Turns pixels as stored by an EXIF orientation."""
     swap, row_step, column_step = _TURNS[orientation]
     turned = srgb.swapaxes(0, 1) if swap else srgb
     return cast(Srgb, np.ascontiguousarray(turned[::row_step, ::column_step]))

@@ -63,6 +63,27 @@ def make_pair(
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
+def make_noisy(
+    unrounded: Float, plan: Plan, limits_dn: tuple[float, float], origin: tuple[int, int] = (0, 0)
+) -> tuple[Raw, NDArray[np.int64]]:
+    """Make the noisy frame alone, for one more noise level or draw of a clean frame.
+
+    ``unrounded`` is that clean frame before rounding, float64 ``[H, W]`` DN; the other arguments are as for
+    `make_pair`, whose noisy frame this is, to the byte. Returns it and the numbers of `Counts` in their order, of which
+    those of the clean frame are 0. ValueError for a plan whose body or level the clean frame depends on.
+    """
+    if plan.averaged or "full_well" in plan.effects:
+        raise ValueError("a clean frame with fixed patterns or a full well is another at every noise level")
+    noisy = np.empty(unrounded.shape, dtype=np.uint16)
+    counts = np.zeros(6, dtype=np.int64)
+    scene = scene_of(plan, np.empty(0), unrounded.shape, origin)  # no curve: nothing is unprocessed
+    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
+    body, tables, normal = _body(plan, unrounded.shape, origin), poisson_tables(), columns(normal_table())
+    frame = np.ascontiguousarray(unrounded)
+    _physical_noisy(frame, scene, key, limits_dn, origin, body, tables, normal, noisy, counts)
+    return noisy, counts
+
+
 class _Body(NamedTuple):
     """What the noisy frame of a physical profile is made with; a number that leaves its effect out is said."""
 
@@ -82,7 +103,7 @@ class _Body(NamedTuple):
     quantiles: tuple[Float, Float, Float]
     rows_dn: Float  # [H]
     columns_dn: Float  # [W]
-    errors_dn: Float  # [2, 2]
+    errors_dn: Float  # [2, CHUNK]
     dead_below: np.uint64
     read_purpose: np.uint64
     key: Key
@@ -96,7 +117,7 @@ def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
         return _Body(
             a_dn or 1.0, np.ones((1, 1), np.float32), False, False, a_dn > 0, False, 0.0, 0.0, np.uint64(0), 0.0,
             exponential_levels(), np.inf, float(np.sqrt(max(b_dn2, 0.0))), columns(normal_table()),
-            np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, 2)), np.uint64(0), HETEROSCEDASTIC, key_words(0),
+            np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, CHUNK)), np.uint64(0), HETEROSCEDASTIC, key_words(0),
         )  # fmt: skip
     on = frozenset(plan.effects)
     return _Body(
@@ -120,7 +141,7 @@ def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
         quantiles=columns(effects.read_table(physics)),
         rows_dn=effects.row(plan, shape[0], origin[0]) if "row" in on else np.zeros(shape[0]),
         columns_dn=effects.column(physics, shape[1], origin[1]) if "column" in on else np.zeros(shape[1]),
-        errors_dn=effects.black_error(physics, (2, 2), origin) if "black_error" in on else np.zeros((2, 2)),
+        errors_dn=effects.black_error(physics, (2, CHUNK), origin) if "black_error" in on else np.zeros((2, CHUNK)),
         dead_below=share_limit(physics.dead_pixel_share) if "dead_pixels" in on else np.uint64(0),
         read_purpose=np.uint64(purpose("read")),
         key=key_words(physics.body_key),
@@ -177,29 +198,15 @@ def _physical_pair(
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a physical profile: `effects.physical`, row by row."""
+    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a physical profile, row by row."""
     height, width = clean.shape
     light = np.empty(CHUNK)
     unrounded = np.empty(CHUNK)
-    electrons = np.empty(CHUNK)
-    added = np.empty(CHUNK)
-    drawn = np.empty(CHUNK)  # counts may not lie where their means do
-    fixed = np.empty(CHUNK)
-    noisy_dn = np.empty(CHUNK)
-    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    kept = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    normals = np.empty(CHUNK + BLOCK)
+    buffers = _buffers()
     site_gains, site_headroom = by_site(scene)
-    black = scene.levels_dn[0]
-    errors = np.empty((2, CHUNK))
-    for y in range(2):
-        for x in range(CHUNK):
-            errors[y, x] = body.errors_dn[y, x & 1]
     for y in range(height):
         for start in range(0, width, CHUNK):
             n = min(CHUNK, width - start)
-            place = (origin[0] + y, origin[1] + start)
             fill_signal(srgb[y, start : start + n], scene, y, light)
             fill_light(light[:n], site_gains[y & 1], site_headroom[y & 1], scene, light)
             if body.responds and body.averaged:
@@ -207,53 +214,121 @@ def _physical_pair(
                     light[x] = light[x] * body.response[y, start + x]
             saturated = counts[4]
             fill_clean(light[:n], scene, unrounded, clean[y, start : start + n], counts)
-
-            for x in range(n):
-                electrons[x] = (unrounded[x] - black) / body.dn_per_e
-            if body.responds and not body.averaged:
-                for x in range(n):
-                    electrons[x] = electrons[x] * body.response[y, start + x]
-            if body.shot:
-                offset = fill_words(key, place, SHOT, n, words)
-                _counts(words, offset, n, electrons, tables, normal, kept, bits, normals, drawn)
-                electrons, drawn = drawn, electrons
-            if body.dark:
-                offset = fill_words(key, place, DARK, n, words)
-                added[:n] = body.dark_e
-                _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
-                for x in range(n):
-                    electrons[x] = electrons[x] + (drawn[x] - body.removed_e)
-            if body.hot_below:
-                hot = _hot_means(body, place, n, words, kept, added)
-                for x in range(n):
-                    fixed[x] = added[x] * body.dn_per_e
-                if hot:
-                    offset = fill_words(key, place, HOT, n, words)
-                    _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
-                    for x in range(n):
-                        electrons[x] = electrons[x] + drawn[x]
-            offset = 0
-            if body.read_std_dn > 0.0:
-                offset = fill_words(key, place, body.read_purpose, n, words)
-                fill_normals(words[: offset + n], body.quantiles, bits, normals)
-            else:
-                normals[:n] = 0.0
-            _digitise(
-                electrons[:n], normals[offset : offset + n], body, y, body.columns_dn[start : start + n],
-                errors[y & 1], black, noisy_dn,
+            _fill_noisy(
+                unrounded[:n], (y, start), origin, scene, key, limits_dn, body, tables, normal, buffers,
+                noisy[y, start : start + n], counts,
             )  # fmt: skip
             if body.averaged:
-                _average(unrounded[:n], fixed, body, y, start, limits_dn, scene, clean[y, start : start + n])
-            if body.dead_below:
-                offset = fill_words(body.key, place, DEAD, n, words)
-                for x in range(n):
-                    if words[offset + x] < body.dead_below:
-                        noisy_dn[x] = 0.0
-                        if body.averaged:
-                            clean[y, start + x] = np.uint16(np.int32(limits_dn[0]))
-            read_out(unrounded[:n], noisy_dn, scene, limits_dn, noisy[y, start : start + n], counts)
-            if body.averaged:
+                _average(unrounded[:n], (y, start), origin, body, limits_dn, buffers, clean[y, start : start + n])
                 counts[4] = saturated + _saturated(clean[y, start : start + n], scene.levels_dn[2])
+
+
+@kernel
+def _physical_noisy(
+    unrounded: Float,
+    scene: Scene,
+    key: Key,
+    limits_dn: tuple[float, float],
+    origin: tuple[int, int],
+    body: _Body,
+    tables: PoissonTables,
+    normal: tuple[Float, Float, Float],
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill ``noisy`` and ``counts`` with the noisy frame of a clean one."""
+    height, width = noisy.shape
+    buffers = _buffers()
+    for y in range(height):
+        for start in range(0, width, CHUNK):
+            end = min(start + CHUNK, width)
+            _fill_noisy(
+                unrounded[y, start:end], (y, start), origin, scene, key, limits_dn, body, tables, normal, buffers,
+                noisy[y, start:end], counts,
+            )  # fmt: skip
+
+
+class _Buffers(NamedTuple):
+    """What a run of pixels is worked on in; words and normals have room for whole blocks around it."""
+
+    electrons: Float
+    added: Float
+    drawn: Float  # counts may not lie where their means do
+    noisy_dn: Float
+    words: NDArray[np.uint64]
+    kept: NDArray[np.uint64]
+    bits: NDArray[np.uint64]
+    normals: Float
+
+
+@kernel
+def _buffers() -> _Buffers:
+    return _Buffers(
+        np.empty(CHUNK),
+        np.empty(CHUNK),
+        np.empty(CHUNK),
+        np.empty(CHUNK),
+        np.empty(CHUNK + BLOCK, dtype=np.uint64),
+        np.empty(CHUNK + BLOCK, dtype=np.uint64),
+        np.empty(CHUNK + BLOCK, dtype=np.uint64),
+        np.empty(CHUNK + BLOCK),
+    )
+
+
+@kernel
+def _fill_noisy(
+    unrounded: Float,
+    at: tuple[int, int],
+    origin: tuple[int, int],
+    scene: Scene,
+    key: Key,
+    limits_dn: tuple[float, float],
+    body: _Body,
+    tables: PoissonTables,
+    normal: tuple[Float, Float, Float],
+    buffers: _Buffers,
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Make a run of pixels of the noisy frame, from ``at`` in the cut-out on: `effects.physical`."""
+    n, (y, start), black = unrounded.shape[0], at, scene.levels_dn[0]
+    place = (origin[0] + y, origin[1] + start)
+    electrons, added, drawn, noisy_dn, words, kept, bits, normals = buffers
+    for x in range(n):
+        electrons[x] = (unrounded[x] - black) / body.dn_per_e
+    if body.responds and not body.averaged:
+        for x in range(n):
+            electrons[x] = electrons[x] * body.response[y, start + x]
+    if body.shot:
+        offset = fill_words(key, place, SHOT, n, words)
+        _counts(words, offset, n, electrons, tables, normal, kept, bits, normals, drawn)
+        electrons, drawn = drawn, electrons
+    if body.dark:
+        offset = fill_words(key, place, DARK, n, words)
+        added[:n] = body.dark_e
+        _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
+        for x in range(n):
+            electrons[x] = electrons[x] + (drawn[x] - body.removed_e)
+    if body.hot_below:
+        hot = _hot_means(body, place, n, words, kept, added)
+        if hot:
+            offset = fill_words(key, place, HOT, n, words)
+            _counts(words, offset, n, added, tables, normal, kept, bits, normals, drawn)
+            for x in range(n):
+                electrons[x] = electrons[x] + drawn[x]
+    offset = 0
+    if body.read_std_dn > 0.0:
+        offset = fill_words(key, place, body.read_purpose, n, words)
+        fill_normals(words[: offset + n], body.quantiles, bits, normals)
+    else:
+        normals[:n] = 0.0
+    _digitise(electrons[:n], normals[offset : offset + n], body, y, body.columns_dn[start : start + n], black, noisy_dn)
+    if body.dead_below:
+        offset = fill_words(body.key, place, DEAD, n, words)
+        for x in range(n):
+            if words[offset + x] < body.dead_below:
+                noisy_dn[x] = 0.0
+    read_out(unrounded, noisy_dn, scene, limits_dn, noisy, counts)
 
 
 @kernel
@@ -306,12 +381,12 @@ def _digitise(
     body: _Body,
     y: int,
     columns_dn: Float,
-    errors_dn: Float,
     black: float,
     out: Float,
 ) -> None:
     """Go from electrons to DN, and add what is added there."""
     full_well_e, dn_per_e, read_std_dn, row_dn = body.full_well_e, body.dn_per_e, body.read_std_dn, body.rows_dn[y]
+    errors_dn = body.errors_dn[y & 1]
     for x in range(electrons.shape[0]):
         dn = min(electrons[x], full_well_e) * dn_per_e + black
         out[x] = (dn + read_std_dn * normals[x]) + ((row_dn + columns_dn[x]) + errors_dn[x])
@@ -320,20 +395,31 @@ def _digitise(
 @kernel
 def _average(
     unrounded: Float,
-    fixed: Float,
+    at: tuple[int, int],
+    origin: tuple[int, int],
     body: _Body,
-    y: int,
-    start: int,
     limits_dn: tuple[float, float],
-    scene: Scene,
+    buffers: _Buffers,
     clean: Raw,
 ) -> None:
-    """Round the clean frame anew, with what an average of many frames keeps of the body."""
-    low, high = limits_dn
-    for x in range(unrounded.shape[0]):
-        dn = unrounded[x] + fixed[x] if body.hot_below else unrounded[x]
-        dn = dn + ((0.0 + body.columns_dn[start + x]) + body.errors_dn[y & 1, (start + x) & 1])
-        clean[x] = np.uint16(np.int32(min(max((dn + ROUND) - ROUND, low), high)))
+    """Round the clean frame anew, with what an average of many frames keeps of the body: `effects.average`."""
+    n, (y, start), (low, high) = unrounded.shape[0], at, limits_dn
+    place = (origin[0] + y, origin[1] + start)
+    averaged_dn, fixed, words = buffers.electrons, buffers.added, buffers.words
+    averaged_dn[:n] = unrounded
+    if body.hot_below:
+        _hot_means(body, place, n, words, buffers.kept, fixed)
+        for x in range(n):
+            averaged_dn[x] = averaged_dn[x] + fixed[x] * body.dn_per_e
+    for x in range(n):
+        averaged_dn[x] = averaged_dn[x] + ((0.0 + body.columns_dn[start + x]) + body.errors_dn[y & 1, x])
+    if body.dead_below:
+        offset = fill_words(body.key, place, DEAD, n, words)
+        for x in range(n):
+            if words[offset + x] < body.dead_below:
+                averaged_dn[x] = 0.0
+    for x in range(n):
+        clean[x] = np.uint16(np.int32(min(max((averaged_dn[x] + ROUND) - ROUND, low), high)))
 
 
 @kernel

@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from unprocess_gen import accuracy
-from unprocess_gen.config import AccuracyConfig, Config, is_physical
+from unprocess_gen.config import AccuracyConfig, Config, is_physical, patch_law
 from unprocess_gen.errors import SourceError
 from unprocess_gen.manifest import json_size
-from unprocess_gen.pair import make_pair
+from unprocess_gen.pair import make_pair, make_pairs
+from unprocess_gen.patches import cut, patches, pixels_in_none
 from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image, plan_pairs, plan_with_reasons
 from unprocess_gen.planner import COST_NS, Prediction, facts_for
@@ -32,9 +33,11 @@ SAMPLE = 16
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What one photograph would give: the bytes of its pair (0 where it fails), the time, its plan or the reason.
+    """What one photograph would give: the bytes of its pairs (0 where it fails), the time, its plan or the reason.
 
-    ``predictions``: what was decided about each effect of a physical profile, and why.
+    ``predictions``: what was decided about each effect of a physical profile, and why. ``patches`` and ``pairs`` are
+    how many it gives, ``pixels`` and ``left_out`` how many it has and how many of them lie in no patch; ``complaint``
+    says more of the reason.
     """
 
     source: Source
@@ -43,6 +46,11 @@ class Look:
     plan: Plan | None
     reason: str | None
     predictions: tuple[Prediction, ...] = ()
+    patches: int = 0
+    pairs: int = 0
+    pixels: int = 0
+    left_out: int = 0
+    complaint: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,24 +98,28 @@ def forecast(
 
 
 def look(config: Config, source: Source) -> Look:
-    """Make one pair, with the digests that its shard takes, and throw it away."""
+    """Make the pairs of one photograph, with the digests that its shard takes, and throw them away."""
     started = time.perf_counter()
     try:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
-        return Look(source, 0, time.perf_counter() - started, None, error.reason)
+        return Look(source, 0, time.perf_counter() - started, None, error.reason, complaint=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *identity, facts, source.frame)
-    for plan in plans:
-        pair = make_pair(photograph.srgb, plan)
-        for frame in (pair.clean, pair.noisy) if plan is plans[0] else (pair.noisy,):
-            array_xxh3(frame)
-            hashlib.sha256(frame.data)
-    height, width = pair.clean.shape
-    size = image_bytes(width, height, json_size(source.name, len(plans)), len(plans))
+    height, width = photograph.srgb.shape[:2]
+    cuts = patches(patch_law(config.source), plans[0].stream_key, height, width)
+    for patch in cuts:
+        for number, pair in enumerate(make_pairs(cut(photograph.srgb, patch), plans, patch.origin)):
+            for frame in (pair.clean, pair.noisy) if number == 0 else (pair.noisy,):
+                array_xxh3(frame)
+                hashlib.sha256(frame.data)
+    json_bytes = json_size(source.name, len(plans))
+    size = sum(image_bytes(patch.width, patch.height, json_bytes, len(plans)) for patch in cuts)
     seconds = time.perf_counter() - started
     _, predictions = plan_with_reasons(config, *identity, facts)
-    return Look(source, size, seconds, plans[0], None, predictions)
+    pixels, left_out = width * height, pixels_in_none(cuts, height, width)
+    pairs = len(cuts) * len(plans)
+    return Look(source, size, seconds, plans[0], None, predictions, len(cuts), pairs, pixels, left_out)
 
 
 def _prices(config: Config, looks: tuple[Look, ...], tiers: Mapping[str, AccuracyConfig]) -> dict[str, float]:
@@ -138,6 +150,7 @@ def text(config: Config, told: Forecast) -> str:
     lines = [
         f"sources   {told.sources} ({config.source.root or 'built-in scenes'}), {len(told.looks)} of them read",
         f"pairs     {_pairs(told)}, in {told.shards} shards of {config.output.pairs_per_shard}",
+        *_patches(config, told.looks),
         f"bytes     {about}{told.bytes:,} in shards" + ("" if told.exact else " (--all reads every source: exact)"),
         f"disk      {told.free_bytes:,} bytes free" + ("" if told.free_bytes > told.bytes else ": NOT ENOUGH"),
         f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}, "
@@ -156,8 +169,19 @@ def _duration(seconds: float) -> str:
 
 
 def _pairs(told: Forecast) -> str:
-    failed = sum(one.reason is not None for one in told.looks)
-    return str(told.sources - failed) if told.exact else f"{told.sources - failed} at the most"
+    pairs = sum(one.pairs for one in told.looks)
+    return str(pairs) if told.exact else f"about {pairs * told.sources // len(told.looks)}"
+
+
+def _patches(config: Config, looks: tuple[Look, ...]) -> list[str]:
+    """Return what is cut out of an image and how much of it is in no patch; nothing where images stay whole."""
+    law, cut_up = patch_law(config.source), [one for one in looks if one.patches]
+    if law is None or not cut_up:
+        return []
+    places = f"{law.count} at random places" if law.kind == "random" else f"a grid, {law.stride} apart"
+    left_out = sum(one.left_out for one in cut_up) / sum(one.pixels for one in cut_up)
+    counts = _span([one.patches for one in cut_up])
+    return [f"patches   {law.side} x {law.side}, {places}: {counts} an image; {left_out:.1%} of the pixels are in none"]
 
 
 def _accuracy(chosen: AccuracyConfig, prices: dict[str, float]) -> list[str]:
@@ -174,8 +198,9 @@ def _accuracy(chosen: AccuracyConfig, prices: dict[str, float]) -> list[str]:
 
 
 def _failures(config: Config, told: Forecast) -> list[str]:
-    lines = [f"fails     {one.source.name}: {one.reason}" for one in told.looks if one.reason]
-    if len(lines) > config.source.max_failed:
+    failed = [one for one in told.looks if one.reason is not None]
+    lines = [f"fails     {one.source.name}: {one.reason}\n          {one.complaint}" for one in failed]
+    if len(failed) > config.source.max_failed:
         lines.append(f"          more than source.max_failed={config.source.max_failed}: the run will end with 3")
     return lines
 

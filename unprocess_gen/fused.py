@@ -71,6 +71,36 @@ def make_pair(
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
+def unprocess(
+    srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)
+) -> tuple[Float, Raw, NDArray[np.int64]]:
+    """Make the clean frame alone, for several noisy ones; arguments as for `make_pair`.
+
+    Returns it before rounding, float64 ``[H, W]`` DN, and rounded; and the numbers of `Counts` in their order, of which
+    those of the noisy frame are 0.
+    """
+    unrounded = np.empty(srgb.shape[:2])
+    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
+    counts = np.zeros(6, dtype=np.int64)
+    _unprocess(np.ascontiguousarray(srgb), scene_of(plan, curve, srgb.shape, origin), unrounded, clean, counts)
+    return unrounded, clean, counts
+
+
+def make_noisy(
+    unrounded: Float, plan: Plan, limits_dn: tuple[float, float], origin: tuple[int, int] = (0, 0)
+) -> tuple[Raw, NDArray[np.int64]]:
+    """Make the noisy frame of a clean one that `unprocess` made, by any plan that shares it.
+
+    Returns it and the numbers of `Counts` in their order, of which those of the clean frame are 0.
+    """
+    noisy = np.empty(unrounded.shape, dtype=np.uint16)
+    counts = np.zeros(6, dtype=np.int64)
+    scene = scene_of(plan, np.zeros(1), unrounded.shape, origin)  # no code is looked up
+    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
+    _noisy(unrounded, scene, key, limits_dn, origin, columns(normal_table()), noisy, counts)
+    return noisy, counts
+
+
 class Scene(NamedTuple):
     """What the clean frame is made with: small arrays and numbers, as the kernels take them."""
 
@@ -157,6 +187,46 @@ def _pair(
                 noisy[y, start : start + length],
                 counts,
             )
+
+
+@kernel
+def _unprocess(srgb: Srgb, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+    """Fill ``unrounded``, ``clean`` and ``counts`` with the clean frame."""
+    height, width = clean.shape
+    signal = np.empty(CHUNK)
+    site_gains, site_headroom = by_site(scene)
+    for y in range(height):
+        for start in range(0, width, CHUNK):
+            end = min(start + CHUNK, width)
+            fill_signal(srgb[y, start:end], scene, y, signal)
+            fill_light(signal[: end - start], site_gains[y & 1], site_headroom[y & 1], scene, signal)
+            fill_clean(signal[: end - start], scene, unrounded[y, start:end], clean[y, start:end], counts)
+
+
+@kernel
+def _noisy(
+    unrounded: Float,
+    scene: Scene,
+    key: Key,
+    limits_dn: tuple[float, float],
+    origin: tuple[int, int],
+    quantiles: tuple[Float, Float, Float],
+    noisy: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill ``noisy`` and ``counts`` with the noisy frame of a two-parameter profile."""
+    height, width = noisy.shape
+    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    normals = np.empty(CHUNK + BLOCK)
+    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
+    for y in range(height):
+        for start in range(0, width, CHUNK):
+            end = min(start + CHUNK, width)
+            length = end - start
+            offset = fill_words(key, (origin[0] + y, origin[1] + start), HETEROSCEDASTIC, length, words)
+            fill_normals(words[: offset + length], quantiles, bits, normals)
+            drawn = normals[offset : offset + length]
+            _fill_noisy(unrounded[y, start:end], drawn, scene, limits_dn, noisy[y, start:end], counts)
 
 
 @kernel

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 
 from unprocess_gen.colour import matrix
 from unprocess_gen.errors import DamageError
-from unprocess_gen.records import Pair, Physics, Plan, Source
+from unprocess_gen.records import Pair, Patch, Physics, Plan, Source
 from unprocess_gen.tables import gamma_text
 
 Value = str | int | float | None
@@ -52,7 +52,7 @@ def number_or_text(cell: str) -> str | int | float:
 
 
 COLUMNS = (
-    Column("key", str, "source index as eight digits; the pair's name in its shard"),
+    Column("key", str, "source index as eight digits; then patch, and level and draw, where there are several"),
     Column("source", str, "path below the source folder, percent-encoded where unsafe"),
     Column("source_sha256", str, "SHA-256 of the source's bytes"),
     Column("source_bytes", int, "size of the source; 0 for a built-in scene"),
@@ -134,6 +134,9 @@ COLUMNS = (
     Column("clip", str, "the clip"),
     Column("downscale", int, "side of the squares of source pixels that were averaged"),
     Column("dequantize", str, "whether 8-bit codes were dithered: off or dither"),
+    Column("patch", int, "number of the patch in its image; 0 for a whole image too"),
+    Column("patch_y", int, "row of the full frame in which the arrays begin; even"),
+    Column("patch_x", int, "column of the full frame in which the arrays begin; even"),
 )
 NAMES = tuple(column.name for column in COLUMNS)
 
@@ -141,8 +144,8 @@ JSON_BYTES = 5632
 """Room for a row without its source's name: the longest numbers and reasons in every column take less."""
 
 
-KEY = re.compile(r"(\d{8,})(-l\d\dd\d\d)?")
-"""A row's key: the source index, and level and draw where an image has several pairs."""
+KEY = re.compile(r"\d{8,}(-p\d{4,})?(-l\d\dd\d\d)?")
+"""A row's key: the source index, the patch where images are cut, level and draw where there are several of them."""
 
 
 def key_text(index: int) -> str:
@@ -150,19 +153,37 @@ def key_text(index: int) -> str:
     return f"{index:08d}"
 
 
-def pair_key(index: int, plan: Plan, several: bool) -> str:
-    """Return the key of a row: that of its source, and the level and draw where the image has ``several`` pairs."""
-    return f"{key_text(index)}-l{plan.level:02d}d{plan.draw:02d}" if several else key_text(index)
+def patch_key(index: int, patch: Patch, several: bool) -> str:
+    """Return the key of a sample in its shard: that of its source, and the patch where images are cut in ``several``.
+
+    Four digits, more where there are more patches.
+    """
+    return f"{key_text(index)}-p{patch.number:04d}" if several else key_text(index)
+
+
+def pair_key(sample: str, plan: Plan, several: bool) -> str:
+    """Return the key of a row: that of its sample, and the level and draw where the sample has ``several`` pairs."""
+    return f"{sample}-l{plan.level:02d}d{plan.draw:02d}" if several else sample
 
 
 def image_key(row: Row) -> str:
-    """Return the key of a row's image: that of its members in the shard."""
+    """Return the key of a row's image."""
     return str(row["key"]).partition("-")[0]
+
+
+def sample_key(row: Row) -> str:
+    """Return the key of a row's members in the shard: that of its image, or of its patch."""
+    return str(row["key"]).partition("-l")[0]
 
 
 def images(rows: Iterable[Row]) -> Iterator[list[Row]]:
     """Yield the rows of one image together, in order."""
     return (list(some) for _, some in itertools.groupby(rows, key=image_key))
+
+
+def samples(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    """Yield the rows of one sample, a clean frame with its noisy ones, together, in order."""
+    return (list(some) for _, some in itertools.groupby(rows, key=sample_key))
 
 
 def ok_row(
@@ -174,6 +195,7 @@ def ok_row(
     plan: Plan,
     pair: Pair,
     digests: tuple[str, str],
+    patch: Patch,
 ) -> Row:
     """Return the row of a pair; ``digests`` are the XXH3-128 of clean and noisy."""
     height, width = pair.clean.shape
@@ -225,6 +247,9 @@ def ok_row(
         "clip": source.clip,
         "downscale": plan.downscale,
         "dequantize": plan.dequantize,
+        "patch": patch.number,
+        "patch_y": patch.y,
+        "patch_x": patch.x,
     }
     return _row(source, sha256, shard, plan.seed, values | {"key": key})
 
@@ -244,8 +269,12 @@ def _physics_values(physics: Physics | None) -> dict[str, Value]:
 
 
 def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str) -> Row:
-    """Return the row of a photograph that could not be used; ``sha256`` is None where it could not even be read."""
-    return _row(source, sha256, shard, seed, {"status": "failed", "reason": reason})
+    """Return the row of a photograph that could not be used; ``sha256`` is None where it could not even be read.
+
+    A frame of a video is told by its number alone, so its row has it even then.
+    """
+    place: dict[str, Value] = {"frame": source.frame, "clip": source.clip} if source.is_video else {}
+    return _row(source, sha256, shard, seed, {"status": "failed", "reason": reason, **place})
 
 
 _WEIGHTS = tuple(name for name in NAMES if name.startswith("w_"))
@@ -318,6 +347,15 @@ def plan_of(row: Row) -> Plan:
         )
     except (TypeError, ValueError) as error:
         raise DamageError(f"row {row.get('key')}: not a plan ({error})") from error
+
+
+def patch_of(row: Row) -> Patch:
+    """Return what of the full frame a row's pair is; DamageError as `plan_of`."""
+    try:
+        number, y, x, height, width = (_int(row, name) for name in ("patch", "patch_y", "patch_x", "height", "width"))
+    except ValueError as error:
+        raise DamageError(f"row {row.get('key')}: not a patch ({error})") from error
+    return Patch(number, y, x, height, width)
 
 
 def _physics_of(row: Row) -> Physics | None:
@@ -445,17 +483,17 @@ def _typed(header: Sequence[str], line: bytes) -> Row:
 
 
 def json_size(source_name: str, pairs: int = 1) -> int:
-    """Return the bytes of an image's JSON in the shard, padding included: its source's name and its pairs decide."""
-    named = 2 * len(json.dumps(source_name))  # its clip is named by a part of it
+    """Return the bytes of a sample's JSON in the shard, padding included: its source's name and its pairs decide."""
+    named = 2 * len(json.dumps(source_name))  # its clip is named by a part of it, a video's by all of it
     return -(-(JSON_BYTES + named) * pairs // 512) * 512
 
 
 OTHERS = "others"
-"""The key under which an image's JSON holds the rows of its pairs but the first."""
+"""The key under which a sample's JSON holds the rows of its pairs but the first."""
 
 
 def row_json(rows: Sequence[Row]) -> bytes:
-    """Return an image's rows as typed JSON: the first one, and the others in a list; padded to `json_size`."""
+    """Return a sample's rows as typed JSON: the first one, and the others in a list; padded to `json_size`."""
     first, others = dict(rows[0]), [dict(row) for row in rows[1:]]
     content = first | {OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
@@ -466,6 +504,6 @@ def row_json(rows: Sequence[Row]) -> bytes:
 
 
 def rows_of_json(content: dict[str, Any]) -> list[Row]:
-    """Return the rows that an image's JSON holds."""
+    """Return the rows that a sample's JSON holds."""
     others = content.pop(OTHERS, [])
     return [content, *others]

@@ -6,6 +6,9 @@ what datasets are made with; the tests hold the two together, on photographs and
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from unprocess_gen import effects, electrons, fused
@@ -24,12 +27,47 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     """
     _check(srgb)
     srgb = _dequantised(srgb, plan, origin)
-    curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     if plan.readable:
-        return _reference_pair(srgb, plan, origin, curve)
-    limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+        return _reference_pair(srgb, plan, origin, _curve(srgb, plan))
     maker = electrons.make_pair if plan.counts_electrons else fused.make_pair
-    return maker(srgb, plan, curve, limits_dn, origin)
+    return maker(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin)
+
+
+def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> Iterator[Pair]:
+    """Make the pairs of plans that share the clean frame: levels and draws of its noise, one after the other.
+
+    Each is what `make_pair` gives, byte for byte, but the photograph is unprocessed once and the clean array is one.
+    Raises ValueError where the plans do not share it.
+    """
+    _check(srgb)
+    if any(_of_the_clean_frame(plan) != _of_the_clean_frame(plans[0]) for plan in plans):
+        raise ValueError("the plans do not share the clean frame: they may differ in the noise, level and draw alone")
+    if len(plans) < 2 or not all(map(_is_made_of_the_clean_frame, plans)):
+        return (make_pair(srgb, plan, origin) for plan in plans)
+    return _pairs_of_one_clean_frame(srgb, plans, origin)
+
+
+def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
+    srgb = _dequantised(srgb, plans[0], origin)
+    unrounded, clean, of_clean = fused.unprocess(srgb, plans[0], _curve(srgb, plans[0]), origin)
+    for plan in plans:
+        maker = electrons.make_noisy if plan.counts_electrons else fused.make_noisy
+        noisy, of_noisy = maker(unrounded, plan, _limits_dn(plan), origin)
+        yield Pair(clean, noisy, Counts(*(int(count) for count in of_clean + of_noisy)))
+
+
+def _is_made_of_the_clean_frame(plan: Plan) -> bool:
+    """Whether the noisy frame can be made of the unrounded clean one alone."""
+    return not (plan.readable or plan.averaged or "full_well" in plan.effects)
+
+
+def _of_the_clean_frame(plan: Plan) -> tuple[object, ...]:
+    """Return all of a plan that the clean frame depends on."""
+    without_noise = replace(
+        plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
+        effects=(), skipped=(), physics=None, level=0, draw=0, frame=0,
+    )  # fmt: skip
+    return without_noise, plan.brightest, plan.averaged and (plan.physics, plan.effects)
 
 
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
@@ -51,7 +89,7 @@ def _reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Floa
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
     averaged_dn = effects.average(clean_dn, plan, origin) if plan.averaged else clean_dn
 
-    low, high = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+    low, high = _limits_dn(plan)
     lowest, highest = (low, high) if plan.averaged else (plan.black_level_dn, plan.white_level_dn)
     clean = quantise(averaged_dn, lowest, highest)
     noisy = quantise(noisy_dn, low, high)
@@ -71,6 +109,14 @@ def _dequantised(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
     if plan.dequantize == "off" or srgb.dtype != np.uint8:
         return srgb
     return dequantise(srgb, plan, linear_table(plan.tone, plan.gamma, 256), origin)
+
+
+def _curve(srgb: Srgb, plan: Plan) -> Float:
+    return linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
+
+
+def _limits_dn(plan: Plan) -> tuple[float, float]:
+    return noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
 
 
 def _check(srgb: Srgb) -> None:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unprocess_gen.errors import DamageError
-from unprocess_gen.manifest import image_key, located_rows, read_row
+from unprocess_gen.manifest import located_rows, read_row, sample_key
 from unprocess_gen.records import Raw
 from unprocess_gen.shards import CLEAN, Member, map_array, noisy_member, read_index, shard_name
 
@@ -56,7 +56,7 @@ class RawPairs:
         if shard not in self._indexes:
             self._indexes[shard] = read_index(path)
         members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
-        clean, noisy = (self._array(path, shard, f"{image_key(row)}.{member}", shape) for member in members)
+        clean, noisy = (self._array(path, shard, f"{sample_key(row)}.{member}", shape) for member in members)
         return Sample(clean, noisy, row)
 
     def _array(self, path: Path, shard: int, name: str, shape: tuple[int, int]) -> Raw:

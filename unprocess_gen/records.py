@@ -12,9 +12,13 @@ Raw = NDArray[np.uint16]
 Float = NDArray[np.float64]
 
 
+NO_CLIP = "none"
+"""The clip of a photograph that is part of none."""
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One photograph, as the listing found it.
+    """One photograph, or one frame of a video, as the listing found it.
 
     ``name`` is the manifest's spelling (``/``-joined, percent-encoded where needed); ``path`` the file's path relative
     to the source folder as the operating system spells it (undecodable bytes as surrogate escapes), or the name of a
@@ -22,7 +26,8 @@ class Source:
     for a scene. Files that share a size were hashed beforehand (``sha256``) and identical ones numbered
     (``occurrence``). Where folders are clips, ``clip`` is the folder's name as ``name`` spells it, ``frame`` the number
     of the frame in it, and ``clip_sha256`` with ``clip_occurrence`` stands for the whole clip: the digest of its first
-    frame, and the number of clips before it that begin with the same; ``frames`` is how many frames it has.
+    frame, and the number of clips before it that begin with the same; ``frames`` is how many frames it has. All frames
+    of a video have its name, which is its clip's too, and its digest.
     """
 
     index: int
@@ -32,11 +37,16 @@ class Source:
     reason: str | None = None
     occurrence: int = 0
     sha256: str | None = None
-    clip: str = "none"
+    clip: str = NO_CLIP
     frame: int = 0
     clip_sha256: str | None = None
     clip_occurrence: int = 0
     frames: int = 1
+
+    @property
+    def is_video(self) -> bool:
+        """Whether it is a frame of a video file: no folder of photographs has the name of one of them."""
+        return self.clip == self.name != NO_CLIP
 
     def stream_identity(self, sha256: str) -> tuple[str, int]:
         """Return the digest and the number that the streams are keyed by: the clip's, or those of the photograph."""
@@ -51,6 +61,39 @@ class Photograph:
 
     srgb: Srgb
     orientation: int
+
+
+@dataclass(frozen=True, slots=True)
+class PatchLaw:
+    """Which patches are cut out of each image, squares of ``side`` pixels.
+
+    ``kind`` is ``grid``, whose corners are ``stride`` pixels apart, or ``random``, ``count`` of them; the number that
+    the other kind has is 0.
+    """
+
+    kind: str
+    side: int
+    stride: int = 0
+    count: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A cut-out of a full frame: its number in the image, the row and column of its corner, its size in pixels.
+
+    A whole image is patch 0 at row 0, column 0.
+    """
+
+    number: int
+    y: int
+    x: int
+    height: int
+    width: int
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Row and column of its corner in the full frame."""
+        return self.y, self.x
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,13 +35,14 @@ from unprocess_gen.manifest import (
     key_text,
     readable_rows,
     rows_of_json,
+    samples,
     write_rows,
 )
 from unprocess_gen.photographs import list_photographs, load
 from unprocess_gen.records import Raw, Source
 from unprocess_gen.runner import Bench, Task, make_shard, shard_tasks, tally
 from unprocess_gen.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
-from unprocess_gen.verify import expected, file_sha256, make_again, noisy_member_of, rows_by_shard, uses_physics
+from unprocess_gen.verify import Maker, expected, file_sha256, noisy_member_of, rows_by_shard, uses_physics
 from unprocess_gen.workspace import (
     Made,
     Workspace,
@@ -254,7 +255,7 @@ def _kept_rows(folder: Path, facts: Facts) -> Iterator[Row]:
             failures.setdefault(row["shard"], []).append(row)
     for number, entry in enumerate(facts["shards"]):
         inside = _rows_inside(folder / entry["file"]) if entry["file"] and _is_sound(folder, entry) else []
-        yield from sorted([*inside, *failures.get(number, [])], key=lambda row: str(row["key"]))
+        yield from sorted([*inside, *failures.get(number, [])], key=lambda row: int(image_key(row)))
 
 
 def _rows_inside(shard: Path) -> list[Row]:
@@ -304,11 +305,11 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, asi
     if not rows or (path.is_file() and not any(check_members(path, wanted))):
         return
     part = aside / path.name
-    kept = 0
+    kept, maker = 0, Maker(root)
     try:
         with ShardWriter(part) as writer:
-            for image, some, frames in zip(wanted, images(rows), salvage(path, wanted), strict=True):
-                kept += _mend_image(writer, image, some, frames, root)
+            for sample, some, frames in zip(wanted, samples(rows), salvage(path, wanted), strict=True):
+                kept += _mend_sample(writer, sample, some, frames, maker)
     except UnprocessGenError as error:
         part.unlink()
         yield Step(f"shards/{path.name}", f"cannot be mended: {error}", mended=False)
@@ -319,19 +320,17 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, asi
     yield Step(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs made again, the others kept")
 
 
-def _mend_image(
-    writer: ShardWriter, image: Expected, rows: Sequence[Row], kept: dict[str, Raw], root: str | None
-) -> int:
-    """Append an image, its frames kept or made again; return how many of its pairs were kept."""
+def _mend_sample(writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Raw], maker: Maker) -> int:
+    """Append a sample, its frames kept or made again; return how many of its pairs were kept."""
     whole = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]
     for row in rows:
         selftest.check(uses_physics(row))
-    made = {str(row["key"]): make_again(row, root) for row in rows if row not in whole}
-    writer.add_frame(image.key, CLEAN, kept[CLEAN] if CLEAN in kept else made[str(rows[0]["key"])].clean)
+    made = {str(row["key"]): maker.make_again(row) for row in rows if row not in whole}
+    writer.add_frame(sample.key, CLEAN, kept[CLEAN] if CLEAN in kept else made[str(rows[0]["key"])].clean)
     for row in rows:
         member = noisy_member_of(row)
-        writer.add_frame(image.key, member, kept[member] if row in whole else made[str(row["key"])].noisy)
-    writer.add_rows(image.key, image.json)
+        writer.add_frame(sample.key, member, kept[member] if row in whole else made[str(row["key"])].noisy)
+    writer.add_rows(sample.key, sample.json)
     return len(whole)
 
 

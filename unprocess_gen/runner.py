@@ -33,18 +33,23 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen import selftest
-from unprocess_gen.config import Config, dataset_yaml, source_kind, uses_physics
+from unprocess_gen.config import Config, dataset_yaml, patch_law, source_kind, uses_physics
 from unprocess_gen.errors import MachineError, SourceError
-from unprocess_gen.manifest import Row, failed_row, images, key_text, ok_row, pair_key, row_json
-from unprocess_gen.pair import make_pair
+from unprocess_gen.manifest import Row, failed_row, images, ok_row, pair_key, patch_key, row_json
+from unprocess_gen.pair import make_pairs
+from unprocess_gen.patches import cut, patches
 from unprocess_gen.photographs import list_photographs, load
 from unprocess_gen.plan import plan_pairs
 from unprocess_gen.planner import facts_for
-from unprocess_gen.records import Counts, Source
+from unprocess_gen.records import Counts, Pair, Patch, Plan, Source, Srgb
 from unprocess_gen.shards import CLEAN, ShardWriter, array_xxh3, noisy_member, shard_name
+from unprocess_gen.video import is_installed
 from unprocess_gen.workspace import Made, Workspace, machine_error
 
-PACKAGES = ("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash")
+PACKAGES = (
+    *("unprocess_gen", "numpy", "opencv-python-headless", "numba", "llvmlite", "joblib", "xxhash"),
+    *(("av",) if is_installed() else ()),
+)
 PARENT_POLL_S = 0.5
 PLAIN_LINE_S = 5.0
 """Seconds between progress lines where there is no terminal."""
@@ -82,11 +87,15 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What every task of a run shares: the settings, where to write aside, and whose run it is."""
+    """What every task of a run shares: the settings, where to write aside, and whose run it is.
+
+    ``core_to_spare``: there are more cores than workers, so that each can have a thread that writes.
+    """
 
     config: Config
     tmp: str
     coordinator_pid: int
+    core_to_spare: bool = False
 
 
 def generate(config: Config) -> Summary:
@@ -106,7 +115,7 @@ def generate(config: Config) -> Summary:
         done = set(workspace.committed(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
         n_jobs = effective_jobs(config.n_jobs, len(todo))
-        bench = Bench(config, str(workspace.tmp), os.getpid())
+        bench = Bench(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < cpu_count())
         given_up: dict[int, Made] = {}
         warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
@@ -230,7 +239,7 @@ def make_shard(bench: Bench, task: Task) -> Made:
     failed = _self_test(bench.config)
     path = Path(bench.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     try:
-        with ShardWriter(path) as writer:
+        with ShardWriter(path, beside=bench.core_to_spare) as writer:
             rows = tuple(_make_rows(bench, task, writer))
         _busy_path(bench, task).unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
@@ -256,7 +265,7 @@ def _make_rows(bench: Bench, task: Task, writer: ShardWriter) -> Iterator[Row]:
 
 
 def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) -> list[Row]:
-    """Append one image's clean frame, all of its noisy ones and their rows to a shard; return the rows."""
+    """Append one image to a shard, whole or patch by patch, and return its rows."""
     try:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
@@ -265,21 +274,32 @@ def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) 
                 f"source {source.name} is gone since it was listed; what is committed is kept, run again with it back"
             ) from error
         return [failed_row(source, error.sha256, shard, config.seed, error.reason)]
-    key = key_text(source.index)
-    rows: list[Row] = []
+    law = patch_law(config.source)
     facts = facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
-    for plan in plans:
-        pair = make_pair(photograph.srgb, plan)
-        if not rows:
+    rows: list[Row] = []
+    for patch in patches(law, plans[0].stream_key, *photograph.srgb.shape[:2]):
+        key = patch_key(source.index, patch, several=law is not None)
+        some: list[Row] = []
+        for plan, pair, digests in _add_frames(writer, key, cut(photograph.srgb, patch), patch, plans):
+            row_key = pair_key(key, plan, several=len(plans) > 1)
+            some.append(ok_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch))
+        writer.add_rows(key, row_json(some))
+        rows += some
+    return rows
+
+
+def _add_frames(
+    writer: ShardWriter, key: str, srgb: Srgb, patch: Patch, plans: Sequence[Plan]
+) -> Iterator[tuple[Plan, Pair, tuple[str, str]]]:
+    """Append a patch's clean frame and all of its noisy ones; yield each pair as it is made, with its digests."""
+    clean_xxh3 = ""
+    for plan, pair in zip(plans, make_pairs(srgb, plans, patch.origin), strict=True):
+        if plan is plans[0]:
             clean_xxh3 = array_xxh3(pair.clean)
             writer.add_frame(key, CLEAN, pair.clean)
         writer.add_frame(key, noisy_member(plan.level, plan.draw), pair.noisy)
-        row_key = pair_key(source.index, plan, several=len(plans) > 1)
-        digests = clean_xxh3, array_xxh3(pair.noisy)
-        rows.append(ok_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests))
-    writer.add_rows(key, row_json(rows))
-    return rows
+        yield plan, pair, (clean_xxh3, array_xxh3(pair.noisy))
 
 
 def _is_there(config: Config, source: Source) -> bool:

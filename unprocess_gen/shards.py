@@ -1,10 +1,10 @@
 """Shards: uncompressed tar files in the WebDataset layout, whose bytes depend on nothing but their members.
 
-Members of one image stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 ``[H, W]``), the noisy frames of
-other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with time, owner and mode fixed.
-Writing goes straight from the arrays to the file while SHA-256 runs along (0.5 ns a byte together), reading maps just
-the bytes of one array into memory, found through an index of offsets that is read from the tar headers: nothing is ever
-unpacked.
+Members of one sample, an image or a patch of it, stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16
+``[H, W]``), the noisy frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with
+time, owner and mode fixed. Writing goes straight from the arrays to the file while SHA-256 runs along (0.5 ns a byte
+together), reading maps just the bytes of one array into memory, found through an index of offsets that is read from the
+tar headers: nothing is ever unpacked.
 """
 
 from __future__ import annotations
@@ -15,8 +15,11 @@ import io
 import json
 import math
 import mmap
+import os
 import tarfile
+from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple
@@ -68,7 +71,7 @@ def _padding(size: int) -> int:
 
 
 def image_bytes(width: int, height: int, json_bytes: int, pairs: int = 1) -> int:
-    """Return the bytes that one image and its noisy frames take in a shard, tar framing included."""
+    """Return the bytes that one sample and its noisy frames take in a shard, tar framing included."""
     array = len(_npy_header((height, width))) + 2 * width * height
     return sum(RECORD + size + _padding(size) for size in (*[array] * (1 + pairs), json_bytes))
 
@@ -78,15 +81,26 @@ def shard_bytes(pairs: list[int]) -> int:
     return sum(pairs) + len(END) if pairs else 0
 
 
+MOST_UNDERWAY = 2**26
+SYNC_BYTES = 2**25
+"""Synced so often beside the work, so that little is left to sync when a shard is put into place."""
+
+
 class ShardWriter:
     """Write one shard to ``path``, which must not exist; its size and SHA-256 are known on leaving.
 
-    Raises OSError as the file system does; the caller owns the file and what becomes of it.
+    ``beside`` has a thread of its own hash, write and sync, while the caller makes the next frames: worth it where a
+    core is idle. At most `MOST_UNDERWAY` bytes and one part more wait for it; frames given to it must stay as they are.
+    Raises OSError as the file system does, then or with a later call; the caller owns the file and what becomes of it.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, beside: bool = False) -> None:
         self._file: BinaryIO = path.open("xb", buffering=0)
         self._hash = hashlib.sha256()
+        self._thread = ThreadPoolExecutor(1, "shard writer") if beside else None
+        self._underway: deque[tuple[int, Future[None]]] = deque()
+        self._bytes_underway = 0
+        self._unsynced = 0
         self.bytes = 0
 
     def __enter__(self) -> ShardWriter:
@@ -96,36 +110,63 @@ class ShardWriter:
         try:
             if kind is None:
                 self._write(END)
+                self._wait(-1)
         finally:
+            if self._thread is not None:
+                self._thread.shutdown(cancel_futures=True)
             self._file.close()
 
     @property
     def sha256(self) -> str:
-        """Hex digest of what was written so far."""
+        """Hex digest of what was written."""
+        self._wait(-1)
         return self._hash.hexdigest()
 
     def add_frame(self, key: str, member: str, frame: Raw) -> None:
-        """Append a frame of an image."""
+        """Append a frame of a sample."""
         header = _npy_header(frame.shape)
         self._member(f"{key}.{member}", len(header) + frame.nbytes, header, _little_endian(frame).data)
 
     def add_rows(self, key: str, row_json: bytes) -> None:
-        """Append the rows of an image, after its frames."""
+        """Append the rows of a sample, after its frames."""
         self._member(f"{key}.{ROW}", len(row_json), row_json)
 
     def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
-        for part in (_tar_header(name, size), *parts, b"\0" * _padding(size)):
-            self._write(part)
+        self._write(_tar_header(name, size), *parts, b"\0" * _padding(size))
 
-    def _write(self, content: bytes | memoryview) -> None:
-        view = memoryview(content).cast("B")
-        self._hash.update(view)
-        self.bytes += len(view)
-        while view:
-            written = self._file.write(view)
-            if not written:
-                raise OSError(errno.EIO, "the file takes no more bytes", self._file.name)
-            view = view[written:]
+    def _write(self, *parts: bytes | memoryview) -> None:
+        views = [memoryview(part).cast("B") for part in parts]
+        size = sum(map(len, views))
+        self.bytes += size
+        if self._thread is None:
+            self._put(views)
+        else:
+            self._wait(MOST_UNDERWAY)
+            self._underway.append((size, self._thread.submit(self._put_and_sync, views)))
+            self._bytes_underway += size
+
+    def _wait(self, most: int) -> None:
+        """Wait until no more than so many bytes are underway; what failed there is raised here."""
+        while self._underway and (self._bytes_underway > most or self._underway[0][1].done()):
+            size, done = self._underway.popleft()
+            self._bytes_underway -= size
+            done.result()
+
+    def _put_and_sync(self, views: Sequence[memoryview]) -> None:
+        self._put(views)
+        self._unsynced += sum(map(len, views))
+        if self._unsynced >= SYNC_BYTES:
+            os.fdatasync(self._file.fileno())
+            self._unsynced = 0
+
+    def _put(self, views: Sequence[memoryview]) -> None:
+        for view in views:
+            self._hash.update(view)
+            while view:
+                written = self._file.write(view)
+                if not written:
+                    raise OSError(errno.EIO, "the file takes no more bytes", self._file.name)
+                view = view[written:]
 
 
 # --------------------------------------------------------------------------------------------------------- reading
@@ -174,7 +215,7 @@ def map_array(path: Path, member: Member, shape: tuple[int, int]) -> Raw:
 
 
 class Expected(NamedTuple):
-    """What a shard must hold of one image: the frames' shape, members and XXH3-128, and the JSON to the byte."""
+    """What a shard must hold of one sample: the frames' shape, members and XXH3-128, and the JSON to the byte."""
 
     key: str
     width: int

@@ -31,7 +31,9 @@ from unprocess_gen.records import Source
 _Result = TypeVar("_Result")
 
 MAX_FILE_BYTES = 2**30
-"""Larger files are refused unread; 2^26 pixels of 16-bit RGBA, the most we may be asked for, are half of it."""
+"""Larger photographs are refused unread; 2^26 pixels of 16-bit RGBA, the most we may be asked for, are half of it."""
+
+Stamp = tuple[int, int, int, int]
 
 # A pipe put in the place of a listed file must not block the open for ever.
 _OPEN_FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY
@@ -95,7 +97,7 @@ def list_folder(root: str, include: Sequence[str], recursive: bool, limit: int |
         The root is missing or no folder, a sub-folder cannot be read, or nothing matches.
     """
     _check_root(root)
-    found, skipped = _walk(root, _matcher(include), recursive)
+    found, skipped = _walk(root, matcher(include), recursive)
     matched = sorted((entry for entry in found if entry.matched), key=lambda entry: os.fsencode(entry.path))
     if not matched:
         raise ConfigError(
@@ -142,6 +144,28 @@ def read_bytes(root: str, source: Source) -> bytes:
     return data
 
 
+def stamp(root: str, source: Source) -> Stamp:
+    """Tells a file from any that takes its place: device, inode, size, and when it was last changed.
+
+    Raises as `read_bytes` does; no file is too large.
+    """
+    with _opened(root, source, max_bytes=None) as file:
+        return _stamp(file)
+
+
+def keep_open(root: str, source: Source, wanted: Stamp) -> BinaryIO:
+    """Opens a file for the caller to close; MachineError where it is no longer the one that was stamped."""
+    with _opened(root, source, max_bytes=None) as file:
+        if _stamp(file) != wanted:
+            raise MachineError(f"source {source.name} changed while it was opened; run again when nothing writes to it")
+        return os.fdopen(os.dup(file.fileno()), "rb", buffering=0)
+
+
+def _stamp(file: BinaryIO) -> Stamp:
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
 def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     """Numbers the files of the same content 0, 1, … in listing order (``occurrence``).
 
@@ -157,14 +181,14 @@ def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
 
 
 def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
-    """Takes each folder for a clip, and its files for frames 0, 1, … in listing order.
+    """Takes each folder for a clip, and its files for frames 0, 1, … in listing order; videos are clips already.
 
     Of each clip the first file is read: its digest stands for the clip, so that other clips that come or go
     move nothing. One that cannot be read is stood for by the digest of its name.
     """
     clips: dict[str, list[Source]] = {}
     for source in sources:
-        clips.setdefault(source.name.rpartition("/")[0] or ".", []).append(source)
+        clips.setdefault(source.name if source.is_video else source.name.rpartition("/")[0] or ".", []).append(source)
     seen: Counter[str] = Counter()
     placed: dict[int, Source] = {}
     for clip, frames in clips.items():
@@ -196,7 +220,8 @@ def _check_root(root: str) -> None:
         raise ConfigError(f"source.root={root}: not a folder; name the folder that holds the photographs")
 
 
-def _matcher(include: Iterable[str]) -> Callable[[str], bool]:
+def matcher(include: Iterable[str]) -> Callable[[str], bool]:
+    """Returns what tells whether a relative path matches one of the globs of `list_folder`."""
     globs = [("/" in glob, re.compile(fnmatch.translate(glob), re.IGNORECASE)) for glob in include]
     return lambda path: any(rule.match(path if whole else path.rpartition("/")[2]) for whole, rule in globs)
 
@@ -270,7 +295,7 @@ def _percent(text: str) -> str:
 
 
 @contextmanager
-def _opened(root: str, source: Source) -> Iterator[BinaryIO]:
+def _opened(root: str, source: Source, max_bytes: int | None = MAX_FILE_BYTES) -> Iterator[BinaryIO]:
     """Opens a source, unless it is not, or no longer, the regular file that was listed."""
     if source.reason is not None:
         raise SourceError(source.reason, f"{source.name} was no readable file when the folder was listed")
@@ -278,18 +303,18 @@ def _opened(root: str, source: Source) -> Iterator[BinaryIO]:
     descriptor = _reading(source, lambda: os.open(path, _OPEN_FLAGS))
     try:
         status = os.fstat(descriptor)
-        _check_regular(source, status)
+        _check_regular(source, status, max_bytes)
         _check_size(source, status.st_size, "since it was listed")
         yield os.fdopen(descriptor, "rb", buffering=0, closefd=False)
     finally:
         os.close(descriptor)
 
 
-def _check_regular(source: Source, status: os.stat_result) -> None:
+def _check_regular(source: Source, status: os.stat_result, max_bytes: int | None) -> None:
     if not stat.S_ISREG(status.st_mode):
         raise SourceError("not_a_file", f"{source.name} is {stat.filemode(status.st_mode)}, not a regular file")
-    if status.st_size > MAX_FILE_BYTES:
-        raise SourceError("too_large", f"{source.name} has {status.st_size} bytes, more than {MAX_FILE_BYTES}")
+    if max_bytes is not None and status.st_size > max_bytes:
+        raise SourceError("too_large", f"{source.name} has {status.st_size} bytes, more than {max_bytes}")
 
 
 def _check_size(source: Source, size_bytes: int, when: str) -> None:

@@ -37,6 +37,7 @@ STREAMS = {
     "column": 8,
     "dead_pixels": 9,
     "dequantize": 10,
+    "patch": 11,
 }
 """What randomness is for. The numbers are part of every dataset ever made: add, never renumber."""
 
@@ -108,6 +109,17 @@ def words(
     outputs = philox4x32(tuple(np.asarray(word) for word in counter), key)
     chosen = np.broadcast_to((x % block // lanes).astype(np.intp), shape)
     return np.asarray(np.choose(chosen, outputs), dtype=np.uint32)
+
+
+def patch_words(key: int, count: int) -> list[tuple[int, int]]:
+    """Return two words of 32 bits for each of the first ``count`` patches of one image.
+
+    Patch n is counter (0, n) of the stream ``patch``, so that more patches leave the first ones where they are.
+    """
+    zero = np.zeros(count, dtype=np.uint64)
+    counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("patch")), zero)
+    first, second, _, _ = philox4x32(counter, key)
+    return list(zip(first.tolist(), second.tolist(), strict=True))
 
 
 def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:

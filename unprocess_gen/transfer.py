@@ -31,6 +31,11 @@ ALARM = 6.0
 """Standard errors at which a fit is called wrong: 2e-9 by chance, for any one of them."""
 
 
+NORMAL_EXCESS = 3.0
+"""Fourth moment of a normal over the square of its variance, the least that is believed: of few sites it is measured
+low where the variance is, and an error taken from it would be too small just where it counts."""
+
+
 @dataclass(frozen=True, slots=True)
 class Fit:
     """What the arrays of one pair say: slope (DN) and intercept (DN²) of the variance, each with its standard error.
@@ -96,7 +101,7 @@ def fit(clean: Raw, noisy: Raw, row: Row) -> Fit | None:
     count, signal, law = count[used], signal[used], law[used]
     mean = first[used] / count
     variance = (second[used] - count * mean * mean) / (count - 1)
-    excess = float((fourth[used] / law**2).sum() / count.sum())
+    excess = max(float((fourth[used] / law**2).sum() / count.sum()), NORMAL_EXCESS)
     weights = count / ((excess - 1) * law * law)
     points = variance - (prnu * signal) ** 2 - ROUNDING_VARIANCE
     normal = np.array(

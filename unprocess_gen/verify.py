@@ -24,10 +24,22 @@ import numpy as np
 from unprocess_gen import selftest
 from unprocess_gen.config import SourceConfig
 from unprocess_gen.errors import ConfigError, DamageError, MachineError, SourceError
-from unprocess_gen.manifest import Row, image_key, images, located_rows, plan_of, read_row, read_rows, row_json
+from unprocess_gen.manifest import (
+    Row,
+    image_key,
+    located_rows,
+    patch_of,
+    plan_of,
+    read_row,
+    read_rows,
+    row_json,
+    sample_key,
+    samples,
+)
 from unprocess_gen.pair import make_pair
+from unprocess_gen.patches import cut
 from unprocess_gen.photographs import load, source_of
-from unprocess_gen.records import Pair
+from unprocess_gen.records import Pair, Photograph, Source
 from unprocess_gen.shards import CLEAN, Expected, array_xxh3, check_members, noisy_member, shard_name
 from unprocess_gen.workspace import read_dataset
 
@@ -127,8 +139,8 @@ def _check_sha256(path: Path, entry: dict[str, Any] | None) -> Iterator[Damage]:
 
 
 def expected(rows: Iterable[Row]) -> list[Expected]:
-    """Return what rows say of the members of each of their images; DamageError where a value is missing."""
-    return [_expected(some) for some in images(row for row in rows if row["status"] == "ok")]
+    """Return what rows say of the members of each of their samples; DamageError where a value is missing."""
+    return [_expected(some) for some in samples(row for row in rows if row["status"] == "ok")]
 
 
 def _expected(rows: Sequence[Row]) -> Expected:
@@ -136,7 +148,7 @@ def _expected(rows: Sequence[Row]) -> Expected:
     if not isinstance(width, int) or not isinstance(height, int):
         raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
     noisy = tuple((noisy_member_of(row), str(row["noisy_xxh3"])) for row in rows)
-    return Expected(image_key(rows[0]), width, height, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
+    return Expected(sample_key(rows[0]), width, height, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
 
 
 def noisy_member_of(row: Row) -> str:
@@ -203,7 +215,8 @@ def _with_keys(manifest: Path, keys: Sequence[str]) -> Iterator[Row]:
     wanted = set(keys)
     missing = set(keys)
     for row in read_rows(manifest):
-        named = {str(row["key"]), image_key(row)} & wanted  # an image's own key stands for all of its pairs
+        # the key of an image, or of a patch, stands for all of its pairs
+        named = {str(row["key"]), sample_key(row), image_key(row)} & wanted
         if named:
             missing -= named
             yield row
@@ -223,19 +236,23 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
     passed over. Raises ConfigError where a row needs a folder and there is none, MachineError where this machine
     computes differently (`selftest`).
     """
+    maker = Maker(root)
     for row in rows:
         if row["status"] != "ok":
             continue
         selftest.check(uses_physics(row))
-        scene = row["source_bytes"] == 0
-        if root is None and not scene:
+        if root is None and not _is_scene(row):
             raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
-        yield Replayed(str(row["key"]), str(row["source"]), _replay(row, None if scene else root, to))
+        yield Replayed(str(row["key"]), str(row["source"]), _replay(row, maker, to))
 
 
-def _replay(row: Row, root: str | None, to: Path | None) -> str:
+def _is_scene(row: Row) -> bool:
+    return row["source_bytes"] == 0
+
+
+def _replay(row: Row, maker: Maker, to: Path | None) -> str:
     try:
-        pair = _make(row, root)
+        pair = maker.make(row)
     except DamageError as error:
         return str(error)
     if to is not None:
@@ -243,27 +260,51 @@ def _replay(row: Row, root: str | None, to: Path | None) -> str:
     return _unlike(pair, row)
 
 
-def make_again(row: Row, root: str | None) -> Pair:
-    """Return the pair of a row; DamageError where its source has changed, or the pair is not the row's."""
-    pair = _make(row, root)
-    if complaint := _unlike(pair, row):
-        raise DamageError(complaint)
-    return pair
+class Maker:
+    """Make pairs again from rows and the folder of their sources, ``root``; built-in scenes need none.
 
+    The last photograph is kept decoded, since the pairs of one image stand side by side.
+    """
 
-def _make(row: Row, root: str | None) -> Pair:
-    try:
-        sha256, photograph = load(
-            SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1)), source_of(row)
-        )
-    except SourceError as error:
-        sha256 = error.sha256 or str(row["source_sha256"])
-        raise DamageError(_changed(sha256, row) or f"its source cannot be used ({error})") from error
-    except MachineError as error:
-        raise DamageError(str(error)) from error
-    if complaint := _changed(sha256, row):
-        raise DamageError(complaint)
-    return make_pair(photograph.srgb, plan_of(row))
+    def __init__(self, root: str | None) -> None:
+        self._root = root
+        self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
+
+    def make(self, row: Row) -> Pair:
+        """Return a row's pair, whatever its digests; DamageError where its source has changed."""
+        try:
+            sha256, photograph = self._load(row)
+        except SourceError as error:
+            sha256 = error.sha256 or str(row["source_sha256"])
+            raise DamageError(_changed(sha256, row) or f"its source cannot be used ({error})") from error
+        except MachineError as error:
+            raise DamageError(str(error)) from error
+        if complaint := _changed(sha256, row):
+            raise DamageError(complaint)
+        patch = patch_of(row)
+        pixels = cut(photograph.srgb, patch)
+        if pixels.shape[:2] != (patch.height, patch.width):
+            raise DamageError(
+                f"its {patch.width} x {patch.height} pixels from row {patch.y}, column {patch.x} on "
+                f"are not all in its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]}"
+            )
+        return make_pair(pixels, plan_of(row), patch.origin)
+
+    def make_again(self, row: Row) -> Pair:
+        """Return the pair of a row; DamageError where its source has changed, or the pair is not the row's."""
+        pair = self.make(row)
+        if complaint := _unlike(pair, row):
+            raise DamageError(complaint)
+        return pair
+
+    def _load(self, row: Row) -> tuple[str, Photograph]:
+        root = None if _is_scene(row) else self._root
+        config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
+        source = source_of(row)
+        if self._kept is None or self._kept[:2] != (config, source):
+            self._kept = None  # two photographs at a time would take twice the memory
+            self._kept = config, source, *load(config, source)
+        return self._kept[2:]
 
 
 def _unlike(pair: Pair, row: Row) -> str:

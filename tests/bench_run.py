@@ -1,0 +1,130 @@
+"""What whole runs cost beside the least they can: every file decoded once, the same bytes hashed, written and synced.
+
+    python tests/bench_run.py PHOTO [PHOTO ...] [--copies 10] [--rounds 3] [--to FOLDER]
+
+Copies the photographs under other names and, in turns, makes datasets of them and does only what no tool can leave
+out (the floor: `cv2.imdecode`, one SHA-256, one write and one fdatasync of as many bytes, one thread). Times are from
+the first pair to the last; ratios are medians over the rounds. Prints a Markdown table: one worker with a core to
+spare, one worker pinned to one core, two workers and five noise levels against that, start-up to the first pair, and
+the peak memory of a worker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+RUN = """
+import json, os, resource, sys, time
+started = time.time()
+cores = json.loads(sys.argv[1])
+if cores:
+    os.sched_setaffinity(0, cores)
+from unprocess_gen import cli, workspace
+committed = []
+commit = workspace.Workspace.commit
+def told(self, made):
+    commit(self, made)
+    committed.append(time.time())
+workspace.Workspace.commit = told
+begin = workspace.Workspace.begin
+def begun(self, sources):
+    begin(self, sources)
+    committed.append(time.time())
+workspace.Workspace.begin = begun
+sys.argv = ["gen-dataset", *sys.argv[2:]]
+code = cli.main()
+peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+print(json.dumps({"code": code, "seconds": committed[-1] - committed[0], "first": committed[0] - started, "kib": peak}))
+"""
+
+FLOOR = """
+import hashlib, json, os, sys, time
+import cv2
+cv2.setNumThreads(1)
+os.sched_setaffinity(0, json.loads(sys.argv[1]))
+out, names = sys.argv[2], json.load(open(sys.argv[3]))
+started = time.time()
+with open(out, "wb", buffering=0) as file:
+    for at, name in enumerate(names):
+        pixels = cv2.imdecode(__import__("numpy").fromfile(name, dtype="uint8"), cv2.IMREAD_COLOR)
+        content = memoryview(bytearray(4 * pixels.shape[0] * pixels.shape[1]))
+        hashlib.sha256(content).digest()
+        while content:
+            content = content[file.write(content):]
+        if at % 8 == 7:
+            os.fdatasync(file.fileno())
+    os.fdatasync(file.fileno())
+print(time.time() - started)
+"""
+
+
+def run(cores: Sequence[int], *arguments: str) -> dict[str, float]:
+    """Time one run of the tool in a process of its own."""
+    command = [sys.executable, "-c", RUN, json.dumps(list(cores)), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    told: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    assert told["code"] == 0, done.stderr
+    return told
+
+
+def floor(names: Path, to: Path) -> float:
+    """Time what no tool can leave out, on one core."""
+    command = [sys.executable, "-c", FLOOR, "[0]", str(to), str(names)]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photos", nargs="+", type=Path)
+    parser.add_argument("--copies", type=int, default=10)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--to", type=Path, default=Path("bench_run"))
+    options = parser.parse_args()
+    source, out = options.to / "source", options.to / "out"
+    source.mkdir(parents=True)
+    files = []
+    for copy in range(options.copies):
+        for photo in options.photos:
+            files.append(shutil.copy(photo, source / f"{copy:02d}_{photo.name}"))
+    names = options.to / "names.json"
+    names.write_text(json.dumps([os.path.abspath(name) for name in sorted(files)]))
+    said = (f"source.root={source}", f"out={out}")
+    all_cores = sorted(os.sched_getaffinity(0))
+    levels = "noise.levels=5"
+    runs: dict[str, tuple[list[int], tuple[str, ...]]] = {
+        "core to spare": (all_cores, ("n_jobs=1",)),
+        "one core": (all_cores[:1], ("n_jobs=1",)),
+        "two workers": (all_cores[:2], ("n_jobs=2",)),
+        "five levels": (all_cores[:1], ("n_jobs=1", levels)),
+    }
+    against = {"core to spare": "", "one core": "", "two workers": "one core", "five levels": "one core"}
+    run(all_cores, "source.limit=1", f"out={options.to / 'warm'}", said[0], "n_jobs=1")
+    times: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
+    floors: list[float] = []
+    for _ in range(options.rounds):
+        floors.append(floor(names, options.to / "floor.bin"))
+        for name, (cores, more) in runs.items():
+            times[name].append(run(cores, *said, *more))
+            shutil.rmtree(out)
+    print("| run | seconds | ratio | to |\n|---|--:|--:|---|")
+    print(f"| floor | {statistics.median(floors):.2f} | | |")
+    for name, other in against.items():
+        own = [one["seconds"] for one in times[name]]
+        beside = [one["seconds"] for one in times[other]] if other else floors
+        ratio = statistics.median(a / b for a, b in zip(own, beside, strict=True))
+        print(f"| {name} | {statistics.median(own):.2f} | {ratio:.3f} | {other or 'floor'} |")
+    first = statistics.median(one["first"] for one in times["one core"])
+    peak = max(one["kib"] for one in times["one core"])
+    print(f"\nstart to the first pair {first:.2f} s; peak of a process {peak:.0f} KiB")
+
+
+if __name__ == "__main__":
+    main()
