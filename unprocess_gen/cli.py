@@ -330,16 +330,15 @@ def _check_noise(folder: Path, to: str | None) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen import transfer
 
-    found = list(transfer.fits(folder))
-    if not found:
+    looked = transfer.look(folder)
+    if looked.worst is None:
         print(f"{folder}: no pair has sites enough to fit its noise")
         return []
-    worst = max(found, key=lambda one: one.deviation)
-    print(f"noise of {len(found)} pairs fitted (a, b with 95 % intervals); the farthest from its row: {worst}")
+    print(f"noise of {looked.count} pairs fitted (a, b with 95 % intervals); the farthest from its row: {looked.worst}")
     if to is not None:
-        transfer.draw(found, Path(to))
+        transfer.draw(looked.first, Path(to))
         print(f"drawn in {to}")
-    return _told(folder, (f"noise of {one}" for one in found if one.deviation > transfer.ALARM))
+    return _told(folder, (f"noise of {one}" for one in looked.wrong))
 
 
 def _told(folder: Path, damages: Iterable[object]) -> list[str]:

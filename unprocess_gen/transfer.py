@@ -68,6 +68,29 @@ class Fit:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What is kept of a dataset's fits: how many, the farthest from its row, the wrong ones, and the first few."""
+
+    count: int
+    worst: Fit | None
+    wrong: list[Fit]
+    first: list[Fit]
+
+
+def look(folder: Path) -> Look:
+    """Fit every pair of a dataset, one at a time; raises as `fits`."""
+    count, worst = 0, None
+    wrong: list[Fit] = []
+    first: list[Fit] = []
+    for one in fits(folder):
+        count += 1
+        worst = one if worst is None or one.deviation > worst.deviation else worst
+        wrong += [one] if one.deviation > ALARM else []
+        first += [one] if len(first) < MOST_DRAWN else []
+    return Look(count, worst, wrong, first)
+
+
 def fits(folder: Path) -> Iterator[Fit]:
     """Yield a fit for every pair of a dataset that has sites enough; DamageError where it is not whole."""
     for clean, noisy, row in RawPairs(folder):
@@ -158,7 +181,7 @@ def draw(found: list[Fit], path: Path) -> None:
         raise ConfigError(f"--to {path}: drawing needs matplotlib; pip install 'unprocess_gen[figures]'") from None
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
-    for number, one in enumerate(found[:MOST_DRAWN]):
+    for number, one in enumerate(found):
         colour = f"C{number % 10}"
         axes.plot(one.signal_dn, one.variance_dn2, ".", color=colour, markersize=2, alpha=0.5)
         ends = np.array([one.signal_dn.min(), one.signal_dn.max()])
