@@ -16,13 +16,13 @@ from conftest import Door, fill
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import accuracy, report
+from unprocess_gen import accuracy, effects, report
 from unprocess_gen.accuracy import BY_NAME, EXACT, MEASUREMENTS, REFERENCE, TIER_STAGES, Beside, Effort, Report, Row
 from unprocess_gen.cli import conf_dir
 from unprocess_gen.config import AccuracyConfig, Config, NoiseConfig, SensorConfig, budget, check, read_option
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.forecast import forecast, text
-from unprocess_gen.methods import METHODS, STAGES, choose
+from unprocess_gen.methods import METHODS, STAGES, choose, gaussian_distance
 
 Settings = Callable[..., Config]
 
@@ -140,6 +140,25 @@ def test_the_distance_of_laws_is_the_largest_difference_of_their_distribution_fu
     one, other = np.array([[1, 1, 2, 3]], dtype=np.uint16), np.array([[2, 2, 2, 3]], dtype=np.uint16)
 
     assert accuracy.law_distance([one, one], [one, other]) == 0.5
+
+
+def test_normals_in_place_of_counts_are_as_far_from_the_law_as_the_formula_says(
+    settings: Settings, beside: Beside, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = settings("noise=sony_a7s2", "scene=night", "source.limit=1")
+    lab = accuracy.Lab(accuracy._settings(config, beside), TIERS, accuracy._subjects(config, LITTLE), LITTLE)
+    plans = [plan for _, plan in accuracy._flat_plans(lab, TIERS[REFERENCE])]
+    counted = lab.flats(TIERS[REFERENCE])
+    monkeypatch.setattr(effects, "poisson", lambda words, rate: rate + np.sqrt(rate) * effects.normals(words))
+    lab._flats.clear()
+    drawn = lab.flats(TIERS[REFERENCE])
+
+    for plan, one, other in zip(plans, drawn, counted, strict=True):
+        physics = plan.physics
+        rate_e = (plan.white_level_dn - plan.black_level_dn) / plan.exposure_ratio / physics.dn_per_e
+        if rate_e >= 10:  # the formula is the first term of an expansion
+            stated = gaussian_distance(rate_e, physics.read_std_dn / physics.dn_per_e)
+            assert accuracy.law_distance([one], [other]) == pytest.approx(stated, rel=0.2, abs=0.9 / LITTLE.flat)
 
 
 def test_the_words_of_normals_reach_every_segment_and_both_ends_of_each() -> None:

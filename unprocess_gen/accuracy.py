@@ -100,10 +100,10 @@ class Effort:
 
     photographs: int = 8
     rounds: int = 7
-    sampled: tuple[int, int] = (256, 384)
+    sampled: tuple[int, int] = (384, 512)
     readable: tuple[int, int] = (512, 768)
     compiled: tuple[int, int] = (1024, 1536)
-    flat: int = 256
+    flat: int = 512
     positions: int = 64
 
 
@@ -426,7 +426,7 @@ def shot_error(lab: Lab, accuracy: AccuracyConfig) -> Error:
 def law_distance(ours: Sequence[Raw], reference: Sequence[Raw]) -> float:
     """Return the largest difference of the distribution functions of two frames, over all pairs of them.
 
-    Frames of common uniforms: what both share by chance cancels, and some 1/1000 is left of 65,536 sites.
+    Frames of common uniforms: what both share by chance cancels, and some 5e-4 is left of 512² sites.
     """
     return max(_distance(one, other) for one, other in zip(ours, reference, strict=True))
 
