@@ -371,6 +371,10 @@ def test_a_body_is_the_same_at_every_iso_and_another_with_another_seed_or_camera
         (("noise=nikon_d850", "noise.dark_e_per_s=-1"), "noise.dark_e_per_s=-1.0: expected 0 to 1e+06"),
         (("noise=nikon_d850", "noise.hot_pixel_share=1.5"), "noise.hot_pixel_share=1.5: expected 0 to 1"),
         (("noise=nikon_d850", "noise.assumed=[gain]"), "noise.assumed=gain: expected one of prnu_std, "),
+        (
+            ("noise=heteroscedastic", "noise.law=poisson", "noise.a=1e-6", "noise.b=1"),
+            "noise.a=1e-06: noise.law=poisson counts up to 1e+09 electrons, so a must be 0, or at least 3.855e-06",
+        ),
         (("noise=nikon_d850", "sensor.units=0"), "sensor.units=0: expected image, or a number of bodies"),
     ],
 )

@@ -561,6 +561,8 @@ def _check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
     else:
         _check_calibration(noise)
         offset = _black_share(noise)
+    if noise.law == "poisson":
+        _check_countable(noise)
     if lowest(b) + offset < 0 and noise.negative_variance == "refuse":
         raise ConfigError(
             f"noise.b={_text(noise.b)}: the variance at black is {lowest(b) + offset:.6g}, below 0; "
@@ -633,6 +635,17 @@ def _check_branch(key: str, branch: BranchConfig) -> None:
 
 MAX_ELECTRONS = 1e9
 """Counts are exact up to this mean (`poisson`), which no pixel holds."""
+
+
+def _check_countable(noise: NoiseConfig) -> None:
+    """Refuse a gain so small that white is more electrons than can be counted; without shot noise nothing is."""
+    span = 1 if noise.units == "normalized" else (noise.white_level_dn or 0) - (noise.black_level_dn or 0)
+    a = law("noise.a", noise.a, A_LAWS)
+    if a.numbers != (0.0,) and lowest(a) * MAX_ELECTRONS < span:
+        raise ConfigError(
+            f"noise.a={_text(noise.a)}: noise.law=poisson counts up to {MAX_ELECTRONS:g} electrons, so a must be 0, or "
+            f"at least {span / MAX_ELECTRONS:g}"
+        )
 
 
 def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
