@@ -1,7 +1,12 @@
 """The fast form of a pair whose noise is made in electrons, effect by effect: `fused`'s passes with `effects.physical`.
 
-Must give the DN of `pair.reference_pair` everywhere, by the same means as `fused`, of which the clean frame, the words,
-the normals and the read-out are. Of a body that is seen again the response pattern is kept.
+Must give the DN of `pair.reference_pair` everywhere, by the same means as `fused`, of which the clean frame, the words
+and the read-out are. Counts and read noise are made of quick normals, and again of exact ones where they could round
+otherwise (`normals`). Of a body that is seen again the response pattern is kept.
+
+Measured on a daylight frame, AVX2, one thread of a busy machine, nanoseconds a pixel of the noisy frame: electrons 0.5,
+words 0.7 for each of shot and read noise, counts 3.1, digitising 1.5, the read-out 0.7. Tried and slower: chunks of 256
+and 512 pixels; one function for all counts (0.8 more: it takes as much to hand it the body and the buffers).
 """
 
 from __future__ import annotations

@@ -11,19 +11,20 @@ With s = w / √rate,
     x = rate + √rate·w + w²·A(s) + B(s) + C(s) / rate + D(s) / rate² + E(s) / rate³,
 
 the expansion of Giles and of Temme with all powers of s kept together, so that it holds into the tails; cut where it
-costs 2e-12 of the distribution function at rate 64. A short form of it with the normals as they are (1.5e-7) is
-certain but within a thousandth or so of an integer; only there w is sharpened by a Newton step (1e-13) and x computed
-in full.
+costs 2e-12 of the distribution function at rate 64. A short form of it, of quick normals (`normals`) and in single
+precision, is certain but within a thousandth or so of an integer, from 6 up (`SHORT_LEAST`; at 8 within a twentieth);
+only there is the count made in full, from 64 up of w sharpened by a Newton step (1e-13).
 
-Below 64 the distribution function itself is compared with u. It is tabulated for the middles of 81 cells of √rate,
-each P(K <= k) with its seven derivatives in the rate (272 kB), which gives it to 6e-12 within the cell. One comparison
-decides, since a guess from √rate and the normal, made exact to half a count by a small table, leaves two counts.
+Below 64 the full form compares the distribution function itself with u. It is tabulated for the middles of 81 cells of
+√rate, each P(K <= k) with its seven derivatives in the rate (272 kB), which gives it to 6e-12 within the cell. One
+comparison decides, since a guess from √rate and the normal, made exact to half a count by a small table, leaves two.
 
 Both forms give the same counts; the tables are made of `decimal` and of single + - × ÷, in 0.05 s.
 
-Measured, nanoseconds a value beyond the normals, AVX2, one thread of a shared machine, rows of 2880 words never seen
-before: rates from 64 up 3.9 (2.4 of it the short form), 4.5 at 1e9, where one in a hundred is computed in full; below
-64 from 14 to 15; 10 where both kinds are mixed at random. The reference takes 1500.
+Measured, nanoseconds a value with its normal, AVX2, one thread of a busy machine, rows of 1024 words, rates spread
+evenly in their logarithm: from 64 up 3.7 (5.6 by double precision), 4.0 from 20 to 64, 6.2 from 6 to 20, 16 below 6, 12
+where all kinds are mixed at random; at 1e6, where one in a hundred is computed in full, 6.6, and at 1e9 40. The
+reference takes 1500.
 Tried and dropped: a test of each count as it comes instead of lists of those left open (21 where kinds are mixed: no
 processor can predict it); helpers that take a row of a table (90: a view counts references); nine tables through a
 function that is not inlined (75); signed indices, which may count from the end (19 below 64); counting up from 0 by
@@ -40,7 +41,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.compiled import inner, kernel
+from unprocess_gen.compiled import inner
 from unprocess_gen.errors import MachineError
 from unprocess_gen.normals import Quantiles, exact_normal, quick_normals
 from unprocess_gen.records import Float
@@ -310,7 +311,7 @@ class Room(NamedTuple):
     offsets: Float
 
 
-@kernel
+@inner
 def room_for(count: int) -> Room:
     """Return the room for runs of up to ``count`` counts, a multiple of 8."""
     flags = np.zeros(count + 8, dtype=np.uint8)
@@ -331,7 +332,7 @@ def room_for(count: int) -> Room:
     )
 
 
-@kernel
+@inner
 def draw(words: NDArray[np.uint32], rates: Float, normal: Quantiles, tables: Tables, room: Room, out: Float) -> None:
     """Fill ``out`` with what `poisson` gives, all ``[n]``.
 
