@@ -14,6 +14,7 @@ HOUSE = Path(unprocess_gen.__file__).parent
 FLOORS = (
     {"errors", "records"},
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
+    {"normals"},
     {"methods", "poisson"},
     {
         *("config", "decode", "draws", "effects", "manifest", "patches", "process"),
@@ -90,9 +91,9 @@ def test_the_import_test_sees_an_upward_import(tmp_path: Path) -> None:
 
 
 def test_no_fast_math_on_the_way_to_the_output() -> None:
-    from unprocess_gen import electrons, fused, poisson
+    from unprocess_gen import electrons, fused, normals, poisson
 
-    kernels = [value for room in (electrons, fused, poisson) for value in vars(room).values()]
+    kernels = [value for room in (electrons, fused, normals, poisson) for value in vars(room).values()]
     kernels = [value for value in kernels if hasattr(value, "targetoptions")]
 
     assert len(kernels) >= 20

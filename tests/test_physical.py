@@ -759,6 +759,40 @@ def test_a_clean_frame_with_fixed_patterns_is_the_mean_of_many_noisy_ones() -> N
     assert (clean[mean == 0] == 0).all()
 
 
+def test_a_clean_frame_with_fixed_patterns_keeps_the_dark_offset_that_its_frames_keep() -> None:
+    """Beside it: where the mean is taken away, the clean frame is that of light alone."""
+    size, frames, dark_e = (16, 31), 200, 7.3
+    plan = made("shot", "dark_current", dark_e=dark_e, dark_offset="kept", fixed_pattern_in_clean=True)
+    clean = make_pair(flat(5000, *size), plan).clean
+    assert (clean == round(signal_dn(5000) + BLACK + 8 * dark_e)).all()
+    mean = np.mean([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)], axis=0)
+    rate = signal_dn(5000) / 8 + dark_e
+    assert np.abs(mean - clean).max() <= bernstein(64 * rate, 16 * poisson_reach(rate), frames, 1e-15) + 0.5
+    removed = make_pair(flat(5000, *size), with_physics(plan, dark_offset="removed")).clean
+    assert (removed == round(signal_dn(5000) + BLACK)).all()
+
+
+def test_no_mean_of_frames_exceeds_the_full_well() -> None:
+    """Hot pixels and dark current fill wells too; what is added in DN, columns here, stands on top."""
+    size, frames = (24, 31), 100
+    plan = made(
+        *("shot", "dark_current", "hot_pixels", "full_well", "column"),
+        dark_e=50.0, dark_offset="kept", hot_pixel_share=0.3, hot_pixel_e=4000.0, full_well_e=2000.0,
+        column_std_dn=20.0, fixed_pattern_in_clean=True,
+    )  # fmt: skip
+    clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
+    columns_dn = effects.offsets(plan, size, fixed_alone=True)
+    full = np.rint(8 * 2000 + BLACK + columns_dn)
+    assert (clean <= full).all()
+    assert 0.1 < (clean == full).mean() < 0.3
+    noisy = np.array([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)])
+    assert (noisy.mean(axis=0) <= full).all()
+    overfull = effects.hot_pixel_means(plan.physics, size) > 3000  # type: ignore[arg-type]
+    assert overfull.any()
+    assert (noisy[:, overfull] == full[overfull]).all()
+    assert (clean[overfull] == full[overfull]).all()
+
+
 # One effect and another -----------------------------------------------------------------------------------------------
 
 COUNTED = {"dark_e": 3.0, "hot_pixel_share": 0.3, "hot_pixel_e": 20.0, "dn_per_e": 16.0}

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from moments import bernstein
 
-from unprocess_gen import poisson as room
+from unprocess_gen import poisson as poissons
 from unprocess_gen import streams, tables
+from unprocess_gen.compiled import kernel
 from unprocess_gen.effects import normals
 from unprocess_gen.errors import MachineError
-from unprocess_gen.poisson import LIMIT, draw, poisson, poisson_tables
+from unprocess_gen.normals import Quantiles, normal_quantiles, quick_normals
+from unprocess_gen.poisson import LIMIT, Tables, draw, poisson, poisson_tables, room_for
 
 WORDS = 2**32
 SIGN = 2**31
@@ -31,8 +33,13 @@ Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def fast(words: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """The compiled form, called as `poisson` is."""
     out = np.full(words.shape, np.nan)
-    draw(words.astype(np.uint64), rates, normals(words), poisson_tables(), out)
+    _draw(words.astype(np.uint32), rates, normal_quantiles(), poisson_tables(), out)
     return out
+
+
+@kernel
+def _draw(words: np.ndarray, rates: np.ndarray, normal: Quantiles, tables: Tables, out: np.ndarray) -> None:
+    draw(words, rates, normal, tables, room_for((len(words) + 7) // 8 * 8), out)
 
 
 def word(rank: np.ndarray) -> np.ndarray:
@@ -141,8 +148,8 @@ def test_the_probability_of_none_is_exp_of_minus_the_rate(rate: float) -> None:
 @pytest.mark.parametrize(("coefficients", "factor"), [("A", 1.001), ("B", 1.001), ("C", 1.001), ("D", 1.1), ("E", 2)])
 def test_a_wrong_coefficient_breaks_the_law(coefficients: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of each; the last two count for so little that a thousandth of them is no error at all."""
-    first, *others = getattr(room, coefficients)
-    monkeypatch.setattr(room, coefficients, (first * factor, *others))
+    first, *others = getattr(poissons, coefficients)
+    monkeypatch.setattr(poissons, coefficients, (first * factor, *others))
     assert np.abs(error_in_words(LIMIT, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
 
 
@@ -154,7 +161,7 @@ def test_a_wrong_entry_of_the_tables_breaks_the_law(n: int, monkeypatch: pytest.
     wrong = right.cdf.copy()
     row = right.first[cell] + int(right.middle[cell])
     wrong[row, n] *= 1 + 10.0 ** (n - 5)
-    monkeypatch.setattr(room, "poisson_tables", lambda: right._replace(cdf=wrong))
+    monkeypatch.setattr(poissons, "poisson_tables", lambda: right._replace(cdf=wrong))
     rate = ((cell + 1 - 1e-9) / 10) ** 2
     assert np.abs(error_in_words(rate, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
 
@@ -250,16 +257,51 @@ def test_the_guess_leaves_two_counts_in_every_cell() -> None:
     assert (fast(*every) == poisson(*every)).all()
 
 
-def test_the_short_form_is_within_its_error() -> None:
-    """Twice over: the margin about integers has room for as much again."""
-    z = np.linspace(-room.SHORT_REACH, room.SHORT_REACH, 1001)
-    for rate in (LIMIT, 65.0, 80.0, 100.0, 1e3, 1e4, 1e6, 1e9):
-        s = z / math.sqrt(rate)
-        short = rate + math.sqrt(rate) * z + z * z * np.polyval(room.A[4::-1], s) + np.polyval(room.B[3::-1], s)
-        exact = room.expansion(np.full(z.shape, rate), z)
-        assert np.abs(short - exact).max() <= room.SHORT_ERROR / 2 + rate * 1e-15
-        moved = room.expansion(np.full(z.shape, rate), z + 1.5e-7)
-        assert np.abs(moved - exact).max() <= room.SHORT_ERROR / 4 + room.NORMAL_ERROR * math.sqrt(rate)
+def short(words: np.ndarray, rate: float) -> np.ndarray:
+    """The short form of x as it is compiled: quick normals, single precision, the whole part of the rate kept out."""
+    quick = np.empty(words.shape, dtype=np.float32)
+    _quick(words, normal_quantiles().lines, np.empty(words.shape, dtype=np.uint64), quick)
+    a, b = (np.array(one, dtype=np.float32) for one in (poissons.A, poissons.B))
+    root = np.sqrt(np.float32(rate))
+    s = quick * (np.float32(1) / root)
+    s2 = s * s
+    powers_a = (a[0] + s * a[1]) + s2 * ((a[2] + s * a[3]) + s2 * a[4])
+    powers_b = (b[0] + s * b[1]) + s2 * (b[2] + s * b[3])
+    x = (np.float32(rate - np.rint(rate)) + root * quick) + (quick * quick * powers_a + powers_b)
+    assert x.dtype == np.float32
+    return np.asarray(np.rint(rate) + x.astype(np.float64))
+
+
+@kernel
+def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
+    quick_normals(words, lines, pairs, out)
+
+
+def real_quantile(rate: float, w: float) -> float:
+    """The x with Gamma(x, rate) / Gamma(x) = Phi(w), by an independent library."""
+    with mpmath.workdps(20):
+        share = mpmath.ncdf(w)
+        near = float(poissons.expansion(np.array([rate]), np.array([w]))[0])
+        return float(
+            mpmath.findroot(
+                lambda x: mpmath.gammainc(x, rate, mpmath.inf, regularized=True) - share, (near, near + 1e-4)
+            )
+        )
+
+
+@pytest.mark.parametrize(
+    "rate", [6.0, 6.7, 8.3, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
+)
+def test_the_short_form_is_within_its_error(rate: float) -> None:
+    """One and a half times over, so that what lies between the words that are tried is safe too."""
+    w = np.linspace(-poissons.SHORT_REACH, poissons.SHORT_REACH, 37 if rate < LIMIT else 4001)
+    index = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in w]
+    words = np.array([min(int(i), SIGN - 1) | SIGN * (v < 0) for i, v in zip(index, w, strict=True)], dtype=np.uint32)
+    z = normals(words)  # to 1.5e-7
+    exact = [real_quantile(rate, v) for v in z] if rate < LIMIT else poissons.expansion(np.full(z.shape, rate), z)
+    claimed = poissons.NORMAL_ERROR * (8 + math.sqrt(rate)) + poissons.SHORT_ERROR / rate
+    claimed += poissons.LOW_ERROR / rate**3
+    assert np.abs(short(words, rate) - exact).max() <= claimed / 1.5
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 7])
@@ -315,12 +357,12 @@ def test_moments_are_those_of_the_law(rate: float) -> None:
 
 
 def test_the_tables_have_the_published_hash() -> None:
-    assert room.digest(poisson_tables()) == room.TABLES_SHA256
+    assert poissons.digest(poisson_tables()) == poissons.TABLES_SHA256
 
 
 def test_tables_that_come_out_otherwise_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     poisson_tables.cache_clear()
-    monkeypatch.setattr(room, "TABLES_SHA256", "0" * 64)
+    monkeypatch.setattr(poissons, "TABLES_SHA256", "0" * 64)
     with pytest.raises(MachineError, match="expected 0000"):
         poisson_tables()
     poisson_tables.cache_clear()
@@ -335,7 +377,7 @@ def test_the_hash_sees_every_table() -> None:
     for name, table in right._asdict().items():
         wrong = table.copy()
         wrong.flat[wrong.size // 2] += 1
-        assert room.digest(right._replace(**{name: wrong})) != room.TABLES_SHA256
+        assert poissons.digest(right._replace(**{name: wrong})) != poissons.TABLES_SHA256
 
 
 def test_the_sharpened_normal_is_the_quantile_to_1e_12_of_the_distribution() -> None:
@@ -345,13 +387,13 @@ def test_the_sharpened_normal_is_the_quantile_to_1e_12_of_the_distribution() -> 
     tails = poisson_tables().tails
     for index in indices:
         tail = (int(index) + 0.5) / WORDS
-        w = room._sharpened(tail, float(normals(np.array([index], dtype=np.uint32))[0]), tails)
+        w = poissons._sharpened.py_func(tail, float(normals(np.array([index], dtype=np.uint32))[0]), tails)
         with mpmath.workdps(30):
             assert abs(mpmath.erfc(mpmath.mpf(w) / mpmath.sqrt(2)) / 2 - tail) < 1e-12
 
 
 def test_only_the_reference_order_and_no_fast_math() -> None:
-    kernels = [value for value in vars(room).values() if hasattr(value, "targetoptions")]
+    kernels = [value for value in vars(poissons).values() if hasattr(value, "targetoptions")]
     assert len(kernels) >= 5
     assert not any(kernel.targetoptions.get("fastmath") for kernel in kernels)
 
@@ -428,7 +470,7 @@ def derived() -> list[Polynomial]:
 
 def test_the_coefficients_are_those_of_the_expansion() -> None:
     b = derived()
-    for m, coefficients in enumerate((room.A, room.B, room.C, room.D, room.E)):
+    for m, coefficients in enumerate((poissons.A, poissons.B, poissons.C, poissons.D, poissons.E)):
         first = 2 if m == 0 else 0
         for n, coefficient in enumerate(coefficients, start=first):
             assert coefficient == float(b[n + 2 * m][n]), (m, n)
@@ -439,7 +481,7 @@ def test_the_coefficients_are_those_of_the_expansion() -> None:
 def test_the_expansion_solves_its_equation(rate: float) -> None:
     """Gamma(x, rate) / Gamma(x) = Phi(w) to 5e-12, by an independent library."""
     w = np.linspace(-6.2, 6.2, 21)
-    x = room.expansion(np.full(w.shape, rate), w)
+    x = poissons.expansion(np.full(w.shape, rate), w)
     with mpmath.workdps(30):
         for at, normal in zip(x, w, strict=True):
             share = mpmath.gammainc(mpmath.mpf(at), mpmath.mpf(rate), mpmath.inf, regularized=True)
@@ -453,12 +495,12 @@ def test_the_table_of_distribution_functions_is_right_at_both_ends_of_every_cell
             counts, cdf = law(rate)
             k = np.arange(max(found.least[cell], counts[0]), min(found.most[cell], counts[-1]) + 1)
             offset = rate - found.middle[cell]
-            tabulated = [room._at_most(found.cdf, found.first[cell] + n, offset) for n in k]
+            tabulated = [poissons._at_most.py_func(found.cdf, found.first[cell] + n, offset) for n in k]
             assert np.abs(tabulated - cdf[k - counts[0]]).max() < 1e-11
 
 
 def test_the_tail_table_shares_the_normals_of_the_words() -> None:
     """The reference makes the normal of a word as `effects.normals` does, bit for bit."""
     words = np.random.default_rng(12).integers(0, SIGN, 100_000, dtype=np.uint32)
-    assert (room._quantile(room._tail(words)) == normals(words)).all()
+    assert (poissons._quantile(poissons._tail(words)) == normals(words)).all()
     assert tables.SEGMENTS == 32

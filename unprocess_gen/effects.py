@@ -220,11 +220,18 @@ def respond(light: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
 
 
 def average(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
-    """Add the other fixed patterns to the unrounded clean frame, ``[H, W]`` DN, not clipped."""
+    """Add the other fixed patterns, and a dark offset that is kept, to the unrounded clean frame, ``[H, W]`` DN.
+
+    Not clipped. What light, heat and hot pixels set free ends at the full well, as in every frame that is averaged.
+    """
     physics = plan.physics
     assert physics is not None
     if "hot_pixels" in plan.effects:
         clean_dn = clean_dn + hot_pixel_means(physics, clean_dn.shape, origin) * physics.dn_per_e
+    if "dark_current" in plan.effects and physics.dark_offset == "kept":
+        clean_dn = clean_dn + physics.dark_e * physics.dn_per_e
+    if "full_well" in plan.effects:
+        clean_dn = np.minimum(clean_dn, physics.full_well_e * physics.dn_per_e + plan.black_level_dn)
     clean_dn = clean_dn + offsets(plan, clean_dn.shape, origin, fixed_alone=True)
     if "dead_pixels" in plan.effects:
         clean_dn = np.where(dead(physics, clean_dn.shape, origin), 0.0, clean_dn)

@@ -44,12 +44,12 @@ BEFORE_WELL = frozenset({"prnu", "shot", "dark_current", "hot_pixels"})
 """What a full well cuts."""
 
 COST_NS = {
-    "heteroscedastic": 2.3, "prnu": 3.2, "shot": 11.0, "dark_current": 18.5, "hot_pixels": 1.2, "full_well": 0.1,
-    "read": 2.2, "row": 0.1, "column": 0.1, "black_error": 0.1, "dead_pixels": 1.2, "quantise": 0.3,
+    "heteroscedastic": 2.3, "prnu": 3.3, "shot": 9.5, "dark_current": 15.5, "hot_pixels": 1.0, "full_well": 0.1,
+    "read": 1.8, "row": 0.1, "column": 0.1, "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3,
 }  # fmt: skip
 """What an effect costs, nanoseconds a pixel, as measured on one machine with AVX2 (`tests/bench_scenes.py`).
 
-Shown, and never decided by. Shot noise: 5 where a pixel has many electrons, 18 below 64, as dark current. PRNU: of a
+Shown, and never decided by. Shot noise: 4 where a pixel has many electrons, 15 below 6, as dark current. PRNU: of a
 body that was not seen just before. 0.1: less than could be measured.
 """
 

@@ -11,19 +11,20 @@ With s = w / √rate,
     x = rate + √rate·w + w²·A(s) + B(s) + C(s) / rate + D(s) / rate² + E(s) / rate³,
 
 the expansion of Giles and of Temme with all powers of s kept together, so that it holds into the tails; cut where it
-costs 2e-12 of the distribution function at rate 64. A short form of it with the normals as they are (1.5e-7) is
-certain but within a thousandth or so of an integer; only there w is sharpened by a Newton step (1e-13) and x computed
-in full.
+costs 2e-12 of the distribution function at rate 64. A short form of it, of quick normals (`normals`) and in single
+precision, is certain but within a thousandth or so of an integer, from 6 up (`SHORT_LEAST`; at 8 within a twentieth);
+only there is the count made in full, from 64 up of w sharpened by a Newton step (1e-13).
 
-Below 64 the distribution function itself is compared with u. It is tabulated for the middles of 81 cells of √rate,
-each P(K <= k) with its seven derivatives in the rate (272 kB), which gives it to 6e-12 within the cell. One comparison
-decides, since a guess from √rate and the normal, made exact to half a count by a small table, leaves two counts.
+Below 64 the full form compares the distribution function itself with u. It is tabulated for the middles of 81 cells of
+√rate, each P(K <= k) with its seven derivatives in the rate (272 kB), which gives it to 6e-12 within the cell. One
+comparison decides, since a guess from √rate and the normal, made exact to half a count by a small table, leaves two.
 
 Both forms give the same counts; the tables are made of `decimal` and of single + - × ÷, in 0.05 s.
 
-Measured, nanoseconds a value beyond the normals, AVX2, one thread of a shared machine, rows of 2880 words never seen
-before: rates from 64 up 3.9 (2.4 of it the short form), 4.5 at 1e9, where one in a hundred is computed in full; below
-64 from 14 to 15; 10 where both kinds are mixed at random. The reference takes 1500.
+Measured, nanoseconds a value with its normal, AVX2, one thread of a busy machine, rows of 1024 words, rates spread
+evenly in their logarithm: from 64 up 3.7 (5.6 by double precision), 4.0 from 20 to 64, 6.2 from 6 to 20, 16 below 6, 12
+where all kinds are mixed at random; at 1e6, where one in a hundred is computed in full, 6.6, and at 1e9 40. The
+reference takes 1500.
 Tried and dropped: a test of each count as it comes instead of lists of those left open (21 where kinds are mixed: no
 processor can predict it); helpers that take a row of a table (90: a view counts references); nine tables through a
 function that is not inlined (75); signed indices, which may count from the end (19 below 64); counting up from 0 by
@@ -40,8 +41,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.compiled import kernel
+from unprocess_gen.compiled import inner
 from unprocess_gen.errors import MachineError
+from unprocess_gen.normals import Quantiles, exact_normal, quick_normals
 from unprocess_gen.records import Float
 from unprocess_gen.streams import Words
 from unprocess_gen.tables import DIGITS, SEGMENTS, normal_cdf, normal_density, normal_table, sha256
@@ -70,12 +72,11 @@ D = (
     362985384281 / 117328567910400,
 )
 E = (5408 / 3444525, -18075959 / 4232632320, 27968607743 / 3928411872000, -9969287490329 / 1055957111193600)
-_A0, _A1, _A2, _A3, _A4 = A[:5]
-_B0, _B1, _B2, _B3 = B[:4]
 
-SHORT_REACH = 4.5
-SHORT_ERROR, NORMAL_ERROR = 1e-3, 2e-7
-"""The short form is off by less than SHORT_ERROR + NORMAL_ERROR·√rate for normals within SHORT_REACH."""
+SHORT_LEAST, SHORT_REACH = 6.0, 3.5
+NORMAL_ERROR, SHORT_ERROR, LOW_ERROR = 6e-6, 0.05, 18.0
+"""For rates from SHORT_LEAST up and normals within SHORT_REACH the short form of x, of quick normals and in single
+precision, is off by less than NORMAL_ERROR·(8 + √rate) + SHORT_ERROR / rate + LOW_ERROR / rate³."""
 
 TAIL_CELLS = 8
 """Cells of the normal's tail per standard deviation."""
@@ -279,74 +280,148 @@ def _by_cdf(uniform: Float, rate: Float) -> Float:
 
 # ---------------------------------------------------------------------------------------------------------- fast form
 
-_ROUND = 1.5 * 2.0**52
+_ROUND, _ROUND32 = 1.5 * 2.0**52, np.float32(1.5 * 2.0**23)
 _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
 _1, _31 = np.uint64(1), np.uint64(31)
-_UNSURE = -1.0
+_0F, _1F, _8F = np.float32(0.0), np.float32(1.0), np.float32(8.0)
+_A0, _A1, _A2, _A3, _A4 = (np.float32(a) for a in A[:5])
+_B0, _B1, _B2, _B3 = (np.float32(b) for b in B[:4])
+_LEAST, _REACH = np.float32(SHORT_LEAST), np.float32(SHORT_REACH)
+_ERROR, _NORMAL_ERROR, _LOW_ERROR = (np.float32(e) for e in (SHORT_ERROR, NORMAL_ERROR, LOW_ERROR))
+_POWERS = len(A)
+_COEFFICIENTS = np.array([(*one, *(0.0,) * (_POWERS - len(one))) for one in (A, B, C, D, E)])
+_OPEN, _CLOSED = np.float32(9.0), np.float32(-1.0)
 
 
-@kernel
-def draw(words: NDArray[np.uint64], rates: Float, normals: Float, tables: Tables, out: Float) -> None:
+class Room(NamedTuple):
+    """What a run of counts is made in."""
+
+    normals: NDArray[np.float32]
+    pairs: NDArray[np.uint64]
+    whole: Float  # the rate, rounded
+    part: NDArray[np.float32]  # what it is more than that; then what the count is more
+    rate: NDArray[np.float32]
+    near: NDArray[np.float32]  # not negative: too near to an integer
+    open: NDArray[np.uint8]
+    eights: NDArray[np.uint64]  # the same, eight at a time
+    listed: NDArray[np.int64]
+    high: NDArray[np.int64]
+    low: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    offsets: Float
+
+
+@inner
+def room_for(count: int) -> Room:
+    """Return the room for runs of up to ``count`` counts, a multiple of 8."""
+    flags = np.zeros(count + 8, dtype=np.uint8)
+    return Room(
+        np.empty(count, dtype=np.float32),
+        np.empty(count, dtype=np.uint64),
+        np.empty(count),
+        np.empty(count, dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+        flags,
+        flags.view(np.uint64),
+        np.empty(count + 8, dtype=np.int64),
+        np.empty(count + 8, dtype=np.int64),
+        np.empty(count + 8, dtype=np.int64),
+        np.empty(count, dtype=np.int64),
+        np.empty(count),
+    )
+
+
+@inner
+def draw(words: NDArray[np.uint32], rates: Float, normal: Quantiles, tables: Tables, room: Room, out: Float) -> None:
     """Fill ``out`` with what `poisson` gives, all ``[n]``.
 
-    ``words`` are 32-bit words, ``rates`` means in counts up to 1e9 (the caller sees to that), ``normals`` those of the
-    same words by `effects.normals`, bit for bit.
+    ``rates`` are means in counts up to 1e9 (the caller sees to that); ``out`` may not lie where they do.
     """
     count = out.shape[0]
-    high, low = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
-    _sure(rates, normals, out)
-    highs, lows = _left_open(rates, out, high, low)
-    _by_exact_normal(words, rates, normals, tables.tails, high[:highs], out)
+    quick_normals(words, normal.lines, room.pairs, room.normals[:count])
+    _short(rates, room, out)
+    highs, lows = _left_open(rates, room)
+    _by_exact_normal(words, rates, normal.quadratics, tables.tails, room.high[:highs], room.pairs, out)
     if lows > 0:
-        rows, offsets = np.empty(count, dtype=np.int64), np.empty(count)
+        low, rows, offsets = room.low[:lows], room.rows, room.offsets
         cells = (tables.first, tables.least, tables.most, tables.middle)
-        _guess(rates, normals, cells, tables.guess, low[:lows], rows, offsets, out)
-        _compare(words, tables.cdf, low[:lows], rows, offsets, out)
+        _guess(rates, room.normals, cells, tables.guess, low, rows, offsets, out)
+        _compare(words, tables.cdf, low, rows, offsets, out)
 
 
-@kernel
-def _sure(rates: Float, normals: Float, out: Float) -> None:
-    """Fill ``out`` with floor(x) by the short form where that is certain, else with `_UNSURE`; no branches."""
+@inner
+def _short(rates: Float, room: Room, out: Float) -> None:
+    """Fill ``out`` with floor(x) by the short form, and flag where that is not certain; no branches.
+
+    In single precision, of which the rate as a whole number is kept out. No light is certain to give none.
+    """
+    normals, whole, part, single, near = room.normals, room.whole, room.part, room.rate, room.near
     for n in range(out.shape[0]):
-        rate, z = rates[n], normals[n]
-        root = np.sqrt(max(rate, LIMIT))
-        s = z / root
-        rest = z * z * (_A0 + s * (_A1 + s * (_A2 + s * (_A3 + s * _A4)))) + (_B0 + s * (_B1 + s * (_B2 + s * _B3)))
-        x = rate + (root * z + rest)
-        whole = (x + _ROUND) - _ROUND
-        certain = abs(x - whole) > SHORT_ERROR + NORMAL_ERROR * root
-        certain &= abs(z) < SHORT_REACH
-        certain &= rate >= LIMIT
-        out[n] = whole - (1.0 if whole > x else 0.0) if certain else _UNSURE
+        whole[n] = (rates[n] + _ROUND) - _ROUND
+        part[n] = np.float32(rates[n] - whole[n])
+        single[n] = np.float32(rates[n])
+    for n in range(out.shape[0]):
+        rate, z = single[n], normals[n]
+        root = np.sqrt(max(rate, _LEAST))
+        inverse = _1F / root
+        s = z * inverse
+        s2, i2 = s * s, inverse * inverse
+        a = (_A0 + s * _A1) + s2 * ((_A2 + s * _A3) + s2 * _A4)
+        b = (_B0 + s * _B1) + s2 * (_B2 + s * _B3)
+        x = (part[n] + root * z) + (z * z * a + b)
+        error = _NORMAL_ERROR * (_8F + root) + i2 * (_ERROR + _LOW_ERROR * (i2 * i2))
+        error = error if abs(z) < _REACH else _OPEN
+        error = error if rate >= _LEAST else _OPEN
+        error = error if rate > _0F else _CLOSED
+        rounded = (x + _ROUND32) - _ROUND32
+        near[n] = error - abs(x - rounded)
+        part[n] = rounded - (_1F if rounded > x else _0F)
+    for n in range(out.shape[0]):
+        room.open[n] = near[n] >= _0F
+    for n in range(out.shape[0]):
+        out[n] = whole[n] + np.float64(part[n]) if single[n] > _0F else 0.0
 
 
-@kernel
-def _left_open(rates: Float, out: Float, high: NDArray[np.int64], low: NDArray[np.int64]) -> tuple[int, int]:
-    """List the counts that are open, by the side of `LIMIT` their rate is on; no branches, as they may be any."""
+@inner
+def _left_open(rates: Float, room: Room) -> tuple[int, int]:
+    """List the counts that are open, by the side of `LIMIT` their rate is on: they may be few, or any."""
+    listed, high, low = room.listed, room.high, room.low
+    count = rates.shape[0]
+    room.open[count : count + 8] = 0
     left, highs, lows = 0, 0, 0
-    for n in range(out.shape[0]):
-        low[left] = n
-        left += out[n] == _UNSURE
+    for eight in range((count + 7) // 8):
+        if room.eights[eight] != 0:
+            for n in range(8 * eight, 8 * eight + 8):
+                listed[left] = n
+                left += room.open[n]
     for m in range(left):
-        n = low[m]
+        n = listed[m]
         high[highs] = low[lows] = n
         highs += rates[n] >= LIMIT
-        lows = m + 1 - highs  # NaN, too, is among these
+        lows = m + 1 - highs
     return highs, lows
 
 
-@kernel
+@inner
 def _by_exact_normal(
-    words: NDArray[np.uint64], rates: Float, normals: Float, tails: Float, high: NDArray[np.int64], out: Float
+    words: NDArray[np.uint32],
+    rates: Float,
+    quadratics: tuple[Float, Float, Float],
+    tails: Float,
+    high: NDArray[np.int64],
+    bits: NDArray[np.uint64],
+    out: Float,
 ) -> None:
     """Fill in the counts listed in ``high``, in the order of the reference."""
     for n in high:
         tail = (np.float64(words[n] & _LOW31) + 0.5) * 2.0**-32
-        w = _sharpened(tail, abs(normals[n]), tails)
+        z = exact_normal(words[n], quadratics, bits)
+        w = _sharpened(tail, abs(z), tails)
         out[n] = np.floor(_x(rates[n], -w if words[n] & _SIGN else w))
 
 
-@kernel
+@inner
 def _sharpened(tail: float, z: float, tails: Float) -> float:
     """Return the upper quantile of ``tail`` by a Newton step from z, in the order of the reference."""
     cell = int(z * TAIL_CELLS)
@@ -359,28 +434,28 @@ def _sharpened(tail: float, z: float, tails: Float) -> float:
     return float(z - (value - tail) / slope)
 
 
-@kernel
+@inner
 def _x(rate: float, w: float) -> float:
     """Return x, in the order of `expansion`."""
     root = np.sqrt(rate)
     s = w / root
-    c, d, e = _power_sum(C, s), _power_sum(D, s), _power_sum(E, s)
-    rest = w * w * _power_sum(A, s) + (_power_sum(B, s) + (c + (d + e / rate) / rate) / rate)
+    c, d, e = _power_sum(2, s), _power_sum(3, s), _power_sum(4, s)
+    rest = w * w * _power_sum(0, s) + (_power_sum(1, s) + (c + (d + e / rate) / rate) / rate)
     return float(rate + (root * w + rest))
 
 
-@kernel
-def _power_sum(coefficients: tuple[float, ...], s: float) -> float:
-    total = coefficients[len(coefficients) - 1]
-    for n in range(len(coefficients) - 2, -1, -1):
-        total = coefficients[n] + s * total
+@inner
+def _power_sum(which: int, s: float) -> float:
+    total = 0.0  # powers that a sum lacks have coefficients of 0, which change no bit
+    for n in range(_POWERS - 1, -1, -1):
+        total = _COEFFICIENTS[which, n] + s * total
     return total
 
 
-@kernel
+@inner
 def _guess(
     rates: Float,
-    normals: Float,
+    normals: NDArray[np.float32],
     cells: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float],
     guess: NDArray[np.int8],
     low: NDArray[np.int64],
@@ -395,7 +470,7 @@ def _guess(
     first, least, most, middle = cells
     for m in range(low.shape[0]):
         n = np.uint64(low[m])
-        rate, z = rates[n] if rates[n] > 0.0 else 0.0, normals[n]
+        rate, z = rates[n], np.float64(normals[n])
         root = np.sqrt(rate)
         cell = np.uint64(np.int64(root * RATE_CELLS))  # unsigned: no index counts from the end
         beyond = guess[cell, np.uint64(np.int64((z - LEAST_NORMAL) * NORMAL_CELLS))] * GUESS_UNIT
@@ -405,9 +480,9 @@ def _guess(
         out[n] = k
 
 
-@kernel
+@inner
 def _compare(
-    words: NDArray[np.uint64],
+    words: NDArray[np.uint32],
     cdf: Float,
     low: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -418,7 +493,8 @@ def _compare(
     for m in range(low.shape[0]):
         n, row, offset = np.uint64(low[m]), np.uint64(rows[m]), offsets[m]
         # The word's rank by its normal: turned top bit, and the others too where that was 0; no branch to mispredict.
-        rank = words[n] ^ (_SIGN | (((words[n] >> _31) - _1) & _LOW31))
+        word = np.uint64(words[n])
+        rank = word ^ (_SIGN | (((word >> _31) - _1) & _LOW31))
         uniform = (np.float64(rank) + 0.5) * 2.0**-32
         over = np.int64(uniform > _at_most(cdf, row, offset))
         if row == 0 and over > 0:
@@ -427,7 +503,7 @@ def _compare(
         out[n] += over
 
 
-@kernel
+@inner
 def _at_most(cdf: Float, row: int, offset: float) -> float:
     """Return P(K <= k) of a row, in the order of the reference."""
     total: float = cdf[row, ORDER]

@@ -1,0 +1,79 @@
+"""Quick normals: within the error they claim for every law, and the exact one of a word bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from unprocess_gen import effects
+from unprocess_gen.compiled import kernel
+from unprocess_gen.normals import PIECES, Quantiles, exact_normal, normal_quantiles, quantiles, quick_normals
+from unprocess_gen.records import Float
+from unprocess_gen.tables import normal_table, tukey_table
+
+SIGN = 2**31
+
+
+@kernel
+def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
+    quick_normals(words, lines, pairs, out)
+
+
+@kernel
+def _exact(words: np.ndarray, quadratics: tuple[Float, Float, Float], out: np.ndarray) -> None:
+    bits = np.empty(1, dtype=np.uint64)
+    for n in range(out.shape[0]):
+        out[n] = exact_normal(words[n], quadratics, bits)
+
+
+def quick(words: np.ndarray, law: Quantiles) -> np.ndarray:
+    out = np.empty(words.shape, dtype=np.float32)
+    _quick(words, law.lines, np.empty(words.shape, dtype=np.uint64), out)
+    return out.astype(np.float64)
+
+
+def exact(words: np.ndarray, law: Quantiles) -> np.ndarray:
+    out = np.empty(words.shape)
+    _exact(words, law.quadratics, out)
+    return out
+
+
+def telling_words() -> np.ndarray:
+    """The words beside every end of every line, those that single precision rounds up there, and some at random."""
+    ends = (2.0 ** np.arange(-1, 31)[:, None] * (1 + np.arange(PIECES) / PIECES)).ravel().astype(np.int64)
+    spread = np.concatenate([ends[:, None] + np.arange(-3, 4), ends[:, None] - 2 ** np.arange(8)], axis=1).ravel()
+    random = np.random.default_rng(1).integers(0, SIGN, 2**21)
+    tails = (2 ** (31 * np.random.default_rng(2).random(2**20))).astype(np.int64)
+    last = SIGN - 1 - np.arange(300)
+    index = np.unique(np.clip(np.concatenate([spread, random, tails, last]), 0, SIGN - 1))
+    return np.concatenate([index, index + SIGN]).astype(np.uint32)
+
+
+LAWS = {"normal": normal_table(), **{f"tukey {shape}": tukey_table(shape) for shape in (0.0, 0.1571, 1.0, -0.2429)}}
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_quick_values_are_within_the_error_that_is_claimed(law: str) -> None:
+    table, words = LAWS[law], telling_words()
+    form = quantiles(table)
+    off = np.abs(quick(words, form) - effects.by_inverse_cdf(words, table))
+    assert off.max() <= form.error
+    assert off.max() > form.error / 20  # nor is the claim far too wide
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_exact_value_of_a_word_is_the_reference_s(law: str) -> None:
+    words = telling_words()
+    assert (exact(words, quantiles(LAWS[law])) == effects.by_inverse_cdf(words, LAWS[law])).all()
+
+
+def test_normals_are_known_to_a_hundred_thousandth() -> None:
+    assert normal_quantiles().error < 1e-5
+
+
+@pytest.mark.slow
+def test_quick_normals_are_within_their_error_for_every_word() -> None:
+    form = normal_quantiles()
+    for start in range(0, SIGN, 2**24):
+        words = np.arange(start, start + 2**24, dtype=np.uint32)
+        assert np.abs(quick(words, form) - exact(words, form)).max() <= form.error
