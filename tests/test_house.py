@@ -16,7 +16,7 @@ FLOORS = (
     {"bayer", "colour", "compiled", "headers", "streams", "tables"},
     {"poisson"},
     {
-        *("config", "decode", "draws", "effects", "manifest", "process"),
+        *("config", "decode", "draws", "effects", "manifest", "methods", "process"),
         *("sensor", "shards", "sources", "synthetic", "unprocess"),
     },
     {"fused", "physics", "planner"},
