@@ -148,7 +148,7 @@ def doubles() -> str:
     tally = np.zeros(6, dtype=np.int64)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
     products = (np.arange(1, 9 * 256 + 1) / 1999.0).reshape(3, 3, 256)
-    camera, gray, lit, unrounded, normals, counts, digitised = (np.empty(count) for _ in range(7))
+    camera, gray, lit, unrounded, normals, counts, digitised, std, dim = (np.empty(count) for _ in range(9))
     bits, words = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
     clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
@@ -169,8 +169,14 @@ def doubles() -> str:
     level = replace(selftest.GOLDEN_PLAN, a_dn=0.0, b_dn2=2500.0)
     half_way = (n % 9 + 0.5) - 50.0 * normals
     still = fused.scene_of(level, np.arange(256) / 255.0, (1, count), (0, 0))
-    fused._fill_noisy(half_way, normals, still, (0.0, 4095.0), noisy, tally)
-    return digest(camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, noisy, tally)
+    quantiles, blocks = fused.columns(normal_table()), count // fused.BLOCK
+    fused._fill_draws(key, 0, blocks, np.uint64(3), still, half_way, std, words)
+    fused._add_noise(count, half_way, words, quantiles, still, std)
+    fused._digitise(std, (0.0, 4095.0), noisy, tally)
+    fused._fill_dim(signal, gains, scene, dim, clean, tally)
+    return digest(
+        camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, std, noisy, tally
+    )
 
 
 # Machine code ---------------------------------------------------------------------------------------------------------
@@ -207,12 +213,15 @@ def code() -> dict[str, Any]:
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
     black = np.zeros((2, 2, 3), dtype=np.uint8)
-    outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"))
+    outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"), (fused, "_pair32"))
     for room, name in (*outer, (electrons, "_physical_pair"), (electrons, "_responses")):
         setattr(room, name, compiler(getattr(room, name)))
     for plan in selftest.GOLDEN_PLANS.values():
         make_pair(black, plan)
     list(make_pairs(black, [selftest.GOLDEN_PLAN] * 2))
+    fused.make_pair(black, selftest.GOLDEN_PLAN, np.zeros(256), (0.0, 1023.0), (0, 0), "float32", "linear")
+    single = (numba.float32[::1],) * 3
+    fused.fill_line_normals.compile((numba.uint32[::1], *single))
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint64), np.zeros(1)

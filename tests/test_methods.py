@@ -14,7 +14,17 @@ from hypothesis import strategies as st
 from unprocess_gen import synthetic
 from unprocess_gen.config import Config, budget, check
 from unprocess_gen.errors import ConfigError
-from unprocess_gen.methods import METHODS, STAGES, Budget, choose, gaussian_distance, gaussian_from, of_stage
+from unprocess_gen.methods import (
+    FORMS,
+    METHODS,
+    STAGES,
+    Budget,
+    choose,
+    gaussian_distance,
+    gaussian_from,
+    method,
+    of_stage,
+)
 from unprocess_gen.pair import make_pair, reference_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_for
@@ -41,7 +51,14 @@ def test_each_tier_has_a_method_for_every_stage(settings: Settings, tier: str) -
 
 
 def test_a_budget_for_everything_takes_the_cheapest_of_every_stage() -> None:
-    assert choose(ALL, counts_electrons=True) == tuple(of_stage(stage)[0].spelled for stage in STAGES)
+    assert choose(ALL, counts_electrons=False) == tuple(
+        of_stage(stage)[0].spelled for stage in STAGES if stage != "shot"
+    )
+
+
+def test_counts_are_taken_for_normals_where_the_budget_allows() -> None:
+    assert "shot:gaussian_where_near" in choose(ALL, counts_electrons=True)
+    assert "shot:inversion" in choose(replace(ALL, law_distance=0.0), counts_electrons=True)
 
 
 @given(
@@ -52,12 +69,13 @@ def test_a_budget_for_everything_takes_the_cheapest_of_every_stage() -> None:
 )
 def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
     some = Budget("some", False, dn, share, normal, distance)
-    for spelled in choose(some, counts_electrons=True):
-        stage = spelled.partition(":")[0]
-        methods = of_stage(stage)
-        at = [one.spelled for one in methods].index(spelled)
-        assert methods[at].fits(some)
-        assert not any(one.fits(some) for one in methods[:at])
+    chosen = [method(*spelled.split(":")) for spelled in choose(some, counts_electrons=False)]
+    cheaper = FORMS[: FORMS.index(chosen[0].form)]
+
+    assert len({one.form for one in chosen}) == 1
+    assert all(one.fits(some) for one in chosen)
+    for form in cheaper:
+        assert not all(one.fits(some) for one in METHODS if one.form == form)
 
 
 def test_the_exact_tier_gives_no_dn_away() -> None:
@@ -77,10 +95,12 @@ def test_the_reference_reads_like_the_method(settings: Settings) -> None:
 
 
 def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
-    own = settings("accuracy.name=mine", "accuracy.normal_error=1e-3").accuracy
+    said = ("accuracy.name=mine", "accuracy.normal_error=1e-4", "accuracy.clean_dn=1")
+    own = budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
+    stricter = budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
 
-    assert "normal:linear_float32" in choose(budget(own), counts_electrons=False)
-    assert "colour:fused_float64" in choose(budget(own), counts_electrons=False)
+    assert "normal:linear_float32" in choose(own, counts_electrons=False)
+    assert "normal:quadratic_float64" in choose(stricter, counts_electrons=False)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +204,9 @@ def test_the_distance_is_the_greatest_difference_of_the_two_distribution_functio
 def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
     """Cheapest first; the readable form last, and there is one."""
     for stage in STAGES:
-        readable = [one.readable for one in of_stage(stage)]
-        assert readable == sorted(readable)
-        assert any(readable)
+        forms = [FORMS.index(one.form) for one in of_stage(stage)]
+        assert forms == sorted(forms)
+        assert forms[-1] == FORMS.index("numpy")
 
 
 def test_a_method_is_named_once() -> None:

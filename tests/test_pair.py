@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, synthetic
+from unprocess_gen import colour, effects, fused, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
 from unprocess_gen.effects import EFFECTS
+from unprocess_gen.methods import method
 from unprocess_gen.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Plan
+from unprocess_gen.records import Pair, Plan
 from unprocess_gen.selftest import GOLDEN_PHYSICS
+from unprocess_gen.sensor import noisy_limits
+from unprocess_gen.tables import linear_table, normal_lines
 
 SENSORS = {8: (0, 255), 10: (64, 1023), 12: (240, 4095), 14: (1024, 16383), 16: (4096, 65535)}
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
@@ -192,6 +195,133 @@ def test_plans_of_different_clean_frames_are_refused_at_once(
 ) -> None:
     with pytest.raises(ValueError, match="do not share the clean frame"):
         make_pairs(scene, [plan, replace(plan, **other)])  # type: ignore[arg-type]
+
+
+# The form in float32 --------------------------------------------------------------------------------------------------
+
+
+def in_float32(srgb: np.ndarray, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
+    curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
+    limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+    return fused.make_pair(srgb, replace(plan, methods=("colour:fused_float32",)), curve, limits_dn, origin)
+
+
+def assert_within(differing: int, worst: int, sites: int) -> None:
+    """As `methods` states it."""
+    stated = method("colour", "fused_float32")
+    assert worst <= stated.clean_dn
+    assert differing <= stated.clean_changed_share * sites
+
+
+@pytest.mark.parametrize("highlight", HIGHLIGHTS)
+@pytest.mark.parametrize("camera", colour.CAMERAS)
+def test_float32_is_as_near_the_reference_as_it_says_on_a_sample_of_colours(
+    plan: Plan, camera: str, highlight: str
+) -> None:
+    codes = np.random.Generator(np.random.Philox(key=4)).integers(0, 256, (512, 1024, 3)).astype(np.uint8)
+    made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]), highlight=highlight)
+
+    apart = np.abs(in_float32(codes, made).clean.astype(int) - make_pair(codes, made).clean)
+
+    assert_within(int((apart > 0).sum()), int(apart.max()), apart.size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", colour.CAMERAS)
+def test_float32_is_as_near_the_reference_as_it_says_on_all_colours(plan: Plan, camera: str) -> None:
+    """Each colour on each of the four sites."""
+    made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
+    green, blue = np.mgrid[:256, :256]
+    differing, worst = 0, 0
+    for red in range(256):
+        codes = np.stack([np.full_like(green, red), green, blue], axis=-1).astype(np.uint8)
+        codes = codes.repeat(2, axis=0).repeat(2, axis=1)
+        apart = np.abs(in_float32(codes, made).clean.astype(int) - make_pair(codes, made).clean)
+        differing, worst = differing + int((apart > 0).sum()), max(worst, int(apart.max()))
+    assert_within(differing, worst, 4 * 2**24)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"saturated": "pinned"},
+        {"highlight": "gray_mean", "sensor_clip": "black"},
+        {"exposure_ratio": 3.0},
+        {"a_dn": 8.0034, "b_dn2": -122.69544},
+        {"a_dn": 0.0, "b_dn2": 0.0},
+        {"pattern": "GBRG"},
+    ],
+    ids=lambda options: ",".join(options) or "as it is",
+)
+@pytest.mark.parametrize("bits", SENSORS)
+def test_the_noisy_frame_in_float32_is_near_the_reference_and_counts_alike(
+    scene: np.ndarray, plan: Plan, options: dict[str, object], bits: int
+) -> None:
+    made = replace(with_sensor(plan, bits), **options)  # type: ignore[arg-type]
+
+    single, exact = in_float32(scene, made, (3, 130)), make_pair(scene, made, (3, 130))
+
+    apart = np.abs(single.noisy.astype(int) - exact.noisy)
+    assert apart.max() <= 1
+    assert (apart > 0).mean() <= (0.01 if bits == 16 else 0.002)
+    for one, other in zip(astuple(single.counts), astuple(exact.counts), strict=True):
+        assert abs(one - other) <= 0.002 * apart.size
+
+
+@pytest.mark.parametrize("bits", SENSORS)
+def test_white_is_white_and_black_is_black_in_float32(plan: Plan, bits: int) -> None:
+    ends = np.array([[[255] * 3, [0] * 3], [[0] * 3, [255] * 3]], dtype=np.uint8)
+    for camera in colour.CAMERAS.values():
+        pair = in_float32(ends, replace(with_sensor(plan, bits), rgb2cam=colour.rgb2cam(camera)))
+
+        black, white = SENSORS[bits]
+        np.testing.assert_array_equal(pair.clean, [[white, black], [black, white]])
+        assert (pair.counts.saturated, pair.counts.clean_clipped_low, pair.counts.clean_clipped_high) == (2, 0, 0)
+
+
+def test_a_tile_in_float32_is_the_same_cut_out_of_the_frame(plan: Plan, scene: np.ndarray) -> None:
+    whole = in_float32(scene, plan)
+
+    for top, left, height, width in [(0, 0, 1, 1), (7, 63, 5, 2), (8, 64, 90, 65), (11, 1, 200, 296)]:
+        tile = in_float32(scene[top : top + height, left : left + width], plan, (top, left))
+        np.testing.assert_array_equal(tile.clean, whole.clean[top : top + height, left : left + width])
+        np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
+
+
+def test_noise_far_beyond_16_bits_is_clipped_in_float32(plan: Plan) -> None:
+    gray = np.full((32, 64, 3), 128, dtype=np.uint8)
+    wide = replace(with_sensor(plan, 16), a_dn=0.0, b_dn2=1e15)
+
+    apart = np.abs(in_float32(gray, wide).noisy.astype(int) - make_pair(gray, wide).noisy)
+
+    assert apart.max() <= method("normal", "linear_float32").normal_error * np.sqrt(1e15)
+
+
+def error_of_the_lines(words: np.ndarray) -> float:
+    drawn = np.empty(words.size, dtype=np.float32)
+    fused.fill_line_normals(words, *normal_lines(), drawn)
+    return float(np.abs(drawn - effects.normals(words)).max())
+
+
+def test_normals_by_lines_are_as_near_as_they_say_on_a_dense_sample() -> None:
+    """Every 4093rd word, and both sides of every octave's and segment's edge."""
+    edges = [2**octave * (32 + segment) // 64 for octave in range(32) for segment in range(33)]
+    near = (np.array(edges)[:, None] + np.arange(-40, 41)).clip(0, 2**31 - 1).ravel().astype(np.uint32)
+    words = np.concatenate([np.arange(0, 2**32, 4093).astype(np.uint32), near, near | np.uint32(2**31)])
+
+    assert error_of_the_lines(words) <= method("normal", "linear_float32").normal_error
+
+
+@pytest.mark.slow
+def test_normals_by_lines_are_as_near_as_they_say_on_a_sixteenth_of_all_words() -> None:
+    chunk = 2**22
+    worst = max(
+        error_of_the_lines((np.arange(start, start + 16 * chunk, 16) + start // chunk // 16 % 16).astype(np.uint32))
+        for start in range(0, 2**32, 16 * chunk)
+    )
+
+    assert worst <= method("normal", "linear_float32").normal_error
 
 
 # Limits ---------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ too (the quadratics of `tables.normal_table`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from unprocess_gen.errors import ConfigError
@@ -36,12 +37,15 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One way to compute a stage; its errors are zero where they are not stated."""
+    """One way to compute a stage; its errors are zero where they are not stated.
+
+    ``form``: which of `FORMS` it belongs to.
+    """
 
     stage: str
     name: str
+    form: str
     meaning: str
-    readable: bool = False
     clean_dn: float = 0.0
     clean_changed_share: float = 0.0
     normal_error: float = 0.0
@@ -51,6 +55,11 @@ class Method:
     def spelled(self) -> str:
         """How a row names it."""
         return f"{self.stage}:{self.name}"
+
+    @property
+    def readable(self) -> bool:
+        """Whether it is a form that one can read."""
+        return self.form == "numpy"
 
     def fits(self, budget: Budget) -> bool:
         """Whether a budget can afford it."""
@@ -63,46 +72,61 @@ class Method:
         )
 
 
-FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE = 1.0, 1e-3
-FLOAT64_NORMAL, FLOAT32_NORMAL = 1.5e-7, 1e-3
+FORMS = ("float32", "float64", "numpy")
+"""Forms of a whole pair, cheapest first: the stages of one kernel are computed in its precision, all or none."""
+
+FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE = 1.0, 5e-4
+QUADRATIC_NORMAL, LINEAR_NORMAL = 1.5e-7, 3e-5
 
 
-def _float32(stage: str, name: str, meaning: str) -> Method:
-    return Method(stage, name, meaning, clean_dn=FLOAT32_CLEAN_DN, clean_changed_share=FLOAT32_CHANGED_SHARE)
+def _clean32(stage: str, name: str, meaning: str) -> Method:
+    return Method(stage, name, "float32", meaning, FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE)
 
 
 METHODS = (
-    _float32("curve", "float32_table", "the exact table, each entry rounded to float32"),
-    Method("curve", "exact_table", "tone and gamma of every code, correctly rounded to float64", readable=True),
-    _float32("colour", "fused_float32", "matrix and gains of the one channel of a site, float32"),
-    Method("colour", "fused_float64", "the same in float64, in the reference's order of operations"),
-    Method("colour", "numpy_float64", "matrix and gains of all three channels, NumPy", readable=True),
-    Method("mosaic", "at_site", "no other channel than the site's is computed"),
-    Method("mosaic", "after_colour", "the site's channel is taken from the three", readable=True),
-    Method("normal", "linear_float32", "inverse CDF, lines between table entries", normal_error=FLOAT32_NORMAL),
-    Method("normal", "quadratic_float64", "inverse CDF, quadratics", normal_error=FLOAT64_NORMAL),
-    Method("normal", "numpy_float64", "the same, NumPy", readable=True, normal_error=FLOAT64_NORMAL),
-    Method("shot", "gaussian_where_near", "a normal where that law is near enough, else counts", approximates_law=True),
-    Method("shot", "inversion", "Poisson counts by inversion, right to 2^-32"),
-    Method("shot", "numpy_inversion", "the same, NumPy", readable=True),
-    Method("effects", "fused_float64", "effects in order, row by row"),
-    Method("effects", "numpy_float64", "effects in order, NumPy", readable=True),
-    _float32("quantise", "fused_float32", "half to even, clipped, of a float32"),
-    Method("quantise", "fused_float64", "half to even, clipped"),
-    Method("quantise", "numpy_float64", "the same, NumPy", readable=True),
+    _clean32("curve", "float32_table", "the exact table, rounded to float32 with the matrix"),
+    Method("curve", "exact_table", "float64", "tone and gamma of every code, correctly rounded to float64"),
+    Method("curve", "numpy_table", "numpy", "the same table, NumPy"),
+    _clean32("colour", "fused_float32", "matrix and gains of the one channel of a site, float32"),
+    Method("colour", "fused_float64", "float64", "the same in float64, in the reference's order of operations"),
+    Method("colour", "numpy_float64", "numpy", "matrix and gains of all three channels, NumPy"),
+    Method("mosaic", "at_site_float32", "float32", "no other channel than the site's is computed"),
+    Method("mosaic", "at_site", "float64", "the same"),
+    Method("mosaic", "after_colour", "numpy", "the site's channel is taken from the three"),
+    Method("normal", "linear_float32", "float32", "inverse CDF by 1024 straight lines", normal_error=LINEAR_NORMAL),
+    Method("normal", "quadratic_float64", "float64", "inverse CDF by 1024 quadratics", normal_error=QUADRATIC_NORMAL),
+    Method("normal", "numpy_float64", "numpy", "the same, NumPy", normal_error=QUADRATIC_NORMAL),
+    Method(
+        "shot", "gaussian_where_near", "float64", "a normal where that law is near, else counts", approximates_law=True
+    ),
+    Method("shot", "inversion", "float64", "Poisson counts by inversion, right to 2^-32"),
+    Method("shot", "numpy_inversion", "numpy", "the same, NumPy"),
+    Method("effects", "fused_float32", "float32", "the noise of two-parameter profiles, float32"),
+    Method("effects", "fused_float64", "float64", "effects in order, row by row"),
+    Method("effects", "numpy_float64", "numpy", "effects in order, NumPy"),
+    _clean32("quantise", "fused_float32", "half to even above black, clipped, float32"),
+    Method("quantise", "fused_float64", "float64", "half to even, clipped"),
+    Method("quantise", "numpy_float64", "numpy", "the same, NumPy"),
 )
 """Every method, by stage, cheapest first."""
 
 STAGES = tuple(dict.fromkeys(method.stage for method in METHODS))
 
-OF_ELECTRONS = frozenset({"shot"})
+OF_COUNTS = frozenset({"shot"})
 """Stages that only noise made of counts has."""
 
 
 def choose(budget: Budget, counts_electrons: bool) -> tuple[str, ...]:
-    """Return for each stage the first method that fits, as a row names them; ConfigError where none does."""
-    stages = (stage for stage in STAGES if counts_electrons or stage not in OF_ELECTRONS)
-    return tuple(_first(stage, budget).spelled for stage in stages)
+    """Return the methods of the first form that fits, as a row names them; ConfigError where none does.
+
+    Noise made of counts has no form in float32.
+    """
+    stages = [stage for stage in STAGES if counts_electrons or stage not in OF_COUNTS]
+    for form in FORMS:
+        chosen = [_first(stage, form, budget) for stage in stages]
+        if None not in chosen:
+            return tuple(method.spelled for method in chosen if method is not None)
+    raise ConfigError(_best(stages, budget))
 
 
 def of_stage(stage: str) -> tuple[Method, ...]:
@@ -110,24 +134,30 @@ def of_stage(stage: str) -> tuple[Method, ...]:
     return tuple(method for method in METHODS if method.stage == stage)
 
 
-def _first(stage: str, budget: Budget) -> Method:
-    for method in of_stage(stage):
-        if method.fits(budget):
-            return method
-    raise ConfigError(_best(stage, budget))
+def method(stage: str, name: str) -> Method:
+    """Return a method by stage and name; KeyError where there is none."""
+    for one in of_stage(stage):
+        if one.name == name:
+            return one
+    raise KeyError(f"{stage} has no method {name}")
 
 
-def _best(stage: str, budget: Budget) -> str:
+def _first(stage: str, form: str, budget: Budget) -> Method | None:
+    fitting = (one for one in of_stage(stage) if one.form == form and one.fits(budget))
+    return next(fitting, None)
+
+
+def _best(stages: Sequence[str], budget: Budget) -> str:
     """Say what is the best that can be had, of the first number that is asked too much of."""
-    usable = [method for method in of_stage(stage) if method.readable or not budget.readable]
     for key in ("clean_dn", "clean_changed_share", "normal_error"):
-        best = min(usable, key=lambda method: float(getattr(method, key)))
-        if getattr(best, key) > getattr(budget, key):
-            return (
-                f"accuracy.{key}={getattr(budget, key):g}: the best that can be had is {getattr(best, key):g} "
-                f"({best.spelled})"
-            )
-    raise AssertionError(f"no method of {stage} fits {budget}")
+        for stage in stages:
+            best = min(of_stage(stage), key=lambda one: float(getattr(one, key)))
+            if getattr(best, key) > getattr(budget, key):
+                return (
+                    f"accuracy.{key}={getattr(budget, key):g}: the best that can be had is {getattr(best, key):g} "
+                    f"({best.spelled})"
+                )
+    raise AssertionError(f"no form fits {budget}")
 
 
 # ---------------------------------------------------------------------------------------------- Gauss for Poisson

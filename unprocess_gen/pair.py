@@ -58,7 +58,7 @@ def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[i
 
 def _is_made_of_the_clean_frame(plan: Plan) -> bool:
     """Whether the noisy frame can be made of the unrounded clean one alone."""
-    return not (plan.readable or plan.averaged or "full_well" in plan.effects)
+    return not (plan.readable or plan.in_float32 or plan.averaged or "full_well" in plan.effects)
 
 
 def _of_the_clean_frame(plan: Plan) -> tuple[object, ...]:

@@ -208,6 +208,11 @@ class Plan:
         return "colour:numpy_float64" in self.methods
 
     @property
+    def in_float32(self) -> bool:
+        """Whether the form in single precision is asked for."""
+        return "colour:fused_float32" in self.methods
+
+    @property
     def exposure(self) -> float:
         """What the light of the scene is multiplied by."""
         return 1 / self.exposure_ratio

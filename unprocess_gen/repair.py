@@ -24,7 +24,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen import selftest
 from unprocess_gen.config import Config, dataset_yaml, read_dataset_yaml, source_kind
 from unprocess_gen.errors import ConfigError, DamageError, SourceError, UnprocessGenError
 from unprocess_gen.manifest import (
@@ -42,7 +41,7 @@ from unprocess_gen.photographs import list_photographs, load
 from unprocess_gen.records import Raw, Source
 from unprocess_gen.runner import Bench, Task, make_shard, shard_tasks, tally
 from unprocess_gen.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
-from unprocess_gen.verify import Maker, expected, file_sha256, noisy_member_of, rows_by_shard, uses_physics
+from unprocess_gen.verify import Maker, expected, file_sha256, noisy_member_of, rows_by_shard
 from unprocess_gen.workspace import (
     Made,
     Workspace,
@@ -323,8 +322,6 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, asi
 def _mend_sample(writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Raw], maker: Maker) -> int:
     """Append a sample, its frames kept or made again; return how many of its pairs were kept."""
     whole = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]
-    for row in rows:
-        selftest.check(uses_physics(row))
     made = {str(row["key"]): maker.make_again(row) for row in rows if row not in whole}
     writer.add_frame(sample.key, CLEAN, kept[CLEAN] if CLEAN in kept else made[str(rows[0]["key"])].clean)
     for row in rows:

@@ -33,9 +33,10 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen import selftest
-from unprocess_gen.config import Config, dataset_yaml, patch_law, source_kind, uses_physics
+from unprocess_gen.config import Config, budget, dataset_yaml, patch_law, source_kind, uses_physics
 from unprocess_gen.errors import MachineError, SourceError
 from unprocess_gen.manifest import Row, failed_row, images, ok_row, pair_key, patch_key, row_json
+from unprocess_gen.methods import choose
 from unprocess_gen.pair import make_pairs
 from unprocess_gen.patches import cut, patches
 from unprocess_gen.photographs import list_photographs, load
@@ -318,10 +319,11 @@ def _settle(coordinator_pid: int) -> None:
 
 def _self_test(config: Config) -> str | None:
     """Return what is wrong with this process, None where nothing is; MachineError unless told to go on."""
-    physical = uses_physics(config.noise)
+    counts = uses_physics(config.noise)
+    kernels = selftest.kernels(counts, choose(budget(config.accuracy), counts))
     if config.self_test == "stop":
-        selftest.check(physical, ", or say self_test=go_on")
-    return "; ".join(selftest.failures(physical)) or None
+        selftest.check(kernels, ", or say self_test=go_on")
+    return "; ".join(selftest.failures(kernels)) or None
 
 
 WATCHDOG = "unprocess_gen watchdog"

@@ -11,7 +11,7 @@ curves are held to their digests when they are first read.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -93,6 +93,10 @@ GOLDEN_PHYSICS = Physics(
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
     "gray_mean": replace(GOLDEN_PLAN, highlight="gray_mean"),
+    "float32": replace(
+        GOLDEN_PLAN, methods=("colour:fused_float32",), bits=16, black_level_dn=4096, white_level_dn=65535
+    ),
+    "readable": replace(GOLDEN_PLAN, methods=("colour:numpy_float64",)),
     "physical": replace(
         GOLDEN_PLAN, physics=GOLDEN_PHYSICS, effects=EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3
     ),
@@ -101,31 +105,44 @@ GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
     "per_channel": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
     "gray_mean": ("b4c0b18f1bbccbf881c82b00455253e9", "16f26b70e50c70f03babed405092f5b2"),
+    "float32": ("57775dc39f9f50a4b68d4e12c49bf406", "679b912194422e64d192ce9c12a23d32"),
+    "readable": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
-PHYSICAL = ("physical",)
-"""What only a run of a physical profile tests: it takes seconds to compile where it never was."""
+PROVED_BY = {
+    "one_normal": ("per_channel", "gray_mean"),
+    "float32": ("float32",),
+    "counts": ("per_channel", "gray_mean", "physical"),
+    "readable": ("readable",),
+}
+"""Which golden pairs prove which kernels: those that are not needed would take seconds to compile."""
 
 
-def check(physical: bool, way_out: str = "") -> None:
-    """Raise MachineError, with every proof that failed, where this process computes differently.
+def kernels(counts_electrons: bool, methods: Collection[str]) -> str:
+    """Return which of `PROVED_BY` make the pairs of a plan, by its methods."""
+    if "colour:numpy_float64" in methods:
+        return "readable"
+    if counts_electrons:
+        return "counts"
+    return "float32" if "colour:fused_float32" in methods else "one_normal"
 
-    ``physical`` says whether the kernels of physical profiles are needed, and so tested too.
-    """
-    if failures(physical):
+
+def check(kernels: str, way_out: str = "") -> None:
+    """Raise MachineError, with every proof that failed, where this process computes differently."""
+    if failures(kernels):
         raise MachineError(
-            f"the self-test failed: {'; '.join(failures(physical))}; this machine computes differently from others: "
+            f"the self-test failed: {'; '.join(failures(kernels))}; this machine computes differently from others: "
             f"try other versions of numpy and numba{way_out}"
         )
 
 
-@functools.lru_cache(maxsize=2)
-def failures(physical: bool) -> tuple[str, ...]:
-    """Return each proof that failed, in words; once in a process."""
-    return tuple(_failures(physical))
+@functools.lru_cache(maxsize=4)
+def failures(kernels: str) -> tuple[str, ...]:
+    """Return each proof of some of `PROVED_BY` that failed, in words; once in a process."""
+    return tuple(_failures(kernels))
 
 
-def _failures(physical: bool) -> Iterator[str]:
+def _failures(kernels: str) -> Iterator[str]:
     try:
         _ = linear_table("smoothstep", 2.2, 256), normal_table()
     except MachineError as error:
@@ -139,9 +156,8 @@ def _failures(physical: bool) -> Iterator[str]:
     _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), rest)
     if rest.any():
         yield "a kernel multiplies and adds in one rounding"
-    for name, wanted in GOLDEN.items():
-        if name in PHYSICAL and not physical:
-            continue
+    for name in PROVED_BY[kernels]:
+        wanted = GOLDEN[name]
         pair = make_pair(golden_picture(), GOLDEN_PLANS[name], (1, 57))
         for which, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), wanted, strict=True):
             if (found := array_xxh3(frame)) != digest:

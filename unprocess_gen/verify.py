@@ -224,25 +224,16 @@ def _with_keys(manifest: Path, keys: Sequence[str]) -> Iterator[Row]:
         raise ConfigError(f"--keys {min(missing)}: {manifest} has no such key")
 
 
-def uses_physics(row: Row) -> bool:
-    """Whether a row's pair is made by the kernels of the physical effects."""
-    return row["read_law"] != "none" or row["noise_law"] == "poisson"
-
-
 def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[Replayed]:
     """Make the pairs of rows again, compare them with the rows' digests, and keep them in ``to`` if it is given.
 
     ``root`` is the folder of the sources; rows of built-in scenes need none. Failed photographs have no pair and are
-    passed over. Raises ConfigError where a row needs a folder and there is none, MachineError where this machine
-    computes differently (`selftest`).
+    passed over. Raises ConfigError and MachineError as `Maker.make` does.
     """
     maker = Maker(root)
     for row in rows:
         if row["status"] != "ok":
             continue
-        selftest.check(uses_physics(row))
-        if root is None and not _is_scene(row):
-            raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
         yield Replayed(str(row["key"]), str(row["source"]), _replay(row, maker, to))
 
 
@@ -271,7 +262,15 @@ class Maker:
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
     def make(self, row: Row) -> Pair:
-        """Return a row's pair, whatever its digests; DamageError where its source has changed."""
+        """Return a row's pair, whatever its digests.
+
+        Raises DamageError where its source has changed, ConfigError where it was made from a folder's file and there
+        is no folder, MachineError where this machine computes differently (`selftest`).
+        """
+        if self._root is None and not _is_scene(row):
+            raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
+        plan = plan_of(row)
+        selftest.check(selftest.kernels(plan.counts_electrons, plan.methods))
         try:
             sha256, photograph = self._load(row)
         except SourceError as error:
@@ -288,10 +287,10 @@ class Maker:
                 f"its {patch.width} x {patch.height} pixels from row {patch.y}, column {patch.x} on "
                 f"are not all in its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]}"
             )
-        return make_pair(pixels, plan_of(row), patch.origin)
+        return make_pair(pixels, plan, patch.origin)
 
     def make_again(self, row: Row) -> Pair:
-        """Return the pair of a row; DamageError where its source has changed, or the pair is not the row's."""
+        """Return the pair of a row; raises as `make`, and DamageError where the pair is not the row's."""
         pair = self.make(row)
         if complaint := _unlike(pair, row):
             raise DamageError(complaint)
