@@ -152,7 +152,7 @@ def doubles() -> str:
     bits, words = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
     clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
-    fused._fill_camera(codes, products[0], products[1], camera)
+    fused.fill_camera(codes, products[0], products[1], camera)
     fused._fill_light_by_gray(codes, products, np.array([0, 1]), np.array([0.37, 0.8, 0.47]), 0.9, gray)
     signal, gains = n / 999.0, np.full(count, 0.37)
     plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
@@ -172,8 +172,8 @@ def doubles() -> str:
     quantiles, blocks = fused.columns(normal_table()), count // fused.BLOCK
     fused._fill_draws(key, 0, blocks, np.uint64(3), still, half_way, std, words)
     fused._add_noise(count, half_way, words, quantiles, still, std)
-    fused._digitise(std, (0.0, 4095.0), noisy, tally)
-    fused._fill_dim(signal, gains, scene, dim, clean, tally)
+    fused.digitise(std, (0.0, 4095.0), noisy, tally)
+    fused.fill_dim(signal, gains, scene, dim, clean, tally)
     return digest(
         camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, std, noisy, tally
     )

@@ -76,19 +76,21 @@ def test_errors_and_times_are_there_where_they_can_be_measured(found: Report) ->
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
 def test_a_method_is_measured_under_a_budget_that_takes_it(method: Any) -> None:
-    assert method.spelled in choose(budget(accuracy.alone(method, TIERS)), counts_electrons=True)
+    assert method.spelled in accuracy.taken(budget(accuracy.alone(method, TIERS)))
 
 
-def test_a_methods_budget_is_exact_in_all_other_stages_of_noise() -> None:
+def test_a_method_is_measured_with_no_other_form_than_its_own() -> None:
     exact = set(choose(budget(TIERS[EXACT]), counts_electrons=True))
     for method in METHODS:
-        if method.stage in ("normal", "shot") and not method.readable:
+        if method.form == "float64":
             chosen = set(choose(budget(accuracy.alone(method, TIERS)), counts_electrons=True))
             assert len(chosen - exact) <= 1
 
 
 def test_the_tiers_of_a_method_are_those_that_take_it(found: Report) -> None:
-    assert rows_of(found, "curve")["curve:exact_table"].tier.split() == [REFERENCE, EXACT]
+    assert rows_of(found, "curve")["curve:exact_table"].tier.split() == [EXACT, "fast"]  # fast: where electrons count
+    assert rows_of(found, "curve")["curve:float32_table"].tier.split() == ["fast"]
+    assert rows_of(found, "curve")["curve:numpy_table"].tier.split() == [REFERENCE]
     assert rows_of(found, "tier")["tier:fast"].tier == "fast"
 
 

@@ -21,10 +21,10 @@ compilation are not in them; the first touch of new memory is, as it is in a run
 they would take all the time: as large as it takes for their arrays to leave the caches, as a photograph's do.
 
 The compiled form has no stages one could run alone: the curve is folded into the matrix, and no other channel exists.
-So a clean stage's time goes from the codes to the end of that stage, in kernels made of the same building blocks on
-the same small buffers: ``curve`` what looks the codes up, ``colour`` that and the gains, ``mosaic`` the same up to one
-channel a site; ``quantise`` starts from light, ``normal`` from words. Shot noise and the other effects are differences
-between whole pairs with and without them.
+So a clean stage's time goes from the codes to the end of that stage, by the kernels' own loops on the same small
+buffers: ``curve`` what looks the codes up, ``colour`` and ``mosaic``, which are one loop, that and all up to the clean
+frame; ``quantise`` reads out DN, ``normal`` starts from words. Shot noise and the other physical effects are
+differences between whole pairs with and without them.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from unprocess_gen import colour, effects, electrons
+from unprocess_gen import colour, effects, electrons, fused
 from unprocess_gen.compiled import kernel
 from unprocess_gen.config import (
     AccuracyConfig,
@@ -62,9 +62,25 @@ from unprocess_gen.config import (
     is_physical,
 )
 from unprocess_gen.errors import ConfigError, SourceError
-from unprocess_gen.fused import CHUNK, Scene, by_site, columns, fill_clean, fill_light, fill_normals, fill_signal
+from unprocess_gen.fused import (
+    CHUNK,
+    Scene,
+    Single,
+    by_site,
+    columns,
+    digitise,
+    digitise32,
+    fill_bright,
+    fill_bright32,
+    fill_camera,
+    fill_dim,
+    fill_dim32,
+    fill_line_normals,
+    fill_normals,
+    fill_signal,
+)
 from unprocess_gen.fused import scene_of as fused_scene
-from unprocess_gen.methods import METHODS, STAGES, Method, choose, gaussian_from, of_stage
+from unprocess_gen.methods import METHODS, STAGES, Budget, Method, choose, gaussian_from, of_stage
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image
@@ -72,7 +88,7 @@ from unprocess_gen.planner import facts_for
 from unprocess_gen.records import Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import quantise, to_dn
 from unprocess_gen.streams import Words
-from unprocess_gen.tables import linear_table, normal_table
+from unprocess_gen.tables import linear_table, normal_lines, normal_table
 from unprocess_gen.unprocess import camera_light, unprocess
 
 
@@ -370,18 +386,24 @@ def flat_rates(read_std_e: float, law_distance: float) -> list[float]:
 # ------------------------------------------------------------------------------------------------------- errors
 
 
+def taken(asked: Budget) -> frozenset[str]:
+    """Return the methods that a budget takes, for noise of two numbers or of counts."""
+    return frozenset(spelled for counts in (False, True) for spelled in choose(asked, counts))
+
+
 def alone(method: Method, tiers: dict[str, AccuracyConfig]) -> AccuracyConfig:
-    """Return the budget that takes a method and is exact otherwise; all readable ones where only those take it."""
+    """Return the budget that takes a method and is exact otherwise; of those that go together, all of them."""
     exact = tiers[EXACT]
-    if method.spelled in choose(budget(exact), counts_electrons=True):
+    if method.spelled in taken(budget(exact)):
         return exact
     if method.readable:
         return tiers[REFERENCE]
+    together = [one for one in METHODS if one.form == method.form and one.form != "float64"] or [method]
     return replace(
         exact,
-        clean_dn=max(exact.clean_dn, method.clean_dn),
-        clean_changed_share=max(exact.clean_changed_share, method.clean_changed_share),
-        normal_error=max(exact.normal_error, method.normal_error),
+        clean_dn=max(exact.clean_dn, *(one.clean_dn for one in together)),
+        clean_changed_share=max(exact.clean_changed_share, *(one.clean_changed_share for one in together)),
+        normal_error=max(exact.normal_error, *(one.normal_error for one in together)),
         law_distance=max(tier.law_distance for tier in tiers.values()) if method.approximates_law else 0.0,
     )
 
@@ -479,6 +501,13 @@ def quadratic_normals(words: Words) -> Float:
     return out
 
 
+def linear_normals(words: Words) -> Float:
+    """Return the float32 form's normals of uint32 words ``[n]``."""
+    out = np.empty(words.size, dtype=np.float32)
+    fill_line_normals(words, *normal_lines(), out)
+    return out.astype(np.float64)
+
+
 # -------------------------------------------------------------------------------------------------------- times
 
 Clock = Callable[[], float]
@@ -533,10 +562,35 @@ def _look_up_ns(lab: Lab, method: Method, subject: Subject) -> float:
     return clocked(lambda: _signals(srgb, scene, out), srgb.shape[0] * srgb.shape[1])
 
 
-def _light_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _look_up32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     srgb, scene = _scene(lab, subject)
-    out = np.empty(CHUNK)
-    return clocked(lambda: _lights(srgb, scene, out), srgb.shape[0] * srgb.shape[1])
+    products, out = scene.products.astype(np.float32), np.empty(CHUNK, dtype=np.float32)
+    return clocked(lambda: _signals32(srgb, products, scene.sites, out), srgb.shape[0] * srgb.shape[1])
+
+
+def _clean_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    srgb, scene = _scene(lab, subject)
+    buffers = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
+    return clocked(lambda: _cleans(srgb, scene, *buffers), srgb.shape[0] * srgb.shape[1])
+
+
+def _clean32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    srgb, scene = _scene(lab, subject)
+    single = np.float32
+    of_site = scene.gains[scene.sites], scene.headroom[scene.sites]
+    gains, headroom = (np.tile(one.astype(single), (1, CHUNK // 2)) for one in of_site)
+    products, scene32 = scene.products.astype(single), fused.scene32_of(scene, LIMITS_DN)
+    buffers = np.empty(CHUNK, single), np.empty(CHUNK, single), np.empty(CHUNK, np.uint16), np.zeros(6, np.int64)
+    return clocked(
+        lambda: _cleans32(srgb, products, scene.sites, scene32, gains, headroom, *buffers),
+        srgb.shape[0] * srgb.shape[1],
+    )
+
+
+def _numpy_curve_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    srgb = subject.readable
+    _, curve = _clean_plan(lab, srgb, subject)
+    return clocked(lambda: curve[srgb], srgb.shape[0] * srgb.shape[1])
 
 
 def _numpy_colour_ns(lab: Lab, method: Method, subject: Subject) -> float:
@@ -560,13 +614,28 @@ def _light_of(lab: Lab, subject: Subject, srgb: Srgb) -> tuple[Plan, Float]:
     return plan, unprocess(srgb, plan, curve=curve)
 
 
+LIMITS_DN = (0.0, 16383.0)
+
+
 def _round_ns(lab: Lab, method: Method, subject: Subject) -> float:
-    srgb, scene = _scene(lab, subject)
-    _, light = _light_of(lab, subject, subject.readable)
-    chunks = np.resize(light, (BUFFERS, CHUNK))
-    turns = -(-srgb.shape[0] * srgb.shape[1] // chunks.size)
-    buffers = np.empty(CHUNK), np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
-    return clocked(lambda: _cleans(chunks, turns, scene, *buffers), turns * chunks.size)
+    chunks, turns = _chunks_of_dn(lab, subject)
+    buffers = np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
+    return clocked(lambda: _digits(chunks, turns, LIMITS_DN, *buffers), turns * chunks.size)
+
+
+def _round32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    _, scene = _scene(lab, subject)
+    doubles, turns = _chunks_of_dn(lab, subject)
+    chunks, scene32 = doubles.astype(np.float32), fused.scene32_of(scene, LIMITS_DN)
+    buffers = np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
+    return clocked(lambda: _digits32(chunks, turns, scene32, *buffers), turns * chunks.size)
+
+
+def _chunks_of_dn(lab: Lab, subject: Subject) -> tuple[Float, int]:
+    """Return chunks of a photograph's DN before rounding, and how often they go round for as many as it has pixels."""
+    plan, light = _light_of(lab, subject, subject.readable)
+    chunks = np.resize(to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest), (BUFFERS, CHUNK))
+    return chunks, -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
 
 
 def _numpy_round_ns(lab: Lab, method: Method, subject: Subject) -> float:
@@ -588,6 +657,13 @@ def _quadratics_ns(lab: Lab, method: Method, subject: Subject) -> float:
     return clocked(lambda: _normals(chunks, turns, quantiles, *buffers), turns * chunks.size)
 
 
+def _lines_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    chunks = _some_words(BUFFERS * CHUNK).reshape(BUFFERS, CHUNK)
+    turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
+    out = np.empty(CHUNK, dtype=np.float32)
+    return clocked(lambda: _normals32(chunks, turns, *normal_lines(), out), turns * chunks.size)
+
+
 def _numpy_normals_ns(lab: Lab, method: Method, subject: Subject) -> float:
     words = _some_words(subject.readable.shape[0] * subject.readable.shape[1])
     return clocked(lambda: effects.normals(words), words.size)
@@ -603,23 +679,68 @@ def _signals(srgb: Srgb, scene: Scene, out: Float) -> None:
 
 
 @kernel
-def _lights(srgb: Srgb, scene: Scene, out: Float) -> None:
-    """Go from codes to the light at each site."""
-    gains, headroom = by_site(scene)
+def _signals32(srgb: Srgb, products: Single, sites: NDArray[np.int64], out: Single) -> None:
+    """As `_signals`, in float32."""
     height, width = srgb.shape[:2]
     for y in range(height):
+        even, odd = products[sites[y & 1, 0]], products[sites[y & 1, 1]]
         for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
-            fill_signal(srgb[y, start : start + n], scene, y, out)
-            fill_light(out[:n], gains[y & 1], headroom[y & 1], scene, out)
+            fill_camera(srgb[y, start : min(start + CHUNK, width)], even, odd, out)
 
 
 @kernel
-def _cleans(light: Float, turns: int, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
-    """Round chunks of light in turns."""
+def _cleans(srgb: Srgb, scene: Scene, signal: Float, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+    """Go from codes to the clean frame."""
+    site_gains, site_headroom = by_site(scene)
+    height, width = srgb.shape[:2]
+    for y in range(height):
+        gains, headroom = site_gains[y & 1], site_headroom[y & 1]
+        for start in range(0, width, CHUNK):
+            n = min(CHUNK, width - start)
+            fill_signal(srgb[y, start : start + n], scene, y, signal)
+            if fill_dim(signal, gains, scene, unrounded, clean[:n], counts):
+                fill_bright(signal, gains, headroom, scene, unrounded, clean[:n], counts)
+
+
+@kernel
+def _cleans32(
+    srgb: Srgb,
+    products: Single,
+    sites: NDArray[np.int64],
+    scene: Any,
+    site_gains: Single,
+    site_headroom: Single,
+    signal: Single,
+    unrounded: Single,
+    clean: Raw,
+    counts: NDArray[np.int64],
+) -> None:
+    """As `_cleans`, in float32."""
+    height, width = srgb.shape[:2]
+    for y in range(height):
+        even, odd = products[sites[y & 1, 0]], products[sites[y & 1, 1]]
+        gains, headroom = site_gains[y & 1], site_headroom[y & 1]
+        for start in range(0, width, CHUNK):
+            n = min(CHUNK, width - start)
+            fill_camera(srgb[y, start : start + n], even, odd, signal)
+            if fill_dim32(signal, gains, scene, unrounded, clean[:n], counts):
+                fill_bright32(signal, gains, headroom, scene, unrounded, clean[:n], counts)
+
+
+@kernel
+def _digits(chunks: Float, turns: int, limits_dn: tuple[float, float], noisy: Raw, counts: NDArray[np.int64]) -> None:
+    """Round chunks of DN in turns."""
     for _ in range(turns):
-        for chunk in range(light.shape[0]):
-            fill_clean(light[chunk], scene, unrounded, clean, counts)
+        for chunk in range(chunks.shape[0]):
+            digitise(chunks[chunk], limits_dn, noisy, counts)
+
+
+@kernel
+def _digits32(chunks: Single, turns: int, scene: Any, noisy: Raw, counts: NDArray[np.int64]) -> None:
+    """As `_digits`, in float32."""
+    for _ in range(turns):
+        for chunk in range(chunks.shape[0]):
+            digitise32(chunks[chunk], scene, noisy, counts)
 
 
 @kernel
@@ -636,6 +757,14 @@ def _normals(
         for chunk in range(chunks.shape[0]):
             words[:] = chunks[chunk]
             fill_normals(words, quantiles, bits, out)
+
+
+@kernel
+def _normals32(chunks: Words, turns: int, offsets: Single, slopes: Single, out: Single) -> None:
+    """As `_normals`, in float32."""
+    for _ in range(turns):
+        for chunk in range(chunks.shape[0]):
+            fill_line_normals(chunks[chunk], offsets, slopes, out)
 
 
 # --------------------------------------------------------------------------------------------- the table of both
@@ -669,14 +798,16 @@ def _of_normals(sampler: Callable[[Words], Float]) -> MethodError:
 
 
 MEASUREMENTS = (
-    Measurement("curve:float32_table", _of_clean, None),
+    Measurement("curve:float32_table", _of_clean, _look_up32_ns),
     Measurement("curve:exact_table", _of_clean, _look_up_ns),
-    Measurement("colour:fused_float32", _of_clean, None),
-    Measurement("colour:fused_float64", _of_clean, _light_ns),
+    Measurement("curve:numpy_table", _of_clean, _numpy_curve_ns),
+    Measurement("colour:fused_float32", _of_clean, _clean32_ns),
+    Measurement("colour:fused_float64", _of_clean, _clean_ns),
     Measurement("colour:numpy_float64", _of_clean, _numpy_colour_ns),
-    Measurement("mosaic:at_site", _of_clean, _light_ns),
+    Measurement("mosaic:at_site_float32", _of_clean, _clean32_ns),
+    Measurement("mosaic:at_site", _of_clean, _clean_ns),
     Measurement("mosaic:after_colour", _of_clean, _numpy_mosaic_ns),
-    Measurement("normal:linear_float32", None, None),
+    Measurement("normal:linear_float32", _of_normals(linear_normals), _lines_ns),
     Measurement("normal:quadratic_float64", _of_normals(quadratic_normals), _quadratics_ns),
     Measurement("normal:numpy_float64", _of_normals(effects.normals), _numpy_normals_ns),
     Measurement("shot:gaussian_where_near", _of_shot, _shot_ns),
@@ -684,7 +815,7 @@ MEASUREMENTS = (
     Measurement("shot:numpy_inversion", _of_shot, _shot_ns),
     Measurement("effects:fused_float64", _of_effects, _effects_ns),
     Measurement("effects:numpy_float64", _of_effects, _effects_ns),
-    Measurement("quantise:fused_float32", _of_clean, None),
+    Measurement("quantise:fused_float32", _of_clean, _round32_ns),
     Measurement("quantise:fused_float64", _of_clean, _round_ns),
     Measurement("quantise:numpy_float64", _of_clean, _numpy_round_ns),
 )
@@ -726,7 +857,7 @@ def _one_round(lab: Lab, subject: Subject, steps: Steps) -> Times:
 
 
 def _method_rows(lab: Lab, errors: dict[tuple[str, str], Error | None], rounds: Sequence[Times]) -> Iterator[Row]:
-    chosen = {name: choose(budget(tier), counts_electrons=True) for name, tier in lab.tiers.items()}
+    chosen = {name: taken(budget(tier)) for name, tier in lab.tiers.items()}
     for stage in STAGES:
         reference = of_stage(stage)[-1].name
         for method in of_stage(stage):

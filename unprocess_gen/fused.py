@@ -206,12 +206,12 @@ def _pair(
             if scene.by_gray:
                 fill_signal(row, scene, y, signal)
             else:
-                _fill_camera(row, even, odd, signal)
-            if _fill_dim(signal, gains, scene, clean_dn, out, counts):
-                _fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
+                fill_camera(row, even, odd, signal)
+            if fill_dim(signal, gains, scene, clean_dn, out, counts):
+                fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
             _fill_draws(key, block, blocks, np.uint64(origin[0] + y), scene, unrounded, std, drawn)
             _add_noise(blocks * BLOCK, unrounded, drawn, quantiles, scene, std)
-            _digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
+            digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
             if _may_be_still(scene):
                 counts[5] += _still(clean_dn, scene)
 
@@ -231,9 +231,9 @@ def _unprocess(srgb: Srgb, scene: Scene, unrounded: Float, clean: Raw, counts: N
             if scene.by_gray:
                 fill_signal(row, scene, y, signal)
             else:
-                _fill_camera(row, even, odd, signal)
-            if _fill_dim(signal, gains, scene, clean_dn, out, counts):
-                _fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
+                fill_camera(row, even, odd, signal)
+            if fill_dim(signal, gains, scene, clean_dn, out, counts):
+                fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
 
 
 @kernel
@@ -258,7 +258,7 @@ def _noisy(
             _copy(clean_dn[y, start:end], unrounded[first:after])
             _fill_draws(key, block, blocks, np.uint64(origin[0] + y), scene, unrounded, std, drawn)
             _add_noise(blocks * BLOCK, unrounded, drawn, quantiles, scene, std)
-            _digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
+            digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
             if _may_be_still(scene):
                 counts[5] += _still(unrounded[first:after], scene)
 
@@ -303,11 +303,11 @@ def fill_signal(row: Srgb, scene: Scene, y: int, out: Float) -> None:
         _fill_light_by_gray(row, scene.products, scene.sites[y & 1], scene.gains, scene.threshold, out)
     else:
         even, odd = _products(scene, y)
-        _fill_camera(row, even, odd, out)
+        fill_camera(row, even, odd, out)
 
 
 @kernel
-def _fill_camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
+def fill_camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
     """Linearise and apply the matrix, for the one channel that each site keeps."""
     length = row.shape[0]
     for pair in range(length // 2):
@@ -417,10 +417,8 @@ def fill_normals(
 
 
 @kernel
-def _fill_dim(
-    signal: Float, gains: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]
-) -> int:
-    """Do `fill_light` and `fill_clean` of signals that are not bright, and return how many are: see `_fill_bright`."""
+def fill_dim(signal: Float, gains: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> int:
+    """Do `fill_light` and `fill_clean` of signals that are not bright, and return how many are: see `fill_bright`."""
     black, span, _ = scene.levels_dn
     dim, exposure = scene.dim, scene.exposure
     bright, below = 0, 0
@@ -437,7 +435,7 @@ def _fill_dim(
 
 
 @kernel
-def _fill_bright(
+def fill_bright(
     signal: Float,
     gains: Float,
     headroom: Float,
@@ -580,7 +578,7 @@ def _add_noise(
 
 
 @kernel
-def _digitise(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts: NDArray[np.int64]) -> None:
+def digitise(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts: NDArray[np.int64]) -> None:
     """Round half to even, clip, cast."""
     low, high = limits_dn[0] + ROUND, limits_dn[1] + ROUND
     below, above = 0, 0
@@ -622,7 +620,7 @@ def read_out(
     if scene.pinned_dn < np.inf:
         for x in range(unrounded.shape[0]):
             noisy_dn[x] = scene.pinned_dn if unrounded[x] >= scene.pinned_dn else noisy_dn[x]
-    _digitise(noisy_dn, limits_dn, noisy, counts)
+    digitise(noisy_dn, limits_dn, noisy, counts)
     if _may_be_still(scene):
         counts[5] += _still(unrounded, scene)
 
@@ -660,7 +658,8 @@ class _Scene32(NamedTuple):
     high: np.float32
 
 
-def _scene32(scene: Scene, limits_dn: tuple[float, float]) -> _Scene32:
+def scene32_of(scene: Scene, limits_dn: tuple[float, float]) -> _Scene32:
+    """Return what the loops in float32 need of a scene."""
     black, span, _ = scene.levels_dn
     f = np.float32
     return _Scene32(
@@ -684,7 +683,7 @@ def _make_pair32(srgb: Srgb, plan: Plan, curve: Float, limits_dn: tuple[float, f
     offsets, slopes = normal_lines()
     _pair32(
         np.ascontiguousarray(srgb), products, scene.sites, scene.gains.astype(np.float32), scene.by_gray,
-        _scene32(scene, limits_dn), gains, headroom, key, origin, offsets, slopes, clean, noisy, counts,
+        scene32_of(scene, limits_dn), gains, headroom, key, origin, offsets, slopes, clean, noisy, counts,
     )  # fmt: skip
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
@@ -721,14 +720,14 @@ def _pair32(
             if by_gray:
                 _fill_light_by_gray32(srgb[y, start:end], products, site, channel_gains, scene, signal)
             else:
-                _fill_camera(srgb[y, start:end], even, odd, signal)
+                fill_camera(srgb[y, start:end], even, odd, signal)
             unrounded, out = clean_dn[first:after], clean[y, start:end]
-            if _fill_dim32(signal, gains, scene, unrounded, out, counts):
-                _fill_bright32(signal, gains, headroom, scene, unrounded, out, counts)
-            _fill_words32(key, block, blocks, np.uint64(origin[0] + y), words)
-            _fill_draws32(blocks * BLOCK, words, clean_dn, scene, std, index)
-            _add_noise32(blocks * BLOCK, clean_dn, index, offsets, slopes, std)
-            _digitise32(std[first:after], scene, noisy[y, start:end], counts)
+            if fill_dim32(signal, gains, scene, unrounded, out, counts):
+                fill_bright32(signal, gains, headroom, scene, unrounded, out, counts)
+            fill_words32(key, block, blocks, np.uint64(origin[0] + y), words)
+            fill_draws32(blocks * BLOCK, words, clean_dn, scene, std, index)
+            add_noise32(blocks * BLOCK, clean_dn, index, offsets, slopes, std)
+            digitise32(std[first:after], scene, noisy[y, start:end], counts)
             if scene.a < _0F or scene.b <= _0F:
                 counts[5] += _still32(unrounded, scene)
 
@@ -750,10 +749,10 @@ def _fill_light_by_gray32(
 
 
 @kernel
-def _fill_dim32(
+def fill_dim32(
     signal: Single, gains: Single, scene: _Scene32, clean_dn: Single, clean: Raw, counts: NDArray[np.int64]
 ) -> int:
-    """`_fill_dim` in float32."""
+    """`fill_dim` in float32."""
     dim, exposure, span, black = scene.dim, scene.exposure, scene.span, scene.black
     bright, below = np.int32(0), np.int32(0)
     for x in range(clean.shape[0]):
@@ -769,7 +768,7 @@ def _fill_dim32(
 
 
 @kernel
-def _fill_bright32(
+def fill_bright32(
     signal: Single,
     gains: Single,
     headroom: Single,
@@ -778,7 +777,7 @@ def _fill_bright32(
     clean: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """`_fill_bright` in float32, and of all blocks."""
+    """`fill_bright` in float32, and of all blocks."""
     threshold, above_threshold, exposure, limit = scene.threshold, scene.above_threshold, scene.exposure, scene.limit
     brightest, clipped, span, black = scene.brightest, scene.clipped, scene.span, scene.black
     above, saturated = np.int32(0), np.int32(0)
@@ -802,7 +801,7 @@ def _low16_32(rounded: np.float32, black: np.uint32) -> np.uint16:
 
 
 @kernel
-def _fill_words32(key: Key, first_block: int, blocks: int, y: np.uint64, out: Indices) -> None:
+def fill_words32(key: Key, first_block: int, blocks: int, y: np.uint64, out: Indices) -> None:
     """`_fill_blocks` for half the memory."""
     for block in range(blocks):
         counter = np.uint64((first_block + block) * LANES)
@@ -842,7 +841,8 @@ def fill_line_normals(words: Indices, offsets: Single, slopes: Single, out: Sing
 
 
 @kernel
-def _fill_draws32(count: int, words: Indices, clean_dn: Single, scene: _Scene32, std: Single, index: Single) -> None:
+def fill_draws32(count: int, words: Indices, clean_dn: Single, scene: _Scene32, std: Single, index: Single) -> None:
+    """Fill ``std`` with the noise's deviation, signed as the draw is, and ``index`` with the draw's."""
     a, b, pinned_dn = scene.a, scene.b, scene.pinned_dn
     for x in range(count):
         root = np.sqrt(max(a * clean_dn[x] + b, _0F))
@@ -852,16 +852,16 @@ def _fill_draws32(count: int, words: Indices, clean_dn: Single, scene: _Scene32,
 
 
 @kernel
-def _add_noise32(
-    count: int, clean_dn: Single, index: Single, offsets: Single, slopes: Single, noisy_dn: Single
-) -> None:
+def add_noise32(count: int, clean_dn: Single, index: Single, offsets: Single, slopes: Single, noisy_dn: Single) -> None:
+    """Replace signed deviations by the clean frame plus noise."""
     for x in range(count):
         line = _line_of(index[x])
         noisy_dn[x] = clean_dn[x] + noisy_dn[x] * (offsets[line] + slopes[line] * index[x])
 
 
 @kernel
-def _digitise32(noisy_dn: Single, scene: _Scene32, noisy: Raw, counts: NDArray[np.int64]) -> None:
+def digitise32(noisy_dn: Single, scene: _Scene32, noisy: Raw, counts: NDArray[np.int64]) -> None:
+    """Round half to even above black, clip, cast."""
     low, high, black = scene.low, scene.high, scene.black
     first, last = low + _ROUND32, high + _ROUND32
     below, above = np.int32(0), np.int32(0)

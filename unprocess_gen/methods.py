@@ -101,7 +101,6 @@ METHODS = (
     ),
     Method("shot", "inversion", "float64", "Poisson counts by inversion, right to 2^-32"),
     Method("shot", "numpy_inversion", "numpy", "the same, NumPy"),
-    Method("effects", "fused_float32", "float32", "the noise of two-parameter profiles, float32"),
     Method("effects", "fused_float64", "float64", "effects in order, row by row"),
     Method("effects", "numpy_float64", "numpy", "effects in order, NumPy"),
     _clean32("quantise", "fused_float32", "half to even above black, clipped, float32"),
@@ -112,7 +111,7 @@ METHODS = (
 
 STAGES = tuple(dict.fromkeys(method.stage for method in METHODS))
 
-OF_COUNTS = frozenset({"shot"})
+OF_COUNTS = frozenset({"shot", "effects"})
 """Stages that only noise made of counts has."""
 
 
