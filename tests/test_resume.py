@@ -8,6 +8,7 @@ import os
 import random
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -611,3 +612,42 @@ def test_an_out_that_vanishes_is_the_machines_failure(
     monkeypatch.setattr(runner, "run_tasks", vanishing)
     with pytest.raises(MachineError, match=r"the folder is gone"):
         make(fill(tmp_path / "p", 1), tmp_path / "ds")
+
+
+# A million rows -------------------------------------------------------------------------------------------------------
+
+MERGE = """
+import json, os, resource, sys
+from pathlib import Path
+from unprocess_gen.manifest import NAMES, read_rows
+from unprocess_gen.runner import tally
+from unprocess_gen.workspace import Workspace
+
+out, shards = Path(sys.argv[1]), int(sys.argv[2])
+row = next(read_rows(Path(sys.argv[3])))
+record = {"entry": {"file": None, "bytes": 0, "sha256": None}, "rows": [[row[name] for name in NAMES]] * 100}
+with Workspace(out, "seed: 0\\n") as workspace:
+    workspace.open()
+    workspace.begin([])
+    first = workspace._rows_path(0)
+    first.write_text(json.dumps(record))
+    for shard in range(1, shards):
+        os.link(first, workspace._rows_path(shard))
+    tally(workspace.all_rows(shards, {}))
+    workspace.finish(shards, {}, {"pairs": 100 * shards, "failed": {}})
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, sum(1 for _ in (out / "manifest.csv").open("rb")))
+"""
+
+
+@pytest.mark.slow
+def test_a_million_rows_are_merged_in_the_memory_of_a_thousand(tmp_path: Path) -> None:
+    """The rows of committed shards, simulated: what else a run does with each is bounded by its shard."""
+    manifest = str(Path(__file__).parents[1] / "manifests" / "scenes_imx385_iso3200.csv")
+    peaks_kib = []
+    for shards in (10, 10_000):
+        command = [sys.executable, "-c", MERGE, str(tmp_path / f"ds{shards}"), str(shards), manifest]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        peak_kib, lines = map(int, done.stdout.split())
+        assert lines == 100 * shards + 1
+        peaks_kib.append(peak_kib)
+    assert peaks_kib[1] - peaks_kib[0] < 30_000
