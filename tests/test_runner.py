@@ -459,6 +459,13 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(
     assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)
 
 
+def test_the_first_run_of_a_machine_says_that_it_compiles_and_no_other(cli: Cli, tmp_path: Path) -> None:
+    line = "compiling the kernels first: some ten seconds, once on a machine"
+    said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
+
+    assert [line in one for one in said] == [True, False]
+
+
 def test_the_summary_adds_up_the_manifests_counts(dataset: Path) -> None:
     rows = [sample.row for sample in RawPairs(dataset)]
     known = facts(dataset)["sites"]

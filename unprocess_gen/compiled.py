@@ -25,6 +25,14 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Whether a kernel's machine code lies ready; True where that cannot be told."""
+    try:
+        return bool(cast(Any, function)._cache._cache_file._load_index())
+    except (AttributeError, OSError):
+        return True
+
+
 def _compiled(function: Callable[..., Any], **more: bool) -> Callable[..., Any]:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, **more}
     try:

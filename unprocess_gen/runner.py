@@ -120,6 +120,8 @@ def generate(config: Config) -> Summary:
         given_up: dict[int, Made] = {}
         warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
+            if todo and not selftest.are_compiled(_kernels(config)):
+                progress.say_compiling()
             for made in run_tasks(bench, todo, n_jobs):
                 if made.killer is None:
                     workspace.commit(made)
@@ -317,10 +319,15 @@ def _settle(coordinator_pid: int) -> None:
         threading.Thread(target=_end_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
 
 
+def _kernels(config: Config) -> str:
+    """Return which of `selftest.PROVED_BY` a run needs."""
+    counts = uses_physics(config.noise)
+    return selftest.kernels(counts, choose(budget(config.accuracy), counts))
+
+
 def _self_test(config: Config) -> str | None:
     """Return what is wrong with this process, None where nothing is; MachineError unless told to go on."""
-    counts = uses_physics(config.noise)
-    kernels = selftest.kernels(counts, choose(budget(config.accuracy), counts))
+    kernels = _kernels(config)
     if config.self_test == "stop":
         selftest.check(kernels, ", or say self_test=go_on")
     return "; ".join(selftest.failures(kernels)) or None
@@ -354,6 +361,17 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
+
+    def say_compiling(self) -> None:
+        """Say why nothing happens yet."""
+        self._bar.set_postfix_str("compiling the kernels, once on a machine")
+        if self._plain:
+            print(
+                f"gen-dataset: {self._done}/{self._total} images, compiling the kernels first: some ten seconds, once "
+                "on a machine",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def advance(self, rows: Iterable[Row]) -> None:
         """Count the images of a committed shard."""

@@ -16,7 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from unprocess_gen.compiled import kernel
+from unprocess_gen import electrons, fused
+from unprocess_gen.compiled import is_kept, kernel
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import MachineError
 from unprocess_gen.pair import make_pair
@@ -116,6 +117,20 @@ PROVED_BY = {
     "readable": ("readable",),
 }
 """Which golden pairs prove which kernels: those that are not needed would take seconds to compile."""
+
+
+OUTER = {
+    "one_normal": (fused._pair,),
+    "float32": (fused._pair32,),
+    "counts": (fused._pair, electrons._physical_pair),
+    "readable": (),
+}
+"""The kernels that bring all others of their kind with them."""
+
+
+def are_compiled(kernels: str) -> bool:
+    """Whether the machine code of some of `PROVED_BY` lies ready, so that the first pair does not wait for it."""
+    return all(is_kept(kernel) for kernel in OUTER[kernels])
 
 
 def kernels(counts_electrons: bool, methods: Collection[str]) -> str:
