@@ -226,6 +226,18 @@ def test_float32_is_as_near_the_reference_as_it_says_on_a_sample_of_colours(
     assert_within(int((apart > 0).sum()), int(apart.max()), apart.size)
 
 
+@pytest.mark.parametrize("camera", colour.CAMERAS)
+def test_float32_is_as_near_the_reference_as_it_says_on_all_grays_of_16_bits(plan: Plan, camera: str) -> None:
+    """Each gray on each of the four sites."""
+    made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
+    grays = np.arange(2**16, dtype=np.uint16).repeat(2)
+    codes = np.broadcast_to(grays[None, :, None], (2, grays.size, 3)).copy()
+
+    apart = np.abs(in_float32(codes, made).clean.astype(int) - make_pair(codes, made).clean)
+
+    assert_within(int((apart > 0).sum()), int(apart.max()), apart.size)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 def test_float32_is_as_near_the_reference_as_it_says_on_all_colours(plan: Plan, camera: str) -> None:
