@@ -74,7 +74,7 @@ def test_time_is_divided_by_the_workers(settings: Settings, tmp_path: Path) -> N
 def test_a_photograph_that_fails_takes_no_bytes_and_keeps_its_reason(settings: Settings, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
     told = forecast(settings(f"source.root={tmp_path / 'p'}"), 1, read_all=True)
-    assert (told.bytes, told.looks[0].reason, told.looks[0].plan) == (0, "empty", None)
+    assert (told.bytes, told.looks[0].reason, told.looks[0].levels) == (0, "empty", ())
 
 
 def test_free_bytes_are_those_of_the_nearest_folder_that_exists(settings: Settings, tmp_path: Path) -> None:
@@ -96,6 +96,17 @@ def test_skipped_effects_are_told_with_their_reason(settings: Settings, tmp_path
 def test_shadows_without_noise_are_told(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=imx385_iso3200_rvdd")
     assert "no noise up to 15.33 DN above black" in text(config, forecast(config, 1, True))
+
+
+def test_every_noise_level_is_told(door: Door, tmp_path: Path) -> None:
+    levels = "noise.levels=[{a: 1, b: 2},{a: 30, b: 900}]"
+    told = door("plan", "source.limit=1", "noise=heteroscedastic", levels, f"out={tmp_path}/ds").out
+    assert "a=1, b=2; a=30, b=900 (" in told
+    assert "a_dn 1 to 30, b_dn2 2 to 900" in told
+
+    told = door("plan", "source.limit=1", "noise=nikon_d850", "noise.levels=[100,6400]", f"out={tmp_path}/ds").out
+    assert "ISO 100 to 6400" in told
+    assert " of 2 " in told
 
 
 def test_an_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:

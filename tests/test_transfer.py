@@ -67,6 +67,25 @@ def test_a_pair_with_no_range_of_signal_is_passed_over() -> None:
     assert transfer.fit(flat, flat, row) is None
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [("noise=none",), ("effects.heteroscedastic=off",), ("noise=heteroscedastic", "noise.a=0.02", "noise.b=0.01")],
+)
+def test_noise_that_rounding_hides_is_no_damage(
+    overrides: tuple[str, ...], make: Make, door: Door, tmp_path: Path
+) -> None:
+    """Below 0.7 DN rounding is no noise of its own."""
+    make(None, tmp_path / "ds", "source.limit=1", *overrides)
+    done = door("verify", tmp_path / "ds", "--noise")
+    assert (done.code, done.err) == (0, "")
+
+
+def test_a_variance_below_zero_is_none(make: Make, door: Door, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.limit=1", "noise=imx385_iso3200_rvdd")
+    done = door("verify", tmp_path / "ds", "--noise")
+    assert (done.code, done.err) == (0, "")
+
+
 def test_the_command_says_how_far_the_worst_pair_lies(scenes: Path, door: Door, tmp_path: Path) -> None:
     done = door("verify", scenes, "--noise", "--to", tmp_path / "curves.png")
     assert done.code == 0

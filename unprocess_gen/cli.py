@@ -213,7 +213,12 @@ def _plan(config: Config, read_all: bool) -> tuple[int, None]:
 
 
 def accuracy(arguments: list[str]) -> int:
-    """``gen-dataset accuracy [overrides]``: measure error and time of every method and tier, and report in ``out``."""
+    """``gen-dataset accuracy [overrides]``: measure error and time of every method and tier, and report in ``out``.
+
+    Which is ``accuracy`` unless it is said: a report is no dataset.
+    """
+    if not any(argument.startswith("out=") for argument in arguments):
+        arguments = [*arguments, "out=accuracy"]
     return compose(arguments, lambda config: _accuracy(config, shlex.join(["gen-dataset", "accuracy", *arguments])))
 
 

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from unprocess_gen import accuracy
-from unprocess_gen.config import AccuracyConfig, Config, is_physical, patch_law
+from unprocess_gen.config import AccuracyConfig, Config, is_physical, noise_levels, patch_law
 from unprocess_gen.errors import SourceError
 from unprocess_gen.manifest import json_size
-from unprocess_gen.pair import make_pair, make_pairs
+from unprocess_gen.pair import make_pairs
 from unprocess_gen.patches import cut, patches, pixels_in_none
 from unprocess_gen.photographs import list_photographs, load, spread
-from unprocess_gen.plan import plan_image, plan_pairs, plan_with_reasons
+from unprocess_gen.plan import plan_pairs, plan_with_reasons
 from unprocess_gen.planner import COST_NS, Prediction, facts_for
 from unprocess_gen.records import Plan, Source
 from unprocess_gen.shards import array_xxh3, image_bytes, shard_bytes
@@ -33,7 +33,8 @@ SAMPLE = 16
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What one photograph would give: the bytes of its pairs (0 where it fails), the time, its plan or the reason.
+    """What one photograph would give: the bytes of its pairs (0 where it fails), the time, the plans of its
+    noise levels or the reason.
 
     ``predictions``: what was decided about each effect of a physical profile, and why. ``patches`` and ``pairs`` are
     how many it gives, ``pixels`` and ``left_out`` how many it has and how many of them lie in no patch; ``complaint``
@@ -43,9 +44,9 @@ class Look:
     source: Source
     bytes: int
     seconds: float
-    plan: Plan | None
+    levels: tuple[Plan, ...]
     reason: str | None
-    predictions: tuple[Prediction, ...] = ()
+    predictions: tuple[tuple[Prediction, ...], ...] = ()
     patches: int = 0
     pairs: int = 0
     pixels: int = 0
@@ -103,7 +104,7 @@ def look(config: Config, source: Source) -> Look:
     try:
         sha256, photograph = load(config.source, source)
     except SourceError as error:
-        return Look(source, 0, time.perf_counter() - started, None, error.reason, complaint=error.text)
+        return Look(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *identity, facts, source.frame)
     height, width = photograph.srgb.shape[:2]
@@ -116,16 +117,17 @@ def look(config: Config, source: Source) -> Look:
     json_bytes = json_size(source.name, len(plans))
     size = sum(image_bytes(patch.width, patch.height, json_bytes, len(plans)) for patch in cuts)
     seconds = time.perf_counter() - started
-    _, predictions = plan_with_reasons(config, *identity, facts)
+    told = [plan_with_reasons(config, *identity, facts, level) for level in range(len(noise_levels(config.noise)))]
+    levels, predictions = tuple(plan for plan, _ in told), tuple(of_level for _, of_level in told)
     pixels, left_out = width * height, pixels_in_none(cuts, height, width)
     pairs = len(cuts) * len(plans)
-    return Look(source, size, seconds, plans[0], None, predictions, len(cuts), pairs, pixels, left_out)
+    return Look(source, size, seconds, levels, None, predictions, len(cuts), pairs, pixels, left_out)
 
 
 def _prices(config: Config, looks: tuple[Look, ...], tiers: Mapping[str, AccuracyConfig]) -> dict[str, float]:
     """Measure what accuracy costs on the first photograph that can be read."""
     for one in looks:
-        if one.plan is not None:
+        if one.levels:
             return accuracy.prices(config, dict(tiers), load(config.source, one.source)[1].srgb)
     return {}
 
@@ -133,7 +135,8 @@ def _prices(config: Config, looks: tuple[Look, ...], tiers: Mapping[str, Accurac
 def _warm_up(config: Config) -> None:
     """Have the machine code ready, so that its compilation is not taken for the price of an image."""
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
-    make_pair(srgb, plan_image(config, "0" * 64, facts=facts_for(config, srgb)))
+    for _ in make_pairs(srgb, plan_pairs(config, "0" * 64, facts=facts_for(config, srgb))):
+        pass
 
 
 def _existing(path: Path) -> Path:
@@ -206,15 +209,17 @@ def _failures(config: Config, told: Forecast) -> list[str]:
 
 
 def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
-    plans = [one.plan for one in looks if one.plan is not None]
+    plans = [plan for one in looks for plan in one.levels]
     if not plans:
         return []
     if is_physical(config.noise):
-        return [*_physical(config, plans), *_table([one.predictions for one in looks if one.plan is not None])]
+        return [*_physical(config, plans), *_table([of_level for one in looks for of_level in one.predictions])]
     sensor, noise, first = config.sensor, config.noise, plans[0]
     profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
+    levels = noise_levels(noise)
+    numbers = "; ".join(dict.fromkeys(f"a={one.a}, b={one.b}" for one in levels))
     lines = [
-        f"noise     {noise.name}: a={noise.a}, b={noise.b} ({noise.units}, black {profile_levels[0]} "
+        f"noise     {noise.name}: {numbers} ({noise.units}, black {profile_levels[0]} "
         f"{noise.black}, white {profile_levels[1]})",
         f"          on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}): "
         f"a_dn {_span([plan.a_dn for plan in plans])}, b_dn2 {_span([plan.b_dn2 for plan in plans])}",

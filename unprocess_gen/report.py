@@ -35,7 +35,7 @@ OF_A_DATASET = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work"
 
 
 def check_out(out: Path) -> None:
-    """Make the folder of a report; ConfigError where it cannot be written, holds a dataset, or nothing can be drawn."""
+    """Refuse a folder that cannot be written or holds a dataset, and where nothing can be drawn: ConfigError."""
     if find_spec("matplotlib") is None:
         raise ConfigError("accuracy: drawing needs matplotlib; pip install 'unprocess_gen[figures]'")
     for name in OF_A_DATASET:
@@ -43,11 +43,10 @@ def check_out(out: Path) -> None:
             raise ConfigError(
                 f"out={out}: holds a dataset ({name}), where a report would be damage; choose another out"
             )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"out={out}: cannot be written ({error.strerror})") from error
-    if not os.access(out, os.W_OK | os.X_OK):
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise ConfigError(f"out={out}: cannot be written ({there} is no folder)")
+    if not os.access(there, os.W_OK | os.X_OK):
         raise ConfigError(f"out={out}: cannot be written (Permission denied)")
 
 
@@ -56,6 +55,7 @@ def write(report: Report, out: Path) -> None:
     picture = png(report.rows)
     contents = (csv_text(report.rows).encode(), picture, page(report, picture).encode())
     try:
+        out.mkdir(parents=True, exist_ok=True)
         for name, content in zip(FILES, contents, strict=True):
             (out / name).write_bytes(content)
     except OSError as error:

@@ -81,6 +81,8 @@ def shard_bytes(pairs: list[int]) -> int:
     return sum(pairs) + len(END) if pairs else 0
 
 
+_sync_data = getattr(os, "fdatasync", os.fsync)  # not everywhere is there one for the data alone
+
 MOST_UNDERWAY = 2**26
 SYNC_BYTES = 2**25
 """Synced so often beside the work, so that little is left to sync when a shard is put into place."""
@@ -156,7 +158,7 @@ class ShardWriter:
         self._put(views)
         self._unsynced += sum(map(len, views))
         if self._unsynced >= SYNC_BYTES:
-            os.fdatasync(self._file.fileno())
+            _sync_data(self._file.fileno())
             self._unsynced = 0
 
     def _put(self, views: Sequence[memoryview]) -> None:

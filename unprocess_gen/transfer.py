@@ -27,6 +27,9 @@ ROUNDING_VARIANCE = 1 / 6
 REACH = 5.0
 """Sites are taken where the sensor's ends lie this many deviations away."""
 
+LEAST_VARIANCE = 0.7**2
+"""DN²: below it rounding is no noise of its own, and what rounding adds is no longer 1/6."""
+
 ALARM = 6.0
 """Standard errors at which a fit is called wrong: 2e-9 by chance, for any one of them."""
 
@@ -112,13 +115,13 @@ def fit(clean: Raw, noisy: Raw, row: Row) -> Fit | None:
     )
     dn = np.arange(codes)
     signal = np.maximum(dn - black, 0.0)
-    law = slope * signal + intercept + (prnu * signal) ** 2 + ROUNDING_VARIANCE
+    noise = np.maximum(slope * signal + intercept, 0.0) + (prnu * signal) ** 2
+    law = noise + ROUNDING_VARIANCE
     reach = REACH * np.sqrt(law)
     high = 2.0 ** _number(row, "bits") - 1
     low = black if row["sensor_clip"] == "black" else 0.0
-    used = (
-        (count >= 16) & (dn - reach > low) & (dn + reach < high) & (dn < _number(row, "white_level_dn")) & (dn > black)
-    )
+    inside = (dn - reach > low) & (dn + reach < high) & (dn < _number(row, "white_level_dn")) & (dn > black)
+    used = inside & (count >= 16) & (noise >= LEAST_VARIANCE)
     if int(used.sum()) < 3:
         return None
     count, signal, law = count[used], signal[used], law[used]
