@@ -33,13 +33,14 @@ from unprocess_gen.manifest import ok_row, plan_of, read_rows, write_rows
 from unprocess_gen.pair import make_pair, reference_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_of
-from unprocess_gen.records import Physics, Plan, Source, Srgb
+from unprocess_gen.records import Patch, Physics, Plan, Source, Srgb
 from unprocess_gen.sensor import noisy_limits, to_dn
 from unprocess_gen.tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
 from unprocess_gen.unprocess import unprocess
 
 Settings = Callable[..., Config]
 SHA256 = "7" * 64
+WHOLE = Patch(number=0, y=0, x=0, height=33, width=61)
 
 ISOS = {
     "imx385": 3200, "sony_a7s2": 800, "nikon_d850": 1600, "canon_5d4": 400, "canon_70d": 3200, "canon_700d": 6400,
@@ -254,7 +255,7 @@ def test_a_row_alone_gives_the_same_pair_again(settings: Settings, noise: str, f
     overrides = (f"noise={noise}", "scene=low_light", f"noise.iso={ISOS[noise]}", "sensor.units=7")
     plan = planned(settings, picture(), *overrides, forced=forced)
     pair = make_pair(picture(), plan)
-    row = ok_row("00000000", Source(0, "a.png", "a.png", 1), SHA256, 1, 0, plan, pair, ("0" * 32, "0" * 32))
+    row = ok_row("00000000", Source(0, "a.png", "a.png", 1), SHA256, 1, 0, plan, pair, ("0" * 32, "0" * 32), WHOLE)
     stream = io.StringIO(newline="")
     write_rows(stream, [row])
     (tmp_path / "m.csv").write_text(stream.getvalue(), encoding="utf-8", newline="")
@@ -951,8 +952,7 @@ def test_so_many_bodies_are_shared_by_all_images(settings: Settings) -> None:
 
 def test_fields_of_a_physics_are_all_in_the_row() -> None:
     """A number that the row does not hold could not be replayed."""
-    row = ok_row(
-        "00000000", Source(0, "a", "a", 1), SHA256, 1, 0, made(), make_pair(flat(0, 2, 2), made()), ("0" * 32, "0" * 32)
-    )
+    pair = make_pair(flat(0, 2, 2), made())
+    row = ok_row("00000000", Source(0, "a", "a", 1), SHA256, 1, 0, made(), pair, ("0" * 32, "0" * 32), WHOLE)
     for field in dataclasses.fields(Physics):
         assert field.name in row or f"{field.name}_00" in row
