@@ -173,7 +173,7 @@ def doubles() -> str:
     fused._fill_draws(key, 0, blocks, np.uint64(3), still, half_way, std, words)
     fused._add_noise(count, half_way, words, quantiles, still, std)
     fused._digitise(std, (0.0, 4095.0), noisy, tally)
-    fused._fill_dim(signal, gains, scene, dim, clean, tally)
+    fused.fill_dim(signal, gains, scene, dim, clean, tally)
     return digest(
         camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, std, noisy, tally
     )

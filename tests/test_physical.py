@@ -157,6 +157,41 @@ def test_fast_form_equals_the_reference_on_sixteen_bits(everything: Plan, fixed:
         assert_same(srgb, replace(averaged(everything, fixed), bits=bits, black_level_dn=black, white_level_dn=white))
 
 
+PLAIN = ("shot", "read", "row", "black_error", "quantise")
+"""Effects that have a kernel of their own."""
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 511), (3, 512), (2, 577), (2, 1100), (97, 1)])
+@pytest.mark.parametrize(("bits", "black", "white"), [(16, 4096, 65535), (14, 0, 16383), (8, 0, 255)])
+def test_shot_and_read_noise_alone_equal_the_reference(
+    everything: Plan, shape: tuple[int, int], bits: int, black: int, white: int
+) -> None:
+    """Of rates from none, and hardly any, to millions."""
+    srgb = np.random.Generator(np.random.Philox(key=3)).integers(0, 65536, (*shape, 3)).astype(np.uint16)
+    srgb[:, : shape[1] // 8] = 0
+    srgb[:, -1:] >>= 14
+    plan = replace(everything, effects=PLAIN, bits=bits, black_level_dn=black, white_level_dn=white)
+    for dn_per_e, ratio, law in (
+        (1e-3, 1.0, "gaussian"),
+        (0.7, 1.0, "tukey"),
+        (40.0, 3.0, "tukey"),
+        (4.0, 1e25, "gaussian"),
+    ):
+        one = with_physics(plan, dn_per_e=dn_per_e, read_law=law, read_shape=-0.1, read_std_dn=1.3)
+        one = replace(one, exposure_ratio=ratio, a_dn=dn_per_e, b_dn2=1.69)
+        assert_same(srgb, one, (1001, 1007))
+        assert_noisy_alone(srgb, one, (0, 63))
+
+
+def test_a_tile_of_shot_and_read_noise_is_the_same_cut_out_of_the_frame(everything: Plan) -> None:
+    plan = replace(everything, effects=PLAIN)
+    whole = make_pair(picture(), plan)
+    for top, left in ((0, 1), (7, 15), (31, 60)):
+        np.testing.assert_array_equal(
+            make_pair(picture()[top:, left:], plan, (top, left)).noisy, whole.noisy[top:, left:]
+        )
+
+
 def number(low: float, high: float) -> st.SearchStrategy[float]:
     """Numbers from low to high; 0 or above a billionth, so that no product of two underflows."""
     return st.floats(low, high) if low else st.just(0.0) | st.floats(1e-9, high)

@@ -86,7 +86,7 @@ def test_a_philox_with_another_constant_is_found(monkeypatch: pytest.MonkeyPatch
 
 
 KERNELS = (
-    *("_fill_camera", "_fill_light_by_gray", "_fill_dim", "_fill_bright"),
+    *("_fill_camera", "_fill_light_by_gray", "fill_dim", "fill_bright"),
     *("_fill_draws", "_add_noise", "_digitise"),
 )
 
