@@ -47,8 +47,19 @@ from unprocess_gen.fused import (
     read_out,
     scene_of,
 )
+from unprocess_gen.methods import gaussian_from
 from unprocess_gen.normals import Quantiles, exact_normal, normal_quantiles, quantiles, quick_normals
-from unprocess_gen.poisson import Room, flag, list_open, poisson_tables, room_for, settle, short_counts
+from unprocess_gen.poisson import (
+    Room,
+    all_near_normal,
+    flag,
+    list_open,
+    normal_counts,
+    poisson_tables,
+    room_for,
+    settle,
+    short_counts,
+)
 from unprocess_gen.poisson import Tables as PoissonTables
 from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.records import Counts, Float, Pair, Physics, Plan, Raw, Srgb
@@ -136,6 +147,7 @@ class _Body(NamedTuple):
     dead_below: np.uint64
     read_purpose: np.uint64
     key: Key
+    reach: tuple[np.float32, np.float32]  # roots of the mean electrons between which shot noise is made of counts
 
 
 def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
@@ -147,6 +159,7 @@ def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
             a_dn or 1.0, np.ones((1, 1), np.float32), False, False, a_dn > 0, False, 0.0, 0.0, np.uint64(0), 0.0,
             exponential_levels(), np.inf, float(np.sqrt(max(b_dn2, 0.0))), normal_quantiles(),
             np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, CHUNK)), np.uint64(0), HETEROSCEDASTIC, key_words(0),
+            _reach(plan, float(np.sqrt(max(b_dn2, 0.0))) / (a_dn or 1.0)),
         )  # fmt: skip
     on = frozenset(plan.effects)
     return _Body(
@@ -174,7 +187,16 @@ def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
         dead_below=share_limit(physics.dead_pixel_share) if "dead_pixels" in on else np.uint64(0),
         read_purpose=np.uint64(purpose("read")),
         key=key_words(physics.body_key),
+        reach=_reach(plan, physics.read_std_dn / physics.dn_per_e if "read" in on else 0.0),
     )
+
+
+def _reach(plan: Plan, read_std_e: float) -> tuple[np.float32, np.float32]:
+    """Return the roots of the means, in electrons, between which no normal is near enough to counts."""
+    lowest, highest = -1.0, np.inf
+    if "shot:gaussian_where_near" in plan.methods:
+        lowest, highest = np.sqrt(gaussian_from(read_std_e, plan.law_distance))
+    return np.float32(lowest), np.float32(highest)
 
 
 def _read_quantiles(physics: Physics) -> Quantiles:
@@ -237,6 +259,7 @@ class _Plain(NamedTuple):
     rows_dn: Float  # [H]
     errors_dn: Float  # [2, CHUNK]
     slack_dn: float  # what a quick DN is off by, beside a share of it
+    reach: tuple[np.float32, np.float32]
 
 
 def _is_plain(body: _Body, scene: Scene) -> bool:
@@ -259,7 +282,16 @@ def _plain(body: _Body, scene: Scene) -> _Plain:
     farthest_dn = body.read_std_dn * float(np.abs(body.read.quadratics[0]).max())
     offset_dn = float(np.abs(body.rows_dn).max(initial=0.0) + np.abs(body.errors_dn).max()) + scene.levels_dn[0]
     slack_dn = body.read_std_dn * body.read.error + QUICK_SLACK * (2 * farthest_dn + 2 * offset_dn + 0.5)
-    return _Plain(body.dn_per_e, body.read_std_dn, body.read, body.read_purpose, body.rows_dn, body.errors_dn, slack_dn)
+    return _Plain(
+        body.dn_per_e,
+        body.read_std_dn,
+        body.read,
+        body.read_purpose,
+        body.rows_dn,
+        body.errors_dn,
+        slack_dn,
+        body.reach,
+    )
 
 
 @kernel
@@ -295,7 +327,7 @@ def _plain_pair(
     pairs, flags, eights, listed, quadratics = room.pairs, room.open, room.eights, room.listed, plain.read.quadratics
     site_gains, site_headroom = by_site(scene)
     black, purposes = scene.levels_dn[0], (SHOT | key[2], plain.read_purpose | key[2])
-    dn_per_e, read_std_dn = plain.dn_per_e, plain.read_std_dn
+    dn_per_e, read_std_dn, reach = plain.dn_per_e, plain.read_std_dn, plain.reach
     for y in range(height):
         gains, headroom, errors_dn, row_dn = (
             site_gains[y & 1], site_headroom[y & 1], plain.errors_dn[y & 1], plain.rows_dn[y]
@@ -319,11 +351,15 @@ def _plain_pair(
             )  # fmt: skip
             words, run_rates, electrons = shot_words[first:after], rates[first:after], whole[first:after]
             quick_normals(words, lines, pairs, normals[:n])
-            short_counts(part[first:after], root[first:after], inverse[first:after], normals, electrons, near)
-            flag(near, n, flags)
-            left = list_open(flags, eights, n, listed)
-            if left > 0:
-                settle(words, run_rates, normal, tables, room, left, electrons)
+            parts, roots = part[first:after], root[first:after]
+            if reach[1] < np.inf and all_near_normal(roots, reach):
+                normal_counts(parts, roots, normals, electrons)
+            else:
+                short_counts(parts, roots, inverse[first:after], normals, reach, electrons, near)
+                flag(near, n, flags)
+                left = list_open(flags, eights, n, listed)
+                if left > 0:
+                    settle(words, run_rates, normal, tables, room, left, electrons)
             words = read_words[first:after]
             quick_normals(words, read_lines, pairs, read[:n])
             _add_read(electrons, read, dn_per_e, read_std_dn, plain.slack_dn, base, near)
@@ -568,6 +604,8 @@ def _fill_noisy(
         offset = fill_words(key, place, purpose_word, n, words)
         draw_counts(words[offset : offset + n], means[:n], normal, tables, buffers.room, drawn[:n])
         if purpose_word == SHOT:
+            if body.reach[1] < np.inf:
+                _draw_normals(means, body.reach, buffers.room.normals, drawn, n)
             electrons, drawn = drawn, buffers.electrons
         else:
             removed_e = body.removed_e if purpose_word == DARK else 0.0
@@ -581,6 +619,18 @@ def _fill_noisy(
         for x in range(n):
             noisy_dn[x] = 0.0 if buffers.dead[x] else noisy_dn[x]
     read_out(unrounded, noisy_dn, scene, limits_dn, noisy, counts)
+
+
+@inner
+def _draw_normals(
+    rates: Float, reach: tuple[np.float32, np.float32], normals: NDArray[np.float32], drawn: Float, count: int
+) -> None:
+    """Replace counts by `poisson.normal_counts`, in the order of that."""
+    for x in range(count):
+        whole = (rates[x] + ROUND) - ROUND
+        root = np.sqrt(np.float32(rates[x]))
+        electrons = np.float32(whole) + (np.float32(rates[x] - whole) + root * normals[x])
+        drawn[x] = drawn[x] if root > reach[0] and root < reach[1] else np.float64(electrons)
 
 
 @inner

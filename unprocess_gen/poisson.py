@@ -353,13 +353,16 @@ def short_counts(
     root: NDArray[np.float32],
     inverse: NDArray[np.float32],
     normals: NDArray[np.float32],
+    reach: tuple[np.float32, np.float32],
     whole: NDArray[np.float32],
     near: NDArray[np.float32],
 ) -> None:
     """Do `_short` of rates that are 0 at least, in single precision throughout.
 
-    A rate is ``whole`` (an integer, replaced by the count), ``part``, its ``root`` and the root's ``inverse``.
+    A rate is ``whole`` (an integer, replaced by the count), ``part``, its ``root`` and the root's ``inverse``. Where its
+    root does not lie within ``reach``, a normal, not rounded, stands for the count.
     """
+    low, high = reach
     for n in range(part.shape[0]):
         z = normals[n]
         s = z * inverse[n]
@@ -371,8 +374,33 @@ def short_counts(
         error = error if abs(z) < _REACH else _OPEN
         rounded = (x + _ROUND32) - _ROUND32
         by_rate = _OPEN if root[n] > _0F else _CLOSED  # of the lowest rates x may be no number
-        near[n] = error - abs(x - rounded) if root[n] >= _LEAST_ROOT else by_rate
-        whole[n] = whole[n] + (rounded - (_1F if rounded > x else _0F)) if root[n] > _0F else _0F
+        quick = error - abs(x - rounded) if root[n] >= _LEAST_ROOT else by_rate
+        count = whole[n] + (rounded - (_1F if rounded > x else _0F)) if root[n] > _0F else _0F
+        within = root[n] > low and root[n] < high
+        near[n] = quick if within else _CLOSED
+        whole[n] = count if within else whole[n] + (part[n] + root[n] * z)
+
+
+@inner
+def all_near_normal(root: NDArray[np.float32], reach: tuple[np.float32, np.float32]) -> bool:
+    """Whether no root of a rate lies within ``reach``."""
+    low, high = reach
+    within = np.int32(0)
+    for n in range(root.shape[0]):
+        within = np.int32(within + (root[n] > low and root[n] < high))
+    return bool(within == 0)
+
+
+@inner
+def normal_counts(
+    part: NDArray[np.float32],
+    root: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    whole: NDArray[np.float32],
+) -> None:
+    """Do `short_counts` by normals alone, not rounded."""
+    for n in range(part.shape[0]):
+        whole[n] = whole[n] + (part[n] + root[n] * normals[n])
 
 
 @inner
