@@ -28,7 +28,7 @@ from unprocess_gen.decode import decode
 from unprocess_gen.manifest import ok_row
 from unprocess_gen.pair import make_pair
 from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Plan, Source
+from unprocess_gen.records import Patch, Plan, Source
 
 
 def fixed_plan() -> Plan:
@@ -38,7 +38,7 @@ def fixed_plan() -> Plan:
 
 def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
     tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
-    values = ok_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""))
+    values = ok_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(0, 0, 0, 1, 1))
     row = {name: str(value) for name, value in values.items()}
     rng = np.random.default_rng(0)
 

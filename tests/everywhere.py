@@ -44,6 +44,8 @@ import numba
 import numpy as np
 
 from unprocess_gen import cli, electrons, fused, poisson, selftest
+from unprocess_gen.compiled import kernel
+from unprocess_gen.normals import normal_quantiles
 from unprocess_gen.pair import make_pair, make_pairs
 from unprocess_gen.tables import normal_table
 
@@ -137,6 +139,16 @@ def kernels() -> dict[str, Any]:
 # Doubles before they are rounded --------------------------------------------------------------------------------------
 
 
+@kernel
+def _draw(words: Any, rates: Any, normal: Any, tables: Any, out: Any) -> None:
+    poisson.draw(words, rates, normal, tables, poisson.room_for((out.shape[0] + 7) // 8 * 8), out)
+
+
+@kernel
+def _digitise(counts: Any, words: Any, body: Any, out: Any) -> None:
+    electrons._digitise(counts, words, body, (0, 0), 64.0, poisson.room_for(out.shape[0]), out)
+
+
 def doubles() -> str:
     """A digest of what the kernels compute before anything is rounded to a DN, where one bit in the last place shows.
 
@@ -163,9 +175,10 @@ def doubles() -> str:
     fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
     fused.fill_normals(words, tuple(normal_table()[:, i].copy() for i in range(3)), bits, normals)
     fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
-    poisson.draw(words, 10.0 ** (n % 10 - 1.0), normals, poisson.poisson_tables(), counts)
+    short = words.astype(np.uint32)
+    _draw(short, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), counts)
     body = electrons._body(plan, (1, count), (0, 0))
-    electrons._digitise(counts, normals, body, 0, body.columns_dn, gains, 64.0, digitised)
+    _digitise(counts, short, body, digitised)
     level = replace(selftest.GOLDEN_PLAN, a_dn=0.0, b_dn2=2500.0)
     half_way = (n % 9 + 0.5) - 50.0 * normals
     still = fused.scene_of(level, np.arange(256) / 255.0, (1, count), (0, 0))
@@ -214,18 +227,22 @@ def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
     black = np.zeros((2, 2, 3), dtype=np.uint8)
     outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"), (fused, "_pair32"))
-    for room, name in (*outer, (electrons, "_physical_pair"), (electrons, "_responses")):
+    of_counts = ("_physical_pair", "_plain_pair", "_physical_noisy", "_responses")
+    for room, name in (*outer, *((electrons, name) for name in of_counts)):
         setattr(room, name, compiler(getattr(room, name)))
     for plan in selftest.GOLDEN_PLANS.values():
         make_pair(black, plan)
-    list(make_pairs(black, [selftest.GOLDEN_PLAN] * 2))
-    fused.make_pair(black, selftest.GOLDEN_PLAN, np.zeros(256), (0.0, 1023.0), (0, 0), "float32", "linear")
+    for name in ("per_channel", "plain", "physical"):
+        plan = selftest.GOLDEN_PLANS[name]
+        plan = replace(plan, effects=tuple(one for one in plan.effects if one != "full_well"))
+        list(make_pairs(black, [plan] * 2))
     single = (numba.float32[::1],) * 3
     fused.fill_line_normals.compile((numba.uint32[::1], *single))
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
-    words, doubles = np.zeros(1, dtype=np.uint64), np.zeros(1)
-    poisson.draw.compile(tuple(map(numba.typeof, (words, doubles, doubles, poisson.poisson_tables(), doubles))))
+    words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)
+    given = words, doubles, normal_quantiles(), poisson.poisson_tables(), doubles
+    _draw.compile(tuple(map(numba.typeof, given)))
 
 
 def compiler(kernel: Any) -> Callable[..., None]:

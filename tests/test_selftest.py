@@ -30,7 +30,7 @@ def test_this_machine_computes_as_all_others(kernels: str) -> None:
     assert selftest.failures(kernels) == ()
 
 
-@pytest.mark.parametrize("name", sorted(set(selftest.GOLDEN) - {"float32"}))
+@pytest.mark.parametrize("name", sorted(set(selftest.GOLDEN) - {"float32", "near"}))
 def test_the_golden_pair_is_the_references(name: str) -> None:
     plan = selftest.GOLDEN_PLANS[name]
     pair = reference_pair(selftest.golden_picture(), plan, (1, 57))

@@ -45,8 +45,8 @@ RUN = 512
 SEGMENT_BITS = SEGMENTS.bit_length() - 1
 
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
-_STEP0, _STEP1 = (np.uint64(step) for step in KEY_STEPS)
-_LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+STEP0, STEP1 = (np.uint64(step) for step in KEY_STEPS)
+LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
 _1 = np.uint64(1)
 _EVEN32, _SIGN64 = np.uint64(0xFFFFFFFE), np.uint64(1 << 63)
@@ -201,7 +201,7 @@ def _pair(
         gains, headroom = site_gains[y & 1], site_headroom[y & 1]
         for start in range(0, width, RUN):
             end = min(start + RUN, width)
-            first, after, block, blocks = _blocks(origin[1] + start, end - start)
+            first, after, block, blocks = blocks_of(origin[1] + start, end - start)
             row, clean_dn, out = srgb[y, start:end], unrounded[first:after], clean[y, start:end]
             if scene.by_gray:
                 fill_signal(row, scene, y, signal)
@@ -254,8 +254,8 @@ def _noisy(
     for y in range(height):
         for start in range(0, width, RUN):
             end = min(start + RUN, width)
-            first, after, block, blocks = _blocks(origin[1] + start, end - start)
-            _copy(clean_dn[y, start:end], unrounded[first:after])
+            first, after, block, blocks = blocks_of(origin[1] + start, end - start)
+            copy(clean_dn[y, start:end], unrounded[first:after])
             _fill_draws(key, block, blocks, np.uint64(origin[0] + y), scene, unrounded, std, drawn)
             _add_noise(blocks * BLOCK, unrounded, drawn, quantiles, scene, std)
             digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
@@ -264,14 +264,14 @@ def _noisy(
 
 
 @kernel
-def _copy(source: Float, target: Float) -> None:
+def copy(source: Float, target: Float) -> None:
     """Copy a run; an assignment of slices would be compiled with a logarithm, for its error message."""
     for x in range(target.shape[0]):
         target[x] = source[x]
 
 
 @kernel
-def _blocks(x: int, length: int) -> tuple[int, int, int, int]:
+def blocks_of(x: int, length: int) -> tuple[int, int, int, int]:
     """Return where in its blocks a run from pixel ``x`` on begins and ends, and number and count of the blocks."""
     first = x % BLOCK
     after = first + length
@@ -340,14 +340,14 @@ _Block = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 
 
 @kernel
-def _round(c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64) -> _Block:
+def philox_round(c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64) -> _Block:
     """One round of Philox4x32: four words, each in the low half of what goes in and comes out; the high half is chaff.
 
     A vector unit multiplies the low halves alone, so that masks before a product are free and all others are not. The
     loop over the rounds stands with the caller: a function that held it would not be inlined, nor made vector code.
     """
-    p0 = _M0 * (c0 & _LOW32)
-    p1 = _M1 * (c2 & _LOW32)
+    p0 = _M0 * (c0 & LOW32)
+    p1 = _M1 * (c2 & LOW32)
     return (p1 >> _32) ^ (c1 ^ k0), p1, (p0 >> _32) ^ (c3 ^ k1), p0
 
 
@@ -368,12 +368,12 @@ def _fill_blocks(
             c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word | key[2], key[3]
             k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
-                c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-                k0, k1 = (k0 + _STEP0) & _LOW32, (k1 + _STEP1) & _LOW32
-            out[at + lane] = c0 & _LOW32
-            out[at + LANES + lane] = c1 & _LOW32
-            out[at + 2 * LANES + lane] = c2 & _LOW32
-            out[at + 3 * LANES + lane] = c3 & _LOW32
+                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
+                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
+            out[at + lane] = c0 & LOW32
+            out[at + LANES + lane] = c1 & LOW32
+            out[at + 2 * LANES + lane] = c2 & LOW32
+            out[at + 3 * LANES + lane] = c3 & LOW32
 
 
 @kernel
@@ -536,8 +536,8 @@ def _fill_draws(
             c0, c1, c2, c3 = counter + np.uint64(lane), y, HETEROSCEDASTIC | key[2], key[3]
             k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
-                c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-                k0, k1 = (k0 + _STEP0) & _LOW32, (k1 + _STEP1) & _LOW32
+                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
+                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
             std[x0], drawn[x0] = _signed(std0, c0), _odd_double(c0)
             std[x1], drawn[x1] = _signed(std1, c1), _odd_double(c1)
             std[x2], drawn[x2] = _signed(std2, c2), _odd_double(c2)
@@ -716,7 +716,7 @@ def _pair32(
         site, gains, headroom = sites[y & 1], site_gains[y & 1], site_headroom[y & 1]
         for start in range(0, width, RUN32):
             end = min(start + RUN32, width)
-            first, after, block, blocks = _blocks(origin[1] + start, end - start)
+            first, after, block, blocks = blocks_of(origin[1] + start, end - start)
             if by_gray:
                 _fill_light_by_gray32(srgb[y, start:end], products, site, channel_gains, scene, signal)
             else:
@@ -810,12 +810,12 @@ def fill_words32(key: Key, first_block: int, blocks: int, y: np.uint64, out: Ind
             c0, c1, c2, c3 = counter + np.uint64(lane), y, HETEROSCEDASTIC | key[2], key[3]
             k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
-                c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
-                k0, k1 = (k0 + _STEP0) & _LOW32, (k1 + _STEP1) & _LOW32
-            out[at + lane] = np.uint32(c0 & _LOW32)
-            out[at + LANES + lane] = np.uint32(c1 & _LOW32)
-            out[at + 2 * LANES + lane] = np.uint32(c2 & _LOW32)
-            out[at + 3 * LANES + lane] = np.uint32(c3 & _LOW32)
+                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
+                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
+            out[at + lane] = np.uint32(c0 & LOW32)
+            out[at + LANES + lane] = np.uint32(c1 & LOW32)
+            out[at + 2 * LANES + lane] = np.uint32(c2 & LOW32)
+            out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
 
 
 @kernel

@@ -290,6 +290,7 @@ _LEAST, _REACH = np.float32(SHORT_LEAST), np.float32(SHORT_REACH)
 _ERROR, _NORMAL_ERROR, _LOW_ERROR = (np.float32(e) for e in (SHORT_ERROR, NORMAL_ERROR, LOW_ERROR))
 _POWERS = len(A)
 _COEFFICIENTS = np.array([(*one, *(0.0,) * (_POWERS - len(one))) for one in (A, B, C, D, E)])
+_LEAST_ROOT = np.float32(np.sqrt(SHORT_LEAST * 1.000001))
 _OPEN, _CLOSED = np.float32(9.0), np.float32(-1.0)
 
 
@@ -341,8 +342,97 @@ def draw(words: NDArray[np.uint32], rates: Float, normal: Quantiles, tables: Tab
     count = out.shape[0]
     quick_normals(words, normal.lines, room.pairs, room.normals[:count])
     _short(rates, room, out)
-    highs, lows = _left_open(rates, room)
-    _by_exact_normal(words, rates, normal.quadratics, tables.tails, room.high[:highs], room.pairs, out)
+    left = list_open(room.open, room.eights, count, room.listed)
+    if left > 0:
+        settle(words, rates, normal, tables, room, left, out)
+
+
+@inner
+def short_counts(
+    part: NDArray[np.float32],
+    root: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    reach: tuple[np.float32, np.float32],
+    whole: NDArray[np.float32],
+    near: NDArray[np.float32],
+) -> None:
+    """Do `_short` of rates that are 0 at least, in single precision; flagged where ``near`` is not negative.
+
+    A rate is ``whole`` (an integer, replaced by the count), ``part``, its ``root`` and the root's ``inverse``. Where
+    the root does not lie within ``reach``, a normal, not rounded, stands for the count. Overwrites ``part``.
+    """
+    low, high = reach
+    # Three loops, and every choice one between two values that are there: of more arrays at once, or of branches, LLVM
+    # makes scalar code, which takes twice the time.
+    for n in range(part.shape[0]):
+        z = normals[n]
+        s = z * inverse[n]
+        s2 = s * s
+        a = (_A0 + s * _A1) + s2 * ((_A2 + s * _A3) + s2 * _A4)
+        b = (_B0 + s * _B1) + s2 * (_B2 + s * _B3)
+        near[n] = (part[n] + root[n] * z) + (z * z * a + b)
+        part[n] = part[n] + root[n] * z
+    for n in range(part.shape[0]):
+        x, i2 = near[n], inverse[n] * inverse[n]
+        rounded = (x + _ROUND32) - _ROUND32
+        error = _NORMAL_ERROR * (_8F + root[n]) + i2 * (_ERROR + _LOW_ERROR * (i2 * i2))
+        error = error if abs(normals[n]) < _REACH else _OPEN
+        quick = error - abs(x - rounded)
+        quick = quick if root[n] >= _LEAST_ROOT else _OPEN  # of the lowest rates x may be no number
+        quick = quick if root[n] > low else _CLOSED
+        near[n] = quick if root[n] < high else _CLOSED
+        one = _1F if rounded > x else _0F
+        count = rounded - one
+        count = count if root[n] > low else part[n]
+        part[n] = count if root[n] < high else part[n]
+    for n in range(part.shape[0]):
+        whole[n] = whole[n] + part[n]
+
+
+@inner
+def all_near_normal(root: NDArray[np.float32], reach: tuple[np.float32, np.float32]) -> bool:
+    """Whether no root of a rate lies within ``reach``."""
+    low, high = reach
+    within = np.int32(0)
+    for n in range(root.shape[0]):
+        within = np.int32(within + (root[n] > low and root[n] < high))
+    return bool(within == 0)
+
+
+@inner
+def normal_counts(
+    part: NDArray[np.float32],
+    root: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    whole: NDArray[np.float32],
+) -> None:
+    """Do `short_counts` by normals alone, not rounded."""
+    for n in range(part.shape[0]):
+        whole[n] = whole[n] + (part[n] + root[n] * normals[n])
+
+
+@inner
+def flag(near: NDArray[np.float32], count: int, open_ones: NDArray[np.uint8]) -> None:
+    """Flag which of ``near`` are not negative."""
+    for n in range(count):
+        open_ones[n] = near[n] >= _0F
+
+
+@inner
+def settle(
+    words: NDArray[np.uint32],
+    rates: Float,
+    normal: Quantiles,
+    tables: Tables,
+    room: Room,
+    left: int,
+    out: Float | NDArray[np.float32],
+) -> None:
+    """Make the first ``left`` counts that are listed as open; ``room`` holds the quick normals."""
+    highs, lows = _by_side(rates, room.listed, left, room.high, room.low)
+    if highs > 0:
+        _by_exact_normal(words, rates, normal.quadratics, tables.tails, room.high[:highs], room.pairs, out)
     if lows > 0:
         low, rows, offsets = room.low[:lows], room.rows, room.offsets
         cells = (tables.first, tables.least, tables.most, tables.middle)
@@ -377,24 +467,30 @@ def _short(rates: Float, room: Room, out: Float) -> None:
         rounded = (x + _ROUND32) - _ROUND32
         near[n] = error - abs(x - rounded)
         part[n] = rounded - (_1F if rounded > x else _0F)
-    for n in range(out.shape[0]):
-        room.open[n] = near[n] >= _0F
+    flag(near, out.shape[0], room.open)
     for n in range(out.shape[0]):
         out[n] = whole[n] + np.float64(part[n]) if single[n] > _0F else 0.0
 
 
 @inner
-def _left_open(rates: Float, room: Room) -> tuple[int, int]:
-    """List the counts that are open, by the side of `LIMIT` their rate is on: they may be few, or any."""
-    listed, high, low = room.listed, room.high, room.low
-    count = rates.shape[0]
-    room.open[count : count + 8] = 0
-    left, highs, lows = 0, 0, 0
+def list_open(open_ones: NDArray[np.uint8], eights: NDArray[np.uint64], count: int, listed: NDArray[np.int64]) -> int:
+    """List which of the first ``count`` flags are set, and return how many; eight stand together in ``eights``."""
+    open_ones[count : count + 8] = 0
+    left = 0
     for eight in range((count + 7) // 8):
-        if room.eights[eight] != 0:
+        if eights[eight] != 0:
             for n in range(8 * eight, 8 * eight + 8):
                 listed[left] = n
-                left += room.open[n]
+                left += open_ones[n]
+    return left
+
+
+@inner
+def _by_side(
+    rates: Float, listed: NDArray[np.int64], left: int, high: NDArray[np.int64], low: NDArray[np.int64]
+) -> tuple[int, int]:
+    """Part what is listed by the side of `LIMIT` that its rate is on."""
+    highs, lows = 0, 0
     for m in range(left):
         n = listed[m]
         high[highs] = low[lows] = n

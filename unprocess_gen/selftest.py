@@ -98,6 +98,19 @@ GOLDEN_PLANS = {
         GOLDEN_PLAN, methods=("colour:fused_float32",), bits=16, black_level_dn=4096, white_level_dn=65535
     ),
     "readable": replace(GOLDEN_PLAN, methods=("colour:numpy_float64",)),
+    "plain": replace(
+        GOLDEN_PLAN,
+        physics=GOLDEN_PHYSICS,
+        effects=("shot", "read", "row", "black_error", "quantise"),
+        saturated="pinned",
+    ),
+    "near": replace(
+        GOLDEN_PLAN,
+        physics=GOLDEN_PHYSICS,
+        effects=("shot", "read", "quantise"),
+        law_distance=0.01,
+        methods=("shot:gaussian_where_near",),
+    ),
     "physical": replace(
         GOLDEN_PLAN, physics=GOLDEN_PHYSICS, effects=EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3
     ),
@@ -108,12 +121,14 @@ GOLDEN = {
     "gray_mean": ("b4c0b18f1bbccbf881c82b00455253e9", "16f26b70e50c70f03babed405092f5b2"),
     "float32": ("57775dc39f9f50a4b68d4e12c49bf406", "679b912194422e64d192ce9c12a23d32"),
     "readable": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
+    "plain": ("443ea2ae03acfbab1df2b27f58ddbe39", "2c88b2a41a0afed433bce5130a98ae1f"),
+    "near": ("443ea2ae03acfbab1df2b27f58ddbe39", "09862c7001e946428c4fbf317b8b9bd6"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
 PROVED_BY = {
     "one_normal": ("per_channel", "gray_mean"),
     "float32": ("float32",),
-    "counts": ("per_channel", "gray_mean", "physical"),
+    "counts": ("per_channel", "gray_mean", "physical", "plain", "near"),
     "readable": ("readable",),
 }
 """Which golden pairs prove which kernels: those that are not needed would take seconds to compile."""
@@ -122,7 +137,7 @@ PROVED_BY = {
 OUTER = {
     "one_normal": (fused._pair,),
     "float32": (fused._pair32,),
-    "counts": (fused._pair, electrons._physical_pair),
+    "counts": (fused._pair, electrons._physical_pair, electrons._plain_pair),
     "readable": (),
 }
 """The kernels that bring all others of their kind with them."""
