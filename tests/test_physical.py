@@ -30,11 +30,13 @@ from unprocess_gen.colour import IDENTITY
 from unprocess_gen.config import Config, branch_of, check
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.manifest import ok_row, plan_of, read_rows, write_rows
+from unprocess_gen.methods import gaussian_from
 from unprocess_gen.pair import make_pair, reference_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_of
 from unprocess_gen.records import Patch, Physics, Plan, Source, Srgb
 from unprocess_gen.sensor import noisy_limits, to_dn
+from unprocess_gen.streams import words
 from unprocess_gen.tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
 from unprocess_gen.unprocess import unprocess
 
@@ -279,6 +281,82 @@ def test_a_clean_frame_that_depends_on_the_level_has_no_noisy_frame_alone(everyt
     for plan in (everything, replace(averaged(everything), effects=WITHOUT_WELL)):
         with pytest.raises(ValueError, match="another at every noise level"):
             electrons.make_noisy(np.zeros((2, 2)), plan, (0.0, 4095.0))
+
+
+# A normal for counts where that law is near --------------------------------------------------------------------------
+
+
+def near_normal(plan: Plan, law_distance: float = 5e-3) -> Plan:
+    return replace(plan, methods=("shot:gaussian_where_near",), law_distance=law_distance)
+
+
+def at_mean(rate_e: float, read_std_e: float, *on: str) -> tuple[Srgb, Plan]:
+    """A flat of a mean of so many electrons, with shot and read noise."""
+    code = 10000
+    dn_per_e = signal_dn(code) / rate_e
+    return flat(code), made(*(on or ("shot", "read")), dn_per_e=dn_per_e, read_std_dn=read_std_e * dn_per_e)
+
+
+@pytest.mark.parametrize("read_std_e", [0.0, 0.5, 2.0, 6.0])
+@pytest.mark.parametrize("edge", [0.5, 0.999, 1.001, 4.0])
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_normal_for_counts_is_within_its_distance_and_has_their_mean_and_variance(
+    read_std_e: float, edge: float, which: int
+) -> None:
+    rate_e = edge * (gaussian_from(read_std_e, 5e-3)[which] or 200.0)
+    srgb, plan = at_mean(rate_e, read_std_e)
+    assert plan.physics is not None
+    exact, ours = make_pair(srgb, plan).noisy, make_pair(srgb, near_normal(plan)).noisy
+    shares = np.bincount(exact.ravel(), minlength=2**16) - np.bincount(ours.ravel(), minlength=2**16)
+    assert np.abs(np.cumsum(shares)).max() / COUNT <= 5e-3 + 0.9 / 1024
+    frame, std_dn = ours - float(BLACK), plan.physics.dn_per_e * math.sqrt(rate_e + read_std_e**2)
+    variance_dn2 = std_dn**2 + 1 / 12
+    if ours.min() > 0 and ours.max() < WHITE:
+        assert abs(frame.mean() - rate_e * plan.physics.dn_per_e) <= 7 * math.sqrt(variance_dn2 / COUNT)
+        assert frame.var() == pytest.approx(variance_dn2, rel=7 * math.sqrt(3 / COUNT))
+
+
+def test_counts_stand_between_the_means_where_normals_stand_for_them() -> None:
+    dn_per_e, read_std_e = 8.0, 2.0
+    low, high = gaussian_from(read_std_e, 5e-3)
+    assert 0 < low < high
+    plan = made("shot", "read", dn_per_e=dn_per_e, read_std_dn=read_std_e * dn_per_e)
+    rates_e = np.linspace(0, 1.5 * high, 1500)
+    codes = np.rint(rates_e * dn_per_e / SPAN * 65535).astype(np.uint16)
+    srgb = np.ascontiguousarray(np.broadcast_to(codes[:, None], (300, 1500, 1)).repeat(3, axis=2))
+    rates_e = np.array([signal_dn(int(code)) / dn_per_e for code in codes])
+    changed = (make_pair(srgb, plan).noisy != make_pair(srgb, near_normal(plan)).noisy).any(axis=0)
+    assert not changed[(rates_e > low * 1.0001) & (rates_e < high * 0.9999)].any()
+    assert changed[rates_e > high * 1.0001].all()
+    assert changed[(rates_e > 0.5) & (rates_e < low * 0.9999)].all()
+
+
+def test_the_normal_for_counts_is_the_one_of_the_shot_streams_word() -> None:
+    srgb, plan = at_mean(1000.0, 1.0)
+    n = effects.normals(words(plan.stream_key, "shot", (1024, 1024)))
+    assert plan.physics is not None
+    wanted = (1000.0 + math.sqrt(1000.0) * n) * plan.physics.dn_per_e + effects.read(plan, n)
+    off = np.abs(make_pair(srgb, near_normal(plan)).noisy - BLACK - wanted)
+    assert off.max() <= 0.5 + 1e-3 * math.sqrt(1000.0) * plan.physics.dn_per_e
+
+
+def test_counts_stand_wherever_read_noise_does_not_hide_their_steps() -> None:
+    for read_std_e, on in ((0.49, ("shot", "read")), (5.0, ("shot",))):
+        srgb, plan = at_mean(1e4, read_std_e, *on)
+        np.testing.assert_array_equal(make_pair(srgb, plan).noisy, make_pair(srgb, near_normal(plan)).noisy)
+
+
+@pytest.mark.parametrize("law_distance", [1e-3, 5e-3, 0.5])
+def test_another_effect_moves_no_normal_for_counts(everything: Plan, law_distance: float) -> None:
+    """Nor does the kernel: a response that is 1 everywhere takes another one."""
+    plan = near_normal(replace(everything, effects=PLAIN), law_distance)
+    other = with_physics(replace(plan, effects=("prnu", *PLAIN)), prnu_std=0.0)
+    srgb = np.random.Generator(np.random.Philox(key=5)).integers(0, 256, (9, 1200, 3)).astype(np.uint8)
+    whole = make_pair(srgb, plan)
+    np.testing.assert_array_equal(whole.noisy, make_pair(srgb, other).noisy)
+    np.testing.assert_array_equal(make_pair(srgb[3:, 70:], plan, (3, 70)).noisy, whole.noisy[3:, 70:])
+    for one in (plan, other):
+        assert_noisy_alone(srgb, one, (3, 7))
 
 
 # Replay ---------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,9 @@ otherwise (`normals`). What has shot and read noise and little else, as most fra
 in runs and in single precision as far as that decides. Of a body that is seen again the response pattern is kept.
 
 Measured on a daylight frame, AVX2, one thread of a busy machine: the kernel for shot and read noise takes 1.7 times as
-long as `fused`, the one for every effect 2.5 times; nanoseconds a pixel of the latter's noisy frame: electrons 0.5,
+long as `fused` (1.4 where shot noise is normal), the one for every effect 2.5 times. Nanoseconds a
+pixel of the former: both words with division and roots 2.0 (the words alone 1.4), normals 0.6 each, short counts 0.9,
+the rest 0.5. Nanoseconds a pixel of the latter's noisy frame: electrons 0.5,
 words 0.7 for each of shot and read noise, counts 3.1, digitising 1.5, the read-out 0.7. Tried and slower: chunks of 256
 and 512 pixels; one function for all counts (0.8 more: it takes as much to hand it the body and the buffers).
 """
@@ -26,7 +28,6 @@ from unprocess_gen.fused import (
     HETEROSCEDASTIC,
     LOW32,
     ROUND,
-    RUN,
     STEP0,
     STEP1,
     Key,
@@ -47,8 +48,19 @@ from unprocess_gen.fused import (
     read_out,
     scene_of,
 )
+from unprocess_gen.methods import gaussian_from
 from unprocess_gen.normals import Quantiles, exact_normal, normal_quantiles, quantiles, quick_normals
-from unprocess_gen.poisson import Room, flag, list_open, poisson_tables, room_for, settle, short_counts
+from unprocess_gen.poisson import (
+    Room,
+    all_near_normal,
+    flag,
+    list_open,
+    normal_counts,
+    poisson_tables,
+    room_for,
+    settle,
+    short_counts,
+)
 from unprocess_gen.poisson import Tables as PoissonTables
 from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.records import Counts, Float, Pair, Physics, Plan, Raw, Srgb
@@ -113,6 +125,11 @@ def make_noisy(
     return noisy, counts
 
 
+HIDES_STEPS_E = 0.5
+"""Read noise of less lets the steps of whole electrons show, and no normal has them: 0.2/√rate of distance without any
+read noise, 0.001/√rate with so much, beside the 0.07/√rate of the skewness that `methods.gaussian_distance` is."""
+
+
 class _Body(NamedTuple):
     """What the noisy frame of a physical profile is made with; a number that leaves its effect out is said."""
 
@@ -136,6 +153,7 @@ class _Body(NamedTuple):
     dead_below: np.uint64
     read_purpose: np.uint64
     key: Key
+    reach: tuple[np.float32, np.float32]  # roots of the mean electrons between which shot noise is made of counts
 
 
 def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
@@ -147,6 +165,7 @@ def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
             a_dn or 1.0, np.ones((1, 1), np.float32), False, False, a_dn > 0, False, 0.0, 0.0, np.uint64(0), 0.0,
             exponential_levels(), np.inf, float(np.sqrt(max(b_dn2, 0.0))), normal_quantiles(),
             np.zeros(shape[0]), np.zeros(shape[1]), np.zeros((2, CHUNK)), np.uint64(0), HETEROSCEDASTIC, key_words(0),
+            _reach(plan, float(np.sqrt(max(b_dn2, 0.0))) / (a_dn or 1.0)),
         )  # fmt: skip
     on = frozenset(plan.effects)
     return _Body(
@@ -174,7 +193,16 @@ def _body(plan: Plan, shape: tuple[int, ...], origin: tuple[int, int]) -> _Body:
         dead_below=share_limit(physics.dead_pixel_share) if "dead_pixels" in on else np.uint64(0),
         read_purpose=np.uint64(purpose("read")),
         key=key_words(physics.body_key),
+        reach=_reach(plan, physics.read_std_dn / physics.dn_per_e if "read" in on else 0.0),
     )
+
+
+def _reach(plan: Plan, read_std_e: float) -> tuple[np.float32, np.float32]:
+    """Return the roots of the means, in electrons, between which no normal is near enough to counts."""
+    lowest, highest = 0.0, np.inf  # without light no count is needed
+    if "shot:gaussian_where_near" in plan.methods and read_std_e >= HIDES_STEPS_E:
+        lowest, highest = np.sqrt(gaussian_from(read_std_e, plan.law_distance))
+    return np.float32(lowest), np.float32(highest)
 
 
 def _read_quantiles(physics: Physics) -> Quantiles:
@@ -237,6 +265,7 @@ class _Plain(NamedTuple):
     rows_dn: Float  # [H]
     errors_dn: Float  # [2, CHUNK]
     slack_dn: float  # what a quick DN is off by, beside a share of it
+    reach: tuple[np.float32, np.float32]
 
 
 def _is_plain(body: _Body, scene: Scene) -> bool:
@@ -259,7 +288,16 @@ def _plain(body: _Body, scene: Scene) -> _Plain:
     farthest_dn = body.read_std_dn * float(np.abs(body.read.quadratics[0]).max())
     offset_dn = float(np.abs(body.rows_dn).max(initial=0.0) + np.abs(body.errors_dn).max()) + scene.levels_dn[0]
     slack_dn = body.read_std_dn * body.read.error + QUICK_SLACK * (2 * farthest_dn + 2 * offset_dn + 0.5)
-    return _Plain(body.dn_per_e, body.read_std_dn, body.read, body.read_purpose, body.rows_dn, body.errors_dn, slack_dn)
+    return _Plain(
+        body.dn_per_e,
+        body.read_std_dn,
+        body.read,
+        body.read_purpose,
+        body.rows_dn,
+        body.errors_dn,
+        slack_dn,
+        body.reach,
+    )
 
 
 @kernel
@@ -279,31 +317,31 @@ def _plain_pair(
 ) -> None:
     """Fill ``clean``, ``noisy`` and ``counts``; only the last two where an unrounded clean frame is ``given``."""
     height, width = noisy.shape
-    signal, unrounded, rates = np.empty(RUN), np.zeros(RUN + BLOCK), np.zeros(RUN + BLOCK)
+    signal, unrounded, rates = np.empty(CHUNK), np.zeros(CHUNK + BLOCK), np.zeros(CHUNK + BLOCK)
     whole, part, root, inverse, near, read, base = (
-        np.zeros(RUN + BLOCK, dtype=np.float32),
-        np.zeros(RUN + BLOCK, dtype=np.float32),
-        np.zeros(RUN + BLOCK, dtype=np.float32),
-        np.zeros(RUN + BLOCK, dtype=np.float32),
-        np.zeros(RUN + BLOCK, dtype=np.float32),
-        np.zeros(RUN + BLOCK, dtype=np.float32),
-        np.zeros(RUN + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
+        np.zeros(CHUNK + BLOCK, dtype=np.float32),
     )
-    shot_words, read_words = np.zeros(RUN + BLOCK, dtype=np.uint32), np.zeros(RUN + BLOCK, dtype=np.uint32)
-    room = room_for(RUN)
+    shot_words, read_words = np.zeros(CHUNK + BLOCK, dtype=np.uint32), np.zeros(CHUNK + BLOCK, dtype=np.uint32)
+    room = room_for(CHUNK)
     normals, lines, read_lines = room.normals, normal.lines, plain.read.lines
     pairs, flags, eights, listed, quadratics = room.pairs, room.open, room.eights, room.listed, plain.read.quadratics
     site_gains, site_headroom = by_site(scene)
     black, purposes = scene.levels_dn[0], (SHOT | key[2], plain.read_purpose | key[2])
-    dn_per_e, read_std_dn = plain.dn_per_e, plain.read_std_dn
+    dn_per_e, read_std_dn, reach = plain.dn_per_e, plain.read_std_dn, plain.reach
     for y in range(height):
         gains, headroom, errors_dn, row_dn = (
             site_gains[y & 1], site_headroom[y & 1], plain.errors_dn[y & 1], plain.rows_dn[y]
         )  # fmt: skip
-        for x in range(RUN):
+        for x in range(CHUNK):
             base[x] = np.float32(black + (row_dn + errors_dn[x]))
-        for start in range(0, width, RUN):
-            n = min(RUN, width - start)
+        for start in range(0, width, CHUNK):
+            n = min(CHUNK, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, n)
             clean_dn = unrounded[first:after]
             if given.shape[0] > 0:
@@ -319,11 +357,15 @@ def _plain_pair(
             )  # fmt: skip
             words, run_rates, electrons = shot_words[first:after], rates[first:after], whole[first:after]
             quick_normals(words, lines, pairs, normals[:n])
-            short_counts(part[first:after], root[first:after], inverse[first:after], normals, electrons, near)
-            flag(near, n, flags)
-            left = list_open(flags, eights, n, listed)
-            if left > 0:
-                settle(words, run_rates, normal, tables, room, left, electrons)
+            parts, roots = part[first:after], root[first:after]
+            if reach[1] < np.inf and all_near_normal(roots, reach):
+                normal_counts(parts, roots, normals, electrons)
+            else:
+                short_counts(parts, roots, inverse[first:after], normals, reach, electrons, near)
+                flag(near, n, flags)
+                left = list_open(flags, eights, n, listed)
+                if left > 0:
+                    settle(words, run_rates, normal, tables, room, left, electrons)
             words = read_words[first:after]
             quick_normals(words, read_lines, pairs, read[:n])
             _add_read(electrons, read, dn_per_e, read_std_dn, plain.slack_dn, base, near)
@@ -568,6 +610,8 @@ def _fill_noisy(
         offset = fill_words(key, place, purpose_word, n, words)
         draw_counts(words[offset : offset + n], means[:n], normal, tables, buffers.room, drawn[:n])
         if purpose_word == SHOT:
+            if body.reach[1] < np.inf:
+                _draw_normals(means, body.reach, buffers.room.normals, drawn, n)
             electrons, drawn = drawn, buffers.electrons
         else:
             removed_e = body.removed_e if purpose_word == DARK else 0.0
@@ -581,6 +625,18 @@ def _fill_noisy(
         for x in range(n):
             noisy_dn[x] = 0.0 if buffers.dead[x] else noisy_dn[x]
     read_out(unrounded, noisy_dn, scene, limits_dn, noisy, counts)
+
+
+@inner
+def _draw_normals(
+    rates: Float, reach: tuple[np.float32, np.float32], normals: NDArray[np.float32], drawn: Float, count: int
+) -> None:
+    """Replace counts by `poisson.normal_counts`, in the order of that."""
+    for x in range(count):
+        whole = (rates[x] + ROUND) - ROUND
+        root = np.sqrt(np.float32(rates[x]))
+        electrons = np.float32(whole) + (np.float32(rates[x] - whole) + root * normals[x])
+        drawn[x] = drawn[x] if root > reach[0] and root < reach[1] else np.float64(electrons)
 
 
 @inner

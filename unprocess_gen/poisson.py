@@ -353,26 +353,63 @@ def short_counts(
     root: NDArray[np.float32],
     inverse: NDArray[np.float32],
     normals: NDArray[np.float32],
+    reach: tuple[np.float32, np.float32],
     whole: NDArray[np.float32],
     near: NDArray[np.float32],
 ) -> None:
-    """Do `_short` of rates that are 0 at least, in single precision throughout.
+    """Do `_short` of rates that are 0 at least, in single precision; flagged where ``near`` is not negative.
 
-    A rate is ``whole`` (an integer, replaced by the count), ``part``, its ``root`` and the root's ``inverse``.
+    A rate is ``whole`` (an integer, replaced by the count), ``part``, its ``root`` and the root's ``inverse``. Where
+    the root does not lie within ``reach``, a normal, not rounded, stands for the count. Overwrites ``part``.
     """
+    low, high = reach
+    # Three loops, and every choice one between two values that are there: of more arrays at once, or of branches, LLVM
+    # makes scalar code, which takes twice the time.
     for n in range(part.shape[0]):
         z = normals[n]
         s = z * inverse[n]
-        s2, i2 = s * s, inverse[n] * inverse[n]
+        s2 = s * s
         a = (_A0 + s * _A1) + s2 * ((_A2 + s * _A3) + s2 * _A4)
         b = (_B0 + s * _B1) + s2 * (_B2 + s * _B3)
-        x = (part[n] + root[n] * z) + (z * z * a + b)
-        error = _NORMAL_ERROR * (_8F + root[n]) + i2 * (_ERROR + _LOW_ERROR * (i2 * i2))
-        error = error if abs(z) < _REACH else _OPEN
+        near[n] = (part[n] + root[n] * z) + (z * z * a + b)
+        part[n] = part[n] + root[n] * z
+    for n in range(part.shape[0]):
+        x, i2 = near[n], inverse[n] * inverse[n]
         rounded = (x + _ROUND32) - _ROUND32
-        by_rate = _OPEN if root[n] > _0F else _CLOSED  # of the lowest rates x may be no number
-        near[n] = error - abs(x - rounded) if root[n] >= _LEAST_ROOT else by_rate
-        whole[n] = whole[n] + (rounded - (_1F if rounded > x else _0F)) if root[n] > _0F else _0F
+        error = _NORMAL_ERROR * (_8F + root[n]) + i2 * (_ERROR + _LOW_ERROR * (i2 * i2))
+        error = error if abs(normals[n]) < _REACH else _OPEN
+        quick = error - abs(x - rounded)
+        quick = quick if root[n] >= _LEAST_ROOT else _OPEN  # of the lowest rates x may be no number
+        quick = quick if root[n] > low else _CLOSED
+        near[n] = quick if root[n] < high else _CLOSED
+        one = _1F if rounded > x else _0F
+        count = rounded - one
+        count = count if root[n] > low else part[n]
+        part[n] = count if root[n] < high else part[n]
+    for n in range(part.shape[0]):
+        whole[n] = whole[n] + part[n]
+
+
+@inner
+def all_near_normal(root: NDArray[np.float32], reach: tuple[np.float32, np.float32]) -> bool:
+    """Whether no root of a rate lies within ``reach``."""
+    low, high = reach
+    within = np.int32(0)
+    for n in range(root.shape[0]):
+        within = np.int32(within + (root[n] > low and root[n] < high))
+    return bool(within == 0)
+
+
+@inner
+def normal_counts(
+    part: NDArray[np.float32],
+    root: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    whole: NDArray[np.float32],
+) -> None:
+    """Do `short_counts` by normals alone, not rounded."""
+    for n in range(part.shape[0]):
+        whole[n] = whole[n] + (part[n] + root[n] * normals[n])
 
 
 @inner
