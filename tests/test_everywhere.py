@@ -376,8 +376,8 @@ ADDED_IN_ANY_ORDER = {
 }
 OF_OPENCV = {"imdecode", "error", "setNumThreads", "utils"}
 
-ELSEWHERE = {"unprocess", "process", "tables", "transfer"}
-"""The reference, its mirror and the fit of noise, of which nothing reaches a file, and the tables, held to digests."""
+ELSEWHERE = {"unprocess", "process", "tables", "transfer", "accuracy", "report"}
+"""The reference, its mirror, what measures, of which nothing reaches a dataset, and the tables, held to digests."""
 
 ROOMS = [room for room in sorted((ROOT / "unprocess_gen").glob("*.py")) if room.stem not in ELSEWHERE]
 

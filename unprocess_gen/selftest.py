@@ -102,7 +102,6 @@ GOLDEN_PLANS = {
         GOLDEN_PLAN,
         physics=GOLDEN_PHYSICS,
         effects=("shot", "read", "row", "black_error", "quantise"),
-        saturated="pinned",
     ),
     "near": replace(
         GOLDEN_PLAN,
@@ -121,7 +120,7 @@ GOLDEN = {
     "gray_mean": ("b4c0b18f1bbccbf881c82b00455253e9", "16f26b70e50c70f03babed405092f5b2"),
     "float32": ("57775dc39f9f50a4b68d4e12c49bf406", "679b912194422e64d192ce9c12a23d32"),
     "readable": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
-    "plain": ("443ea2ae03acfbab1df2b27f58ddbe39", "2c88b2a41a0afed433bce5130a98ae1f"),
+    "plain": ("443ea2ae03acfbab1df2b27f58ddbe39", "a3ed0176ff50cf595767857da127dd39"),
     "near": ("443ea2ae03acfbab1df2b27f58ddbe39", "09862c7001e946428c4fbf317b8b9bd6"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
