@@ -166,7 +166,8 @@ def gaussian_distance(rate_e: float, read_std_e: float) -> float:
     """Return the distance between Poisson counts of a mean plus normal read noise, and a normal of their variance.
 
     0.0665 · rate / (rate + read_std²)^1.5, the greatest difference of the two distribution functions by the first term
-    of the Edgeworth expansion: skewness / 6 times the greatest value of (z² - 1) φ(z), that at 0.
+    of the Edgeworth expansion: skewness / 6 times the greatest value of (z² - 1) φ(z), that at 0. That electrons come
+    in steps is not in it: read noise below half an electron shows them, and `electrons` keeps to counts there.
     """
     variance = rate_e + read_std_e * read_std_e
     return 0.0665 * (rate_e / variance) / math.sqrt(variance) if variance else 0.0
