@@ -23,8 +23,9 @@ they would take all the time: as large as it takes for their arrays to leave the
 The compiled form has no stages one could run alone: the curve is folded into the matrix, and no other channel exists.
 So a clean stage's time goes from the codes to the end of that stage, by the kernels' own loops on the same small
 buffers: ``curve`` what looks the codes up, ``colour`` and ``mosaic``, which are one loop, that and all up to the clean
-frame; ``quantise`` reads out DN, ``normal`` starts from words. Shot noise and the other physical effects are
-differences between whole pairs with and without them.
+frame; ``quantise`` reads out DN, ``normal`` starts from words, ``shot`` from words and rates. The other physical
+effects are differences between whole pairs with and without them; normals in place of counts are counts, and the
+difference of pairs to those with them.
 """
 
 from __future__ import annotations
@@ -81,10 +82,14 @@ from unprocess_gen.fused import (
 )
 from unprocess_gen.fused import scene_of as fused_scene
 from unprocess_gen.methods import METHODS, STAGES, Budget, Method, choose, gaussian_from, of_stage
+from unprocess_gen.normals import Quantiles, normal_quantiles
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_for
+from unprocess_gen.poisson import Tables as PoissonTables
+from unprocess_gen.poisson import draw as draw_counts
+from unprocess_gen.poisson import poisson_tables, room_for
 from unprocess_gen.records import Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import quantise, to_dn
 from unprocess_gen.streams import Words
@@ -537,8 +542,29 @@ def _difference_ns(lab: Lab, method: Method, subject: Subject, edits: tuple[str,
     return max(longer - shorter, LEAST_NS)
 
 
-def _shot_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_shot_ns(lab: Lab, method: Method, subject: Subject) -> float:
     return _difference_ns(lab, method, subject, ("with_shot", "without_shot"))
+
+
+def _counts_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    plan, light = _light_of(lab, subject, subject.readable)
+    physics = lab.plan("electrons", lab.tiers[EXACT], subject, subject.readable).physics
+    assert physics is not None
+    span_dn = plan.white_level_dn - plan.black_level_dn
+    rates = np.resize(np.clip(light, 0, 1) * plan.exposure * span_dn / physics.dn_per_e, (BUFFERS, CHUNK))
+    words = _some_words(rates.size).reshape(rates.shape)
+    turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // rates.size)
+    given = normal_quantiles(), poisson_tables(), np.empty(CHUNK)
+    return clocked(lambda: _counts(rates, turns, words, *given), turns * rates.size)
+
+
+def _near_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    """Return what counts take, and by how much a pair takes longer without them: there is no loop of its own."""
+    ours, exact = (
+        _pair_ns(lab, "electrons", accuracy, subject, "with_shot")
+        for accuracy in (alone(method, lab.tiers), lab.tiers[EXACT])
+    )
+    return max(_counts_ns(lab, method, subject) + ours - exact, LEAST_NS)
 
 
 def _effects_ns(lab: Lab, method: Method, subject: Subject) -> float:
@@ -760,6 +786,15 @@ def _normals(
 
 
 @kernel
+def _counts(rates: Float, turns: int, words: Words, normal: Quantiles, tables: PoissonTables, out: Float) -> None:
+    """Draw counts of chunks of rates in turns."""
+    room = room_for(CHUNK)
+    for _ in range(turns):
+        for chunk in range(rates.shape[0]):
+            draw_counts(words[chunk], rates[chunk], normal, tables, room, out)
+
+
+@kernel
 def _normals32(chunks: Words, turns: int, offsets: Single, slopes: Single, out: Single) -> None:
     """As `_normals`, in float32."""
     for _ in range(turns):
@@ -810,9 +845,9 @@ MEASUREMENTS = (
     Measurement("normal:linear_float32", _of_normals(linear_normals), _lines_ns),
     Measurement("normal:quadratic_float64", _of_normals(quadratic_normals), _quadratics_ns),
     Measurement("normal:numpy_float64", _of_normals(effects.normals), _numpy_normals_ns),
-    Measurement("shot:gaussian_where_near", _of_shot, _shot_ns),
-    Measurement("shot:inversion", _of_shot, _shot_ns),
-    Measurement("shot:numpy_inversion", _of_shot, _shot_ns),
+    Measurement("shot:gaussian_where_near", _of_shot, _near_ns),
+    Measurement("shot:inversion", _of_shot, _counts_ns),
+    Measurement("shot:numpy_inversion", _of_shot, _numpy_shot_ns),
     Measurement("effects:fused_float64", _of_effects, _effects_ns),
     Measurement("effects:numpy_float64", _of_effects, _effects_ns),
     Measurement("quantise:fused_float32", _of_clean, _round32_ns),
