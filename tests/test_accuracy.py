@@ -343,7 +343,7 @@ def test_the_command_writes_three_files_and_says_so(door: Door, tmp_path: Path) 
 def test_a_dataset_is_no_place_for_a_report(door: Door, tmp_path: Path, name: str) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds" / name).mkdir()
-    done = door("accuracy")
+    done = door("accuracy", "out=ds")
 
     assert done.code == 2
     assert done.err == (
@@ -355,7 +355,7 @@ def test_a_file_in_the_way_is_refused(door: Door, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = door("accuracy", "out=file")
 
-    assert (done.code, done.err) == (2, "gen-dataset: out=file: cannot be written (File exists)\n")
+    assert (done.code, done.err) == (2, "gen-dataset: out=file: cannot be written (file is no folder)\n")
 
 
 def test_without_matplotlib_the_extra_is_named_before_anything_is_measured(
