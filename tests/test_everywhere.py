@@ -331,10 +331,12 @@ def code(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return dict(json.loads((folder / "code.json").read_text(encoding="utf-8")))
 
 
+@pytest.mark.slow
 def test_the_code_of_every_kernel_is_read(code: dict[str, Any]) -> None:
     assert code["not compiled"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["Numba's own", *everywhere.TARGETS])
 def test_no_kernel_multiplies_and_adds_in_one_rounding(target: str, code: dict[str, Any]) -> None:
     kernels, free_to_fuse = code["instructions"][target]
@@ -346,6 +348,7 @@ def test_no_kernel_multiplies_and_adds_in_one_rounding(target: str, code: dict[s
     assert kernels["guessed"] == []
 
 
+@pytest.mark.slow
 def test_no_kernel_may_take_liberties_with_arithmetic(code: dict[str, Any]) -> None:
     kernels, free = code["liberties"]
 
@@ -353,6 +356,7 @@ def test_no_kernel_may_take_liberties_with_arithmetic(code: dict[str, Any]) -> N
     assert kernels == []
 
 
+@pytest.mark.slow
 def test_kernels_call_no_function_but_exact_ones(code: dict[str, Any]) -> None:
     called = {re.sub(r"^llvm\.|\.v?\d*f(?:32|64)$", "", name) for name in code["called"]}
 
