@@ -292,7 +292,7 @@ def test_want_of_memory_is_told_and_never_put_down_to_the_photograph(
     n_jobs: int, megabytes: int, with_large: Path, with_large_undisturbed: str, cli: Cli, make: Make, tree_hash: Hash,
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    """With 20 MB left it cannot be decoded, with 100 MB its pairs cannot be made; with more memory a rerun makes them."""
+    """With 20 MB left it cannot be decoded, with 100 MB its pairs cannot be made; with more a rerun makes them."""
     env = acting_at(tmp_path, with_large / "large.png", "limit")
     (tmp_path / "note").write_text(str(megabytes))
     done = cli(f"source.root={with_large}", ONE, LEVELS, f"n_jobs={n_jobs}", **env)
