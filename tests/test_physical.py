@@ -89,8 +89,13 @@ def assert_same(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Non
 # The fast form --------------------------------------------------------------------------------------------------------
 
 
+def quick_for(*profiles: str) -> list[object]:
+    """Every profile; all but some among the long proofs."""
+    return [noise if noise in profiles else pytest.param(noise, marks=pytest.mark.slow) for noise in ISOS]
+
+
 @pytest.mark.parametrize("scene", ["daylight", "low_light", "long_exposure"])
-@pytest.mark.parametrize("noise", ISOS)
+@pytest.mark.parametrize("noise", quick_for("nikon_d850", "imx385"))
 def test_fast_form_equals_the_reference_for_every_profile_and_scene(settings: Settings, noise: str, scene: str) -> None:
     group = (f"noise={noise}", f"scene={scene}", f"noise.iso={ISOS[noise]}")
     for forced, fixed, saturated in itertools.product([False, True], ["false", "true"], ["noisy", "pinned"]):
