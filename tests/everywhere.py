@@ -47,7 +47,6 @@ from unprocess_gen import cli, electrons, fused, poisson, selftest
 from unprocess_gen.compiled import kernel
 from unprocess_gen.normals import normal_quantiles
 from unprocess_gen.pair import make_pair, make_pairs
-from unprocess_gen.tables import normal_table
 
 KERNELS = {
     f"{room}.{name}": value
@@ -173,7 +172,7 @@ def doubles() -> str:
     fused.fill_clean(lit, scene, unrounded, clean, tally)
     key = fused.key_words(2**33 + 1, 5, 6, 7)
     fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
-    fused.fill_normals(words, tuple(normal_table()[:, i].copy() for i in range(3)), bits, normals)
+    fused.fill_normals(words, normal_quantiles().quadratics, bits, normals)
     fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
     short = words.astype(np.uint32)
     _draw(short, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), counts)
@@ -182,7 +181,7 @@ def doubles() -> str:
     level = replace(selftest.GOLDEN_PLAN, a_dn=0.0, b_dn2=2500.0)
     half_way = (n % 9 + 0.5) - 50.0 * normals
     still = fused.scene_of(level, np.arange(256) / 255.0, (1, count), (0, 0))
-    quantiles, blocks = fused.columns(normal_table()), count // fused.BLOCK
+    quantiles, blocks = normal_quantiles().quadratics, count // fused.BLOCK
     fused._fill_draws(key, 0, blocks, np.uint64(3), still, half_way, std, words)
     fused._add_noise(count, half_way, words, quantiles, still, std)
     fused.digitise(std, (0.0, 4095.0), noisy, tally)

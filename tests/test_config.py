@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
+from conftest import CRVD
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -108,15 +109,6 @@ def test_default_globs_match_every_kind_of_photograph(name: str, settings: Setti
 
     (tmp_path / name).write_bytes(b"x")
     assert len(list_folder(str(tmp_path), settings().source.include, True, None).sources) == 1
-
-
-CRVD = {
-    1600: (3.513262, 11.917691),
-    3200: (6.955588, 38.117816),
-    6400: (13.486051, 130.818508),
-    12800: (26.585953, 484.539790),
-    25600: (52.032536, 1819.818657),
-}
 
 
 @pytest.mark.parametrize("iso", CRVD)

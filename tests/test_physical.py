@@ -19,6 +19,7 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
+from conftest import CRVD
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -566,15 +567,6 @@ def test_read_noise_has_the_deviation_that_is_said_whatever_its_law(law: str, sh
 def test_a_read_noise_of_another_deviation_is_noticed() -> None:
     deviation = noisy_dn(made("read", read_std_dn=303.0), 32000) - signal_dn(32000)
     assert off(deviation**2, 300.0**2, 2 * 300.0**4, (REACH * 300) ** 2) > 1
-
-
-CRVD = {
-    1600: (3.513262, 11.917691),
-    3200: (6.955588, 38.117816),
-    6400: (13.486051, 130.818508),
-    12800: (26.585953, 484.539790),
-    25600: (52.032536, 1819.818657),
-}
 
 
 @pytest.mark.parametrize("iso", CRVD)

@@ -68,7 +68,6 @@ from unprocess_gen.fused import (
     Scene,
     Single,
     by_site,
-    columns,
     digitise,
     digitise32,
     fill_bright,
@@ -93,7 +92,7 @@ from unprocess_gen.poisson import poisson_tables, room_for
 from unprocess_gen.records import Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import quantise, to_dn
 from unprocess_gen.streams import Words
-from unprocess_gen.tables import linear_table, normal_lines, normal_table
+from unprocess_gen.tables import linear_table, normal_lines
 from unprocess_gen.unprocess import camera_light, unprocess
 
 
@@ -502,7 +501,7 @@ def true_normals(words: Words) -> Float:
 def quadratic_normals(words: Words) -> Float:
     """Return the compiled form's normals of uint32 words ``[n]``."""
     out = np.empty(words.size)
-    fill_normals(words.astype(np.uint64), columns(normal_table()), np.empty(words.size, dtype=np.uint64), out)
+    fill_normals(words.astype(np.uint64), normal_quantiles().quadratics, np.empty(words.size, dtype=np.uint64), out)
     return out
 
 
@@ -678,7 +677,7 @@ def _some_words(count: int) -> Words:
 def _quadratics_ns(lab: Lab, method: Method, subject: Subject) -> float:
     chunks = _some_words(BUFFERS * CHUNK).astype(np.uint64).reshape(BUFFERS, CHUNK)
     turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
-    quantiles = columns(normal_table())
+    quantiles = normal_quantiles().quadratics
     buffers = np.empty(CHUNK, dtype=np.uint64), np.empty(CHUNK, dtype=np.uint64), np.empty(CHUNK)
     return clocked(lambda: _normals(chunks, turns, quantiles, *buffers), turns * chunks.size)
 

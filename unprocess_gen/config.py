@@ -570,7 +570,8 @@ def _check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
         )
 
 
-ISO_LAWS = ("uniform", "log_uniform", "choice")
+SCENE_LAWS = ("uniform", "log_uniform", "choice")
+"""What ISO and the numbers of a scene can be drawn from."""
 
 
 def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
@@ -650,8 +651,8 @@ def _check_countable(noise: NoiseConfig) -> None:
 
 def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
     """Refuse heat that sets free more electrons than can be counted."""
-    seconds = highest(law("scene.exposure_s", scene.exposure_s, ISO_LAWS))
-    celsius = highest(law("scene.temperature_c", scene.temperature_c, ISO_LAWS))
+    seconds = highest(law("scene.exposure_s", scene.exposure_s, SCENE_LAWS))
+    celsius = highest(law("scene.temperature_c", scene.temperature_c, SCENE_LAWS))
     for key in ("dark_e_per_s", "hot_pixel_e_per_s"):
         rate = Decimal((getattr(noise, key) or 0.0) * seconds)
         doublings = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)
@@ -700,7 +701,7 @@ def _check_black_error(key: str, value: Any) -> None:
 def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
     """Refuse an ISO at which nothing was calibrated, whether it is named, drawn or comes with the scene."""
     key, value = ("scene.iso", scene.iso) if noise.iso is None else ("noise.iso", noise.iso)
-    drawn = law(key, value, ISO_LAWS)
+    drawn = law(key, value, SCENE_LAWS)
     ends = drawn.numbers
     inside = all(branch_of(noise, iso) is not None for iso in ends)
     if inside and drawn.kind not in ("constant", "choice"):
@@ -716,7 +717,7 @@ def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
 def _check_scene(scene: SceneConfig) -> None:
     _check_name("scene.name", scene.name)
     for key, low, high in (("exposure_s", 1e-7, 1e5), ("temperature_c", -100.0, 150.0), ("exposure_ratio", 1e-3, 1e6)):
-        drawn = law(f"scene.{key}", getattr(scene, key), ISO_LAWS)
+        drawn = law(f"scene.{key}", getattr(scene, key), SCENE_LAWS)
         if not low <= lowest(drawn) <= highest(drawn) <= high:
             raise ConfigError(f"scene.{key}={_text(getattr(scene, key))}: expected {low:g} to {high:g}")
 

@@ -34,7 +34,6 @@ from unprocess_gen.fused import (
     Scene,
     blocks_of,
     by_site,
-    columns,
     copy,
     fill_bright,
     fill_clean,
@@ -65,7 +64,7 @@ from unprocess_gen.poisson import Tables as PoissonTables
 from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.records import Counts, Float, Pair, Physics, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, LANES, ROUNDS, purpose
-from unprocess_gen.tables import exponential_levels, normal_table
+from unprocess_gen.tables import exponential_levels
 
 PRNU, SHOT, DARK, HOT, DEAD = (
     np.uint64(purpose(stream)) for stream in ("prnu", "shot", "dark_current", "hot_pixels", "dead_pixels")
@@ -112,13 +111,12 @@ def make_noisy(
         raise ValueError("a clean frame with fixed patterns or a full well is another at every noise level")
     noisy = np.empty(unrounded.shape, dtype=np.uint16)
     counts = np.zeros(6, dtype=np.int64)
-    scene = scene_of(plan, np.empty(0), unrounded.shape, origin)  # no curve: nothing is unprocessed
+    scene = scene_of(plan, np.zeros(1), unrounded.shape, origin)  # no code is looked up
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
     body, tables, normal = _body(plan, unrounded.shape, origin), poisson_tables(), normal_quantiles()
     frame = np.ascontiguousarray(unrounded)
     if _is_plain(body, scene):
         pixels, clean, plain = np.empty((0, 0, 3), dtype=np.uint8), np.empty((0, 0), np.uint16), _plain(body, scene)
-        scene = scene._replace(products=np.empty((3, 3, 1)))
         _plain_pair(pixels, frame, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy, counts)
         return noisy, counts
     _physical_noisy(frame, scene, key, limits_dn, origin, body, tables, normal, noisy, counts)
@@ -220,7 +218,7 @@ def body_response(
 ) -> NDArray[np.float32]:
     """Return `effects.response`, kept for the next frame of the same body."""
     response = np.empty((height, width), dtype=np.float32)
-    _responses(key_words(body_key), prnu_std, origin, columns(normal_table()), response)
+    _responses(key_words(body_key), prnu_std, origin, normal_quantiles().quadratics, response)
     return response
 
 

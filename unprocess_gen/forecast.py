@@ -23,7 +23,7 @@ from unprocess_gen.manifest import json_size
 from unprocess_gen.pair import make_pairs
 from unprocess_gen.patches import cut, patches, pixels_in_none
 from unprocess_gen.photographs import list_photographs, load, spread
-from unprocess_gen.plan import plan_pairs, plan_with_reasons
+from unprocess_gen.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.planner import COST_NS, Prediction, facts_for
 from unprocess_gen.records import Plan, Source
 from unprocess_gen.shards import array_xxh3, image_bytes, shard_bytes
@@ -106,7 +106,9 @@ def look(config: Config, source: Source) -> Look:
     except SourceError as error:
         return Look(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
-    plans = plan_pairs(config, *identity, facts, source.frame)
+    told = plan_levels(config, *identity, facts)
+    levels, predictions = tuple(plan for plan, _ in told), tuple(of_level for _, of_level in told)
+    plans = with_draws(config, levels, source.frame)
     height, width = photograph.srgb.shape[:2]
     cuts = patches(patch_law(config.source), plans[0].stream_key, height, width)
     for patch in cuts:
@@ -117,8 +119,6 @@ def look(config: Config, source: Source) -> Look:
     json_bytes = json_size(source.name, len(plans))
     size = sum(image_bytes(patch.width, patch.height, json_bytes, len(plans)) for patch in cuts)
     seconds = time.perf_counter() - started
-    told = [plan_with_reasons(config, *identity, facts, level) for level in range(len(noise_levels(config.noise)))]
-    levels, predictions = tuple(plan for plan, _ in told), tuple(of_level for _, of_level in told)
     pixels, left_out = width * height, pixels_in_none(cuts, height, width)
     pairs = len(cuts) * len(plans)
     return Look(source, size, seconds, levels, None, predictions, len(cuts), pairs, pixels, left_out)

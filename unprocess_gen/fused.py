@@ -33,9 +33,18 @@ from numpy.typing import NDArray
 
 from unprocess_gen.bayer import tile
 from unprocess_gen.compiled import kernel
+from unprocess_gen.normals import (
+    FIRST_ROW,
+    ONE_BITS,
+    POSITION_BITS,
+    POSITION_MASK,
+    TWO52,
+    TWO52_BITS,
+    normal_quantiles,
+)
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
-from unprocess_gen.tables import SEGMENTS, normal_lines, normal_table
+from unprocess_gen.tables import SEGMENTS, normal_lines
 
 CHUNK = 1024
 """Pixels worked on at a time at most."""
@@ -51,12 +60,7 @@ _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
 _1 = np.uint64(1)
 _EVEN32, _SIGN64 = np.uint64(0xFFFFFFFE), np.uint64(1 << 63)
 _LOW16 = np.uint64(0xFFFF)
-_TWO52_BITS, _TWO52 = np.uint64(0x4330000000000000), 2.0**52
-_ODD_TWO52_BITS = _TWO52_BITS | _1
-_ONE_BITS = np.uint64(0x3FF0000000000000)
-_POSITION_BITS = np.uint64(52 - SEGMENT_BITS)
-_POSITION_MASK = np.uint64(2 ** (52 - SEGMENT_BITS) - 1)
-_FIRST_ROW = np.uint64(1023 << SEGMENT_BITS)
+_ODD_TWO52_BITS = TWO52_BITS | _1
 ROUND = 1.5 * 2.0**52
 
 HETEROSCEDASTIC = np.uint64(purpose("heteroscedastic"))
@@ -83,7 +87,7 @@ def make_pair(
     scene = scene_of(plan, curve, srgb.shape, origin)
     frames = (clean, noisy, counts)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, columns(normal_table()), *frames)
+    _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, normal_quantiles().quadratics, *frames)
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
@@ -113,7 +117,7 @@ def make_noisy(
     counts = np.zeros(6, dtype=np.int64)
     scene = scene_of(plan, np.zeros(1), unrounded.shape, origin)  # no code is looked up
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    _noisy(unrounded, scene, key, limits_dn, origin, columns(normal_table()), noisy, counts)
+    _noisy(unrounded, scene, key, limits_dn, origin, normal_quantiles().quadratics, noisy, counts)
     return noisy, counts
 
 
@@ -172,11 +176,6 @@ Key = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 def key_words(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Key:
     """Return the words of a stream's key and counter, as the kernels take them."""
     return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
-
-
-def columns(table: Float) -> tuple[Float, Float, Float]:
-    """Return the three columns of a table of quadratics, each in one piece."""
-    return table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy()
 
 
 @kernel
@@ -401,13 +400,13 @@ def fill_normals(
     doubles = bits.view(np.float64)
     out_bits = out.view(np.uint64)
     for n in range(count):
-        bits[n] = ((words[n] & _LOW31) << _1 | _1) | _TWO52_BITS
+        bits[n] = ((words[n] & _LOW31) << _1 | _1) | TWO52_BITS
     for n in range(count):
-        doubles[n] = doubles[n] - _TWO52
+        doubles[n] = doubles[n] - TWO52
     for n in range(count):
         b = bits[n]
-        words[n] = (words[n] & _SIGN) | ((b >> _POSITION_BITS) - _FIRST_ROW)
-        bits[n] = (b & _POSITION_MASK) | _ONE_BITS
+        words[n] = (words[n] & _SIGN) | ((b >> POSITION_BITS) - FIRST_ROW)
+        bits[n] = (b & POSITION_MASK) | ONE_BITS
     for n in range(count):
         row = words[n] & _LOW31
         t = doubles[n] - 1.0
@@ -554,7 +553,7 @@ def _signed(std: float, word: np.uint64) -> float:
 def _odd_double(word: np.uint64) -> np.uint64:
     """Return the bits of 2i + 1 as a double, i being the low 31 bits of a word."""
     shifted = np.uint64(((word << _1) & _EVEN32) | _ODD_TWO52_BITS).view(np.float64)
-    return np.float64(shifted - _TWO52).view(np.uint64)
+    return np.float64(shifted - TWO52).view(np.uint64)
 
 
 @kernel
@@ -572,8 +571,8 @@ def _add_noise(
         for x in range(count):
             noisy_dn[x] = 0.0 if clean_dn[x] >= scene.pinned_dn else noisy_dn[x]
     for x in range(count):
-        row = (drawn[x] >> _POSITION_BITS) - _FIRST_ROW
-        t = np.uint64((drawn[x] & _POSITION_MASK) | _ONE_BITS).view(np.float64) - 1.0
+        row = (drawn[x] >> POSITION_BITS) - FIRST_ROW
+        t = np.uint64((drawn[x] & POSITION_MASK) | ONE_BITS).view(np.float64) - 1.0
         noisy_dn[x] = clean_dn[x] + noisy_dn[x] * (q0[row] + t * (q1[row] + t * q2[row]))
 
 

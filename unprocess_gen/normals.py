@@ -35,10 +35,10 @@ _PIECE_SHIFT = np.uint32(23 - PIECE_BITS)
 _FIRST_PIECE = np.uint32(126 << PIECE_BITS)
 
 _LOW31_64, _SIGN_64, _1 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.uint64(1)
-_TWO52_BITS, _TWO52, _ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
-_POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
-_POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
-_FIRST_ROW = np.uint64(1023 * SEGMENTS)
+TWO52_BITS, TWO52, ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
+POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
+POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
+FIRST_ROW = np.uint64(1023 * SEGMENTS)
 
 
 class Quantiles(NamedTuple):
@@ -105,10 +105,10 @@ def quick_normals(
 def exact_normal(word: np.uint32, quadratics: tuple[Float, Float, Float], bits: NDArray[np.uint64]) -> float:
     """Return the value of a word as `effects.by_inverse_cdf`; ``bits`` is room for one double."""
     double = bits.view(np.float64)
-    bits[0] = ((np.uint64(word) & _LOW31_64) << _1 | _1) | _TWO52_BITS
-    double[0] = double[0] - _TWO52
-    row = (bits[0] >> _POSITION_BITS) - _FIRST_ROW
-    bits[0] = (bits[0] & _POSITION_MASK) | _ONE_BITS
+    bits[0] = ((np.uint64(word) & _LOW31_64) << _1 | _1) | TWO52_BITS
+    double[0] = double[0] - TWO52
+    row = (bits[0] >> POSITION_BITS) - FIRST_ROW
+    bits[0] = (bits[0] & POSITION_MASK) | ONE_BITS
     t = double[0] - 1.0
     z: float = quadratics[0][row] + t * (quadratics[1][row] + t * quadratics[2][row])
     return -z if np.uint64(word) & _SIGN_64 else z

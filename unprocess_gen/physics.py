@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from decimal import Decimal, localcontext
 from typing import Any
 
-from unprocess_gen.config import BranchConfig, Config, NoiseConfig, branch_of, law
+from unprocess_gen.config import SCENE_LAWS, BranchConfig, Config, NoiseConfig, branch_of, law
 from unprocess_gen.draws import draw
 from unprocess_gen.records import Physics
 from unprocess_gen.streams import body_key
@@ -27,7 +27,7 @@ def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) ->
     """
     noise, scene, sensor = config.noise, config.scene, config.sensor
     iso, seconds, celsius = (
-        draw(law(key, value, LAWS), uniforms[key])
+        draw(law(key, value, SCENE_LAWS), uniforms[key])
         for key, value in (
             ("iso", scene.iso if noise.iso is None else noise.iso),
             ("exposure_s", scene.exposure_s),
@@ -64,10 +64,6 @@ def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) ->
         body_key=body_key(config.seed, noise.name, unit),
         fixed_pattern_in_clean=config.clean.includes_fixed_pattern,
     )
-
-
-LAWS = ("uniform", "log_uniform", "choice")
-"""What the numbers of a scene can be drawn from."""
 
 
 def _doublings(celsius: float, noise: NoiseConfig) -> float:

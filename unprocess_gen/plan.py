@@ -6,10 +6,12 @@ that is not needed moves no other.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 from unprocess_gen import colour
 from unprocess_gen.config import (
+    SCENE_LAWS,
     CameraConfig,
     Config,
     budget,
@@ -24,7 +26,7 @@ from unprocess_gen.config import (
 )
 from unprocess_gen.draws import draw
 from unprocess_gen.methods import choose
-from unprocess_gen.physics import LAWS, plan_physics
+from unprocess_gen.physics import plan_physics
 from unprocess_gen.planner import Prediction, decide, light_of
 from unprocess_gen.records import Facts, Plan
 from unprocess_gen.sensor import noise_in_dn
@@ -59,19 +61,36 @@ def plan_pairs(
     Of a frame of a clip, ``source_sha256`` and ``occurrence`` are the clip's, so that all of its frames share their
     draws, and ``frame`` is its number, so that they do not share their noise.
     """
+    levels = plan_levels(config, source_sha256, occurrence, facts)
+    return with_draws(config, [plan for plan, _ in levels], frame)
+
+
+def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
+    """Return a plan for every draw at each level."""
+    return tuple(replace(plan, draw=draw, frame=frame) for plan in levels for draw in range(config.noise.draws))
+
+
+Reasoned = tuple[Plan, tuple[Prediction, ...]]
+"""A plan, and what was predicted of every effect of a physical profile."""
+
+
+def plan_levels(
+    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None
+) -> tuple[Reasoned, ...]:
+    """Return the plan of every noise level, with its reasons."""
     levels = range(len(noise_levels(config.noise)))
-    plans = (plan_with_reasons(config, source_sha256, occurrence, facts, level)[0] for level in levels)
-    return tuple(replace(plan, draw=draw, frame=frame) for plan in plans for draw in range(config.noise.draws))
+    return tuple(plan_with_reasons(config, source_sha256, occurrence, facts, level) for level in levels)
 
 
 def plan_with_reasons(
     config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, level: int = 0
-) -> tuple[Plan, tuple[Prediction, ...]]:
-    """Return the plan of one noise level, and what was predicted of every effect of a physical profile."""
+) -> Reasoned:
+    """Return the plan of one noise level, with its reasons."""
     key = stream_key(config.seed, source_sha256, occurrence)
     uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
-    at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), level), strict=True))
-    uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
+    if level:
+        at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), level), strict=True))
+        uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
     config = replace(config, noise=noise_levels(config.noise)[level])
     plan = _plan(config, key, uniforms, level)
     if not is_physical(config.noise):
@@ -99,6 +118,7 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
     """Return the plan without what a physical profile adds."""
     camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
     red, blue, inverse_rgb = gain_laws(config.gains)
+    darkened = law("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_LAWS)
     a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
     span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
     effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
@@ -108,7 +128,7 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         downscale=config.source.downscale,
         dequantize=dequantizing(config.source),
         scene=config.scene.name,
-        exposure_ratio=draw(law("scene.exposure_ratio", config.scene.exposure_ratio, LAWS), uniforms["exposure_ratio"]),
+        exposure_ratio=draw(darkened, uniforms["exposure_ratio"]),
         camera=camera,
         weights=weights,
         rgb2cam=rgb2cam,

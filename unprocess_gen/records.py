@@ -148,6 +148,10 @@ class Physics:
     fixed_pattern_in_clean: bool
 
 
+READABLE, IN_FLOAT32 = "colour:numpy_float64", "colour:fused_float32"
+"""The methods that tell the forms of a whole pair (`methods.FORMS`) apart."""
+
+
 @dataclass(frozen=True, slots=True)
 class Plan:
     """Everything that decides a pair besides its pixels: what a manifest row holds, as numbers.
@@ -205,12 +209,12 @@ class Plan:
     @property
     def readable(self) -> bool:
         """Whether the readable forms are asked for."""
-        return "colour:numpy_float64" in self.methods
+        return READABLE in self.methods
 
     @property
     def in_float32(self) -> bool:
         """Whether the form in single precision is asked for."""
-        return "colour:fused_float32" in self.methods
+        return IN_FLOAT32 in self.methods
 
     @property
     def exposure(self) -> float:
@@ -285,7 +289,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """How a parameter is drawn: a kind (`plan.LAWS` says what each does) and its numbers; ``constant`` has one."""
+    """How a parameter is drawn: a kind (`draws.LAWS` says what each does) and its numbers; ``constant`` has one."""
 
     kind: str
     numbers: tuple[float, ...]

@@ -49,8 +49,8 @@ from unprocess_gen.workspace import (
     dataset_text,
     fingerprint,
     machine_error,
+    place,
     read_dataset,
-    sync,
 )
 
 Facts = dict[str, Any]
@@ -122,11 +122,9 @@ def _sound_facts(folder: Path) -> Facts:
 
 
 def _place(aside: Path, path: Path) -> None:
-    """Put a finished file where it belongs, durably."""
-    sync(aside)
+    """Put a finished file where it belongs, in a folder that may be gone too."""
     path.parent.mkdir(exist_ok=True)
-    os.replace(aside, path)
-    sync(path.parent)
+    place(aside, path)
 
 
 def _write(aside: Path, path: Path, text: str) -> None:

@@ -21,7 +21,7 @@ from unprocess_gen.compiled import is_kept, kernel
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import MachineError
 from unprocess_gen.pair import make_pair
-from unprocess_gen.records import Float, Physics, Plan, Srgb
+from unprocess_gen.records import IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
 from unprocess_gen.shards import array_xxh3
 from unprocess_gen.streams import philox4x32
 from unprocess_gen.tables import linear_table, normal_table
@@ -94,10 +94,8 @@ GOLDEN_PHYSICS = Physics(
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
     "gray_mean": replace(GOLDEN_PLAN, highlight="gray_mean"),
-    "float32": replace(
-        GOLDEN_PLAN, methods=("colour:fused_float32",), bits=16, black_level_dn=4096, white_level_dn=65535
-    ),
-    "readable": replace(GOLDEN_PLAN, methods=("colour:numpy_float64",)),
+    "float32": replace(GOLDEN_PLAN, methods=(IN_FLOAT32,), bits=16, black_level_dn=4096, white_level_dn=65535),
+    "readable": replace(GOLDEN_PLAN, methods=(READABLE,)),
     "plain": replace(
         GOLDEN_PLAN,
         physics=GOLDEN_PHYSICS,
@@ -149,11 +147,11 @@ def are_compiled(kernels: str) -> bool:
 
 def kernels(counts_electrons: bool, methods: Collection[str]) -> str:
     """Return which of `PROVED_BY` make the pairs of a plan, by its methods."""
-    if "colour:numpy_float64" in methods:
+    if READABLE in methods:
         return "readable"
     if counts_electrons:
         return "counts"
-    return "float32" if "colour:fused_float32" in methods else "one_normal"
+    return "float32" if IN_FLOAT32 in methods else "one_normal"
 
 
 def check(kernels: str, way_out: str = "") -> None:

@@ -253,12 +253,9 @@ class Workspace:
         """Put a finished shard into place, durably: its rows first, then the shard. MachineError if that fails."""
         record = {"entry": made.entry(), "rows": [[row[name] for name in NAMES] for row in made.rows]}
         try:
-            if made.path is not None:
-                sync(Path(made.path))
             self._write(self._rows_path(made.shard), json.dumps(record, separators=(",", ":")))
             if made.path is not None:
-                os.replace(made.path, self.shards / shard_name(made.shard))
-                sync(self.shards)
+                place(Path(made.path), self.shards / shard_name(made.shard))
         except OSError as error:
             raise machine_error(error, self.out) from error
 
@@ -299,10 +296,7 @@ class Workspace:
         aside = self.work / (path.name + ".part")
         with aside.open("w", encoding="utf-8", newline="") as stream:
             yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(aside, path)
-        sync(path.parent)
+        place(aside, path)
 
 
 def _read_listing(path: Path) -> dict[str, Any]:
@@ -364,6 +358,13 @@ def machine_error(error: OSError, path: Path) -> MachineError:
         free = "the folder is gone"
     what = error.strerror or str(error)
     return MachineError(f"{error.filename or path}: {what} ({free}); what is committed is kept, run again to go on")
+
+
+def place(aside: Path, path: Path) -> None:
+    """Put a finished file where it belongs, durably; another of its name is replaced."""
+    sync(aside)
+    os.replace(aside, path)
+    sync(path.parent)
 
 
 def sync(path: Path) -> None:
