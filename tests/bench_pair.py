@@ -63,9 +63,10 @@ def other_yardstick(path: str) -> Callable[[np.ndarray], object]:
 
 
 def seconds(call: Callable[[], object]) -> float:
-    started = time.perf_counter()
+    """Processor time of this thread, which waits for nobody on a shared machine."""
+    started = time.thread_time()
     call()
-    return time.perf_counter() - started
+    return time.thread_time() - started
 
 
 def main() -> None:

@@ -35,6 +35,7 @@ ONLY_IN = {
     "hydra": {"cli"},
     "omegaconf": {"cli", "config"},
     "joblib": {"runner"},
+    "llvmlite": {"compiled"},
     "numba": {"compiled"},
     "cv2": {"decode", "runner"},
     "PIL": {"decode"},

@@ -5,10 +5,13 @@ No fastmath: nothing is reordered and no multiply-add is fused, so every process
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any, cast
 
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,3 +42,19 @@ def _compiled(function: Callable[..., Any], **more: bool) -> Callable[..., Any]:
         return cast(Callable[..., Any], njit(cache=True, **options)(function))
     except RuntimeError:
         return cast(Callable[..., Any], njit(**options)(function))
+
+
+def _eight_bytes(typing: Any, array: Any, at: Any) -> Any:
+    def load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        place = builder.gep(builder.bitcast(data, ir.IntType(8).as_pointer()), [arguments[1]])
+        number = builder.load(builder.bitcast(place, ir.IntType(64).as_pointer()))
+        number.align = 1
+        return builder.bswap(number) if sys.byteorder == "big" else number
+
+    return types.uint64(array, at), load
+
+
+eight_bytes: Callable[..., Any] = intrinsic(_eight_bytes)
+"""For kernels only: ``eight_bytes(array, at)`` is bytes ``at`` to ``at + 7`` of an array's memory as one uint64, the
+first in its lowest bits. Nothing is checked: the array is contiguous, and the bytes are its own."""
