@@ -3,9 +3,9 @@
     python tests/bench_size.py [--megapixels 1 10 100] [--to FOLDER]
 
 The images are JPEGs tiled from a synthetic scene. For each size a dataset is made by one worker in a process of its
-own, warm. Printed are milliseconds a megapixel from the start of the shard to its commit (decoding to bytes on disk), by
-the clock and of the processor, for the program and for the system (which hands out fresh memory and writes), and the
-peak memory of the process. A thousand megapixels need 12 GB of memory and 5 GB of disk.
+own, warm. Printed are milliseconds a megapixel from the start of the shard to its commit (decoding to bytes on disk),
+by the clock and of the processor, for the program and for the system (which hands out memory and writes), and the peak
+memory of the process. A thousand megapixels need 12 GB of memory and 5 GB of disk.
 """
 
 from __future__ import annotations
