@@ -99,7 +99,7 @@ def test_a_kernel_that_computes_otherwise_is_found(kernel: str, monkeypatch: pyt
             monkeypatch.setattr(fused, name, value.py_func)
     monkeypatch.setattr(fused, kernel, nudged(getattr(fused, kernel)))
     monkeypatch.setattr(fused, "eight_bytes", in_plain_python)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # words wrap around; a nudge meets memory nobody has written
         failed = selftest.failures("one_normal")
 
     assert any("the golden" in one for one in failed)
