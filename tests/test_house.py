@@ -36,7 +36,7 @@ ONLY_IN = {
     "omegaconf": {"cli", "config"},
     "joblib": {"runner"},
     "numba": {"compiled"},
-    "cv2": {"decode", "runner"},
+    "cv2": {"decode", "process", "runner"},
     "PIL": {"decode"},
     "av": {"video"},
     "tarfile": {"shards"},
