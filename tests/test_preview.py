@@ -57,10 +57,9 @@ def codes(values: np.ndarray) -> np.ndarray:
 def places(sheet: np.ndarray, picture: np.ndarray) -> list[tuple[int, int]]:
     """Rows and columns at which a picture stands in a sheet, pixel for pixel."""
     height, width = picture.shape[:2]
-    windows = np.lib.stride_tricks.sliding_window_view(sheet, (1, 1, 3))[..., 0, 0, :]
-    corners = np.argwhere((windows == picture[0, 0]).all(axis=-1)[:, :, 0])
-    inside = [(y, x) for y, x in corners if y + height <= sheet.shape[0] and x + width <= sheet.shape[1]]
-    return [(int(y), int(x)) for y, x in inside if np.array_equal(sheet[y : y + height, x : x + width], picture)]
+    starts = np.lib.stride_tricks.sliding_window_view(sheet, (1, min(width, 16), 3))[:, :, 0, 0]
+    corners = np.argwhere((starts == picture[0, :16]).all(axis=(2, 3)))
+    return [(int(y), int(x)) for y, x in corners if np.array_equal(sheet[y : y + height, x : x + width], picture)]
 
 
 # ------------------------------------------------------------------------------------------------- what a sheet shows
