@@ -25,7 +25,7 @@ FLOORS = (
     {"pair", "photographs", "plan", "reader", "workspace"},
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
-    {"forecast", "repair", "report"},
+    {"forecast", "preview", "repair", "report"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
@@ -37,7 +37,7 @@ ONLY_IN = {
     "joblib": {"runner"},
     "llvmlite": {"compiled"},
     "numba": {"compiled"},
-    "cv2": {"decode", "runner"},
+    "cv2": {"decode", "preview", "process", "runner"},
     "PIL": {"decode"},
     "av": {"video"},
     "tarfile": {"shards"},
