@@ -17,8 +17,9 @@ the other numbers of the row (DNG Specification 1.4; what it leaves open, from A
 * BlackLevel is what the camera believes, the same at all four sites: an error of the black level is one because no
   camera knows it.
 
-No tag says how highlights were kept: above the row's threshold a reader shows them brighter than the photograph, up to
-white. WhiteLevel is the sensor's, also where a full well saturates below it.
+No tag says how highlights were kept: above the row's threshold a reader shows them brighter than the photograph,
+channel by channel, so that bright colours shift too; white stays white. WhiteLevel is the sensor's, also where a full
+well saturates below it.
 
 The row stands as JSON in the XMP packet (properties Frame and Row of ``urn:unprocess-gen:manifest#``), which converters
 keep and show to nobody as a caption. No clock is in a file: the same row and frame are the same bytes.
