@@ -360,6 +360,7 @@ def test_a_file_says_what_it_is(ds: Path) -> None:
     np.testing.assert_array_equal(array, noisy)
     assert (tags["ImageWidth"], tags["ImageLength"], tags["BitsPerSample"], tags["Compression"]) == (97, 65, 16, 1)
     assert tags["PhotometricInterpretation"] == 32803  # CFA
+    assert (tags["DNGVersion"], tags["DNGBackwardVersion"]) == (bytes((1, 4, 0, 0)), bytes((1, 1, 0, 0)))
     assert (tags["CFARepeatPatternDim"], tags["CFAPattern"]) == ((2, 2), bytes((0, 1, 1, 2)))
     assert tags["BlackLevel"] == (plan.black_level_dn,) * 4
     assert tags["WhiteLevel"] == plan.white_level_dn

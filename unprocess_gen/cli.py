@@ -44,9 +44,9 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset verify DIR --noise [--to PNG]    … and fit the noise in its arrays against its rows
   gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
                                                make rows again and compare, or write their arrays
-  gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
   gen-dataset dng DIR --keys K,… [--noisy|--clean] --to FOLDER
                                                frames as DNG files, for raw converters
+  gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
 
 Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
   source   root, include, recursive, limit, max_pixels, max_failed, icc, clips, video,
@@ -402,8 +402,8 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "accuracy": accuracy,
     "verify": verify,
     "replay": replay,
-    "again": again,
     "dng": dng,
+    "again": again,
 }
 
 # ----------------------------------------------------------------------------------------------------------- Hydra

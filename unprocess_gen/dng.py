@@ -9,7 +9,8 @@ the other numbers of the row (DNG Specification 1.4; what it leaves open, from A
 * BaselineExposure is what to brighten by, in stops. A reader scales a neutral so that white is reached where the first
   channel saturates (dng_color_spec::SetWhiteXY; LibRaw too), so it shows the scene times the largest of the inverse
   gains, over the exposure ratio. The tag undoes it: log2(exposure_ratio / largest), above 0 where the photograph was
-  darkened. LibRaw and dcraw leave it to their callers.
+  darkened. LibRaw and dcraw leave it to their callers; LibRaw also takes the brightest DN for white where it lies above
+  three quarters of it, unless told adjust_maximum_thr=0.
 * NoiseProfile: variance = S·x + O with x 0 at black and 1 at white, so S = a_dn / span and O = b_dn2 / span², of those
   of shot and read noise that were simulated. It has no place for rows, columns, dark current and unequal responses, and
   rounding adds 1/12 DN². Readers take no S of 0 or below and no O below 0 (dng_noise_function::IsValid), so the clean
