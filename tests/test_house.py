@@ -25,7 +25,7 @@ FLOORS = (
     {"pair", "photographs", "plan", "reader", "workspace"},
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
-    {"forecast", "preview", "repair", "report"},
+    {"dng", "forecast", "preview", "repair", "report"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
@@ -41,6 +41,7 @@ ONLY_IN = {
     "PIL": {"decode"},
     "av": {"video"},
     "tarfile": {"shards"},
+    "tifffile": {"dng"},
 }
 """Which rooms may name a tool."""
 

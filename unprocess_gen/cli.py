@@ -46,6 +46,8 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
                                                make rows again and compare, or write their arrays
   gen-dataset preview DIR [--keys K,…] --to FOLDER [--source ROOT] [--stages]
                                                contact sheets: PNGs of pairs, and of each step
+  gen-dataset dng DIR --keys K,… [--noisy|--clean] --to FOLDER
+                                               frames as DNG files, for raw converters
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
 
 Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
@@ -257,6 +259,7 @@ AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed"
 VERIFY_KEYS = {"source.root": str, "--regenerate": int, "--to": str}
 REPLAY_KEYS = {"source.root": str, "--rows": str, "--keys": str, "--to": str}
 PREVIEW_KEYS = {"--keys": str, "--to": str, "--source": str}
+DNG_KEYS = {"--keys": str, "--to": str}
 
 
 def again(arguments: list[str]) -> int:
@@ -398,12 +401,35 @@ def preview(arguments: list[str]) -> int:
     return 0
 
 
+def dng(arguments: list[str]) -> int:
+    """``gen-dataset dng DIR --keys K,… [--noisy|--clean] --to FOLDER``: write frames as DNG files."""
+    from unprocess_gen import dng as room
+
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError("dng: expected the folder of a dataset")
+    flags = {f"--{frame}": frame for frame in room.FRAMES}
+    chosen = _values("dng", DNG_KEYS, [argument for argument in arguments[1:] if argument not in flags])
+    for key, wanted in (("--keys", "K,…: the rows to write"), ("--to", "FOLDER: where to write them")):
+        if not chosen.get(key):
+            raise ConfigError(f"dng: missing {key} {wanted}")
+    frames = [frame for flag, frame in flags.items() if flag in arguments] or room.FRAMES
+    done = room.export(Path(arguments[0]), chosen["--keys"], frames, Path(chosen["--to"]))
+    told = (
+        (done.written, "DNG files written"),
+        (done.present, "were there already, the same"),
+        (done.without_profile, "noisy ones without NoiseProfile, which their noise law does not fit"),
+    )
+    print(f"{chosen['--to']}: " + "; ".join(f"{count} {what}" for count, what in told if count))
+    return 0
+
+
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "plan": plan,
     "accuracy": accuracy,
     "verify": verify,
     "replay": replay,
     "preview": preview,
+    "dng": dng,
     "again": again,
 }
 
