@@ -9,9 +9,11 @@ import sys
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
+from numpy.typing import NDArray
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -44,7 +46,23 @@ def _compiled(function: Callable[..., Any], **more: bool) -> Callable[..., Any]:
         return cast(Callable[..., Any], njit(**options)(function))
 
 
-def _eight_bytes(typing: Any, array: Any, at: Any) -> Any:
+def eight_bytes(array: NDArray[Any], at: int) -> np.uint64:
+    """Return bytes ``at`` to ``at + 7`` of an array's memory as one number, the first in its lowest bits.
+
+    Compiled it is one instruction that checks nothing: the array must lie in one piece, and the bytes be its own.
+    """
+    return np.uint64(int.from_bytes(array.tobytes()[at : at + 8], "little"))
+
+
+@overload(eight_bytes, inline="always")
+def _compiled_eight_bytes(array: Any, at: Any) -> Callable[..., Any]:
+    def load(array: Any, at: Any) -> Any:
+        return _load_eight_bytes(array, at)
+
+    return load
+
+
+def _typed_load(typing: Any, array: Any, at: Any) -> Any:
     def load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
         place = builder.gep(builder.bitcast(data, ir.IntType(8).as_pointer()), [arguments[1]])
@@ -55,6 +73,4 @@ def _eight_bytes(typing: Any, array: Any, at: Any) -> Any:
     return types.uint64(array, at), load
 
 
-eight_bytes: Callable[..., Any] = intrinsic(_eight_bytes)
-"""For kernels only: ``eight_bytes(array, at)`` is bytes ``at`` to ``at + 7`` of an array's memory as one uint64, the
-first in its lowest bits. Nothing is checked: the array is contiguous, and the bytes are its own."""
+_load_eight_bytes: Callable[..., Any] = intrinsic(_typed_load)
