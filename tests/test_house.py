@@ -13,7 +13,7 @@ HOUSE = Path(unprocess_gen.__file__).parent
 
 FLOORS = (
     {"errors", "records"},
-    {"bayer", "colour", "compiled", "headers", "streams", "tables"},
+    {"bayer", "colour", "compiled", "headers", "markup", "streams", "tables"},
     {"normals"},
     {"methods", "poisson"},
     {

@@ -228,7 +228,7 @@ def _accuracy(config: Config, command: str) -> tuple[int, None]:
     from unprocess_gen.config import NoiseConfig, SensorConfig, read_option
 
     out = Path(config.out)
-    report.check_out(out)
+    report.check_out(out, "accuracy")
     noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
     beside = room.Beside(
         _tiers(),
