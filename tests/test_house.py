@@ -26,6 +26,7 @@ FLOORS = (
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
     {"forecast", "repair", "report"},
+    {"figures"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
