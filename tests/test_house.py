@@ -26,7 +26,7 @@ FLOORS = (
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
     {"forecast", "repair", "report"},
-    {"figures"},
+    {"figures", "page"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}

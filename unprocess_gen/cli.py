@@ -43,6 +43,7 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
   gen-dataset verify DIR --repair              … and make again what is damaged, to the same bytes
   gen-dataset verify DIR --noise [--to PNG]    … and fit the noise in its arrays against its rows
+  gen-dataset report DIR [--to FILE]           a page of the dataset: DIR/report.html
   gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
                                                make rows again and compare, or write their arrays
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
@@ -282,6 +283,7 @@ def _figures(config: Config, command: str) -> tuple[int, None]:
 
 AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
 VERIFY_KEYS = {"source.root": str, "--regenerate": int, "--to": str}
+REPORT_KEYS = {"--to": Path}
 REPLAY_KEYS = {"source.root": str, "--rows": str, "--keys": str, "--to": str}
 
 
@@ -401,12 +403,24 @@ def replay(arguments: list[str]) -> int:
     return 4 if different else 0
 
 
+def report(arguments: list[str]) -> int:
+    """``gen-dataset report DIR [--to FILE]``: write the page of a dataset, ``DIR/report.html`` by default."""
+    from unprocess_gen import page
+
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError("report: expected the folder of a dataset")
+    chosen = _values("report", REPORT_KEYS, arguments[1:])
+    print(page.write(Path(arguments[0]), chosen.get("--to")))
+    return 0
+
+
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "plan": plan,
     "accuracy": accuracy,
     "figures": figures,
     "verify": verify,
     "replay": replay,
+    "report": report,
     "again": again,
 }
 

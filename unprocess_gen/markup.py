@@ -87,7 +87,7 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 1.5rem au
 h2 { margin-top: 2.5rem; border-bottom: 1px solid var(--rule); }
 img { max-width: 100%; height: auto; background: #fff; }
 figure { margin: 1rem 0; } figcaption { margin-top: .3rem; }
-pre, .wide { overflow-x: auto; }
+pre, .wide { overflow-x: auto; margin: .8rem 0; }
 pre { background: var(--soft); padding: .6rem .8rem; font-size: .85rem; overflow-wrap: normal; }
 table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; white-space: nowrap; }
 th, td { padding: .2rem .6rem; text-align: left; border-bottom: 1px solid var(--rule); }
