@@ -63,11 +63,10 @@ def write(folder: Path, to: Path | None = None) -> Path:
 
 
 def _check_to(folder: Path, to: Path) -> None:
-    inside = to.resolve().is_relative_to(folder.resolve())
-    if inside and to.resolve().relative_to(folder.resolve()).parts[:1] in [(), *((name,) for name in OF_A_DATASET)]:
+    if any(to.resolve().is_relative_to((folder / name).resolve()) for name in OF_A_DATASET):
         raise ConfigError(f"--to {to}: belongs to the dataset; name another file")
-    if to.is_dir():
-        raise ConfigError(f"--to {to}: is a folder; name a file")
+    if to.is_dir() or not to.parent.is_dir():
+        raise ConfigError(f"--to {to}: expected the name of a file in a folder that is there")
 
 
 def page(folder: Path) -> str:
