@@ -25,7 +25,7 @@ FLOORS = (
     {"pair", "photographs", "plan", "reader", "workspace"},
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
-    {"forecast", "repair", "report"},
+    {"forecast", "preview", "repair", "report"},
     {"figures", "page"},
     {"cli"},
 )
@@ -37,7 +37,7 @@ ONLY_IN = {
     "omegaconf": {"cli", "config"},
     "joblib": {"runner"},
     "numba": {"compiled"},
-    "cv2": {"decode", "runner"},
+    "cv2": {"decode", "page", "preview", "process", "runner"},
     "PIL": {"decode"},
     "av": {"video"},
     "tarfile": {"shards"},

@@ -1,7 +1,7 @@
 """There and back: what `unprocess` did, `process` undoes; every colour, to its own code.
 
 Every test of colours here walks all 2**24 of them in the slow form, and a lattice of them with all faces of the cube in
-the quick one.
+the quick one. Through the mosaic: flat colours and ramps to rounding, pictures to what is stated here.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, process, unprocess
+from unprocess_gen import colour, process, synthetic, unprocess
+from unprocess_gen.bayer import PATTERNS, mosaic
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
 from unprocess_gen.pair import make_pair
 from unprocess_gen.plan import plan_image
@@ -190,3 +192,216 @@ def test_what_lies_outside_the_cube_is_clipped(plan: Plan) -> None:
     found = process.process(np.array([[[-0.5, 0.0, 2.0]]]), replace(plan, rgb2cam=(1, 0, 0, 0, 1, 0, 0, 0, 1)))
 
     assert found.tolist() == [[[0.0, 0.0, 1.0]]]
+
+
+# --------------------------------------------------------------------------------------------- through whole DN
+
+LOST = {16: 0, 14: 1, 12: 2, 10: 7}
+"""Codes by which rounding to a sensor's DN moves an 8-bit colour at most, whatever the camera and the gains."""
+
+LEVELS_DN = {16: (4096, 65535), 14: (1024, 16383), 12: (240, 4095), 10: (64, 1023)}
+"""Black and white level of the sensors in ``conf/sensor``, by their bits."""
+
+
+def on_sensor(plan: Plan, bits: int) -> Plan:
+    black, white = LEVELS_DN[bits]
+    return replace(plan, bits=bits, black_level_dn=black, white_level_dn=white)
+
+
+def codes_lost(plan: Plan, step: int) -> float:
+    """By how many codes the colours that are not clipped change, source to DN of all three channels and back."""
+    worst = 0.0
+    for srgb in colours(step):
+        light = unprocess.camera_light(srgb, plan)
+        inside = unclipped(light)
+        dn = quantise(to_dn(light[inside], plan.black_level_dn, plan.white_level_dn), 0, 65535)
+        codes = process.to_codes(process.process(process.to_light(dn, plan), plan))
+        worst = max(worst, float(np.abs(codes - srgb[inside]).max(initial=0)))
+    return worst
+
+
+@pytest.mark.parametrize("step", [pytest.param(15, id="lattice"), pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("camera", colour.CAMERAS)
+@pytest.mark.parametrize("bits", LOST)
+def test_whole_dn_move_a_colour_by_no_more_than_is_stated(plan: Plan, bits: int, camera: str, step: int) -> None:
+    for gains in ("least", "less", "more", "most"):
+        assert codes_lost(on_sensor(plan_with(plan, camera, gains, "per_channel"), bits), step) <= LOST[bits]
+
+
+@pytest.mark.parametrize("camera", colour.CAMERAS)
+def test_at_the_mean_gains_every_colour_returns_to_its_own_code_from_14_bits_on(plan: Plan, camera: str) -> None:
+    planned = replace(
+        plan_with(plan, camera, "most", "per_channel"), red_gain=2.15, blue_gain=1.7, inverse_rgb_gain=0.8
+    )
+
+    assert codes_lost(on_sensor(planned, 14), 15) == 0
+
+
+def test_a_scene_that_was_darkened_is_as_bright_again(plan: Plan) -> None:
+    planned = replace(on_sensor(plan_with(plan, "sony_a7r", "less", "per_channel"), 16), exposure_ratio=8.0)
+    grays = np.arange(0, 256, 5, dtype=np.uint8).reshape(1, -1, 1).repeat(3, axis=2)
+    light = np.minimum(unprocess.camera_light(grays, planned), 1) * planned.exposure
+
+    dn = quantise(to_dn(light, planned.black_level_dn, planned.white_level_dn), 0, 65535)
+
+    found = process.to_codes(process.process(process.to_light(dn, planned), planned))
+    assert np.abs(found - grays).max() <= LOST[14]  # 16 bits less the three that the scene takes
+
+
+# ------------------------------------------------------------------------------------------------ through the mosaic
+
+ORIGINS = [(0, 0), (0, 1), (1, 0), (1, 1)]
+SIZES = [(2, 2), (2, 3), (3, 2), (5, 2), (3, 3), (7, 10)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("origin", ORIGINS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_flat_colour_comes_out_of_its_mosaic(pattern: str, origin: tuple[int, int], size: tuple[int, int]) -> None:
+    flat = np.broadcast_to([0.3, 1.1, -0.2], (*size, 3))
+
+    found = process.demosaic(mosaic(flat, pattern, origin), pattern, origin)
+
+    np.testing.assert_allclose(found, flat, rtol=0, atol=32 * EPS)  # of 13 products, each at most 1.1
+
+
+def ramp(height: int, width: int) -> np.ndarray:
+    """Each channel rises or falls along both axes, each at a rate of its own."""
+    y, x = np.mgrid[:height, :width][..., None].astype(float)
+    return y * [0.5, -1.0, 0.25] + x * [-0.75, 0.5, 1.0] + [10, 20, 30]
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_colour_ramp_comes_out_but_for_the_two_rows_and_columns_at_the_edge(pattern: str) -> None:
+    """A mirrored row lies off the ramp by twice its distance from the edge, 4 steps at most."""
+    whole = ramp(11, 14)
+
+    error = np.abs(process.demosaic(mosaic(whole, pattern), pattern) - whole)
+
+    assert error[2:-2, 2:-2].max() <= 64 * EPS * 50
+    assert 0.1 < error.max() <= 4 * 1.75
+
+
+@pytest.mark.parametrize("other", PATTERNS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_another_pattern_gives_another_colour(pattern: str, other: str) -> None:
+    flat = np.broadcast_to([0.2, 0.5, 0.9], (8, 8, 3))
+
+    error = np.abs(process.demosaic(mosaic(flat, pattern), other) - flat).max()
+
+    assert (error < 1e-12) == (other == pattern)
+    assert other == pattern or error >= 0.3
+
+
+OPENCV_NAMES = {"RGGB": "BG", "BGGR": "RG", "GRBG": "GB", "GBRG": "GR"}
+"""OpenCV names a pattern by its second row's second and third site."""
+
+
+@pytest.mark.parametrize("name", OPENCV_NAMES.values())
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_the_phase_is_that_of_opencvs_own_demosaic(pattern: str, name: str) -> None:
+    smooth = ramp(24, 32) * 100 + 5000
+    bilinear = cv2.cvtColor(mosaic(smooth, pattern).astype(np.uint16), getattr(cv2, f"COLOR_Bayer{name}2RGB"))
+
+    error = np.abs(process.demosaic(mosaic(smooth, pattern), pattern) - bilinear)[2:-2, 2:-2].max()
+
+    assert (error <= 1.5) == (name == OPENCV_NAMES[pattern])  # two roundings
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_what_was_measured_stays(pattern: str) -> None:
+    values = np.random.default_rng(1).normal(size=(9, 12))
+
+    np.testing.assert_array_equal(mosaic(process.demosaic(values, pattern), pattern), values)
+
+
+def test_the_demosaic_is_linear_so_noise_below_black_takes_part() -> None:
+    first, second = np.random.default_rng(2).normal(size=(2, 9, 12))
+    parts = [process.demosaic(values, "RGGB") for values in (first, second)]
+
+    np.testing.assert_allclose(process.demosaic(first - second, "RGGB"), parts[0] - parts[1], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 8), (8, 1)])
+def test_a_mosaic_that_does_not_show_three_colours_is_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match=rf"the mosaic is \[{size[0]}, {size[1]}\]: less than 2 x 2 sites"):
+        process.demosaic(np.zeros(size), "RGGB")
+
+
+@pytest.mark.parametrize("highlight", HIGHLIGHTS)
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_flat_colours_return_from_a_raw_frame_as_they_do_from_all_three_channels(
+    plan: Plan, pattern: str, highlight: str
+) -> None:
+    """64 flat squares in one frame; the inner sites of each see nothing but their own."""
+    side = 8
+    levels = np.array(list(itertools.product((0, 100, 250, 255), repeat=3)), dtype=np.uint8).reshape(8, 8, 3)
+    source = levels.repeat(side, axis=0).repeat(side, axis=1)
+    planned = on_sensor(replace(plan_with(plan, "nexus_6p", "less", highlight), pattern=pattern), 16)
+
+    found = process.to_codes(process.develop(make_pair(source, planned).clean, planned))
+
+    inner = np.zeros(side, dtype=bool)
+    inner[2:-2] = True
+    inner = np.outer(np.tile(inner, 8), np.tile(inner, 8)) & unclipped(unprocess.camera_light(source, planned))
+    assert inner.sum() >= 16 * 30
+    np.testing.assert_array_equal(found[inner], source[inner])
+
+
+def test_a_cut_out_is_developed_in_its_own_phase(plan: Plan) -> None:
+    source = synthetic.scene("dead_leaves-0")[:64, :96]
+    planned = plan_with(plan, "nexus_6p", "less", "per_channel")
+    raw = make_pair(source, planned).clean
+    whole = process.develop(raw, planned)
+    y, x = 21, 34
+
+    cut = process.develop(raw[y:50, x:80], planned, origin=(y, x))
+
+    np.testing.assert_allclose(cut[2:-2, 2:-2], whole[y:50, x:80][2:-2, 2:-2], rtol=0, atol=1e-9)
+
+
+def developed_codes(source: np.ndarray, plan: Plan) -> np.ndarray:
+    return process.to_codes(process.develop(make_pair(source, plan).clean, plan))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_soft_picture_returns_to_two_codes(plan: Plan, pattern: str) -> None:
+    """Colours that change by a code a pixel: the demosaic loses no more than rounding to 8 bits and to 14 does."""
+    planned = replace(plan_with(plan, "sony_a7r", "more", "per_channel"), pattern=pattern)
+    y, x = np.mgrid[:140, :180]
+    source = np.stack([40 + y, 60 + x // 2, 200 - (x + y) // 2], axis=-1).astype(np.uint8)
+
+    error = np.abs(developed_codes(source, on_sensor(planned, 14)) - source)
+
+    assert error[2:-2, 2:-2].max() <= 2
+    assert error.max() <= 4
+
+
+def test_pictures_return_better_than_through_opencvs_bilinear_demosaic(plan: Plan) -> None:
+    """Edges are what a mosaic loses: the figures of two scenes, PSNR of unclipped pixels."""
+    planned = on_sensor(plan_with(plan, "olympus_em10", "more", "per_channel"), 14)
+    for scene, stated_db in (("dead_leaves-0", 32.9), ("highlights-0", 34.4)):
+        source = synthetic.scene(scene)
+        inside = unclipped(unprocess.camera_light(source, planned))
+        raw = make_pair(source, planned).clean
+        bilinear = process.to_light(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB), planned)
+
+        found = psnr_db(process.to_codes(process.develop(raw, planned))[inside], source[inside])
+
+        assert found > stated_db
+        assert found > psnr_db(process.to_codes(process.process(bilinear, planned))[inside], source[inside]) + 3
+
+
+def psnr_db(found: np.ndarray, wanted: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.mean((found - wanted) ** 2)))
+
+
+def test_a_saturated_highlight_on_gray_has_no_coloured_rim(plan: Plan) -> None:
+    """Light that falls off by 8 codes a pixel. With gains applied after the demosaic the rim is 125 codes of colour."""
+    y, x = np.mgrid[:60, :60]
+    gray = np.clip(255 - (np.hypot(y - 30, x - 30) - 9) * 8, 90, 255).astype(np.uint8)
+    planned = on_sensor(plan_with(plan, "nexus_6p", "less", "per_channel"), 14)
+
+    found = developed_codes(gray[..., None].repeat(3, axis=2), planned)
+
+    assert (found.max(axis=-1) - found.min(axis=-1)).max() <= 4

@@ -43,9 +43,12 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
   gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
   gen-dataset verify DIR --repair              … and make again what is damaged, to the same bytes
   gen-dataset verify DIR --noise [--to PNG]    … and fit the noise in its arrays against its rows
-  gen-dataset report DIR [--to FILE]           a page of the dataset: DIR/report.html
+  gen-dataset report DIR [--to FILE] [--source ROOT]
+                                               a page of the dataset: DIR/report.html
   gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
                                                make rows again and compare, or write their arrays
+  gen-dataset preview DIR [--keys K,…] --to FOLDER [--source ROOT] [--stages]
+                                               contact sheets: PNGs of pairs, and of each step
   gen-dataset again DIR [source.root=…] out=…  make a dataset again from its config.yaml
 
 Settings are key=value, in any order. Groups (group=option; their keys are group.key=value):
@@ -283,8 +286,9 @@ def _figures(config: Config, command: str) -> tuple[int, None]:
 
 AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
 VERIFY_KEYS = {"source.root": str, "--regenerate": int, "--to": str}
-REPORT_KEYS = {"--to": Path}
+REPORT_KEYS = {"--to": Path, "--source": Path}
 REPLAY_KEYS = {"source.root": str, "--rows": str, "--keys": str, "--to": str}
+PREVIEW_KEYS = {"--keys": str, "--to": str, "--source": str}
 
 
 def again(arguments: list[str]) -> int:
@@ -404,13 +408,36 @@ def replay(arguments: list[str]) -> int:
 
 
 def report(arguments: list[str]) -> int:
-    """``gen-dataset report DIR [--to FILE]``: write the page of a dataset, ``DIR/report.html`` by default."""
+    """``gen-dataset report DIR [--to FILE] [--source ROOT]``: write the page of a dataset, else ``DIR/report.html``."""
     from unprocess_gen import page
 
     if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
         raise ConfigError("report: expected the folder of a dataset")
     chosen = _values("report", REPORT_KEYS, arguments[1:])
-    print(page.write(Path(arguments[0]), chosen.get("--to")))
+    print(page.write(Path(arguments[0]), chosen.get("--to"), chosen.get("--source")))
+    return 0
+
+
+def preview(arguments: list[str]) -> int:
+    """``gen-dataset preview DIR [--keys K,…] --to FOLDER [--source ROOT] [--stages]``: draw contact sheets of pairs."""
+    from unprocess_gen import preview as room
+
+    with_stages = "--stages" in arguments
+    arguments = [argument for argument in arguments if argument != "--stages"]
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError("preview: expected the folder of a dataset")
+    folder, chosen = Path(arguments[0]), _values("preview", PREVIEW_KEYS, arguments[1:])
+    if "--to" not in chosen:
+        raise ConfigError("preview: --to is missing: the folder to draw the sheets in")
+    to, source = Path(chosen["--to"]), Path(chosen["--source"]) if "--source" in chosen else None
+    keys = chosen["--keys"].split(",") if "--keys" in chosen else []
+    files = 0
+    for drawn in room.preview(folder, to, keys, source, with_stages):
+        files += len(drawn.files)
+        if drawn.lacks:
+            left_out = "the source's panel and the stages are" if with_stages else "the source's panel is"
+            print(f"gen-dataset: {drawn.key} ({drawn.source}): {left_out} left out: {drawn.lacks}", file=sys.stderr)
+    print(f"{files} pictures in {to}")
     return 0
 
 
@@ -421,6 +448,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "verify": verify,
     "replay": replay,
     "report": report,
+    "preview": preview,
     "again": again,
 }
 

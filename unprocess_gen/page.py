@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
@@ -26,6 +27,7 @@ from unprocess_gen import markup, transfer
 from unprocess_gen.errors import ConfigError, DamageError
 from unprocess_gen.manifest import COLUMNS, Row, image_key, read_rows, sample_key
 from unprocess_gen.markup import Html, element
+from unprocess_gen.preview import contact_sheet
 from unprocess_gen.reader import RawPairs
 from unprocess_gen.records import Float
 from unprocess_gen.report import OF_A_DATASET, check_drawing, spelled
@@ -41,17 +43,19 @@ NAMED, SHARDS_NAMED, WORDS_NAMED = 50, 20, 16
 """Failures, shards and values of a word that are listed; what is more is counted."""
 
 
-def write(folder: Path, to: Path | None = None) -> Path:
+def write(folder: Path, to: Path | None = None, source: Path | None = None) -> Path:
     """Write the page of a finished dataset, ``report.html`` in its folder unless told otherwise; return its path.
 
-    Raises ConfigError where nothing can be drawn and where ``to`` is a file of the dataset, DamageError where the
-    dataset is not finished or its manifest or settings are not those it was finished with, MachineError where the page
-    cannot be written.
+    ``source`` is the folder of the photographs, for the contact sheet (`preview.contact_sheet`).
+
+    Raises ConfigError where nothing can be drawn, where ``to`` is a file of the dataset and ``source`` no folder,
+    DamageError where the dataset is not finished or its manifest or settings are not those it was finished with,
+    MachineError where the page cannot be written.
     """
     check_drawing("report")
     to = folder / REPORT if to is None else to
     _check_to(folder, to)
-    content = page(folder).encode()
+    content = page(folder, source).encode()
     aside = to.with_name(to.name + ".part")
     try:
         aside.write_bytes(content)
@@ -69,7 +73,7 @@ def _check_to(folder: Path, to: Path) -> None:
         raise ConfigError(f"--to {to}: expected the name of a file in a folder that is there")
 
 
-def page(folder: Path) -> str:
+def page(folder: Path, source: Path | None = None) -> str:
     """Return the page of a finished dataset; raises DamageError as `write` does."""
     facts = _facts(folder)
     tally = Tally()
@@ -80,6 +84,7 @@ def page(folder: Path) -> str:
         f"Dataset {name}",
         element("h1", f"Dataset {name}"),
         element("p", _headline(facts)),
+        *_pictures(folder, source, facts["pairs"]),
         *_section("Asked for", _asked(facts)),
         *_section("Made", _made(facts, tally)),
         *_section("Failed", _failed(facts, tally)),
@@ -360,6 +365,18 @@ def _headline(facts: Mapping[str, Any]) -> str:
 
 def _bytes(count: int) -> str:
     return f"{count / 1e9:,.2f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"
+
+
+JPEG_QUALITY = 88
+
+
+def _pictures(folder: Path, source: Path | None, pairs: int) -> list[Html]:
+    """Return the contact sheet of a few pairs; as JPEG, since noise makes a PNG four times as large."""
+    if not pairs:
+        return [element("p", "Every photograph failed, so there is no pair to show.")]
+    sheet = contact_sheet(folder, source=source)
+    _, content = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return [element("div", markup.image(content.tobytes(), "contact sheet of a few pairs", "jpeg"), class_="wide")]
 
 
 ASKED = (

@@ -1,22 +1,29 @@
 """The mirror of `unprocess`: from the sensor's light back to a display-referred photograph, for eyes and for proofs.
 
-NumPy, float64, one short function a step, in the camera's order: gains, matrix, gamma, tone. No byte of a dataset
-depends on this room, so it may call libm and LAPACK. It is the inverse of the settings in a manifest row: where nothing
-was clipped, every 8-bit colour returns to its own code (the test walks all 2**24, for four cameras and the gains'
-extremes).
+Float64, one short function a step, in the camera's order: black level, gains, demosaic, matrix, gamma, tone. No byte of
+a dataset depends on this room, so it may call libm, LAPACK and OpenCV. It is the inverse of the settings in a manifest
+row. Where nothing was clipped, every 8-bit colour returns to its own code (the test walks all 2**24, for four cameras
+and the gains' extremes); through whole DN of 16 bits still, of 14 bits to one code at the extremes, of 12 to two, of 10
+to seven. Through the mosaic too, flat colours return so; what edges lose there is the demosaic's.
 
 Tried for the highlights: Cardano's formula for the cubic, which loses half its digits where the mask begins; Newton's
 method from above keeps them and needs 4 to 9 rounds at the gains of the article.
+
+Tried for the demosaic, source to raw to sRGB on seven photographs of a megapixel, median PSNR: OpenCV's bilinear one
+41.7 dB, its edge-aware one 41.3 dB (both take whole numbers only, and its third takes 8 bits); the filters of Malvar,
+He and Cutler, run by OpenCV, 45.2 dB where gains are applied before them, as cameras do, and 40.8 dB after them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
+from unprocess_gen.bayer import mosaic, tile
 from unprocess_gen.colour import invert
-from unprocess_gen.records import Float, Plan
+from unprocess_gen.records import Float, Plan, Raw
 
 ROUNDS = 200
 """More than any search below needs: a bisection halves an interval of doubles at most 64 times until it is two
@@ -29,15 +36,87 @@ def process(camera_light: Float, plan: Plan) -> Float:
     The inverse of `unprocess.camera_light`: colours that left [0, 1] on the way are clipped before the gamma, as
     cameras do.
     """
-    image = apply_gains(camera_light, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
-    image = image @ np.array(invert(plan.rgb2cam)).reshape(3, 3).T
+    return render(apply_gains(camera_light, plan.inverse_gains, plan.highlight, plan.highlight_threshold), plan)
+
+
+def render(camera_rgb: Float, plan: Plan) -> Float:
+    """Return display-referred values in [0, 1] of white-balanced camera RGB, ``[H, W, 3]``: matrix, gamma, tone."""
+    image = camera_rgb @ np.array(invert(plan.rgb2cam)).reshape(3, 3).T
     image = compress_gamma(np.clip(image, 0, 1), plan.gamma)
     return TONES[plan.tone](image)
+
+
+def develop(raw: Raw | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
+    """Return the photograph that a raw frame shows, display-referred in [0, 1], ``[H, W, 3]`` float64.
+
+    ``raw`` is a mosaic ``[H, W]`` in DN, clean or noisy, of at least 2 x 2 sites; ``origin`` is the row and column of
+    its top-left site in the full frame. Noise below black and what a sensor reads above white are kept up to the colour
+    matrix; what then lies outside [0, 1] is clipped, as in `process`. Light that the clip at white or a full well took
+    does not come back; noise and fixed patterns are not undone. Raises ValueError as `demosaic` does.
+
+    The gains are applied site by site, before the demosaic, so that a saturated highlight has no coloured rim. Where
+    highlights were kept by the mean of three channels, no site has them: there the demosaic sees the plain gains.
+    """
+    light = to_light(raw, plan)
+    k = np.broadcast_to(plan.inverse_gains, (*light.shape, 3))
+    site_k = mosaic(k, plan.pattern, origin)
+    if plan.highlight == "gray_mean":
+        return process(demosaic(light / site_k, plan.pattern, origin) * k, plan)
+    balanced = HIGHLIGHTS[plan.highlight](light, site_k, plan.highlight_threshold)
+    return render(demosaic(balanced, plan.pattern, origin), plan)
+
+
+def to_light(dn: Raw | Float, plan: Plan) -> Float:
+    """Return the light of DN before the scene darkened it, any shape: 0 at black, 1 at the photograph's white."""
+    span_dn = float(plan.white_level_dn - plan.black_level_dn)
+    return np.asarray((dn - float(plan.black_level_dn)) / span_dn * plan.exposure_ratio)
 
 
 def to_codes(srgb: Float, codes: int = 256) -> Float:
     """Return the nearest of ``codes`` evenly spaced codes, still float64; ``srgb`` in [0, 1], any shape."""
     return np.rint(srgb * (codes - 1))
+
+
+KERNELS = {
+    "green": ((0, 0, -2, 0, 0), (0, 0, 4, 0, 0), (-2, 4, 8, 4, -2), (0, 0, 4, 0, 0), (0, 0, -2, 0, 0)),
+    "row": ((0, 0, 1, 0, 0), (0, -2, 0, -2, 0), (-2, 8, 10, 8, -2), (0, -2, 0, -2, 0), (0, 0, 1, 0, 0)),
+    "column": ((0, 0, -2, 0, 0), (0, -2, 8, -2, 0), (1, 0, 10, 0, 1), (0, -2, 8, -2, 0), (0, 0, -2, 0, 0)),
+    "diagonal": ((0, 0, -3, 0, 0), (0, 4, 0, 4, 0), (-3, 0, 12, 0, -3), (0, 4, 0, 4, 0), (0, 0, -3, 0, 0)),
+}
+"""Sixteenths (Malvar, He and Cutler, ICASSP 2004, figure 2): the mean of a site's neighbours of the channel wanted,
+which stand in a cross (green at red and blue), in its row, in its column or across (red at blue, blue at red), and a
+correction by the second difference of the channel it has. Each sums to 16 and is symmetric: flat colours and ramps are
+exact."""
+
+GREEN = 1
+
+
+def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
+    """Return the three channels of every site of a mosaic, ``[H, W]`` to ``[H, W, 3]``; what was measured stays.
+
+    Linear in its input. A flat colour comes out exactly but for rounding, and so does a ramp of any slope in each
+    channel, save in the two outermost rows and columns: there the frame is mirrored about its edge sites, which keeps
+    the Bayer phase. Raises ValueError for an unknown pattern and for less than 2 x 2 sites, which do not show all
+    channels.
+    """
+    if min(values.shape) < 2:
+        raise ValueError(f"the mosaic is {list(values.shape)}: less than 2 x 2 sites do not show all three colours")
+    guesses = {name: _filtered(values, kernel) for name, kernel in KERNELS.items()}
+    image = np.empty((*values.shape, 3))
+    sites = tile(pattern, origin)
+    for y in (0, 1):
+        for x in (0, 1):
+            own, beside, below = sites[y][x], sites[y][1 - x], sites[1 - y][x]
+            missing = {beside: "row", below: "column"} if own == GREEN else {GREEN: "green", 2 - own: "diagonal"}
+            image[y::2, x::2, own] = values[y::2, x::2]
+            for channel, name in missing.items():
+                image[y::2, x::2, channel] = guesses[name][y::2, x::2]
+    return image
+
+
+def _filtered(values: Float, sixteenths: tuple[tuple[int, ...], ...]) -> Float:
+    kernel = np.array(sixteenths) / 16
+    return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_REFLECT_101))
 
 
 def smoothstep(y: Float) -> Float:
