@@ -350,6 +350,7 @@ STYLE = """
 svg { display: block; width: 100%; height: 5rem; background: var(--soft); fill: var(--bar); }
 .ends { display: flex; justify-content: space-between; font-size: .8rem; font-variant-numeric: tabular-nums; }
 .wide img { max-width: none; }
+@media (min-width: 60rem) { .wide img { max-width: 100%; } }
 summary { cursor: pointer; }
 """
 
@@ -584,13 +585,18 @@ def _again(folder: Path, facts: Mapping[str, Any]) -> list[Html]:
     name = shlex.quote(folder.resolve().name)
     is_folder = facts["source"]["kind"] == "folder"
     root = " source.root=PHOTOGRAPHS" if is_folder else ""
-    commands = (
-        f"gen-dataset again {name}{root} out=again     # all of it, to the same bytes\n"
-        f"gen-dataset verify {name}                    # every byte, held against the manifest\n"
-        f"gen-dataset replay {name} --rows 0:10{root}  # ten rows made again and compared\n"
+    commands = "\n".join(
+        (
+            "# all of it, to the same bytes",
+            f"gen-dataset again {name}{root} out=again",
+            "# every byte, held against the manifest",
+            f"gen-dataset verify {name}",
+            "# ten rows, made again and compared",
+            f"gen-dataset replay {name} --rows 0:10{root}",
+        )
     )
-    place = f"The photographs were in {facts['source']['root']}." if is_folder else "Made of the built-in scenes."
-    return [element("pre", commands), element("p", place)]
+    origin = f"The photographs were in {facts['source']['root']}." if is_folder else "Made of the built-in scenes."
+    return [element("pre", commands), element("p", origin)]
 
 
 def _hashes(facts: Mapping[str, Any]) -> list[Html]:
