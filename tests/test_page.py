@@ -28,7 +28,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs, page, plan, report, transfer
+from unprocess_gen import RawPairs, markup, page, plan, report, transfer
 from unprocess_gen.manifest import Row, read_rows, write_rows
 from unprocess_gen.page import PARAMETERS, WORDS, Histogram, Tally, Words
 from unprocess_gen.verify import file_sha256, verify
@@ -139,6 +139,18 @@ def test_words_are_counted_and_too_many_are_summed_up() -> None:
 def test_every_drawn_parameter_has_a_column_on_the_page() -> None:
     shown = {draw for one in PARAMETERS for draw in one.draws} | set(WORDS)
     assert set(plan.PARAMETERS) <= shown
+
+
+def test_text_becomes_html_that_shows_it_and_html_stays() -> None:
+    shown = markup.element("p", "<&\"'>", markup.element("b", "x"), title='"')
+    assert shown == '<p title="&quot;">&lt;&amp;&quot;&#x27;&gt;<b>x</b></p>'
+
+
+@pytest.mark.parametrize("sign", ["\x00", "\x1b", "\x85", "\u202e", "\u2066", "\u2028", "\udcff", "\uffff"])
+def test_what_cannot_be_seen_is_spelled_out(sign: str) -> None:
+    shown = markup.escaped(f"a{sign}b")
+    assert sign not in shown
+    assert shown.encode() == b"a" + sign.encode("unicode_escape") + b"b"
 
 
 # What it says ---------------------------------------------------------------------------------------------------------

@@ -256,7 +256,7 @@ def _tiers() -> dict[str, AccuracyConfig]:
     return {path.stem: read_option(path, AccuracyConfig) for path in files}
 
 
-FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out", "n_jobs")
+FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
 """What can be chosen about the article's figures; it sets the rest itself."""
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen import markup
-from unprocess_gen.bayer import CHANNELS, mosaic, tile
+from unprocess_gen.bayer import CHANNELS, tile
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
 from unprocess_gen.errors import ConfigError, SourceError
 from unprocess_gen.markup import Html, element
@@ -213,7 +213,10 @@ def _count(config: Config, recipes: Recipes, listed: Iterable[Source]) -> Counte
 
 def _saturated_before(srgb: Srgb, pattern: str) -> NDArray[np.bool_]:
     """Return which sites have the highest code in the photograph itself, ``[H, W]``."""
-    return mosaic((srgb == np.iinfo(srgb.dtype).max).astype(np.float64), pattern) > 0
+    before = np.empty(srgb.shape[:2], dtype=np.bool_)
+    for (y, x), channel in np.ndenumerate(np.array(tile(pattern))):
+        before[y::2, x::2] = srgb[y::2, x::2, channel] == np.iinfo(srgb.dtype).max
+    return before
 
 
 # ------------------------------------------------------------------------------------------------------ for the eyes
@@ -230,8 +233,8 @@ def _shrunk(image: NDArray[Any], most: int, of_sites: bool = False) -> Picture:
     if of_sites and side > 1:
         side = max(side + side % 2 if side < min(height, width) else side - side % 2, 1)
     rows, columns = height // side, width // side
-    cut = image[: rows * side, : columns * side].astype(np.float64)
-    return np.asarray(cut.reshape(rows, side, columns, side, *image.shape[2:]).mean(axis=(1, 3)))
+    squares = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *image.shape[2:])
+    return np.asarray(squares.mean(axis=(1, 3), dtype=np.float64))
 
 
 def _display(srgb: Srgb, most: int = 720) -> Picture:
