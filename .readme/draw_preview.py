@@ -1,0 +1,27 @@
+"""Draw the README's overview of two pairs: python .readme/draw_preview.py (its dataset is in a temporary folder)."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+
+from unprocess_gen.preview import contact_sheet
+
+KEYS = ["00000001", "00000004"]
+
+
+def main() -> None:
+    """Make the dataset, write preview.png."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "unprocess_gen", f"out={folder}/ds", "noise=imx385_iso12800"]
+        subprocess.run(command, check=True)
+        picture = contact_sheet(Path(folder) / "ds", KEYS)
+    cv2.imwrite(str(Path(__file__).with_name("preview.png")), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+if __name__ == "__main__":
+    main()
