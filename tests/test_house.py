@@ -13,7 +13,7 @@ HOUSE = Path(unprocess_gen.__file__).parent
 
 FLOORS = (
     {"errors", "records"},
-    {"bayer", "colour", "compiled", "headers", "streams", "tables"},
+    {"bayer", "colour", "compiled", "headers", "markup", "streams", "tables"},
     {"normals"},
     {"methods", "poisson"},
     {
@@ -26,6 +26,7 @@ FLOORS = (
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
     {"dng", "forecast", "preview", "repair", "report"},
+    {"figures", "page"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
@@ -37,7 +38,7 @@ ONLY_IN = {
     "joblib": {"runner"},
     "llvmlite": {"compiled"},
     "numba": {"compiled"},
-    "cv2": {"decode", "preview", "process", "runner"},
+    "cv2": {"decode", "page", "preview", "process", "runner"},
     "PIL": {"decode"},
     "av": {"video"},
     "tarfile": {"shards"},

@@ -39,9 +39,12 @@ gen-dataset: pairs of clean and noisy raw images from ordinary photographs
                                                a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset plan [overrides] [--all]         what would be made; writes nothing
   gen-dataset accuracy [overrides] out=…       what accuracy costs in time, measured here: a report
+  gen-dataset figures [overrides] out=…        the article's figures, on the first photograph
   gen-dataset verify DIR [--regenerate N]      check every byte, and make N pairs again
   gen-dataset verify DIR --repair              … and make again what is damaged, to the same bytes
   gen-dataset verify DIR --noise [--to PNG]    … and fit the noise in its arrays against its rows
+  gen-dataset report DIR [--to FILE] [--source ROOT]
+                                               a page of the dataset: DIR/report.html
   gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]
                                                make rows again and compare, or write their arrays
   gen-dataset preview DIR [--keys K,…] --to FOLDER [--source ROOT] [--stages]
@@ -232,7 +235,7 @@ def _accuracy(config: Config, command: str) -> tuple[int, None]:
     from unprocess_gen.config import NoiseConfig, SensorConfig, read_option
 
     out = Path(config.out)
-    report.check_out(out)
+    report.check_out(out, "accuracy")
     noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
     beside = room.Beside(
         _tiers(),
@@ -255,8 +258,37 @@ def _tiers() -> dict[str, AccuracyConfig]:
     return {path.stem: read_option(path, AccuracyConfig) for path in files}
 
 
+FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
+"""What can be chosen about the article's figures; it sets the rest itself."""
+
+
+def figures(arguments: list[str]) -> int:
+    """``gen-dataset figures [overrides]``: draw the article's figures on a photograph, in ``out`` (``figures``)."""
+    for argument in arguments:
+        if "=" in argument and not argument.startswith("-") and re.split(r"[.=]", argument)[0] not in FIGURE_KEYS:
+            raise ConfigError(f"figures: {argument}: the article sets it; expected {', '.join(FIGURE_KEYS)}")
+    if not any(argument.startswith("out=") for argument in arguments):
+        arguments = [*arguments, "out=figures"]
+    return compose(arguments, lambda config: _figures(config, shlex.join(["gen-dataset", "figures", *arguments])))
+
+
+def _figures(config: Config, command: str) -> tuple[int, None]:
+    from unprocess_gen import figures as room
+    from unprocess_gen import report
+    from unprocess_gen.config import GainsConfig, NoiseConfig, read_option
+
+    out = Path(config.out)
+    report.check_out(out, "figures")
+    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in room.GAINS}
+    authors = read_option(conf_dir() / "noise" / f"{room.AUTHORS_NOISE}.yaml", NoiseConfig)
+    drawn = room.draw(config, room.Recipes(gains, authors))
+    print(f"{out}: {', '.join(room.write(drawn, out, command))}")
+    return 0, None
+
+
 AGAIN_KEYS = {"source.root": str, "out": str, "n_jobs": int, "source.max_failed": int}
 VERIFY_KEYS = {"source.root": str, "--regenerate": int, "--to": str}
+REPORT_KEYS = {"--to": Path, "--source": Path}
 REPLAY_KEYS = {"source.root": str, "--rows": str, "--keys": str, "--to": str}
 PREVIEW_KEYS = {"--keys": str, "--to": str, "--source": str}
 DNG_KEYS = {"--keys": str, "--to": str}
@@ -378,6 +410,17 @@ def replay(arguments: list[str]) -> int:
     return 4 if different else 0
 
 
+def report(arguments: list[str]) -> int:
+    """``gen-dataset report DIR [--to FILE] [--source ROOT]``: write the page of a dataset, else ``DIR/report.html``."""
+    from unprocess_gen import page
+
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError("report: expected the folder of a dataset")
+    chosen = _values("report", REPORT_KEYS, arguments[1:])
+    print(page.write(Path(arguments[0]), chosen.get("--to"), chosen.get("--source")))
+    return 0
+
+
 def preview(arguments: list[str]) -> int:
     """``gen-dataset preview DIR [--keys K,…] --to FOLDER [--source ROOT] [--stages]``: draw contact sheets of pairs."""
     from unprocess_gen import preview as room
@@ -426,8 +469,10 @@ def dng(arguments: list[str]) -> int:
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "plan": plan,
     "accuracy": accuracy,
+    "figures": figures,
     "verify": verify,
     "replay": replay,
+    "report": report,
     "preview": preview,
     "dng": dng,
     "again": again,

@@ -7,9 +7,7 @@ Colours are those of Okabe and Ito, which colour-blind readers can tell apart; e
 
 from __future__ import annotations
 
-import base64
 import csv
-import html
 import io
 import math
 import os
@@ -19,8 +17,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from unprocess_gen import markup
 from unprocess_gen.accuracy import REFERENCE, Report, Row
 from unprocess_gen.errors import ConfigError
+from unprocess_gen.markup import element
 from unprocess_gen.methods import STAGES
 from unprocess_gen.workspace import machine_error
 
@@ -34,10 +34,15 @@ OF_A_DATASET = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work"
 """What marks a folder as a dataset, finished or begun, where foreign files would be taken for damage."""
 
 
-def check_out(out: Path) -> None:
-    """Refuse a folder that cannot be written or holds a dataset, and where nothing can be drawn: ConfigError."""
+def check_drawing(verb: str) -> None:
+    """Refuse a verb that draws where nothing can be drawn: ConfigError."""
     if find_spec("matplotlib") is None:
-        raise ConfigError("accuracy: drawing needs matplotlib; pip install 'unprocess_gen[figures]'")
+        raise ConfigError(f"{verb}: drawing needs matplotlib; pip install 'unprocess_gen[figures]'")
+
+
+def check_out(out: Path, verb: str) -> None:
+    """Refuse a folder that cannot be written or holds a dataset, and where nothing can be drawn: ConfigError."""
+    check_drawing(verb)
     for name in OF_A_DATASET:
         if (out / name).exists():
             raise ConfigError(
@@ -303,17 +308,6 @@ def _legend(figure: Figure, rows: Sequence[Row]) -> None:
 
 # ---------------------------------------------------------------------------------------------------------- page
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 1.5rem auto; padding: 0 1rem; color: #222; }
-img { max-width: 100%; height: auto; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; white-space: nowrap; }
-th, td { padding: .2rem .6rem; text-align: left; border-bottom: 1px solid #e4e4e4; }
-td.n, th.n { text-align: right; }
-tr.first td { border-top: 2px solid #999; }
-dt { font-weight: 600; } dd { margin: 0 0 .4rem; overflow-wrap: anywhere; }
-"""
-
 NOTES = (
     "Errors of curve, colour, mosaic and quantise: the clean frame at 14 bits, DN, all else exact. Of normal: σ, "
     "against the true quantile. Of shot: the largest difference of distribution functions, with read noise, as "
@@ -329,31 +323,19 @@ NOTES = (
 
 def page(report: Report, picture: bytes) -> str:
     """Return ``accuracy.html``: one file without a script, the figure in it."""
-    facts = "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(text)}</dd>" for name, text in report.facts.items())
-    image = base64.b64encode(picture).decode()
-    notes = "".join(f"<p>{html.escape(note)}</p>" for note in NOTES)
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>What accuracy costs</title><style>{STYLE}</style></head><body>\n<h1>What accuracy costs</h1>\n"
-        f'<p><img alt="error against time of every method, by stage" src="data:image/png;base64,{image}"></p>\n'
-        "<p>Filled: nothing else is both faster and nearer. Grey: their front. Errors of 0 stand on a line of "
-        f'their own.</p>\n<div class="wide">{_html_table(report.rows)}</div>\n{notes}\n'
-        f"<h2>How it was measured</h2>\n<dl>{facts}</dl>\n</body></html>\n"
+    stages = [None, *(row.stage for row in report.rows)]
+    first = [at for at, row in enumerate(report.rows) if row.stage != stages[at]]
+    return markup.page(
+        "What accuracy costs",
+        element("h1", "What accuracy costs"),
+        element("p", markup.image(picture, "error against time of every method, by stage")),
+        element(
+            "p",
+            "Filled: nothing else is both faster and nearer. Grey: their front. "
+            "Errors of 0 stand on a line of their own.",
+        ),
+        markup.table(HEADINGS, map(cells, report.rows), RIGHT, first),
+        *(element("p", note) for note in NOTES),
+        element("h2", "How it was measured"),
+        markup.facts(report.facts),
     )
-
-
-def _html_table(rows: Sequence[Row]) -> str:
-    before = [None, *(row.stage for row in rows)]
-    lines = [_html_line("th", HEADINGS, "")]
-    lines += [
-        _html_line("td", cells(row), ' class="first"' if row.stage != stage else "")
-        for row, stage in zip(rows, before, strict=False)
-    ]
-    return f"<table>{''.join(lines)}</table>"
-
-
-def _html_line(tag: str, texts: Sequence[str], attribute: str) -> str:
-    right = ' class="n"'
-    made = (f"<{tag}{right if at in RIGHT else ''}>{html.escape(text)}</{tag}>" for at, text in enumerate(texts))
-    return f"<tr{attribute}>{''.join(made)}</tr>"

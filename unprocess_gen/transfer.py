@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -176,12 +177,12 @@ def _shared_error(row: Row) -> float:
     )
 
 
-def draw(found: list[Fit], path: Path) -> None:
-    """Draw variance against signal of the pairs, and the lines expected; ConfigError without matplotlib."""
+def draw(found: list[Fit], to: Path | BinaryIO) -> None:
+    """Draw variance against signal of the pairs, and the lines expected, as PNG; ConfigError without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ConfigError(f"--to {path}: drawing needs matplotlib; pip install 'unprocess_gen[figures]'") from None
+        raise ConfigError(f"--to {to}: drawing needs matplotlib; pip install 'unprocess_gen[figures]'") from None
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     for number, one in enumerate(found):
@@ -191,7 +192,7 @@ def draw(found: list[Fit], path: Path) -> None:
         axes.plot(ends, one.expected[0] * ends + one.expected[1] + ROUNDING_VARIANCE, color=colour, label=one.key)
     axes.set(xlabel="signal above black (DN)", ylabel="variance of noisy - clean (DN²)", title="Photon transfer")
     axes.legend(title="line: the manifest's numbers")
-    figure.savefig(path, dpi=120)
+    figure.savefig(to, dpi=120)
 
 
 MOST_DRAWN = 8

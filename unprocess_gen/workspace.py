@@ -7,6 +7,7 @@
     out/shards/                  committed shards only
     out/manifest.csv             written when every shard is committed or given up for now
     out/dataset.json             written last: the dataset is complete, and .work goes, unless a shard is provisional
+    out/report.html              a page for people, where one was asked for; no part of the dataset, nothing reads it
 
 Only the coordinator moves anything to its final name: synced first, rows before shard, so whatever moment a run is
 killed at, a shard in place has its rows, and all else is made again to the same bytes. The lock is the kernel's
@@ -36,6 +37,9 @@ from unprocess_gen.errors import ConfigError, DamageError, LockedError, MachineE
 from unprocess_gen.manifest import NAMES, Row, read_rows, write_rows
 from unprocess_gen.records import Source
 from unprocess_gen.shards import shard_name
+
+REPORT = "report.html"
+"""The page of a dataset, the one file in its folder that is not of the dataset."""
 
 SHOWN = 3
 """Differences named in an error; the rest is counted."""
