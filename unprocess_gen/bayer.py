@@ -6,7 +6,10 @@ The tile is anchored at the top-left pixel of the full frame, so a part of a fra
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.records import Float
 
@@ -46,3 +49,43 @@ def mosaic(camera_rgb: Float, pattern: str, origin: tuple[int, int] = (0, 0)) ->
         for x in (0, 1):
             raw[y::2, x::2] = camera_rgb[y::2, x::2, sites[y][x]]
     return raw
+
+
+PLANES = ("R", "G of the red rows", "G of the blue rows", "B")
+"""The planes of a packed frame in their order, that of Brooks et al. 2019 (unprocess.py, mosaic()) and of most others."""
+
+Number = TypeVar("Number", np.uint16, np.float32)
+
+
+def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], ...]:
+    """Return row and column in the 2x2 tile, seen from ``origin``, of each of `PLANES`: the same order for any pattern.
+
+    >>> plane_sites("GBRG")
+    ((1, 0), (1, 1), (0, 0), (0, 1))
+    """
+    sites = tile(pattern, origin)
+    red = next((y, x) for y in (0, 1) for x in (0, 1) if sites[y][x] == 0)
+    y, x = red
+    return red, (y, 1 - x), (1 - y, x), (1 - y, 1 - x)
+
+
+def pack(mosaic: NDArray[Number], pattern: str, origin: tuple[int, int] = (0, 0)) -> NDArray[Number]:
+    """Return a mosaic ``[H, W]``, H and W even, as the planes ``[4, H / 2, W / 2]`` of `PLANES`; a copy.
+
+    Raises ValueError where a side is odd.
+    """
+    height, width = mosaic.shape
+    if height % 2 or width % 2:
+        raise ValueError(f"a mosaic of {width} x {height} sites has no whole planes: packing needs even sides")
+    planes = np.empty((4, height // 2, width // 2), dtype=mosaic.dtype)
+    for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
+        plane[:] = mosaic[y::2, x::2]
+    return planes
+
+
+def unpack(planes: NDArray[Number], pattern: str, origin: tuple[int, int] = (0, 0)) -> NDArray[Number]:
+    """Return the mosaic ``[H, W]`` of packed planes ``[4, H / 2, W / 2]``: the inverse of `pack`."""
+    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), dtype=planes.dtype)
+    for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
+        mosaic[y::2, x::2] = plane
+    return mosaic
