@@ -6,12 +6,9 @@ The tile is anchored at the top-left pixel of the full frame, so a part of a fra
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
-from numpy.typing import NDArray
 
-from unprocess_gen.records import Float
+from unprocess_gen.records import Float, Frame
 
 CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -52,9 +49,7 @@ def mosaic(camera_rgb: Float, pattern: str, origin: tuple[int, int] = (0, 0)) ->
 
 
 PLANES = ("R", "G of the red rows", "G of the blue rows", "B")
-"""The planes of a packed frame in their order, that of Brooks et al. 2019 (unprocess.py, mosaic()) and of most others."""
-
-Number = TypeVar("Number", np.uint16, np.float32)
+"""The planes of a packed frame in their order, which is that of Brooks et al. 2019 (unprocess.py, mosaic())."""
 
 
 def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], ...]:
@@ -69,7 +64,7 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
     return red, (y, 1 - x), (1 - y, x), (1 - y, 1 - x)
 
 
-def pack(mosaic: NDArray[Number], pattern: str, origin: tuple[int, int] = (0, 0)) -> NDArray[Number]:
+def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
     """Return a mosaic ``[H, W]``, H and W even, as the planes ``[4, H / 2, W / 2]`` of `PLANES`; a copy.
 
     Raises ValueError where a side is odd.
@@ -77,15 +72,15 @@ def pack(mosaic: NDArray[Number], pattern: str, origin: tuple[int, int] = (0, 0)
     height, width = mosaic.shape
     if height % 2 or width % 2:
         raise ValueError(f"a mosaic of {width} x {height} sites has no whole planes: packing needs even sides")
-    planes = np.empty((4, height // 2, width // 2), dtype=mosaic.dtype)
+    planes: Frame = np.empty((4, height // 2, width // 2), dtype=mosaic.dtype)
     for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
         plane[:] = mosaic[y::2, x::2]
     return planes
 
 
-def unpack(planes: NDArray[Number], pattern: str, origin: tuple[int, int] = (0, 0)) -> NDArray[Number]:
+def unpack(planes: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
     """Return the mosaic ``[H, W]`` of packed planes ``[4, H / 2, W / 2]``: the inverse of `pack`."""
-    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), dtype=planes.dtype)
+    mosaic: Frame = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), dtype=planes.dtype)
     for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
         mosaic[y::2, x::2] = plane
     return mosaic

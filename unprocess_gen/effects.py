@@ -53,7 +53,7 @@ def normals(uniforms: Words) -> Float:
 
 
 class Draws(NamedTuple):
-    """How words are drawn, and made values of a symmetric law and Poisson counts; arguments as for `READABLE_DRAWS`'s."""
+    """How words are drawn, and made values of a symmetric law and Poisson counts; arguments as in `READABLE_DRAWS`."""
 
     words: Callable[..., Words]
     by_inverse_cdf: Callable[[Words, Float], Float]
@@ -91,7 +91,9 @@ def heteroscedastic(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws:
     return np.asarray((count * plan.a_dn + plan.black_level_dn) + np.sqrt(plan.b_dn2) * n)
 
 
-def _image_words(plan: Plan, stream: str, shape: tuple[int, int], origin: Origin, draws: Draws = READABLE_DRAWS) -> Words:
+def _image_words(
+    plan: Plan, stream: str, shape: tuple[int, int], origin: Origin, draws: Draws = READABLE_DRAWS
+) -> Words:
     at = {"frame": plan.frame, "level": plan.level, "draw": plan.draw}
     return draws.words(plan.stream_key, stream, shape, origin=origin, **at)
 

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-
 from unprocess_gen.compiled import kernel
 from unprocess_gen.effects import Draws
 from unprocess_gen.fused import CHUNK, Key, fill_normals, fill_words, key_words
@@ -29,8 +28,9 @@ BAND, PIECE = 2**20, 2**16
 """Sites unprocessed at once: 8 MB of float64; and those that noise is added to: half a megabyte."""
 
 
-def bands(height: int, width: int, sites: int) -> Iterator[slice]:
-    """Yield the rows of a frame, top to bottom, in bands of about so many sites, a row at least."""
+def bands(shape: tuple[int, ...], sites: int) -> Iterator[slice]:
+    """Yield the rows of a frame ``[H, W]``, top to bottom, in bands of about so many sites, a row at least."""
+    height, width = shape
     rows = max(1, sites // max(width, 1))
     return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
@@ -105,5 +105,5 @@ def _poisson(uniforms: Words, rates: Float, normal: Quantiles, tables: Tables, o
             draw_counts(uniforms[y, start:end], rates[y, start:end], normal, tables, room, out[y, start:end])
 
 
-KERNELS = (_words, _by_inverse_cdf, _poisson)
-"""The ways in from Python."""
+OF_NORMALS, OF_COUNTS = (_words, _by_inverse_cdf), (_poisson,)
+"""The kernels that every frame in float32 takes, and those that noise made of counts takes beside them."""

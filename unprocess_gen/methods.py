@@ -124,7 +124,7 @@ def choose(budget: Budget, counts_electrons: bool, normalised: bool = False) -> 
     budget: beside the readable form they have one alone (`floats`), whose effects are the readable ones.
     """
     stages = [stage for stage in STAGES if counts_electrons or stage not in OF_COUNTS]
-    forms = FORMS
+    forms: Sequence[str] = FORMS
     if normalised:
         stages = [stage for stage in stages if stage not in OF_INTEGERS]
         forms, budget = FORMS[1:], replace(budget, law_distance=0.0)

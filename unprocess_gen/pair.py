@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen import effects, electrons, floats, fused
 from unprocess_gen.bayer import pack
-from unprocess_gen.records import PACKED, Counts, Float, Frame, Pair, Plan, Srgb
+from unprocess_gen.records import PACKED, Counts, Float, Frame, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.tables import linear_table
 from unprocess_gen.unprocess import dequantise, unprocess
@@ -56,17 +56,22 @@ def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[i
     first = plans[0]
     srgb = _dequantised(srgb, first, origin)
     unrounded, rounded, of_clean = fused.unprocess(srgb, first, _curve(srgb, first), origin)
-    clean = None if first.normalised else _frame_laid_out(rounded, first, origin)
-    for plan in plans:
-        if plan.normalised:
-            pair = _float_pair_of(unrounded, of_clean, plan, origin)
-            clean = _frame_laid_out(pair.clean, plan, origin) if clean is None else clean
-            yield Pair(clean, _frame_laid_out(pair.noisy, plan, origin), pair.counts)
-            continue
-        maker = electrons.make_noisy if plan.counts_electrons else fused.make_noisy
-        noisy, of_noisy = maker(unrounded, plan, _limits_dn(plan), origin)
-        counts = Counts(*(int(count) for count in of_clean + of_noisy))
-        yield Pair(clean, _frame_laid_out(noisy, plan, origin), counts)
+    if first.normalised:
+        made = (_float_pair_of(unrounded, of_clean, plan, origin) for plan in plans)
+    else:
+        made = (_integer_pair_of(unrounded, rounded, of_clean, plan, origin) for plan in plans)
+    clean: Frame | None = None
+    for pair in made:
+        clean = _frame_laid_out(pair.clean, first, origin) if clean is None else clean
+        yield Pair(clean, _frame_laid_out(pair.noisy, first, origin), pair.counts)
+
+
+def _integer_pair_of(
+    unrounded: Float, rounded: Raw, of_clean: NDArray[np.int64], plan: Plan, origin: tuple[int, int]
+) -> Pair:
+    maker = electrons.make_noisy if plan.counts_electrons else fused.make_noisy
+    noisy, of_noisy = maker(unrounded, plan, _limits_dn(plan), origin)
+    return Pair(rounded, noisy, Counts(*(int(count) for count in of_clean + of_noisy)))
 
 
 def _is_made_of_the_clean_frame(plan: Plan) -> bool:
@@ -95,9 +100,7 @@ def _reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Floa
     return _read_out(_clean_dn(light, plan), _beyond(light, plan), plan, origin, effects.READABLE_DRAWS)
 
 
-def _light(
-    srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None, draws: effects.Draws
-) -> Float:
+def _light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None, draws: effects.Draws) -> Float:
     """Return the light of the scene on each site, 0 at black and 1 at white, before clipping."""
     light = unprocess(srgb, plan, origin, curve)
     if plan.exposure != 1:  # what the photograph shows as white is white before it is darkened
@@ -150,7 +153,7 @@ def _float_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Pair:
     clean, noisy = (np.empty(srgb.shape[:2], dtype=np.float32) for _ in range(2))
     counts = np.zeros(len(fields(Counts)), dtype=np.int64)
     curve = _curve(srgb, plan)
-    for rows in floats.bands(*clean.shape, floats.BAND):
+    for rows in floats.bands(clean.shape, floats.BAND):
         at = origin[0] + rows.start, origin[1]
         if plan.averaged:
             light = _light(srgb[rows], plan, at, curve, floats.COMPILED_DRAWS)
@@ -168,7 +171,7 @@ def _float_pair_of(clean_dn: Float, of_clean: NDArray[np.int64], plan: Plan, ori
     clean, noisy = (np.empty(clean_dn.shape, dtype=np.float32) for _ in range(2))
     counts = np.zeros(len(fields(Counts)), dtype=np.int64)
     counts[:2] = of_clean[:2]
-    for rows in floats.bands(*clean.shape, floats.PIECE):
+    for rows in floats.bands(clean.shape, floats.PIECE):
         at = origin[0] + rows.start, origin[1]
         piece = _read_out(clean_dn[rows], (0, 0), plan, at, floats.COMPILED_DRAWS)
         clean[rows], noisy[rows] = piece.clean, piece.noisy

@@ -157,7 +157,11 @@ def _said(config: Config, effect: str) -> Said | None:
     """Return what the settings decide about an effect; None where the image must decide."""
     switch = effect_switch(config.effects, effect)
     if effect == "quantise":
-        return Said(False, NOT_ROUNDED) if is_normalised(config) else Said(True, "integer output is always rounded and clipped")
+        return (
+            Said(False, NOT_ROUNDED)
+            if is_normalised(config)
+            else Said(True, "integer output is always rounded and clipped")
+        )
     if switch == "off":
         return Said(False, "switched off")
     number = lacks(config.noise, effect)
