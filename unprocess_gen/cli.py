@@ -62,7 +62,7 @@ Settings are key=value, in any order. Groups (group=option; their keys are group
   clean    includes_fixed_pattern
   accuracy exact reference fast or a budget: clean_dn, clean_changed_share, normal_error,
            law_distance, readable
-  output   webdataset, with dtype (uint16, float32), layout (mosaic, packed), pairs_per_shard
+  output   webdataset   dtype (uint16, float32), layout (mosaic, packed), pairs_per_shard
   experiment ipol_demo brooks2019_training crvd_like eld_low_light
            recipes, whose settings others change; added with a plus: +experiment=ipol_demo
 and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on).

@@ -47,11 +47,6 @@ def by_inverse_cdf(uniforms: Words, table: Float) -> Float:
     return np.asarray(np.where(uniforms >> np.uint32(31), -z, z))
 
 
-def normals(uniforms: Words) -> Float:
-    """Map uint32 words to standard normals by inverse CDF, same shape, float64, |z| up to 6.34; error below 1.5e-7."""
-    return by_inverse_cdf(uniforms, normal_table())
-
-
 class Draws(NamedTuple):
     """How words are drawn, and made values of a symmetric law and Poisson counts; arguments as in `READABLE_DRAWS`."""
 
@@ -62,6 +57,11 @@ class Draws(NamedTuple):
 
 READABLE_DRAWS = Draws(words, by_inverse_cdf, poisson)
 """The readable draws. Compiled ones (`floats`) give the same values, to the bit."""
+
+
+def normals(uniforms: Words, draws: Draws = READABLE_DRAWS) -> Float:
+    """Map uint32 words to standard normals by inverse CDF, same shape, float64, |z| up to 6.34; error below 1.5e-7."""
+    return draws.by_inverse_cdf(uniforms, normal_table())
 
 
 def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = READABLE_DRAWS) -> Float:
@@ -83,7 +83,7 @@ def heteroscedastic(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws:
     ``noise_law=gaussian``: one normal of that variance. ``poisson``: a times a Poisson count of mean (x - black) / a,
     and a normal of variance b.
     """
-    n = draws.by_inverse_cdf(_words(plan, "heteroscedastic", clean_dn, origin, draws), normal_table())
+    n = normals(_words(plan, "heteroscedastic", clean_dn, origin, draws), draws)
     if plan.noise_law == "gaussian" or plan.a_dn == 0:  # a of 0: no shot noise, in either form
         return clean_dn + np.sqrt(noise_variance(clean_dn, plan)) * n
     electrons = (clean_dn - plan.black_level_dn) / plan.a_dn
@@ -140,7 +140,7 @@ def response(physics: Physics, shape: Shape, origin: Origin = (0, 0), draws: Dra
 
     A pattern of the body. Kept as float32, so that one that is stored for many frames is the one that is computed.
     """
-    n = draws.by_inverse_cdf(_body_words(physics, "prnu", shape, origin, draws), normal_table())
+    n = normals(_body_words(physics, "prnu", shape, origin, draws), draws)
     return np.maximum(1 + physics.prnu_std * n, 0).astype(np.float32).astype(np.float64)
 
 
