@@ -29,9 +29,12 @@ BAND, PIECE = 2**20, 2**16
 
 
 def bands(shape: tuple[int, ...], sites: int) -> Iterator[slice]:
-    """Yield the rows of a frame ``[H, W]``, top to bottom, in bands of about so many sites, a row at least."""
-    height, width = shape
-    rows = max(1, sites // max(width, 1))
+    """Yield the rows of a frame ``[H, W]`` or ``[H, W, 3]``, top to bottom, in bands of about so many sites.
+
+    Each begins at an even row: two rows at least, but for the last one of an odd height.
+    """
+    height, width = shape[:2]
+    rows = 2 * max(1, sites // (2 * max(width, 1)))
     return (slice(top, min(top + rows, height)) for top in range(0, height, rows))
 
 

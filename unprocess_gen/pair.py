@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen import effects, electrons, floats, fused
 from unprocess_gen.bayer import pack
-from unprocess_gen.records import PACKED, Counts, Float, Frame, Pair, Plan, Raw, Srgb
+from unprocess_gen.records import PACKED, Counts, Float, Frame, Normalised, Pair, Plan, Srgb
 from unprocess_gen.sensor import noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.tables import linear_table
 from unprocess_gen.unprocess import dequantise, unprocess
@@ -31,11 +31,11 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     _check(srgb, plan)
     srgb = _dequantised(srgb, plan, origin)
     if plan.readable:
-        return _laid_out(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
+        return _pair_laid_out(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
     if plan.normalised:
-        return _laid_out(_float_pair(srgb, plan, origin), plan, origin)
+        return _float_pair(srgb, plan, origin)
     maker = electrons.make_pair if plan.counts_electrons else fused.make_pair
-    return _laid_out(maker(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin), plan, origin)
+    return _pair_laid_out(maker(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin), plan, origin)
 
 
 def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> Iterator[Pair]:
@@ -44,7 +44,8 @@ def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 
     Each is what `make_pair` gives, byte for byte, but the photograph is unprocessed once and the clean array is one.
     Raises ValueError where the plans do not share it.
     """
-    _check(srgb, plans[0])
+    for plan in plans:
+        _check(srgb, plan)
     if any(_of_the_clean_frame(plan) != _of_the_clean_frame(plans[0]) for plan in plans):
         raise ValueError("the plans do not share the clean frame: they may differ in the noise, level and draw alone")
     if len(plans) < 2 or not all(map(_is_made_of_the_clean_frame, plans)):
@@ -57,21 +58,19 @@ def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[i
     srgb = _dequantised(srgb, first, origin)
     unrounded, rounded, of_clean = fused.unprocess(srgb, first, _curve(srgb, first), origin)
     if first.normalised:
-        made = (_float_pair_of(unrounded, of_clean, plan, origin) for plan in plans)
-    else:
-        made = (_integer_pair_of(unrounded, rounded, of_clean, plan, origin) for plan in plans)
-    clean: Frame | None = None
-    for pair in made:
-        clean = _frame_laid_out(pair.clean, first, origin) if clean is None else clean
-        yield Pair(clean, _frame_laid_out(pair.noisy, first, origin), pair.counts)
-
-
-def _integer_pair_of(
-    unrounded: Float, rounded: Raw, of_clean: NDArray[np.int64], plan: Plan, origin: tuple[int, int]
-) -> Pair:
-    maker = electrons.make_noisy if plan.counts_electrons else fused.make_noisy
-    noisy, of_noisy = maker(unrounded, plan, _limits_dn(plan), origin)
-    return Pair(rounded, noisy, Counts(*(int(count) for count in of_clean + of_noisy)))
+        del rounded
+        clean = _float_frame(unrounded.shape, first)
+        for plan in plans:
+            noisy = _float_frame(unrounded.shape, plan)
+            counts = _fill_floats(unrounded, of_clean, plan, origin, clean if plan is first else None, noisy)
+            yield Pair(clean, noisy, Counts(*counts.tolist()))
+        return
+    whole = _laid_out(rounded, first, origin)
+    del rounded
+    for plan in plans:
+        maker = electrons.make_noisy if plan.counts_electrons else fused.make_noisy
+        of_dn, of_noisy = maker(unrounded, plan, _limits_dn(plan), origin)
+        yield Pair(whole, _laid_out(of_dn, plan, origin), Counts(*(int(count) for count in of_clean + of_noisy)))
 
 
 def _is_made_of_the_clean_frame(plan: Plan) -> bool:
@@ -91,7 +90,7 @@ def _of_the_clean_frame(plan: Plan) -> tuple[object, ...]:
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     """Make the same pair by the readable forms: Algorithm 1, the scene's exposure, the noise, the sensor's rounding."""
     _check(srgb, plan)
-    return _laid_out(_reference_pair(_dequantised(srgb, plan, origin), plan, origin), plan, origin)
+    return _pair_laid_out(_reference_pair(_dequantised(srgb, plan, origin), plan, origin), plan, origin)
 
 
 def _reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None = None) -> Pair:
@@ -150,40 +149,62 @@ def _read_out(
 
 def _float_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Pair:
     """Make the pair of `_reference_pair` in float32, band by band."""
-    clean, noisy = (np.empty(srgb.shape[:2], dtype=np.float32) for _ in range(2))
+    clean, noisy = (_float_frame(srgb.shape, plan) for _ in range(2))
     counts = np.zeros(len(fields(Counts)), dtype=np.int64)
     curve = _curve(srgb, plan)
-    for rows in floats.bands(clean.shape, floats.BAND):
+    for rows in floats.bands(srgb.shape, floats.BAND):
         at = origin[0] + rows.start, origin[1]
         if plan.averaged:
             light = _light(srgb[rows], plan, at, curve, floats.COMPILED_DRAWS)
             clean_dn, of_clean = _clean_dn(light, plan), np.array(_beyond(light, plan))
         else:
             clean_dn, _, of_clean = fused.unprocess(srgb[rows], plan, curve, at)
-        band = _float_pair_of(clean_dn, of_clean, plan, at)
-        clean[rows], noisy[rows] = band.clean, band.noisy
-        counts += astuple(band.counts)
+        counts += _fill_floats(clean_dn, of_clean, plan, at, _of_rows(clean, rows), _of_rows(noisy, rows))
     return Pair(clean, noisy, Counts(*counts.tolist()))
 
 
-def _float_pair_of(clean_dn: Float, of_clean: NDArray[np.int64], plan: Plan, origin: tuple[int, int]) -> Pair:
-    """Make a pair in float32 of an unrounded clean frame; ``of_clean`` begins with the sites beyond its ends."""
-    clean, noisy = (np.empty(clean_dn.shape, dtype=np.float32) for _ in range(2))
+def _fill_floats(
+    clean_dn: Float,
+    of_clean: NDArray[np.int64],
+    plan: Plan,
+    origin: tuple[int, int],
+    clean: Normalised | None,
+    noisy: Normalised,
+) -> NDArray[np.int64]:
+    """Fill the frames, or the noisy one alone, of an unrounded clean frame, and return the numbers of `Counts`.
+
+    ``of_clean`` begins with the sites beyond the ends of the clean one.
+    """
     counts = np.zeros(len(fields(Counts)), dtype=np.int64)
     counts[:2] = of_clean[:2]
-    for rows in floats.bands(clean.shape, floats.PIECE):
+    for rows in floats.bands(clean_dn.shape, floats.PIECE):
         at = origin[0] + rows.start, origin[1]
         piece = _read_out(clean_dn[rows], (0, 0), plan, at, floats.COMPILED_DRAWS)
-        clean[rows], noisy[rows] = piece.clean, piece.noisy
+        if clean is not None:
+            _of_rows(clean, rows)[:] = _laid_out(piece.clean, plan, at)
+        _of_rows(noisy, rows)[:] = _laid_out(piece.noisy, plan, at)
         counts += astuple(piece.counts)
-    return Pair(clean, noisy, Counts(*counts.tolist()))
+    return counts
 
 
-def _laid_out(pair: Pair, plan: Plan, origin: tuple[int, int]) -> Pair:
-    return Pair(_frame_laid_out(pair.clean, plan, origin), _frame_laid_out(pair.noisy, plan, origin), pair.counts)
+def _float_frame(shape: tuple[int, ...], plan: Plan) -> Normalised:
+    height, width = shape[:2]
+    return np.empty((4, height // 2, width // 2) if plan.layout == PACKED else (height, width), dtype=np.float32)
 
 
-def _frame_laid_out(mosaic: Frame, plan: Plan, origin: tuple[int, int]) -> Frame:
+def _of_rows(frame: Normalised, rows: slice) -> Normalised:
+    """Return a view of some rows of the mosaic, an even number from an even one on; planes have half as many."""
+    return frame[rows] if frame.ndim == 2 else frame[:, rows.start // 2 : rows.stop // 2]
+
+
+def _pair_laid_out(pair: Pair, plan: Plan, origin: tuple[int, int]) -> Pair:
+    clean, noisy, counts = pair.clean, pair.noisy, pair.counts
+    del pair  # each mosaic can go as soon as it is packed
+    clean = _laid_out(clean, plan, origin)
+    return Pair(clean, _laid_out(noisy, plan, origin), counts)
+
+
+def _laid_out(mosaic: Frame, plan: Plan, origin: tuple[int, int]) -> Frame:
     return pack(mosaic, plan.pattern, origin) if plan.layout == PACKED else mosaic
 
 
