@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +40,10 @@ PLANS = {
     "silent": replace(GOLDEN["per_channel"], effects=()),
 }
 """One plan of each kind."""
+DISPATCHED = [
+    name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
+]
+"""What NumPy chooses between on this machine."""
 
 
 def normalised(plan: Plan, clip: str = "none", layout: str = "mosaic") -> Plan:
@@ -176,6 +184,19 @@ def test_levels_and_draws_are_those_made_one_by_one(noise: str, overrides: tuple
         assert (ours.noisy.shape, ours.counts) == (alone.noisy.shape, alone.counts)
 
 
+@pytest.mark.parametrize("hidden", [{}, {"NPY_DISABLE_CPU_FEATURES": " ".join(DISPATCHED)}], ids=["all", "baseline"])
+def test_the_instructions_numpy_chooses_move_no_byte(hidden: dict[str, str]) -> None:
+    """The golden pairs in float32, whose formulas NumPy computes, in a process of their own."""
+    code = (
+        "import numpy as np; from unprocess_gen import selftest; print(selftest.failures('normalised_counts'), "
+        "sum(np._core._multiarray_umath.__cpu_features__[one] for one in np._core._multiarray_umath.__cpu_dispatch__))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | hidden, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"() {0 if hidden else len(DISPATCHED)}\n"
+
+
 # Planes ---------------------------------------------------------------------------------------------------------------
 
 
@@ -314,8 +335,6 @@ def test_every_byte_is_checked_and_every_pair_made_again(packed: Path, photos: P
 
 
 def test_a_flipped_bit_is_found_and_mended(packed: Path, photos: Path, door: Door, tmp_path: Path) -> None:
-    import shutil
-
     shutil.copytree(packed, tmp_path / "ds")
     shard = tmp_path / "ds/shards/shard-00000.tar"
     content = bytearray(shard.read_bytes())
