@@ -113,7 +113,7 @@ def settings() -> Settings:
             return compose("config", overrides=list(choices))
 
     def composed(*overrides: str) -> Config:
-        keys = {override: override.split("=")[0] for override in overrides}
+        keys = {override: override.lstrip("+").split("=")[0] for override in overrides}
         chosen = [override for override, key in keys.items() if (door_room.conf_dir() / key).is_dir()]
         node = copy.deepcopy(groups(*chosen))  # composing takes 0.1 s, so single values are set afterwards
         for override in OverridesParser.create().parse_overrides([one for one in overrides if one not in chosen]):

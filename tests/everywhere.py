@@ -43,7 +43,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 
-from unprocess_gen import cli, electrons, fused, poisson, selftest
+from unprocess_gen import cli, electrons, floats, fused, poisson, selftest
 from unprocess_gen.compiled import kernel
 from unprocess_gen.normals import normal_quantiles
 from unprocess_gen.pair import make_pair, make_pairs
@@ -227,7 +227,8 @@ def compile_kernels() -> None:
     black = np.zeros((2, 2, 3), dtype=np.uint8)
     outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"), (fused, "_pair32"))
     of_counts = ("_physical_pair", "_plain_pair", "_physical_noisy", "_responses")
-    for room, name in (*outer, *((electrons, name) for name in of_counts)):
+    of_floats = ("_words", "_by_inverse_cdf", "_poisson")
+    for room, name in (*outer, *((electrons, name) for name in of_counts), *((floats, name) for name in of_floats)):
         setattr(room, name, compiler(getattr(room, name)))
     for plan in selftest.GOLDEN_PLANS.values():
         make_pair(black, plan)

@@ -151,7 +151,8 @@ def test_normals_in_place_of_counts_are_as_far_from_the_law_as_the_formula_says(
     lab = accuracy.Lab(accuracy._settings(config, beside), TIERS, accuracy._subjects(config, LITTLE), LITTLE)
     plans = [plan for _, plan in accuracy._flat_plans(lab, TIERS[REFERENCE])]
     counted = lab.flats(TIERS[REFERENCE])
-    monkeypatch.setattr(effects, "poisson", lambda words, rate: rate + np.sqrt(rate) * effects.normals(words))
+    near = effects.READABLE_DRAWS._replace(poisson=lambda words, rate: rate + np.sqrt(rate) * effects.normals(words))
+    monkeypatch.setattr(effects, "READABLE_DRAWS", near)
     lab._flats.clear()
     drawn = lab.flats(TIERS[REFERENCE])
 

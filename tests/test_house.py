@@ -21,7 +21,7 @@ FLOORS = (
         *("sensor", "shards", "sources", "synthetic", "unprocess", "video"),
     },
     {"fused", "physics", "planner"},
-    {"electrons"},
+    {"electrons", "floats"},
     {"pair", "photographs", "plan", "reader", "workspace"},
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},

@@ -463,6 +463,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
         saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, law_distance=LONGEST,
+        dtype="float32", layout="mosaic",
         methods=tuple(max((one.spelled for one in of_stage(stage)), key=len) for stage in STAGES),
         effects=("heteroscedastic", "quantise"),
         skipped=(f"heteroscedastic: noise={LONGEST_NAME} has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),

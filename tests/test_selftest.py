@@ -210,7 +210,7 @@ def test_a_replay_on_such_a_machine_is_refused(dataset: Path, door: Door, monkey
 def test_the_golden_pair_depends_on_the_normals_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a change of the sampler that both forms share would go by unseen."""
     true = effects.normals
-    monkeypatch.setattr(effects, "normals", lambda uniforms: -true(uniforms))
+    monkeypatch.setattr(effects, "normals", lambda *given: -true(*given))
     pair = reference_pair(selftest.golden_picture(), selftest.GOLDEN_PLAN, (1, 57))
 
     assert array_xxh3(pair.noisy) != selftest.GOLDEN["per_channel"][1]

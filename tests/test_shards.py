@@ -24,6 +24,7 @@ from unprocess_gen import RawPairs, shards
 from unprocess_gen.errors import DamageError
 from unprocess_gen.records import Counts, Pair
 from unprocess_gen.shards import (
+    Form,
     Member,
     ShardWriter,
     array_xxh3,
@@ -59,6 +60,10 @@ def written(path: Path, *pairs: Pair, json_bytes: int = 512) -> ShardWriter:
         for i, one in enumerate(pairs):
             add(writer, f"{i:08d}", one, json.dumps({"key": i}).encode().ljust(json_bytes))
     return writer
+
+
+def uint16(height: int, width: int) -> Form:
+    return Form("uint16", (height, width))
 
 
 @pytest.fixture
@@ -128,12 +133,12 @@ SIZES = [(1, 1), (1, 2), (2, 1), (3, 5), (16, 16), (17, 31), (1, 191), (1, 193),
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_the_bytes_of_a_pair_are_told_exactly(height: int, width: int, tmp_path: Path) -> None:
     writer = written(tmp_path / "a.tar", pair(height, width), json_bytes=700)
-    assert shard_bytes([image_bytes(width, height, 700)]) == writer.bytes
+    assert shard_bytes([image_bytes(uint16(height, width), 700)]) == writer.bytes
 
 
 def test_the_bytes_of_a_shard_are_told_exactly(tmp_path: Path) -> None:
     writer = written(tmp_path / "a.tar", *(pair(height, width) for height, width in SIZES))
-    assert shard_bytes([image_bytes(width, height, 512) for height, width in SIZES]) == writer.bytes
+    assert shard_bytes([image_bytes(uint16(height, width), 512) for height, width in SIZES]) == writer.bytes
 
 
 def test_no_pair_is_no_bytes() -> None:
@@ -142,8 +147,8 @@ def test_no_pair_is_no_bytes() -> None:
 
 @given(width=st.integers(1, 10**6), height=st.integers(1, 10**6))
 def test_arrays_start_where_eight_bytes_do(width: int, height: int) -> None:
-    assert (image_bytes(width, height, 512) - 4 * width * height) > 0
-    assert image_bytes(width, height, 512) % 512 == 0
+    assert (image_bytes(uint16(height, width), 512) - 4 * width * height) > 0
+    assert image_bytes(uint16(height, width), 512) % 512 == 0
 
 
 @pytest.mark.parametrize(
@@ -267,8 +272,8 @@ def test_the_index_is_that_of_tarfile(shard: Path) -> None:
 def test_mapped_arrays_are_those_written(shard: Path) -> None:
     index = read_index(shard)
     for i, one in enumerate((pair(5, 7, 1), pair(8, 4, 2))):
-        assert np.array_equal(map_array(shard, index[f"{i:08d}.clean.npy"], one.clean.shape), one.clean)
-        assert np.array_equal(map_array(shard, index[f"{i:08d}.noisy.npy"], one.clean.shape), one.noisy)
+        assert np.array_equal(map_array(shard, index[f"{i:08d}.clean.npy"], uint16(*one.clean.shape)), one.clean)
+        assert np.array_equal(map_array(shard, index[f"{i:08d}.noisy.npy"], uint16(*one.clean.shape)), one.noisy)
 
 
 def test_json_is_read_from_its_place(shard: Path) -> None:
@@ -302,14 +307,14 @@ def test_a_member_that_is_no_array_of_ours_is_damage(at: int, shard: Path) -> No
     content[member.offset + at] ^= 0x11
     shard.write_bytes(content)
     with pytest.raises(DamageError, match=r"a.tar: the member at byte 512 is not an array"):
-        map_array(shard, member, (5, 7))
+        map_array(shard, member, uint16(5, 7))
 
 
 def test_a_shard_cut_off_after_its_index_was_read_is_damage(shard: Path) -> None:
     member = read_index(shard)["00000001.noisy.npy"]
     os.truncate(shard, 1024)
     with pytest.raises(DamageError):
-        map_array(shard, member, (8, 4))
+        map_array(shard, member, uint16(8, 4))
 
 
 # WebDataset -----------------------------------------------------------------------------------------------------------

@@ -63,6 +63,7 @@ def test_a_pair_with_no_range_of_signal_is_passed_over() -> None:
     flat = np.full((64, 64), 900, dtype=np.uint16)
     row = {"effects": "heteroscedastic;quantise", "a_dn": 1.0, "b_dn2": 4.0, "black_level_dn": 240, "bits": 12}
     row |= {"white_level_dn": 4095, "sensor_clip": "sensor", "key": "00000000"}
+    row |= {"dtype": "uint16", "layout": "mosaic"}
     row |= dict.fromkeys(("dn_per_e", "row_std_dn", "column_std_dn", "dark_e", "prnu_std", "width", "height"), 0.0)
     assert transfer.fit(flat, flat, row) is None
 

@@ -60,6 +60,7 @@ from unprocess_gen.config import (
     SensorConfig,
     budget,
     check,
+    is_normalised,
     is_physical,
 )
 from unprocess_gen.errors import ConfigError, SourceError
@@ -89,7 +90,7 @@ from unprocess_gen.planner import facts_for
 from unprocess_gen.poisson import Tables as PoissonTables
 from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.poisson import poisson_tables, room_for
-from unprocess_gen.records import Float, Pair, Plan, Raw, Srgb
+from unprocess_gen.records import MOSAIC, Float, Frame, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import quantise, to_dn
 from unprocess_gen.streams import Words
 from unprocess_gen.tables import linear_table, normal_lines
@@ -174,7 +175,12 @@ def measure(config: Config, beside: Beside, effort: Effort | None = None, comman
     ``command`` is what the report says it was made by. Raises ConfigError where no photograph can be read, or the
     settings cannot be measured.
     """
-    effort = effort or Effort()
+    if is_normalised(config):
+        raise ConfigError(
+            "output.dtype=float32: errors are measured in whole DN; say output.dtype=uint16 (frames in float32 are the "
+            "same, and exact, in every tier)"
+        )
+    effort, config = effort or Effort(), _as_mosaics(config)
     lab = Lab(_settings(config, beside), _tiers(config, beside), _subjects(config, effort), effort)
     calls = len(MEASUREMENTS) + len(lab.tiers) * 3
     with Steps(len(MEASUREMENTS) + len(TIER_STAGES) * len(lab.tiers) + calls * (effort.rounds + 1)) as steps:
@@ -191,12 +197,17 @@ def prices(config: Config, tiers: dict[str, AccuracyConfig], srgb: Srgb) -> dict
     Quickly: medians of three turns on cut-outs of one picture, of the readable forms on a small one.
     """
     effort = Effort(sampled=(16, 16), readable=(64, 96), compiled=(384, 512))
-    lab = Lab({"own": config}, {**tiers, config.accuracy.name: config.accuracy}, (), effort)
+    lab = Lab({"own": _as_mosaics(config)}, {**tiers, config.accuracy.name: config.accuracy}, (), effort)
     subject = Subject("", ("0" * 64, 0), *_cuts(srgb, effort))
     for tier in lab.tiers:
         _pair_ns(lab, "own", lab.tiers[tier], lab.tiny(subject))
     turns = [{tier: _pair_ns(lab, "own", lab.tiers[tier], subject) for tier in lab.tiers} for _ in range(3)]
     return {tier: statistics.median(turn[tier] for turn in turns) for tier in lab.tiers}
+
+
+def _as_mosaics(config: Config) -> Config:
+    """Return the settings for frames that are not packed, which moves values and changes none."""
+    return replace(config, output=replace(config.output, layout=MOSAIC))
 
 
 # ---------------------------------------------------------------------------------------- what it is measured on
@@ -222,7 +233,7 @@ class Lab:
     subjects: tuple[Subject, ...]
     effort: Effort
     _made: dict[object, list[tuple[Pair, Plan]]] = field(default_factory=dict)
-    _flats: dict[object, list[Raw]] = field(default_factory=dict)
+    _flats: dict[object, list[Frame]] = field(default_factory=dict)
 
     def plan(
         self, setting: str, accuracy: AccuracyConfig, subject: Subject, srgb: Srgb, edit: str = "as_it_is"
@@ -240,7 +251,7 @@ class Lab:
             self._made[key] = list(zip(pairs, plans, strict=True))
         return self._made[key]
 
-    def flats(self, accuracy: AccuracyConfig) -> list[Raw]:
+    def flats(self, accuracy: AccuracyConfig) -> list[Frame]:
         """Return noisy frames of flat fields in electrons under a budget, made once."""
         key = _numbers(accuracy)
         if key not in self._flats:
@@ -431,7 +442,7 @@ def noise_std_dn(pair: Pair, plan: Plan) -> Float:
 
 
 def compare(
-    ours: Sequence[Raw], reference: Sequence[Raw], unit: str, scales_dn: Sequence[Float] | None = None
+    ours: Sequence[Frame], reference: Sequence[Frame], unit: str, scales_dn: Sequence[Float] | None = None
 ) -> Error:
     """Return the error of all frames together, in DN or in units of ``scales_dn``."""
     differences = [one.astype(np.float64) - other for one, other in zip(ours, reference, strict=True)]
@@ -449,7 +460,7 @@ def shot_error(lab: Lab, accuracy: AccuracyConfig) -> Error:
     return Error(distance, on_photographs.rms, "distribution (max), σ (rms)", on_photographs.changed_share)
 
 
-def law_distance(ours: Sequence[Raw], reference: Sequence[Raw]) -> float:
+def law_distance(ours: Sequence[Frame], reference: Sequence[Frame]) -> float:
     """Return the largest difference of the distribution functions of two frames, over all pairs of them.
 
     Frames of common uniforms: what both share by chance cancels, and some 5e-4 is left of 512² sites.
@@ -457,7 +468,7 @@ def law_distance(ours: Sequence[Raw], reference: Sequence[Raw]) -> float:
     return max(_distance(one, other) for one, other in zip(ours, reference, strict=True))
 
 
-def _distance(one: Raw, other: Raw) -> float:
+def _distance(one: Frame, other: Frame) -> float:
     codes = int(max(one.max(), other.max())) + 1
     shares = np.bincount(one.ravel(), minlength=codes) - np.bincount(other.ravel(), minlength=codes)
     return float(np.abs(np.cumsum(shares)).max() / one.size)

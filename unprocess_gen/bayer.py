@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.records import Float
+from unprocess_gen.records import Float, Frame
 
 CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -46,3 +46,41 @@ def mosaic(camera_rgb: Float, pattern: str, origin: tuple[int, int] = (0, 0)) ->
         for x in (0, 1):
             raw[y::2, x::2] = camera_rgb[y::2, x::2, sites[y][x]]
     return raw
+
+
+PLANES = ("R", "G of the red rows", "G of the blue rows", "B")
+"""The planes of a packed frame in their order, which is that of Brooks et al. 2019 (unprocess.py, mosaic())."""
+
+
+def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], ...]:
+    """Return row and column in the 2x2 tile, seen from ``origin``, of each of `PLANES`: the same order for any pattern.
+
+    >>> plane_sites("GBRG")
+    ((1, 0), (1, 1), (0, 0), (0, 1))
+    """
+    sites = tile(pattern, origin)
+    red = next((y, x) for y in (0, 1) for x in (0, 1) if sites[y][x] == 0)
+    y, x = red
+    return red, (y, 1 - x), (1 - y, x), (1 - y, 1 - x)
+
+
+def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
+    """Return a mosaic ``[H, W]``, H and W even, as the planes ``[4, H / 2, W / 2]`` of `PLANES`; a copy.
+
+    Raises ValueError where a side is odd.
+    """
+    height, width = mosaic.shape
+    if height % 2 or width % 2:
+        raise ValueError(f"a mosaic of {width} x {height} sites has no whole planes: packing needs even sides")
+    planes: Frame = np.empty((4, height // 2, width // 2), dtype=mosaic.dtype)
+    for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
+        plane[:] = mosaic[y::2, x::2]
+    return planes
+
+
+def unpack(planes: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
+    """Return the mosaic ``[H, W]`` of packed planes ``[4, H / 2, W / 2]``: the inverse of `pack`."""
+    mosaic: Frame = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), dtype=planes.dtype)
+    for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
+        mosaic[y::2, x::2] = plane
+    return mosaic

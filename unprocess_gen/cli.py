@@ -69,7 +69,9 @@ Settings are key=value, in any order. Groups (group=option; their keys are group
   clean    includes_fixed_pattern
   accuracy exact reference fast or a budget: clean_dn, clean_changed_share, normal_error,
            law_distance, readable
-  output   webdataset
+  output   webdataset   dtype (uint16, float32), layout (mosaic, packed), pairs_per_shard
+  experiment ipol_demo brooks2019_training crvd_like eld_low_light
+           recipes, whose settings others change; added with a plus: +experiment=ipol_demo
 and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on).
 
   --cfg job           print the settings and stop
@@ -672,6 +674,7 @@ def _sort_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         elif argument.startswith("hydra") and not argument.startswith("hydra.searchpath="):
             raise ConfigError(f"{argument}: Hydra's own settings are fixed, but for hydra.searchpath")
         else:
+            _check_recipe(argument)
             _check_group(*argument.lstrip("+").split("=", 1))
             overrides.append(_quoted_path(argument))
     return flags, overrides
@@ -688,6 +691,15 @@ def _read_flag(argument: str, waiting: Iterator[str]) -> list[str]:
     if not value or (allowed != ANY and value not in allowed):
         raise ConfigError(f"{flag} {value}: expected {'a value' if allowed == ANY else ', '.join(allowed)}")
     return [flag, value]
+
+
+RECIPE = "experiment"
+"""The group of recipes: no settings of its own, so it stands in no list of defaults, and is added."""
+
+
+def _check_recipe(argument: str) -> None:
+    if argument.startswith(f"{RECIPE}="):
+        raise ConfigError(f"{argument}: a recipe is added to the settings; say +{argument}")
 
 
 def _check_group(key: str, value: str) -> None:

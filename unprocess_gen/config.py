@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 from unprocess_gen import bayer, colour
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.methods import Budget, choose
-from unprocess_gen.records import Law, PatchLaw
+from unprocess_gen.records import FLOAT32, MOSAIC, PACKED, UINT16, Law, PatchLaw
 
 
 @dataclass
@@ -199,9 +199,10 @@ class AccuracyConfig:
 
 @dataclass
 class OutputConfig:
-    """What the dataset is written as."""
+    """What the dataset is written as: what its numbers are, how the sites of a frame lie, how large shards are."""
 
-    layout: str = "webdataset"
+    dtype: str = UINT16
+    layout: str = MOSAIC
     pairs_per_shard: int = 8
 
 
@@ -377,7 +378,7 @@ def check(config: Config) -> None:
     _check_levels(config)
     _check_effects(config)
     _check_accuracy(config)
-    _one_of("output.layout", config.output.layout, ("webdataset",))
+    _check_output(config)
     _in_range("output.pairs_per_shard", config.output.pairs_per_shard, 1, MAX_PAIRS_PER_SHARD)
 
 
@@ -475,9 +476,7 @@ def _check_sensor(sensor: SensorConfig) -> None:
         " (above the black level, within the bits)",
     )
     _one_of("sensor.pattern", sensor.pattern, bayer.PATTERNS)
-    if sensor.clip == "none":
-        raise ConfigError("sensor.clip=none: needs float output, and output.layout=webdataset writes uint16")
-    _one_of("sensor.clip", sensor.clip, ("sensor", "black"))
+    _one_of("sensor.clip", sensor.clip, ("sensor", "black", NO_CLIP))
     _one_of("sensor.saturated", sensor.saturated, ("noisy", "pinned"))
     _one_of("sensor.dark_offset", sensor.dark_offset, ("removed", "kept"))
     if sensor.units != "image" and not (_is_whole(sensor.units) and 1 <= sensor.units <= 10**6):
@@ -754,8 +753,6 @@ def _check_effects(config: Config) -> None:
     _one_of("effects.all", YAML_SWITCHES.get(effects.all, effects.all), SWITCHES)
     if not 0 < effects.tolerance <= 10:
         raise ConfigError(f"effects.tolerance={effects.tolerance}: expected more than 0, up to 10")
-    if effects.quantise is not None and effect_switch(effects, "quantise") == "off":
-        raise ConfigError("effects.quantise=off: integer output is always rounded and clipped")
     for effect in (one.name for one in dataclasses.fields(effects) if one.name not in ("all", "tolerance")):
         switch = getattr(effects, effect)
         if switch is None:
@@ -776,7 +773,35 @@ def _check_accuracy(config: Config) -> None:
         value = getattr(config.accuracy, key)
         if not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"accuracy.{key}={value}: expected a number of 0 or more")
-    choose(budget(config.accuracy), uses_physics(config.noise))
+    choose(budget(config.accuracy), uses_physics(config.noise), is_normalised(config))
+
+
+NO_CLIP = "none"
+"""What `sensor.clip` says where noisy frames are not clipped."""
+
+
+def is_normalised(config: Config) -> bool:
+    """Whether frames are float32, 0 at black and 1 at white, and not rounded."""
+    return config.output.dtype == FLOAT32
+
+
+def _check_output(config: Config) -> None:
+    """Refuse a dtype that cannot hold what is asked for: integers are rounded and clipped, floats are not rounded."""
+    _one_of("output.dtype", config.output.dtype, (UINT16, FLOAT32))
+    _one_of("output.layout", config.output.layout, (MOSAIC, PACKED))
+    said = config.effects.quantise is not None and effect_switch(config.effects, "quantise")
+    if is_normalised(config):
+        if said == "on":
+            raise ConfigError("effects.quantise=on: output.dtype=float32 is not rounded; say output.dtype=uint16")
+        return
+    if said == "off":
+        raise ConfigError(
+            "effects.quantise=off: integer output is always rounded and clipped; output.dtype=float32 is not rounded"
+        )
+    if config.sensor.clip == NO_CLIP:
+        raise ConfigError(
+            "sensor.clip=none: output.dtype=uint16 holds nothing beyond the sensor's ends; say output.dtype=float32"
+        )
 
 
 SWITCHES = ("auto", "on", "off")

@@ -26,7 +26,7 @@ from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.planner import COST_NS, Prediction, facts_for
 from unprocess_gen.records import Plan, Source
-from unprocess_gen.shards import array_xxh3, image_bytes, shard_bytes
+from unprocess_gen.shards import array_xxh3, form_of, image_bytes, shard_bytes
 
 SAMPLE = 16
 
@@ -102,7 +102,7 @@ def look(config: Config, source: Source) -> Look:
     """Make the pairs of one photograph, with the digests that its shard takes, and throw them away."""
     started = time.perf_counter()
     try:
-        sha256, photograph = load(config.source, source)
+        sha256, photograph = load(config.source, source, config.output.layout)
     except SourceError as error:
         return Look(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
@@ -110,14 +110,16 @@ def look(config: Config, source: Source) -> Look:
     levels, predictions = tuple(plan for plan, _ in told), tuple(of_level for _, of_level in told)
     plans = with_draws(config, levels, source.frame)
     height, width = photograph.srgb.shape[:2]
-    cuts = patches(patch_law(config.source), plans[0].stream_key, height, width)
+    output = config.output
+    cuts = patches(patch_law(config.source), plans[0].stream_key, height, width, output.layout)
     for patch in cuts:
         for number, pair in enumerate(make_pairs(cut(photograph.srgb, patch), plans, patch.origin)):
             for frame in (pair.clean, pair.noisy) if number == 0 else (pair.noisy,):
                 array_xxh3(frame)
                 hashlib.sha256(frame.data)
     json_bytes = json_size(source.name, len(plans))
-    size = sum(image_bytes(patch.width, patch.height, json_bytes, len(plans)) for patch in cuts)
+    forms = (form_of(output.dtype, output.layout, patch.height, patch.width) for patch in cuts)
+    size = sum(image_bytes(form, json_bytes, len(plans)) for form in forms)
     seconds = time.perf_counter() - started
     pixels, left_out = width * height, pixels_in_none(cuts, height, width)
     pairs = len(cuts) * len(plans)
@@ -179,6 +181,11 @@ def _pairs(told: Forecast) -> str:
 def _patches(config: Config, looks: tuple[Look, ...]) -> list[str]:
     """Return what is cut out of an image and how much of it is in no patch; nothing where images stay whole."""
     law, cut_up = patch_law(config.source), [one for one in looks if one.patches]
+    odd = [one for one in cut_up if one.left_out]
+    if law is None and odd:
+        share = sum(one.left_out for one in odd) / sum(one.pixels for one in cut_up)
+        return [f"packed    {len(odd)} of {len(cut_up)} images have an odd side, whose last row or column is left out: "
+                f"{share:.2%} of the pixels"]  # fmt: skip
     if law is None or not cut_up:
         return []
     places = f"{law.count} at random places" if law.kind == "random" else f"a grid, {law.stride} apart"

@@ -58,8 +58,8 @@ COLUMNS = (
     Column("source_bytes", int, "size of the source; 0 for a built-in scene"),
     Column("status", str, "ok or failed"),
     Column("reason", str, "why it failed"),
-    Column("width", int, "of the arrays"),
-    Column("height", int, "of the arrays"),
+    Column("width", int, "of the arrays; twice that of packed planes"),
+    Column("height", int, "of the arrays; twice that of packed planes"),
     Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8"),
     Column("shard", int, "number of the shard"),
     Column("seed", int, "seed of the run"),
@@ -81,7 +81,7 @@ COLUMNS = (
     Column("bits", int, "of the sensor"),
     Column("black_level_dn", int, "DN of no light"),
     Column("white_level_dn", int, "DN of saturation"),
-    Column("sensor_clip", str, "how the noisy frame was clipped: sensor or black"),
+    Column("sensor_clip", str, "how the noisy frame was clipped: sensor, black or none"),
     Column("noise", str, "name of the noise profile"),
     Column("a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2"),
     Column("b_dn2", float, "noise variance at black, DN²"),
@@ -137,6 +137,8 @@ COLUMNS = (
     Column("patch", int, "number of the patch in its image; 0 for a whole image too"),
     Column("patch_y", int, "row of the full frame in which the arrays begin; even"),
     Column("patch_x", int, "column of the full frame in which the arrays begin; even"),
+    Column("dtype", str, "of the arrays: uint16, DN, or float32, 0 at black and 1 at white"),
+    Column("layout", str, "of the arrays: mosaic, or packed planes"),
 )
 NAMES = tuple(column.name for column in COLUMNS)
 
@@ -198,11 +200,10 @@ def ok_row(
     patch: Patch,
 ) -> Row:
     """Return the row of a pair; ``digests`` are the XXH3-128 of clean and noisy."""
-    height, width = pair.clean.shape
     values: dict[str, Value] = {
         "status": "ok",
-        "width": width,
-        "height": height,
+        "width": patch.width,
+        "height": patch.height,
         "orientation": orientation,
         "stream_key": f"{plan.stream_key:016x}",
         "camera": plan.camera,
@@ -250,6 +251,8 @@ def ok_row(
         "patch": patch.number,
         "patch_y": patch.y,
         "patch_x": patch.x,
+        "dtype": plan.dtype,
+        "layout": plan.layout,
     }
     return _row(source, sha256, shard, plan.seed, values | {"key": key})
 
@@ -344,6 +347,8 @@ def plan_of(row: Row) -> Plan:
             level=_int(row, "level"),
             draw=_int(row, "draw"),
             frame=_int(row, "frame"),
+            dtype=_str(row, "dtype"),
+            layout=_str(row, "layout"),
         )
     except (TypeError, ValueError) as error:
         raise DamageError(f"row {row.get('key')}: not a plan ({error})") from error

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from unprocess_gen.errors import ConfigError
 
@@ -113,16 +113,23 @@ STAGES = tuple(dict.fromkeys(method.stage for method in METHODS))
 
 OF_COUNTS = frozenset({"shot", "effects"})
 """Stages that only noise made of counts has."""
+OF_INTEGERS = frozenset({"quantise"})
+"""Stages that only frames of whole DN have."""
 
 
-def choose(budget: Budget, counts_electrons: bool) -> tuple[str, ...]:
+def choose(budget: Budget, counts_electrons: bool, normalised: bool = False) -> tuple[str, ...]:
     """Return the methods of the first form that fits, as a row names them; ConfigError where none does.
 
-    Noise made of counts has no form in float32.
+    Noise made of counts has no form in float32. Frames that are ``normalised``, and so not rounded, are exact under any
+    budget: beside the readable form they have one alone (`floats`), whose effects are the readable ones.
     """
     stages = [stage for stage in STAGES if counts_electrons or stage not in OF_COUNTS]
-    for form in FORMS:
-        chosen = [_first(stage, form, budget) for stage in stages]
+    forms: Sequence[str] = FORMS
+    if normalised:
+        stages = [stage for stage in stages if stage not in OF_INTEGERS]
+        forms, budget = FORMS[1:], replace(budget, law_distance=0.0)
+    for form in forms:
+        chosen = [_first(stage, "numpy" if normalised and stage == "effects" else form, budget) for stage in stages]
         if None not in chosen:
             return tuple(method.spelled for method in chosen if method is not None)
     raise ConfigError(_best(stages, budget))

@@ -15,18 +15,20 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from unprocess_gen.records import Patch, PatchLaw, Srgb
+from unprocess_gen.records import MOSAIC, PACKED, Patch, PatchLaw, Srgb
 from unprocess_gen.streams import patch_words
 
 
-def patches(law: PatchLaw | None, stream_key: int, height: int, width: int) -> tuple[Patch, ...]:
+def patches(law: PatchLaw | None, stream_key: int, height: int, width: int, layout: str = MOSAIC) -> tuple[Patch, ...]:
     """Return the patches of an image, in order; without a law the whole image is one.
 
-    Grids go row by row from the top-left corner. Random places come from the image's own streams, so no other image,
-    and no patch after them, moves them.
+    Of an odd side packed planes leave out the last row or column, which has no whole 2x2 tiles. Grids go row by row
+    from the top-left corner. Random places come from the image's own streams, so no other image, and no patch after
+    them, moves them.
     """
     if law is None:
-        return (Patch(0, 0, 0, height, width),)
+        side = 2 if layout == PACKED else 1
+        return (Patch(0, 0, 0, height // side * side, width // side * side),)
     corners = _grid(law, height, width) if law.kind == "grid" else _random(law, stream_key, height, width)
     return tuple(Patch(number, y, x, law.side, law.side) for number, (y, x) in enumerate(corners))
 

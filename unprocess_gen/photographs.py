@@ -14,7 +14,7 @@ from unprocess_gen import decode, sources, synthetic
 from unprocess_gen.config import SourceConfig, patch_law
 from unprocess_gen.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.manifest import Row, image_key
-from unprocess_gen.records import NO_CLIP, Photograph, Source, Srgb
+from unprocess_gen.records import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
 from unprocess_gen.video import Video, is_installed
 
 FILMS_OPEN = 2
@@ -58,17 +58,21 @@ def source_of(row: Row) -> Source:
     return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)
 
 
-def load(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
+def load(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:
     """Return the SHA-256 of a source's bytes (of a scene's pixels) and its pixels, decoded and downscaled.
 
     Raises SourceError, with the digest as ``sha256`` where the bytes could be read, also where no patch fits into the
-    pixels; MachineError where the file is not the one that was listed.
+    pixels, or no 2x2 tile that packed planes could be made of; MachineError where the file is not the one that was
+    listed.
     """
     digest, photograph = _full_frame(config, source)
     height, width = photograph.srgb.shape[:2]
     law = patch_law(config)
     if law is not None and min(height, width) < law.side:
         text = f"{width} x {height} pixels hold no patch of {law.side} x {law.side} (source.patch)"
+        raise SourceError("unsupported", text, digest)
+    if layout == PACKED and min(height, width) < 2:
+        text = f"{width} x {height} pixels hold no 2 x 2 sites, one for each plane (output.layout=packed)"
         raise SourceError("unsupported", text, digest)
     return digest, photograph
 

@@ -18,6 +18,7 @@ from unprocess_gen.config import (
     dequantizing,
     effect_switch,
     gain_laws,
+    is_normalised,
     is_physical,
     law,
     noise_laws,
@@ -27,7 +28,7 @@ from unprocess_gen.config import (
 from unprocess_gen.draws import draw
 from unprocess_gen.methods import choose
 from unprocess_gen.physics import plan_physics
-from unprocess_gen.planner import Prediction, decide, light_of
+from unprocess_gen.planner import NOT_ROUNDED, Prediction, decide, light_of
 from unprocess_gen.records import Facts, Plan
 from unprocess_gen.sensor import noise_in_dn
 from unprocess_gen.streams import parameter_uniforms, stream_key
@@ -152,9 +153,11 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         effects=effects,
         skipped=skipped,
         accuracy=config.accuracy.name,
-        methods=choose(budget(config.accuracy), uses_physics(config.noise)),
+        methods=choose(budget(config.accuracy), uses_physics(config.noise), is_normalised(config)),
         law_distance=config.accuracy.law_distance,
         level=level,
+        dtype=config.output.dtype,
+        layout=config.output.layout,
     )
 
 
@@ -210,8 +213,12 @@ def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tup
     ``span_dn`` is white less black: where the variance is nowhere above 0 in it, there is no noise to simulate.
     """
     noise = config.noise.name
+    rounded = not is_normalised(config)
+    last = ("quantise",) if rounded else ()
+    skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)
     if effect_switch(config.effects, "heteroscedastic") == "off":
-        return ("quantise",), ("heteroscedastic: switched off",)
+        return last, ("heteroscedastic: switched off", *skipped)
     if a_dn * span_dn + b_dn2 <= 0:
-        return ("quantise",), (f"heteroscedastic: noise={noise} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})",)
-    return ("heteroscedastic", "quantise"), ()
+        none = f"heteroscedastic: noise={noise} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})"
+        return last, (none, *skipped)
+    return ("heteroscedastic", *last), skipped

@@ -23,7 +23,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 
 from unprocess_gen import colour
-from unprocess_gen.config import EFFECT_NUMBERS, Config, effect_switch, is_physical, lacks
+from unprocess_gen.config import EFFECT_NUMBERS, Config, effect_switch, is_normalised, is_physical, lacks
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.records import Facts, Physics, Srgb
 from unprocess_gen.tables import linear_table
@@ -141,6 +141,10 @@ def decide(config: Config, physics: Physics, facts: Facts, light: Light) -> tupl
     return tuple(_prediction(effect, scene, on, said[effect], config.effects.tolerance) for effect in EFFECTS)
 
 
+NOT_ROUNDED = "float output is not rounded"
+"""Why frames in float32 do not have ``quantise``."""
+
+
 @dataclass(frozen=True, slots=True)
 class Said:
     """What the settings decide about an effect, and why."""
@@ -153,7 +157,11 @@ def _said(config: Config, effect: str) -> Said | None:
     """Return what the settings decide about an effect; None where the image must decide."""
     switch = effect_switch(config.effects, effect)
     if effect == "quantise":
-        return Said(True, "integer output is always rounded and clipped")
+        return (
+            Said(False, NOT_ROUNDED)
+            if is_normalised(config)
+            else Said(True, "integer output is always rounded and clipped")
+        )
     if switch == "off":
         return Said(False, "switched off")
     number = lacks(config.noise, effect)
@@ -202,7 +210,7 @@ class Scene:
 
     def hiding_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
         """Return the variance of a pixel at a signal, DN², of the random effects that are on, but for the effect."""
-        rounding = 0.0 if effect == "quantise" else QUANTISATION_VARIANCE
+        rounding = QUANTISATION_VARIANCE if "quantise" in on - {effect} else 0.0
         if effect in FIXED and self.physics.fixed_pattern_in_clean:
             return rounding
         return rounding + sum(VARIANCES[one](self.physics, level_dn) for one in VARIANCES if one in on - {effect})
@@ -222,7 +230,7 @@ class Scene:
             hiding = self.hiding_variance("full_well", level_dn, on)
             lost_dn = self.lost_in_well(before_well, level_dn, on)
             for at, count in enumerate(self.counts):
-                offsets[at] += lost_dn * math.sqrt(count / hiding)
+                offsets[at] += lost_dn * math.sqrt(_over(count, hiding)) if lost_dn else 0.0
         return tuple(math.sqrt(square + offset * offset) for square, offset in zip(squares, offsets, strict=True))
 
     def lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:

@@ -10,15 +10,19 @@ import numpy as np
 
 from unprocess_gen.errors import DamageError
 from unprocess_gen.manifest import located_rows, read_row, sample_key
-from unprocess_gen.records import Raw
-from unprocess_gen.shards import CLEAN, Member, map_array, noisy_member, read_index, shard_name
+from unprocess_gen.records import Frame
+from unprocess_gen.shards import CLEAN, Form, Member, form_of, map_array, noisy_member, read_index, shard_name
 
 
 class Sample(NamedTuple):
-    """One pair of a dataset: uint16 mosaics ``[H, W]`` in DN, and its manifest row (column → value)."""
+    """One pair of a dataset, and its manifest row (column → value).
 
-    clean: Raw
-    noisy: Raw
+    Arrays are of the row's ``dtype`` and ``layout``: uint16 in DN, or float32 with 0 at black and 1 at white; mosaics
+    ``[H, W]``, or packed planes ``[4, H / 2, W / 2]`` in the order of `bayer.PLANES`.
+    """
+
+    clean: Frame
+    noisy: Frame
     row: dict[str, Any]
 
 
@@ -51,16 +55,17 @@ class RawPairs:
 
     def __getitem__(self, number: int) -> Sample:
         row = dict(read_row(self._manifest, int(self._places[number])))
-        shard, shape = int(row["shard"] or 0), (int(row["height"] or 0), int(row["width"] or 0))
+        shard = int(row["shard"] or 0)
+        form = form_of(str(row["dtype"]), str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0))
         path = self.path / "shards" / shard_name(shard)
         if shard not in self._indexes:
             self._indexes[shard] = read_index(path)
         members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
-        clean, noisy = (self._array(path, shard, f"{sample_key(row)}.{member}", shape) for member in members)
+        clean, noisy = (self._array(path, shard, f"{sample_key(row)}.{member}", form) for member in members)
         return Sample(clean, noisy, row)
 
-    def _array(self, path: Path, shard: int, name: str, shape: tuple[int, int]) -> Raw:
+    def _array(self, path: Path, shard: int, name: str, form: Form) -> Frame:
         member = self._indexes[shard].get(name)
         if member is None:
             raise DamageError(f"{path}: member {name} is missing")
-        return map_array(path, member, shape)
+        return map_array(path, member, form)

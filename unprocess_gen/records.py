@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Srgb = NDArray[np.uint8] | NDArray[np.uint16]
 Raw = NDArray[np.uint16]
+Normalised = NDArray[np.float32]
+Frame = Raw | Normalised
+"""What a dataset holds: DN, or their share of the way from black, 0, to white, 1; mosaic or packed planes."""
 Float = NDArray[np.float64]
 
 
@@ -151,6 +154,11 @@ class Physics:
 READABLE, IN_FLOAT32 = "colour:numpy_float64", "colour:fused_float32"
 """The methods that tell the forms of a whole pair (`methods.FORMS`) apart."""
 
+UINT16, FLOAT32 = "uint16", "float32"
+"""What the numbers of a frame can be."""
+MOSAIC, PACKED = "mosaic", "packed"
+"""How the sites of a frame can lie: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`bayer.pack`)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -167,7 +175,7 @@ class Plan:
     is ``heteroscedastic``. ``accuracy`` names the budget, ``methods`` how each stage is computed (`methods`), and
     ``law_distance`` is how far from its law counted noise may be drawn. ``level``, ``draw`` and ``frame`` number the
     noise levels of one clean frame, the draws at one level, and the frames of a clip: each has values of its own in
-    every stream.
+    every stream. ``dtype`` and ``layout`` say what the numbers of both frames are and how their sites lie.
     """
 
     seed: int
@@ -205,6 +213,13 @@ class Plan:
     level: int = 0
     draw: int = 0
     frame: int = 0
+    dtype: str = UINT16
+    layout: str = MOSAIC
+
+    @property
+    def normalised(self) -> bool:
+        """Whether frames are float32, 0 at black and 1 at white, and not rounded to DN."""
+        return self.dtype == FLOAT32
 
     @property
     def readable(self) -> bool:
@@ -265,9 +280,10 @@ class Plan:
 class Counts:
     """How many sites met a limit.
 
-    ``clean_clipped_*``: the value before clipping lay below black or above white; ``noisy_clipped_*``: the rounded
-    value lay outside what the sensor can say; ``saturated``: sites of the clean frame at the white level;
-    ``zero_variance``: sites where the noise law gives no variance (a fitted b below zero, or no noise at all).
+    ``clean_clipped_*``: the value before clipping lay below black or above white; ``noisy_clipped_*``: the value,
+    rounded where frames are, lay outside what the sensor can say and was clipped; ``saturated``: sites of the clean
+    frame at the white level; ``zero_variance``: sites where the noise law gives no variance (a fitted b below zero, or
+    no noise at all).
     """
 
     clean_clipped_low: int
@@ -280,10 +296,13 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The clean and the noisy frame of one photograph, uint16 mosaics ``[H, W]`` in DN, and what was clipped."""
+    """The clean and the noisy frame of one photograph, in the plan's dtype and layout, and what was clipped.
 
-    clean: Raw
-    noisy: Raw
+    uint16 mosaics ``[H, W]`` in DN, unless the plan says otherwise.
+    """
+
+    clean: Frame
+    noisy: Frame
     counts: Counts
 
 

@@ -38,7 +38,7 @@ from unprocess_gen.manifest import (
     write_rows,
 )
 from unprocess_gen.photographs import list_photographs, load
-from unprocess_gen.records import Raw, Source
+from unprocess_gen.records import Frame, Source
 from unprocess_gen.runner import Bench, Task, make_shard, shard_tasks, tally
 from unprocess_gen.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
 from unprocess_gen.verify import Maker, expected, file_sha256, noisy_member_of, rows_by_shard
@@ -286,7 +286,7 @@ def _with_sources(config: Config) -> Config:
 
 def _failure(config: Config, task: Task, source: Source) -> Row:
     try:
-        load(config.source, source)
+        load(config.source, source, config.output.layout)
     except SourceError as error:
         return failed_row(source, error.sha256, task.shard, config.seed, error.reason)
     raise DamageError(f"source {source.name}: failed when the dataset was made, and can be used now; {AGAIN}")
@@ -317,7 +317,9 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, asi
     yield Step(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs made again, the others kept")
 
 
-def _mend_sample(writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Raw], maker: Maker) -> int:
+def _mend_sample(
+    writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Frame], maker: Maker
+) -> int:
     """Append a sample, its frames kept or made again; return how many of its pairs were kept."""
     whole = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]
     made = {str(row["key"]): maker.make_again(row) for row in rows if row not in whole}

@@ -33,7 +33,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen import selftest
-from unprocess_gen.config import Config, budget, dataset_yaml, patch_law, source_kind, uses_physics
+from unprocess_gen.config import Config, budget, dataset_yaml, is_normalised, patch_law, source_kind, uses_physics
 from unprocess_gen.errors import MachineError, SourceError
 from unprocess_gen.manifest import Row, failed_row, images, ok_row, pair_key, patch_key, row_json
 from unprocess_gen.methods import choose
@@ -270,7 +270,7 @@ def _make_rows(bench: Bench, task: Task, writer: ShardWriter) -> Iterator[Row]:
 def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) -> list[Row]:
     """Append one image to a shard, whole or patch by patch, and return its rows."""
     try:
-        sha256, photograph = load(config.source, source)
+        sha256, photograph = load(config.source, source, config.output.layout)
     except SourceError as error:
         if error.reason == "unreadable" and source.reason is None and not _is_there(config, source):
             raise MachineError(
@@ -281,7 +281,8 @@ def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) 
     facts = facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
     rows: list[Row] = []
-    for patch in patches(law, plans[0].stream_key, *photograph.srgb.shape[:2]):
+    height, width = photograph.srgb.shape[:2]
+    for patch in patches(law, plans[0].stream_key, height, width, config.output.layout):
         key = patch_key(source.index, patch, several=law is not None)
         some: list[Row] = []
         for plan, pair, digests in _add_frames(writer, key, cut(photograph.srgb, patch), patch, plans):
@@ -321,8 +322,8 @@ def _settle(coordinator_pid: int) -> None:
 
 def _kernels(config: Config) -> str:
     """Return which of `selftest.PROVED_BY` a run needs."""
-    counts = uses_physics(config.noise)
-    return selftest.kernels(counts, choose(budget(config.accuracy), counts))
+    counts, normalised = uses_physics(config.noise), is_normalised(config)
+    return selftest.kernels(counts, choose(budget(config.accuracy), counts, normalised), normalised)
 
 
 def _self_test(config: Config) -> str | None:

@@ -16,12 +16,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from unprocess_gen import electrons, fused
+from unprocess_gen import electrons, floats, fused
 from unprocess_gen.compiled import is_kept, kernel
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.errors import MachineError
 from unprocess_gen.pair import make_pair
-from unprocess_gen.records import IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
+from unprocess_gen.records import FLOAT32, IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
 from unprocess_gen.shards import array_xxh3
 from unprocess_gen.streams import philox4x32
 from unprocess_gen.tables import linear_table, normal_table
@@ -113,6 +113,10 @@ GOLDEN_PLANS = {
         GOLDEN_PLAN, physics=GOLDEN_PHYSICS, effects=EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3
     ),
 }
+GOLDEN_PLANS |= {
+    "normalised": replace(GOLDEN_PLAN, dtype=FLOAT32, sensor_clip="none"),
+    "normalised_counts": replace(GOLDEN_PLANS["physical"], dtype=FLOAT32, sensor_clip="none"),
+}
 GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
     "per_channel": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
@@ -121,6 +125,8 @@ GOLDEN = {
     "readable": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
     "plain": ("443ea2ae03acfbab1df2b27f58ddbe39", "a3ed0176ff50cf595767857da127dd39"),
     "near": ("b4c0b18f1bbccbf881c82b00455253e9", "c0308c77164902cd319646844ca0b470"),
+    "normalised": ("aa19fde7d361bcc67ca6c9e52c8d8634", "4de3ab500ebd73704139d53f4f3d8ee3"),
+    "normalised_counts": ("db1e51d036e01d5eaca3d0ebedbab809", "f5e3fd88d4091be074264896a692346f"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
 PROVED_BY = {
@@ -128,6 +134,8 @@ PROVED_BY = {
     "float32": ("float32",),
     "counts": ("physical", "plain", "near"),
     "readable": ("readable",),
+    "normalised": ("normalised",),
+    "normalised_counts": ("normalised", "normalised_counts"),
 }
 """Which golden pairs prove which kernels: those that are not needed would take seconds to compile."""
 
@@ -137,6 +145,8 @@ OUTER = {
     "float32": (fused._pair32,),
     "counts": (electrons._physical_pair, electrons._plain_pair),
     "readable": (),
+    "normalised": (fused._unprocess, *floats.OF_NORMALS),
+    "normalised_counts": (fused._unprocess, *floats.OF_NORMALS, *floats.OF_COUNTS),
 }
 """The kernels that bring all others of their kind with them."""
 
@@ -146,10 +156,12 @@ def are_compiled(kernels: str) -> bool:
     return all(is_kept(kernel) for kernel in OUTER[kernels])
 
 
-def kernels(counts_electrons: bool, methods: Collection[str]) -> str:
-    """Return which of `PROVED_BY` make the pairs of a plan, by its methods."""
+def kernels(counts_electrons: bool, methods: Collection[str], normalised: bool = False) -> str:
+    """Return which of `PROVED_BY` make the pairs of a plan, by its methods and its dtype."""
     if READABLE in methods:
         return "readable"
+    if normalised:
+        return "normalised_counts" if counts_electrons else "normalised"
     if counts_electrons:
         return "counts"
     return "float32" if IN_FLOAT32 in methods else "one_normal"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.records import Float, Raw
+from unprocess_gen.records import FLOAT32, Float, Frame, Normalised, Raw
 
 
 def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0) -> Float:
@@ -19,14 +19,31 @@ def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: flo
 def noisy_limits(bits: int, black_level_dn: int, clip: str) -> tuple[float, float]:
     """Return the lowest and highest DN of the noisy frame.
 
-    ``clip`` is ``sensor`` (0 to 2**bits - 1, the pedestal stays) or ``black`` (nothing below the black level).
+    ``clip`` is ``sensor`` (0 to 2**bits - 1, the pedestal stays), ``black`` (nothing below the black level) or
+    ``none``.
     """
+    if clip == "none":
+        return -np.inf, np.inf
     return float(black_level_dn if clip == "black" else 0), float(2**bits - 1)
 
 
 def quantise(value_dn: Float, low: float, high: float) -> Raw:
     """Round half to even, clip to [low, high], then cast to uint16."""
     return np.clip(np.rint(value_dn), low, high).astype(np.uint16)
+
+
+def normalise(value_dn: Float, low: float, high: float, levels_dn: tuple[int, int]) -> Normalised:
+    """Clip to [low, high], map black and white to 0 and 1 in float64, then round once, to float32."""
+    black_dn, white_dn = levels_dn
+    return ((np.clip(value_dn, low, high) - float(black_dn)) / float(white_dn - black_dn)).astype(np.float32)
+
+
+def in_dn(frame: Frame, levels_dn: tuple[int, int]) -> Float:
+    """Return a frame of either dtype in DN, float64: what `normalise` maps to 0 and 1 are the levels again."""
+    black_dn, white_dn = levels_dn
+    if frame.dtype != FLOAT32:
+        return frame.astype(np.float64)
+    return frame.astype(np.float64) * float(white_dn - black_dn) + float(black_dn)
 
 
 def noise_in_dn(

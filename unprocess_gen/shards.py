@@ -1,10 +1,10 @@
 """Shards: uncompressed tar files in the WebDataset layout, whose bytes depend on nothing but their members.
 
-Members of one sample, an image or a patch of it, stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16
-``[H, W]``), the noisy frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with
-time, owner and mode fixed. Writing goes straight from the arrays to the file while SHA-256 runs along (0.5 ns a byte
-together), reading maps just the bytes of one array into memory, found through an index of offsets that is read from the
-tar headers: nothing is ever unpacked.
+Members of one sample, an image or a patch of it, stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 or
+float32, ``[H, W]`` or packed ``[4, H / 2, W / 2]``), the noisy frames of other levels and draws
+(``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with time, owner and mode fixed. Writing goes straight from
+the arrays to the file while SHA-256 runs along (0.5 ns a byte together), reading maps just the bytes of one array into
+memory, found through an index of offsets that is read from the tar headers: nothing is ever unpacked.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 import xxhash
 
 from unprocess_gen.errors import DamageError
-from unprocess_gen.records import Raw
+from unprocess_gen.records import FLOAT32, PACKED, UINT16, Frame
 
 RECORD = 512
 END = b"\0" * (2 * RECORD)
@@ -45,19 +45,52 @@ def shard_name(number: int) -> str:
     return f"shard-{number:05d}.tar"
 
 
-def array_xxh3(array: Raw) -> str:
+DESCRIPTIONS = {UINT16: "<u2", FLOAT32: "<f4"}
+"""The dtypes of frames as NumPy spells them in a file: little-endian."""
+
+
+class Form(NamedTuple):
+    """How the numbers of a frame lie in a file: their dtype, one of `DESCRIPTIONS`, and the array's shape."""
+
+    dtype: str
+    shape: tuple[int, ...]
+
+    @property
+    def description(self) -> str:
+        """The dtype as NumPy spells it in a file."""
+        return DESCRIPTIONS[self.dtype]
+
+    @property
+    def size(self) -> int:
+        """Bytes of the numbers alone."""
+        return np.dtype(self.description).itemsize * math.prod(self.shape)
+
+    @property
+    def header(self) -> bytes:
+        """What stands before them in the npy format."""
+        stream = io.BytesIO()
+        facts = {"descr": self.description, "fortran_order": False, "shape": self.shape}
+        np.lib.format.write_array_header_1_0(stream, facts)
+        return stream.getvalue()
+
+    def __str__(self) -> str:
+        sides = " x ".join(map(str, reversed(self.shape)))
+        return f"{sides} {'DN' if self.dtype == UINT16 else self.dtype}"
+
+
+def form_of(dtype: str, layout: str, height: int, width: int) -> Form:
+    """Return the form of a frame of ``height`` x ``width`` sites."""
+    shape = (4, height // 2, width // 2) if layout == PACKED else (height, width)
+    return Form(dtype, shape)
+
+
+def array_xxh3(array: Frame) -> str:
     """Return the XXH3-128 of an array's little-endian bytes, 32 hex digits."""
     return xxhash.xxh3_128_hexdigest(_little_endian(array).data)
 
 
-def _little_endian(array: Raw) -> Raw:
-    return np.ascontiguousarray(array, dtype="<u2")
-
-
-def _npy_header(shape: tuple[int, ...]) -> bytes:
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<u2", "fortran_order": False, "shape": shape})
-    return stream.getvalue()
+def _little_endian(array: Frame) -> Frame:
+    return np.ascontiguousarray(array, dtype=DESCRIPTIONS[array.dtype.name])
 
 
 def _tar_header(name: str, size: int) -> bytes:
@@ -70,9 +103,9 @@ def _padding(size: int) -> int:
     return -size % RECORD
 
 
-def image_bytes(width: int, height: int, json_bytes: int, pairs: int = 1) -> int:
+def image_bytes(form: Form, json_bytes: int, pairs: int = 1) -> int:
     """Return the bytes that one sample and its noisy frames take in a shard, tar framing included."""
-    array = len(_npy_header((height, width))) + 2 * width * height
+    array = len(form.header) + form.size
     return sum(RECORD + size + _padding(size) for size in (*[array] * (1 + pairs), json_bytes))
 
 
@@ -124,9 +157,9 @@ class ShardWriter:
         self._wait(-1)
         return self._hash.hexdigest()
 
-    def add_frame(self, key: str, member: str, frame: Raw) -> None:
+    def add_frame(self, key: str, member: str, frame: Frame) -> None:
         """Append a frame of a sample."""
-        header = _npy_header(frame.shape)
+        header = Form(frame.dtype.name, frame.shape).header
         self._member(f"{key}.{member}", len(header) + frame.nbytes, header, _little_endian(frame).data)
 
     def add_rows(self, key: str, row_json: bytes) -> None:
@@ -195,33 +228,32 @@ def read_index(path: Path) -> dict[str, Member]:
     return index
 
 
-def map_array(path: Path, member: Member, shape: tuple[int, int]) -> Raw:
+def map_array(path: Path, member: Member, form: Form) -> Frame:
     """Return an array that lies in the file: mapped, not copied, and private, so that writing to it is harmless.
 
-    DamageError where the member is not a uint16 array of ``shape``, or the file is gone or too short.
+    DamageError where the member is not an array of ``form``, or the file is gone or too short.
     """
     start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
-    skipped, header = member.offset - start, _npy_header(shape)
+    skipped, header = member.offset - start, form.header
     try:
         with path.open("rb") as stream:
             mapped = mmap.mmap(stream.fileno(), skipped + member.size, access=mmap.ACCESS_COPY, offset=start)
     except (OSError, ValueError) as error:
         raise DamageError(f"{path}: the member at byte {member.offset} cannot be read ({error})") from error
-    size = len(header) + 2 * math.prod(shape)
+    size = len(header) + form.size
     if member.size != size or mapped[skipped : skipped + len(header)] != header:
-        raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {shape[1]} x {shape[0]} DN")
-    return np.ndarray(shape, np.dtype("<u2"), mapped, skipped + len(header))
+        raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {form}")
+    return np.ndarray(form.shape, np.dtype(form.description), mapped, skipped + len(header))
 
 
 # ------------------------------------------------------------------------------------------------------- verifying
 
 
 class Expected(NamedTuple):
-    """What a shard must hold of one sample: the frames' shape, members and XXH3-128, and the JSON to the byte."""
+    """What a shard must hold of one sample: the frames' form, members and XXH3-128, and the JSON to the byte."""
 
     key: str
-    width: int
-    height: int
+    form: Form
     frames: tuple[tuple[str, str], ...]
     json: bytes
 
@@ -237,8 +269,8 @@ def check_members(path: Path, images: Sequence[Expected]) -> Iterator[tuple[str,
     """
     with path.open("rb") as stream:
         for image in images:
-            head = _npy_header((image.height, image.width))
-            size = len(head) + 2 * image.width * image.height
+            head = image.form.header
+            size = len(head) + image.form.size
             for member, digest in image.frames:
                 found = [*_check_bytes(stream, _tar_header(f"{image.key}.{member}", size), "tar header")]
                 found += _check_bytes(stream, head, "npy header")
@@ -253,19 +285,18 @@ def check_members(path: Path, images: Sequence[Expected]) -> Iterator[tuple[str,
             yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"
 
 
-def salvage(path: Path, images: Sequence[Expected]) -> Iterator[dict[str, Raw]]:
+def salvage(path: Path, images: Sequence[Expected]) -> Iterator[dict[str, Frame]]:
     """Yield for each image those frames, by member, that lie at their place in a damaged shard, whole."""
     content = np.memmap(path, np.uint8, "r") if path.is_file() and path.stat().st_size else np.empty(0, np.uint8)
     at = 0
     for image in images:
-        size = 2 * image.width * image.height
-        head = len(_npy_header((image.height, image.width)))
+        size, head = image.form.size, len(image.form.header)
         frames = {}
         for member, digest in image.frames:
             frame = content[at + RECORD + head :][:size]
             at += RECORD + head + size + _padding(head + size)
             if len(frame) == size and xxhash.xxh3_128_hexdigest(frame.data) == digest:
-                frames[member] = frame.view("<u2").reshape(image.height, image.width)
+                frames[member] = frame.view(image.form.description).reshape(image.form.shape)
         at += RECORD + len(image.json) + _padding(len(image.json))
         yield frames
 

@@ -6,7 +6,8 @@ row's numbers say, in units of their standard errors. Nothing is taken from the 
 arrays and the row. Sites near the sensor's ends are left out, where clipping would narrow the noise.
 
 What a row's numbers say: shot noise a·u, read noise b, row and column offsets and dark current their variances, unequal
-responses (prnu·u)², and 1/6 DN², since both frames are rounded.
+responses (prnu·u)², and 1/6 DN², where both frames are rounded. Frames in float32 are not: there DN are a scale again,
+the sites of a clean DN are those that lie nearest to it, and noise below 0.7 DN shows too.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from typing import BinaryIO
 
 import numpy as np
 
+from unprocess_gen.bayer import unpack
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.manifest import Row
 from unprocess_gen.reader import RawPairs
-from unprocess_gen.records import Float, Raw
+from unprocess_gen.records import FLOAT32, PACKED, Float, Frame
+from unprocess_gen.sensor import in_dn, noisy_limits
 
 ROUNDING_VARIANCE = 1 / 6
 REACH = 5.0
@@ -30,6 +33,8 @@ REACH = 5.0
 
 LEAST_VARIANCE = 0.7**2
 """DN²: below it rounding is no noise of its own, and what rounding adds is no longer 1/6."""
+LEAST_FLOAT_VARIANCE = 1e-4
+"""DN²: of frames that are not rounded; a hundred times what casts to float32 add at 16 bits."""
 
 ALARM = 6.0
 """Standard errors at which a fit is called wrong: 2e-9 by chance, for any one of them."""
@@ -55,6 +60,7 @@ class Fit:
     expected: tuple[float, float]
     signal_dn: Float
     variance_dn2: Float
+    rounding_dn2: float = ROUNDING_VARIANCE
 
     @property
     def deviation(self) -> float:
@@ -103,26 +109,29 @@ def fits(folder: Path) -> Iterator[Fit]:
             yield found
 
 
-def fit(clean: Raw, noisy: Raw, row: Row) -> Fit | None:
+def fit(clean: Frame, noisy: Frame, row: Row) -> Fit | None:
     """Fit the variance of one pair; None where fewer than three DN of the clean frame have sites enough."""
     black, slope, intercept, prnu = _law(row)
-    difference = noisy.astype(np.float64) - clean
+    clean_dn, noisy_dn = _mosaic_dn(clean, row), _mosaic_dn(noisy, row)
+    rounded = row["dtype"] != FLOAT32
+    rounding, least = (ROUNDING_VARIANCE, LEAST_VARIANCE) if rounded else (0.0, LEAST_FLOAT_VARIANCE)
+    difference = noisy_dn - clean_dn
+    nearest = np.rint(np.maximum(clean_dn, 0)).astype(np.int64)
     for y in range(2):
         for x in range(2):  # an error of the black level differs from plane to plane
             difference[y::2, x::2] -= difference[y::2, x::2].mean() if difference[y::2, x::2].size else 0.0
-    codes = int(clean.max()) + 1
+    codes = int(nearest.max()) + 1
     count, first, second, fourth = (
-        np.bincount(clean.ravel(), weights=(difference**power).ravel(), minlength=codes) for power in (0, 1, 2, 4)
+        np.bincount(nearest.ravel(), weights=(difference**power).ravel(), minlength=codes) for power in (0, 1, 2, 4)
     )
     dn = np.arange(codes)
     signal = np.maximum(dn - black, 0.0)
     noise = np.maximum(slope * signal + intercept, 0.0) + (prnu * signal) ** 2
-    law = noise + ROUNDING_VARIANCE
+    law = noise + rounding
     reach = REACH * np.sqrt(law)
-    high = 2.0 ** _number(row, "bits") - 1
-    low = black if row["sensor_clip"] == "black" else 0.0
+    low, high = noisy_limits(int(row["bits"] or 0), int(black), str(row["sensor_clip"]))
     inside = (dn - reach > low) & (dn + reach < high) & (dn < _number(row, "white_level_dn")) & (dn > black)
-    used = inside & (count >= 16) & (noise >= LEAST_VARIANCE)
+    used = inside & (count >= 16) & (noise >= least)
     if int(used.sum()) < 3:
         return None
     count, signal, law = count[used], signal[used], law[used]
@@ -130,7 +139,7 @@ def fit(clean: Raw, noisy: Raw, row: Row) -> Fit | None:
     variance = (second[used] - count * mean * mean) / (count - 1)
     excess = max(float((fourth[used] / law**2).sum() / count.sum()), NORMAL_EXCESS)
     weights = count / ((excess - 1) * law * law)
-    points = variance - (prnu * signal) ** 2 - ROUNDING_VARIANCE
+    points = variance - (prnu * signal) ** 2 - rounding
     normal = np.array(
         [[(weights * signal**2).sum(), (weights * signal).sum()], [(weights * signal).sum(), weights.sum()]]
     )
@@ -138,7 +147,14 @@ def fit(clean: Raw, noisy: Raw, row: Row) -> Fit | None:
     a, b = inverse @ np.array([(weights * signal * points).sum(), (weights * points).sum()])
     shared = _shared_error(row)
     errors = math.sqrt(inverse[0, 0]), math.sqrt(inverse[1, 1] + shared * shared)
-    return Fit(str(row["key"]), float(a), errors[0], float(b), errors[1], (slope, intercept), signal, variance)
+    expected = slope, intercept
+    return Fit(str(row["key"]), float(a), errors[0], float(b), errors[1], expected, signal, variance, rounding)
+
+
+def _mosaic_dn(frame: Frame, row: Row) -> Float:
+    """Return a frame of any dtype and layout as a mosaic in DN, float64."""
+    mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
+    return in_dn(mosaic, (int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)))
 
 
 def _number(row: Row, name: str) -> float:
@@ -189,7 +205,7 @@ def draw(found: list[Fit], to: Path | BinaryIO) -> None:
         colour = f"C{number % 10}"
         axes.plot(one.signal_dn, one.variance_dn2, ".", color=colour, markersize=2, alpha=0.5)
         ends = np.array([one.signal_dn.min(), one.signal_dn.max()])
-        axes.plot(ends, one.expected[0] * ends + one.expected[1] + ROUNDING_VARIANCE, color=colour, label=one.key)
+        axes.plot(ends, one.expected[0] * ends + one.expected[1] + one.rounding_dn2, color=colour, label=one.key)
     axes.set(xlabel="signal above black (DN)", ylabel="variance of noisy - clean (DN²)", title="Photon transfer")
     axes.legend(title="line: the manifest's numbers")
     figure.savefig(to, dpi=120)

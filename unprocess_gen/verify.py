@@ -40,7 +40,7 @@ from unprocess_gen.pair import make_pair
 from unprocess_gen.patches import cut
 from unprocess_gen.photographs import load, source_of
 from unprocess_gen.records import Pair, Photograph, Source
-from unprocess_gen.shards import CLEAN, Expected, array_xxh3, check_members, noisy_member, shard_name
+from unprocess_gen.shards import CLEAN, Expected, array_xxh3, check_members, form_of, noisy_member, shard_name
 from unprocess_gen.workspace import read_dataset
 
 NO_LIMIT = 2**40
@@ -147,8 +147,9 @@ def _expected(rows: Sequence[Row]) -> Expected:
     width, height = rows[0]["width"], rows[0]["height"]
     if not isinstance(width, int) or not isinstance(height, int):
         raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
+    form = form_of(str(rows[0]["dtype"]), str(rows[0]["layout"]), height, width)
     noisy = tuple((noisy_member_of(row), str(row["noisy_xxh3"])) for row in rows)
-    return Expected(sample_key(rows[0]), width, height, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
+    return Expected(sample_key(rows[0]), form, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
 
 
 def noisy_member_of(row: Row) -> str:
@@ -270,7 +271,7 @@ class Maker:
         if self._root is None and not _is_scene(row):
             raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
         plan = plan_of(row)
-        selftest.check(selftest.kernels(plan.counts_electrons, plan.methods))
+        selftest.check(selftest.kernels(plan.counts_electrons, plan.methods, plan.normalised))
         try:
             sha256, photograph = self._load(row)
         except SourceError as error:
