@@ -47,8 +47,8 @@ from unprocess_gen.bayer import CHANNELS
 from unprocess_gen.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 from unprocess_gen.errors import ConfigError, DamageError
 from unprocess_gen.manifest import Row, plan_of, read_rows
-from unprocess_gen.reader import RawPairs
-from unprocess_gen.records import Plan, Raw
+from unprocess_gen.reader import RawPairs, mosaic_dn
+from unprocess_gen.records import Float, Frame, Plan
 from unprocess_gen.shards import array_xxh3
 from unprocess_gen.verify import choose
 from unprocess_gen.workspace import machine_error, place
@@ -140,7 +140,7 @@ def _writable(row: Row) -> Row:
 def _content(pairs: RawPairs, file: _File) -> bytes:
     sample = pairs[file.number]
     frame = sample.clean if file.frame == "clean" else sample.noisy
-    content = encode(frame, sample.row, file.frame)
+    content = encode(mosaic_dn(frame, sample.row), sample.row, file.frame)
     if array_xxh3(frame) != sample.row[f"{file.frame}_xxh3"]:
         raise DamageError(f"{pairs.path}: the {file.frame} frame of {file.key} is not the one its row tells of")
     return content
@@ -181,7 +181,7 @@ BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 10, 12
 """Types of TIFF 6.0, section 2."""
 
 
-def encode(frame: Raw, row: Row, name: str) -> bytes:
+def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
     """Return the file of a frame of the pair that ``row`` tells of; ``name`` is ``clean`` or ``noisy``.
 
     Raises ConfigError where the frame is not a uint16 mosaic ``[H, W]``, or the row has a number beyond 2^30.

@@ -30,7 +30,7 @@ from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image
 from unprocess_gen.process import compress_gamma, smoothstep
-from unprocess_gen.records import Float, Plan, Raw, Source, Srgb
+from unprocess_gen.records import Float, Frame, Plan, Source, Srgb
 from unprocess_gen.unprocess import expand_gamma, inverse_smoothstep, invert_gains_per_channel, linear_light
 from unprocess_gen.workspace import machine_error
 
@@ -254,7 +254,7 @@ def _channel_shares(of_sites: NDArray[np.bool_], pattern: str, most: int = 720) 
     return np.stack(planes, axis=-1)
 
 
-def _typical(clean: Raw) -> tuple[slice, slice]:
+def _typical(clean: Frame) -> tuple[slice, slice]:
     """Return a square of `CROP_PX` sites that varies as much as half of all do, at even corners."""
     side = min(CROP_PX, *(max(length - length % 2, 1) for length in clean.shape))
     rows, columns = (range(0, length - side + 1, side) for length in clean.shape)
@@ -269,7 +269,7 @@ def _show(axes: Axes, picture: Picture, title: str, low: float = 0.0, high: floa
     axes.set_yticks([])
 
 
-def _stretched(axes: Axes, raw: Raw, title: str) -> None:
+def _stretched(axes: Axes, raw: Frame, title: str) -> None:
     """Show a frame as the article does: its lowest DN black, its highest white."""
     small = _shrunk(raw, 720, of_sites=True)
     _show(axes, small, title, float(raw.min()), float(raw.max()))
@@ -613,7 +613,7 @@ def _highlights(subject: Subject) -> Drawn:
     )
 
 
-def _highlight_line(name: str, plan: Plan, clean: Raw) -> tuple[str, ...]:
+def _highlight_line(name: str, plan: Plan, clean: Frame) -> tuple[str, ...]:
     bright_dn = plan.black_level_dn + HIGHLIGHT * (plan.white_level_dn - plan.black_level_dn)
     return (
         name,
@@ -622,7 +622,7 @@ def _highlight_line(name: str, plan: Plan, clean: Raw) -> tuple[str, ...]:
     )
 
 
-def _profile(axes: Axes, kept: Raw, plain: Raw, lifted: Float, plan: Plan) -> None:
+def _profile(axes: Axes, kept: Frame, plain: Frame, lifted: Float, plan: Plan) -> None:
     """Draw the green sites of one row, with the function and without it."""
     row = int(lifted.sum(axis=1).argmax())
     start = tile(plan.pattern)[row % 2].index(1)

@@ -28,8 +28,8 @@ from unprocess_gen.manifest import Row, image_key, patch_of, plan_of, read_rows,
 from unprocess_gen.patches import cut
 from unprocess_gen.photographs import load, source_of
 from unprocess_gen.process import develop, process, to_light
-from unprocess_gen.reader import RawPairs
-from unprocess_gen.records import Float, Plan, Raw, Srgb
+from unprocess_gen.reader import RawPairs, mosaic_dn
+from unprocess_gen.records import Float, Frame, Plan, Srgb
 from unprocess_gen.tables import linear_table
 from unprocess_gen.verify import NO_LIMIT, source_root
 from unprocess_gen.workspace import machine_error
@@ -45,12 +45,16 @@ PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3)
 KEYS_LOOK = "00000003 names all pairs of an image, 00000003-p0007 those of a patch, 00000003-l01d02 a level and a draw"
 
 
+Mosaic = Frame | Float
+"""A mosaic ``[H, W]`` in DN, of integers or not."""
+
+
 @dataclass(frozen=True, slots=True)
 class Shown:
     """A pair that is to be shown: its frames and row, its plan, and its source's pixels, or what became of them."""
 
-    clean: Raw
-    noisy: Raw
+    clean: Mosaic
+    noisy: Mosaic
     row: Row
     plan: Plan
     source: Srgb | None
@@ -131,7 +135,7 @@ def _shown(folder: Path, keys: Sequence[str], source_folder: Path | None) -> Ite
         if of_image != image_key(row):
             of_image, (photograph, lacks) = image_key(row), _photograph(row, root)
         source_part, lacks_part = _part_of(photograph, lacks, row)
-        yield Shown(clean, noisy, row, plan_of(row), source_part, lacks_part)
+        yield Shown(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_of(row), source_part, lacks_part)
 
 
 def _part_of(photograph: Srgb | None, lacks: str, row: Row) -> tuple[Srgb | None, str]:
@@ -233,7 +237,7 @@ def _middle(length: int, most: int) -> slice:
     return slice(start, start + min(length, most))
 
 
-def binned(raw: Raw, side: int) -> Float:
+def binned(raw: Mosaic, side: int) -> Float:
     """Average squares of ``side`` x ``side`` sites of one colour, so that a smaller mosaic of the same pattern results.
 
     Rows and columns that fill no square are left out.
@@ -241,8 +245,9 @@ def binned(raw: Raw, side: int) -> Float:
     if side == 1:
         return raw.astype(np.float64)
     height, width = (length // (2 * side) for length in raw.shape)
-    rows = raw[: height * 2 * side, : width * 2 * side].reshape(height, side, 2, -1).sum(axis=1, dtype=np.uint32)
-    sites = rows.reshape(height, 2, width, side, 2).sum(axis=3, dtype=np.uint64)  # rows first: ten times as fast
+    of_rows, of_all = (np.uint32, np.uint64) if raw.dtype == np.uint16 else (np.float64, np.float64)
+    rows = raw[: height * 2 * side, : width * 2 * side].reshape(height, side, 2, -1).sum(axis=1, dtype=of_rows)
+    sites = rows.reshape(height, 2, width, side, 2).sum(axis=3, dtype=of_all)  # rows first: ten times as fast
     return np.asarray(sites.reshape(2 * height, 2 * width) / float(side * side))
 
 
@@ -309,21 +314,21 @@ def _source_panel(shown: Shown, at: Window, panel_px: tuple[int, int] = PANEL_PX
 
 
 def _frame_panels(
-    name: str, raw: Raw, whole: Float, plan: Plan, at: Window, panel_px: tuple[int, int] = PANEL_PX
+    name: str, raw: Mosaic, whole: Float, plan: Plan, at: Window, panel_px: tuple[int, int] = PANEL_PX
 ) -> tuple[Panel, Panel, Panel]:
     """Return a raw frame with its own stretch and with the common one, and developed; ``whole`` is it averaged."""
-    low, high = int(raw.min()), int(raw.max())
+    low, high = float(raw.min()), float(raw.max())
     gray, part = _shrunk(whole, panel_px), raw[at.rows, at.columns]
 
-    def own(dn: Float | Raw) -> Picture:
-        return _codes((dn - float(low)) / max(high - low, 1))
+    def own(dn: Mosaic) -> Picture:
+        return _codes(np.asarray((dn - low) / max(high - low, 1.0), dtype=np.float64))
 
-    def common(dn: Float | Raw) -> Picture:
+    def common(dn: Mosaic) -> Picture:
         return _codes(np.sqrt(np.clip(to_light(dn, plan), 0, 1)))
 
     white_dn = plan.black_level_dn + (plan.white_level_dn - plan.black_level_dn) * plan.exposure
     return (
-        Panel(f"{name} raw, own stretch", f"{low} to {high} DN, its least and greatest", own(gray), own(part)),
+        Panel(f"{name} raw, own stretch", f"{low:.6g} to {high:.6g} DN, its least and greatest", own(gray), own(part)),
         Panel(
             f"{name} raw, common stretch",
             f"{plan.black_level_dn} to {white_dn:.5g} DN, square root",
@@ -334,7 +339,7 @@ def _frame_panels(
     )
 
 
-def _developed_panel(name: str, raw: Raw, whole: Float, plan: Plan, at: Window, panel_px: tuple[int, int]) -> Panel:
+def _developed_panel(name: str, raw: Mosaic, whole: Float, plan: Plan, at: Window, panel_px: tuple[int, int]) -> Panel:
     title = f"{name} raw, developed"
     if min(raw.shape) < 2:
         return Panel(title, "left out: less than 2 x 2 sites do not show all three colours", None)
@@ -347,7 +352,7 @@ REACH_PX = 2
 """How far a demosaicked pixel looks (`process.KERNELS`)."""
 
 
-def _developed_part(raw: Raw, plan: Plan, at: Window) -> Float:
+def _developed_part(raw: Mosaic, plan: Plan, at: Window) -> Float:
     """Develop the part and the little around it that the demosaic sees, so that the part is that of the whole."""
     y, x = (max(0, part.start - REACH_PX) for part in (at.rows, at.columns))
     around = develop(raw[y : at.rows.stop + REACH_PX, x : at.columns.stop + REACH_PX], plan)  # y and x are even

@@ -25,7 +25,7 @@ import numpy as np
 
 from unprocess_gen.bayer import mosaic, tile
 from unprocess_gen.colour import invert
-from unprocess_gen.records import Float, Plan, Raw
+from unprocess_gen.records import Float, Frame, Plan
 
 ROUNDS = 200
 """More than any search below needs: a bisection halves an interval of doubles at most 64 times until it is two
@@ -48,7 +48,7 @@ def render(camera_rgb: Float, plan: Plan) -> Float:
     return TONES[plan.tone](image)
 
 
-def develop(raw: Raw | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
+def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
     """Return the photograph that a raw frame shows, display-referred in [0, 1], ``[H, W, 3]`` float64.
 
     ``raw`` is a mosaic ``[H, W]`` in DN, clean or noisy, of at least 2 x 2 sites; ``origin`` is the row and column of
@@ -68,7 +68,7 @@ def develop(raw: Raw | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> F
     return render(demosaic(balanced, plan.pattern, origin), plan)
 
 
-def to_light(dn: Raw | Float, plan: Plan) -> Float:
+def to_light(dn: Frame | Float, plan: Plan) -> Float:
     """Return the light of DN before the scene darkened it, any shape: 0 at black, 1 at the photograph's white."""
     span_dn = float(plan.white_level_dn - plan.black_level_dn)
     return np.asarray((dn - float(plan.black_level_dn)) / span_dn * plan.exposure_ratio)

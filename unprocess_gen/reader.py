@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unprocess_gen.bayer import unpack
 from unprocess_gen.errors import DamageError
-from unprocess_gen.manifest import located_rows, read_row, sample_key
-from unprocess_gen.records import Frame
+from unprocess_gen.manifest import Row, located_rows, read_row, sample_key
+from unprocess_gen.records import PACKED, UINT16, Float, Frame
+from unprocess_gen.sensor import in_dn
 from unprocess_gen.shards import CLEAN, Form, Member, form_of, map_array, noisy_member, read_index, shard_name
 
 
@@ -24,6 +26,14 @@ class Sample(NamedTuple):
     clean: Frame
     noisy: Frame
     row: dict[str, Any]
+
+
+def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
+    """Return a frame of any dtype and layout as a mosaic ``[H, W]`` in DN: uint16 as it is, float32 as float64."""
+    mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
+    if row["dtype"] == UINT16:
+        return mosaic
+    return in_dn(mosaic, (int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)))
 
 
 class RawPairs:

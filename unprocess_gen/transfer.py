@@ -20,12 +20,11 @@ from typing import BinaryIO
 
 import numpy as np
 
-from unprocess_gen.bayer import unpack
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.manifest import Row
-from unprocess_gen.reader import RawPairs
-from unprocess_gen.records import FLOAT32, PACKED, Float, Frame
-from unprocess_gen.sensor import in_dn, noisy_limits
+from unprocess_gen.reader import RawPairs, mosaic_dn
+from unprocess_gen.records import FLOAT32, Float, Frame
+from unprocess_gen.sensor import noisy_limits
 
 ROUNDING_VARIANCE = 1 / 6
 REACH = 5.0
@@ -112,7 +111,7 @@ def fits(folder: Path) -> Iterator[Fit]:
 def fit(clean: Frame, noisy: Frame, row: Row) -> Fit | None:
     """Fit the variance of one pair; None where fewer than three DN of the clean frame have sites enough."""
     black, slope, intercept, prnu = _law(row)
-    clean_dn, noisy_dn = _mosaic_dn(clean, row), _mosaic_dn(noisy, row)
+    clean_dn, noisy_dn = (mosaic_dn(frame, row).astype(np.float64) for frame in (clean, noisy))
     rounded = row["dtype"] != FLOAT32
     rounding, least = (ROUNDING_VARIANCE, LEAST_VARIANCE) if rounded else (0.0, LEAST_FLOAT_VARIANCE)
     difference = noisy_dn - clean_dn
@@ -149,12 +148,6 @@ def fit(clean: Frame, noisy: Frame, row: Row) -> Fit | None:
     errors = math.sqrt(inverse[0, 0]), math.sqrt(inverse[1, 1] + shared * shared)
     expected = slope, intercept
     return Fit(str(row["key"]), float(a), errors[0], float(b), errors[1], expected, signal, variance, rounding)
-
-
-def _mosaic_dn(frame: Frame, row: Row) -> Float:
-    """Return a frame of any dtype and layout as a mosaic in DN, float64."""
-    mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
-    return in_dn(mosaic, (int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)))
 
 
 def _number(row: Row, name: str) -> float:
