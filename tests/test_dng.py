@@ -496,6 +496,23 @@ def test_what_is_no_uint16_mosaic_is_refused(frame: np.ndarray, ds: Path) -> Non
         dng.encode(frame, pair(ds)[2], "clean")
 
 
+def test_packed_planes_are_written_as_the_mosaic_that_they_are(make: Make, tmp_path: Path) -> None:
+    arrays = []
+    for layout in ("mosaic", "packed"):
+        make(None, tmp_path / layout, "source.limit=1", "sensor.pattern=GBRG", f"output.layout={layout}")
+        dng.export(tmp_path / layout, "00000000", dng.FRAMES, tmp_path / f"{layout}.dng")
+        arrays.append([read(tmp_path / f"{layout}.dng" / f"00000000.{frame}.dng")[0] for frame in dng.FRAMES])
+
+    assert all(np.array_equal(*frames) for frames in zip(*arrays, strict=True))
+
+
+def test_float_frames_are_refused_and_nothing_is_written(make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.limit=1", "output.dtype=float32")
+    with pytest.raises(ConfigError, match=r"--keys 00000000: its clean frame is float64 \[.*; a DNG is made of uint16"):
+        dng.export(tmp_path / "ds", "00000000", dng.FRAMES, tmp_path / "files")
+    assert not (tmp_path / "files").exists()
+
+
 def test_without_tifffile_one_line_names_the_extra(
     ds: Path, door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

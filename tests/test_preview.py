@@ -291,6 +291,30 @@ def test_frames_of_any_size_are_shown(dataset: Path, tmp_path: Path) -> None:
     assert all(one.lacks == "" and len(one.files) == 2 for one in drawn)
 
 
+def test_packed_planes_are_shown_as_the_mosaic_that_they_are(gray_world: Path, make: Make, tmp_path: Path) -> None:
+    sheets = []
+    for layout in ("mosaic", "packed"):
+        make(gray_world, tmp_path / layout, "source.include=[large.png]", f"output.layout={layout}")
+        [drawn] = preview.preview(tmp_path / layout, tmp_path / "sheets" / layout, with_stages=True)
+        sheets.append([file.read_bytes() for file in drawn.files])
+
+    assert len(sheets[0]) == 2
+    assert sheets[0] == sheets[1]
+
+
+def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Path) -> None:
+    one = ("source.include=[large.png]", "output.layout=packed")
+    make(gray_world, tmp_path / "whole", *one)
+    make(gray_world, tmp_path / "float", *one, "output.dtype=float32")
+    wholes, floats = (next(iter(preview._shown(tmp_path / name, (), None))) for name in ("whole", "float"))
+
+    assert np.abs(floats.clean - wholes.clean.astype(np.float64)).max() <= 0.5 + 1e-3  # rounded, or not; float32
+    assert np.abs(floats.noisy - wholes.noisy.astype(np.float64)).max() <= 0.5 + 1e-3
+    sheets = [preview.sheet(shown).astype(int) for shown in (wholes, floats)]
+    assert sheets[0].shape == sheets[1].shape
+    assert np.abs(sheets[0] - sheets[1]).mean() < 1
+
+
 def test_built_in_scenes_are_their_own_source(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1")
 
