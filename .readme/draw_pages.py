@@ -1,0 +1,57 @@
+"""Draw the README's look at a dataset's page, at the article's figures and at a DNG file: python .readme/draw_pages.py.
+
+Everything is of built-in scenes, in a temporary folder. Needs the extras figures and dng, rawpy, and chromium.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rawpy
+
+HERE = Path(__file__).parent
+BROWSER = ("chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars")
+CHART = "00000001"
+
+
+def gen_dataset(*arguments: str) -> None:
+    """Run the tool."""
+    subprocess.run([sys.executable, "-m", "unprocess_gen", *arguments], check=True)
+
+
+def save(picture: np.ndarray, name: str) -> None:
+    """Save RGB codes as small as PNG can."""
+    cv2.imwrite(str(HERE / name), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def developed(path: Path) -> np.ndarray:
+    """Return what LibRaw makes of a DNG file with the camera's white balance and the tag's brightening."""
+    with rawpy.imread(str(path)) as raw:
+        return raw.postprocess(use_camera_wb=True, no_auto_bright=True, bright=2.0, adjust_maximum_thr=0)
+
+
+def main() -> None:
+    """Make a dataset, its page, its DNG files and the figures; write page.png, dng.png and figure6.png."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        gen_dataset(f"out={folder}/ds", "noise=imx385_iso12800", "gains=fixed")
+        gen_dataset("report", f"{folder}/ds")
+        gen_dataset("dng", f"{folder}/ds", "--keys", CHART, "--to", f"{folder}/dng")
+        gen_dataset("figures", f"out={folder}/figures")
+        place = f"file://{folder}/ds/report.html"
+        shot = ("--window-size=1220,2100", f"--screenshot={folder}/page.png", f"--user-data-dir={folder}/profile")
+        subprocess.run([*BROWSER, *shot, place], check=True, capture_output=True)
+        page = cv2.imread(f"{folder}/page.png", cv2.IMREAD_COLOR_RGB)
+        save(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), "page.png")
+        frames = [developed(folder / "dng" / f"{CHART}.{frame}.dng") for frame in ("clean", "noisy")]
+        save(cv2.resize(np.hstack(frames), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), "dng.png")
+        (HERE / "figure6.png").write_bytes((folder / "figures" / "fig6.png").read_bytes())
+
+
+if __name__ == "__main__":
+    main()
