@@ -508,7 +508,7 @@ def test_packed_planes_are_written_as_the_mosaic_that_they_are(make: Make, tmp_p
 
 def test_float_frames_are_refused_and_nothing_is_written(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1", "output.dtype=float32")
-    with pytest.raises(ConfigError, match=r"--keys 00000000: its clean frame is float64 \[.*; a DNG is made of uint16"):
+    with pytest.raises(ConfigError, match=r"--keys 00000000: is of float32 numbers, .* needs output\.dtype=uint16"):
         dng.export(tmp_path / "ds", "00000000", dng.FRAMES, tmp_path / "files")
     assert not (tmp_path / "files").exists()
 

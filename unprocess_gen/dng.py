@@ -48,7 +48,7 @@ from unprocess_gen.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 from unprocess_gen.errors import ConfigError, DamageError
 from unprocess_gen.manifest import Row, plan_of, read_rows
 from unprocess_gen.reader import RawPairs, mosaic_dn
-from unprocess_gen.records import Float, Frame, Plan
+from unprocess_gen.records import UINT16, Float, Frame, Plan
 from unprocess_gen.shards import array_xxh3
 from unprocess_gen.verify import choose
 from unprocess_gen.workspace import machine_error, place
@@ -124,6 +124,10 @@ def _writable(row: Row) -> Row:
     key, width, height = row["key"], int(row["width"] or 0), int(row["height"] or 0)
     if row["status"] != "ok":
         raise ConfigError(f"--keys {key}: failed ({row['reason']}), so it has no frames")
+    if row["dtype"] != UINT16:
+        raise ConfigError(
+            f"--keys {key}: is of {row['dtype']} numbers, which LibRaw would round; a DNG needs output.dtype={UINT16}"
+        )
     if min(width, height) < LEAST_SIDE_PX:
         raise ConfigError(
             f"--keys {key}: is {width} x {height}; LibRaw, which most raw converters read with, opens no DNG with a "

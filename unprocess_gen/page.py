@@ -53,6 +53,7 @@ def write(folder: Path, to: Path | None = None, source: Path | None = None) -> P
     MachineError where the page cannot be written.
     """
     check_drawing("report")
+    _check_finished(folder)
     to = folder / REPORT if to is None else to
     _check_to(folder, to)
     content = page(folder, source).encode()
@@ -103,9 +104,13 @@ def _section(title: str, content: Iterable[Html]) -> list[Html]:
     return [element("h2", title), *content]
 
 
-def _facts(folder: Path) -> dict[str, Any]:
+def _check_finished(folder: Path) -> None:
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json is not here; is this a finished dataset?")
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    _check_finished(folder)
     facts = read_dataset(folder / "dataset.json")
     for name, key in (("manifest.csv", "manifest_sha256"), ("config.yaml", "config_sha256")):
         path = folder / name
