@@ -380,8 +380,9 @@ ADDED_IN_ANY_ORDER = {
 }
 OF_OPENCV = {"imdecode", "error", "setNumThreads", "utils"}
 
-ELSEWHERE = {"unprocess", "process", "tables", "transfer", "accuracy", "report", "preview", "figures", "page"}
-"""The reference, its mirror, what measures or draws (nothing of it reaches a dataset), the tables, held to digests."""
+ELSEWHERE = {"unprocess", "process", "tables", "transfer", "accuracy", "report", "preview", "figures", "page", "dng"}
+"""The reference, its mirror, what measures, draws or writes for others (nothing of it reaches a dataset), the tables,
+held to digests."""
 
 ROOMS = [room for room in sorted((ROOT / "unprocess_gen").glob("*.py")) if room.stem not in ELSEWHERE]
 
