@@ -15,6 +15,7 @@ import re
 import shlex
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
@@ -119,6 +120,7 @@ def main() -> int:
     if sys.stderr is None:  # closed by the caller; what codecs say is read from there
         sys.stderr = os.fdopen(os.dup2(os.open(os.devnull, os.O_WRONLY), 2), "w")
     signal.signal(signal.SIGTERM, _terminate)
+    unraisable, sys.unraisablehook = sys.unraisablehook, _send_again
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot show a sign is no reason to stop
@@ -136,10 +138,25 @@ def main() -> int:
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)  # all is said: a late signal ends us at once, without a traceback
+        sys.unraisablehook = unraisable
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
     raise Terminated
+
+
+SENT_AGAIN_S = 0.05
+
+
+def _send_again(unraisable: sys.UnraisableHookArgs) -> None:
+    """Send a signal anew whose exception C dropped: it came while LLVM called back, which takes far less than that."""
+    number = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}.get(unraisable.exc_type)
+    if number is None:
+        sys.__unraisablehook__(unraisable)
+        return
+    timer = threading.Timer(SENT_AGAIN_S, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
 
 
 def _report(error: BaseException, job: str = "") -> int:
