@@ -27,7 +27,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from unprocess_gen import effects, electrons, planner
-from unprocess_gen.cli import conf_dir
+from unprocess_gen.compose import conf_dir
 from unprocess_gen.config import Config, check
 from unprocess_gen.decode import decode
 from unprocess_gen.effects import EFFECTS

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from unprocess_gen import accuracy, effects, report
 from unprocess_gen.accuracy import BY_NAME, EXACT, MEASUREMENTS, REFERENCE, TIER_STAGES, Beside, Effort, Report, Row
-from unprocess_gen.cli import conf_dir
+from unprocess_gen.compose import conf_dir
 from unprocess_gen.config import AccuracyConfig, Config, NoiseConfig, SensorConfig, budget, check, read_option
 from unprocess_gen.errors import ConfigError
 from unprocess_gen.forecast import forecast, text

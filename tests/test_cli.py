@@ -15,7 +15,7 @@ import pytest
 import yaml
 from conftest import COMMAND, fill
 
-from unprocess_gen import RawPairs, __version__, cli
+from unprocess_gen import RawPairs, __version__, cli, compose
 
 Door = Callable[..., Any]
 Cli = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -175,7 +175,7 @@ def test_help_is_answered_whatever_stands_beside_it(arguments: tuple[str, ...], 
 def test_help_names_every_verb_group_and_option() -> None:
     for verb in cli.VERBS:
         assert f"gen-dataset {verb}" in cli.HELP
-    for folder in cli.conf_dir().glob("*/"):
+    for folder in compose.conf_dir().glob("*/"):
         named = re.search(rf"^  {folder.name} +(.*(?:\n {{11}}.*)*)$", cli.HELP, re.MULTILINE)
         assert named is not None
         options = {file.stem for file in folder.glob("*.yaml")} - {"default"}

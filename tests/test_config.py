@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from unprocess_gen import cli, draws, tables, unprocess
+from unprocess_gen import compose, draws, tables, unprocess
 from unprocess_gen.config import (
     HIGHLIGHTS,
     LAW_NUMBERS,
@@ -34,7 +34,9 @@ from unprocess_gen.records import Law
 
 Settings = Callable[..., Config]
 FILES = sorted(
-    path.relative_to(cli.conf_dir()) for path in cli.conf_dir().glob("*/*.yaml") if path.parent.name != cli.RECIPE
+    path.relative_to(compose.conf_dir())
+    for path in compose.conf_dir().glob("*/*.yaml")
+    if path.parent.name != compose.RECIPE
 )
 MATRIX = "[0.7, 0.1, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]"
 NEEDS = {
@@ -61,7 +63,7 @@ def test_every_option_composes_and_passes_the_checks(file: Path, settings: Setti
 @pytest.mark.parametrize("file", FILES, ids=str)
 def test_every_option_says_all_keys_of_its_group(file: Path) -> None:
     group = getattr(Config(), str(file.parent))
-    written = yaml.safe_load((cli.conf_dir() / file).read_text(encoding="utf-8"))
+    written = yaml.safe_load((compose.conf_dir() / file).read_text(encoding="utf-8"))
     keys = {field.name for field in dataclasses.fields(group)}
     if str(file.parent) == "noise":
         assert keys == NOISE_KEYS | TWO_NUMBERS | PHYSICAL | CHOSEN
@@ -70,7 +72,7 @@ def test_every_option_says_all_keys_of_its_group(file: Path) -> None:
 
 
 def test_options_are_those_of_the_contract() -> None:
-    options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in cli.conf_dir().glob("*/")}
+    options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in compose.conf_dir().glob("*/")}
     assert options == {
         "source": {"default"},
         "camera": {

@@ -12,7 +12,7 @@ import pytest
 from conftest import Door, Settings, pixels
 from PIL import Image
 
-from unprocess_gen import cli, figures, report, synthetic
+from unprocess_gen import compose, figures, report, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.config import GainsConfig, NoiseConfig, read_option
 from unprocess_gen.figures import READINGS, Counted, Drawn, Recipes, Saturation
@@ -23,8 +23,8 @@ FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
 
 @pytest.fixture(scope="module")
 def recipes() -> Recipes:
-    gains = {name: read_option(cli.conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in figures.GAINS}
-    return Recipes(gains, read_option(cli.conf_dir() / "noise" / f"{figures.AUTHORS_NOISE}.yaml", NoiseConfig))
+    gains = {name: read_option(compose.conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in figures.GAINS}
+    return Recipes(gains, read_option(compose.conf_dir() / "noise" / f"{figures.AUTHORS_NOISE}.yaml", NoiseConfig))
 
 
 @pytest.fixture(scope="module")

@@ -27,14 +27,15 @@ FLOORS = (
     {"accuracy", "runner", "sweep", "transfer", "verify"},
     {"dng", "forecast", "preview", "repair", "report"},
     {"figures", "page"},
+    {"compose"},
     {"cli"},
 )
 FLOOR = {room: level for level, rooms in enumerate(FLOORS) for room in rooms}
 DOORSTEP = {"__init__", "__main__"}
 
 ONLY_IN = {
-    "hydra": {"cli"},
-    "omegaconf": {"cli", "config"},
+    "hydra": {"compose"},
+    "omegaconf": {"compose", "config"},
     "joblib": {"runner"},
     "llvmlite": {"compiled"},
     "numba": {"compiled"},

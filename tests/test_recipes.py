@@ -11,7 +11,7 @@ from conftest import CRVD, Door, Make, Settings, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs, synthetic
-from unprocess_gen.cli import RECIPE, conf_dir
+from unprocess_gen.compose import RECIPE, conf_dir
 from unprocess_gen.config import check, read_dataset_yaml
 from unprocess_gen.photographs import downscaled
 from unprocess_gen.records import Srgb
