@@ -20,7 +20,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel, and keep the machine code between processes where there is a place for it.
 
     Numba keeps it beside the kernel's file or below the user's cache folder; where neither can be written, every worker
-    compiles for itself (ten seconds).
+    compiles for itself (10 to 40 seconds).
     """
     return _compiled(function)
 

@@ -368,7 +368,7 @@ class Progress:
         self._bar.set_postfix_str("compiling the kernels, once on a machine")
         if self._plain:
             print(
-                f"gen-dataset: {self._done}/{self._total} images, compiling the kernels first: some ten seconds, once "
+                f"gen-dataset: {self._done}/{self._total} images, compiling the kernels first: 10 to 40 seconds, once "
                 "on a machine",
                 file=sys.stderr,
                 flush=True,
