@@ -211,8 +211,7 @@ def accuracy(arguments: list[str]) -> int:
 
     Which is ``accuracy`` unless it is said: a report is no dataset.
     """
-    if not any(argument.startswith("out=") for argument in arguments):
-        arguments = [*arguments, "out=accuracy"]
+    arguments = _with_out(arguments, "accuracy")
     return compose(arguments, lambda config: _accuracy(config, shlex.join(["gen-dataset", "accuracy", *arguments])))
 
 
@@ -254,8 +253,7 @@ def figures(arguments: list[str]) -> int:
     for argument in arguments:
         if "=" in argument and not argument.startswith("-") and re.split(r"[.=]", argument)[0] not in FIGURE_KEYS:
             raise ConfigError(f"figures: {argument}: the article sets it; expected {', '.join(FIGURE_KEYS)}")
-    if not any(argument.startswith("out=") for argument in arguments):
-        arguments = [*arguments, "out=figures"]
+    arguments = _with_out(arguments, "figures")
     return compose(arguments, lambda config: _figures(config, shlex.join(["gen-dataset", "figures", *arguments])))
 
 
@@ -309,6 +307,18 @@ def again(arguments: list[str]) -> int:
     return code
 
 
+def _first(verb: str, arguments: Sequence[str], expected: str = "the folder of a dataset") -> Path:
+    """Return the path that a verb's first argument is; ConfigError where it is none."""
+    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
+        raise ConfigError(f"{verb}: expected {expected}")
+    return Path(arguments[0])
+
+
+def _with_out(arguments: list[str], out: str) -> list[str]:
+    """Add the verb's own ``out`` where none is said."""
+    return arguments if any(argument.startswith("out=") for argument in arguments) else [*arguments, f"out={out}"]
+
+
 def _values(verb: str, known: Mapping[str, Callable[[str], Any]], arguments: Sequence[str]) -> dict[str, Any]:
     """Read ``key=value`` and ``--flag value`` (or ``--flag=value``); ConfigError for anything else."""
     values: dict[str, Any] = {}
@@ -333,10 +343,7 @@ def verify(arguments: list[str]) -> int:
 
     mend, noise = "--repair" in arguments, "--noise" in arguments
     arguments = [argument for argument in arguments if argument not in ("--repair", "--noise")]
-
-    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
-        raise ConfigError("verify: expected the folder of a dataset")
-    folder, chosen = Path(arguments[0]), _values("verify", VERIFY_KEYS, arguments[1:])
+    folder, chosen = _first("verify", arguments), _values("verify", VERIFY_KEYS, arguments[1:])
     damages = _told(folder, room.verify(folder))
     if damages and mend:
         for step in repair.repair(folder, room.source_root(folder / "manifest.csv", chosen.get("source.root"))):
@@ -382,9 +389,8 @@ def replay(arguments: list[str]) -> int:
     """``gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]``: make rows again."""
     from unprocess_gen import verify as room
 
-    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
-        raise ConfigError("replay: expected a manifest.csv, or the folder of a dataset")
-    manifest, chosen = Path(arguments[0]), _values("replay", REPLAY_KEYS, arguments[1:])
+    manifest = _first("replay", arguments, "a manifest.csv, or the folder of a dataset")
+    chosen = _values("replay", REPLAY_KEYS, arguments[1:])
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(chosen["--to"]) if "--to" in chosen else None
     rows = room.choose(manifest, chosen.get("--rows"), chosen.get("--keys"))
@@ -401,10 +407,8 @@ def report(arguments: list[str]) -> int:
     """``gen-dataset report DIR [--to FILE] [--source ROOT]``: write the page of a dataset, else ``DIR/report.html``."""
     from unprocess_gen import page
 
-    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
-        raise ConfigError("report: expected the folder of a dataset")
-    chosen = _values("report", REPORT_KEYS, arguments[1:])
-    print(page.write(Path(arguments[0]), chosen.get("--to"), chosen.get("--source")))
+    folder, chosen = _first("report", arguments), _values("report", REPORT_KEYS, arguments[1:])
+    print(page.write(folder, chosen.get("--to"), chosen.get("--source")))
     return 0
 
 
@@ -414,9 +418,7 @@ def preview(arguments: list[str]) -> int:
 
     with_stages = "--stages" in arguments
     arguments = [argument for argument in arguments if argument != "--stages"]
-    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
-        raise ConfigError("preview: expected the folder of a dataset")
-    folder, chosen = Path(arguments[0]), _values("preview", PREVIEW_KEYS, arguments[1:])
+    folder, chosen = _first("preview", arguments), _values("preview", PREVIEW_KEYS, arguments[1:])
     if "--to" not in chosen:
         raise ConfigError("preview: --to is missing: the folder to draw the sheets in")
     to, source = Path(chosen["--to"]), Path(chosen["--source"]) if "--source" in chosen else None
@@ -435,15 +437,14 @@ def dng(arguments: list[str]) -> int:
     """``gen-dataset dng DIR --keys K,… [--noisy|--clean] --to FOLDER``: write frames as DNG files."""
     from unprocess_gen import dng as room
 
-    if not arguments or arguments[0].startswith("-") or "=" in arguments[0]:
-        raise ConfigError("dng: expected the folder of a dataset")
+    folder = _first("dng", arguments)
     flags = {f"--{frame}": frame for frame in room.FRAMES}
     chosen = _values("dng", DNG_KEYS, [argument for argument in arguments[1:] if argument not in flags])
     for key, wanted in (("--keys", "K,…: the rows to write"), ("--to", "FOLDER: where to write them")):
         if not chosen.get(key):
             raise ConfigError(f"dng: missing {key} {wanted}")
     frames = [frame for flag, frame in flags.items() if flag in arguments] or room.FRAMES
-    done = room.export(Path(arguments[0]), chosen["--keys"], frames, Path(chosen["--to"]))
+    done = room.export(folder, chosen["--keys"], frames, Path(chosen["--to"]))
     told = (
         (done.written, "DNG files written"),
         (done.present, "were there already, the same"),
