@@ -37,37 +37,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.bayer import tile
-from unprocess_gen.compiled import eight_bytes, kernel
+from unprocess_gen.compiled import inner, kernel
+from unprocess_gen.lanes import (
+    WIDE,
+    Numbers,
+    Vector,
+    bare,
+    below,
+    bits_of,
+    float_of,
+    four_bytes,
+    greatest,
+    least,
+    load,
+    mask_of,
+    nothing,
+    root,
+    store,
+    to_float32,
+    to_uint32,
+)
 from unprocess_gen.normals import (
+    FINE_ERROR,
     FIRST_ROW,
     ONE_BITS,
     POSITION_BITS,
     POSITION_MASK,
     TWO52,
     TWO52_BITS,
+    fill_depths,
+    fine_normal,
+    normal_of_word,
     normal_quantiles,
 )
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
-from unprocess_gen.tables import SEGMENTS, normal_lines
 
 CHUNK = 1024
 """Pixels worked on at a time at most."""
 RUN = 512
 """Pixels worked on at a time where a site has one normal: four buffers of 4 kB, beside the tables."""
 
-SEGMENT_BITS = SEGMENTS.bit_length() - 1
-
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
 STEP0, STEP1 = (np.uint64(step) for step in KEY_STEPS)
 LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
-_1 = np.uint64(1)
-_EVEN32, _SIGN64 = np.uint64(0xFFFFFFFE), np.uint64(1 << 63)
+_0, _1, _2, _3, _4, _8 = (np.uint64(number) for number in (0, 1, 2, 3, 4, 8))
 _LOW16 = np.uint64(0xFFFF)
-_BYTE, _8, _16, _24, _40 = np.uint64(0xFF), np.uint64(8), np.uint64(16), np.uint64(24), np.uint64(40)
-_ODD_TWO52_BITS = TWO52_BITS | _1
+_BYTE, _S8, _S16, _S24 = (np.uint32(number) for number in (0xFF, 8, 16, 24))
+_G, _B = np.uint32(256), np.uint32(512)
 ROUND = 1.5 * 2.0**52
+
+Single = NDArray[np.float32]
+Indices = NDArray[np.uint32]
+
+ROUND32, SIGN32, _UNSIGNED32 = np.float32(1.5 * 2.0**23), np.uint32(1 << 31), np.uint32(0x7FFFFFFF)
+ZERO32, _HALF32, _1_32, _ONE_BITS32 = np.float32(0), np.float32(0.5), np.uint32(1), np.uint32(0x3F800000)
+
+NOISE_ERROR, PART_ERROR = np.float32(FINE_ERROR + 2.0**-16), np.float32(2.0**-22)
+"""What the noise of `_fill_noise` is off by, at most: of its standard deviation, and DN."""
+CANCELS = 2.0**-4
+"""Below this share of the offset, float32 knows the variance too little, where one of its terms is below 0."""
 
 HETEROSCEDASTIC = np.uint64(purpose("heteroscedastic"))
 
@@ -82,18 +112,16 @@ def make_pair(
     """Make a pair of a two-parameter profile with normal noise.
 
     Arguments as for `pair.make_pair`, with the curve of the source's codes, and the lowest and highest DN of the noisy
-    frame. A plan whose methods are those of float32 gets that form, whose errors `methods` states, and any other the
-    reference's DN.
+    frame.
     """
-    if plan.in_float32:
-        return _make_pair32(srgb, plan, curve, limits_dn, origin)
     clean = np.empty(srgb.shape[:2], dtype=np.uint16)
     noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
     counts = np.zeros(6, dtype=np.int64)
     scene = scene_of(plan, curve, srgb.shape, origin)
     frames = (clean, noisy, counts)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, normal_quantiles().quadratics, *frames)
+    quadratics = normal_quantiles().quadratics
+    _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, quadratics, make_room(), *frames)
     return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
 
 
@@ -123,7 +151,7 @@ def make_noisy(
     counts = np.zeros(6, dtype=np.int64)
     scene = scene_of(plan, np.zeros(1), unrounded.shape, origin)  # no code is looked up
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    _noisy(unrounded, scene, key, limits_dn, origin, normal_quantiles().quadratics, noisy, counts)
+    _noisy(unrounded, scene, key, limits_dn, origin, normal_quantiles().quadratics, make_room(), noisy, counts)
     return noisy, counts
 
 
@@ -184,6 +212,40 @@ def key_words(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Key:
     return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
 
 
+class Room(NamedTuple):
+    """Where runs of pixels are worked on, by whole blocks. Python makes it; kernels hand it on bare (`lanes.bare`)."""
+
+    signal: Float
+    unrounded: Float
+    whole: Single  # DN of the clean frame, rounded
+    part: Single  # what rounding took
+    words: Indices
+    depths: Single  # of the draws
+    noise: Single  # and `part`: DN from `whole` on
+    margin: Single  # what the noise is off by, at most
+    noisy_dn: Single  # rounded, not clipped
+    clean: Raw
+    noisy: Raw
+    listed: NDArray[np.uint64]  # eights with a site to settle, and the bits that tell which
+
+
+def make_room() -> Room:
+    """Return room for a run; what a part of a block leaves over is computed with as well, and so must be numbers."""
+    size = RUN + BLOCK
+    doubles, singles = np.zeros((2, size)), np.zeros((6, size), dtype=np.float32)
+    raw, words = np.zeros((2, size), dtype=np.uint16), np.zeros(size, dtype=np.uint32)
+    return Room(*doubles, *singles[:2], words, *singles[2:], *raw, np.zeros(size // WIDE, dtype=np.uint64))
+
+
+@inner
+def _bare_room(room: Room) -> Room:
+    return Room(
+        bare(room.signal, _0), bare(room.unrounded, _0), bare(room.whole, _0), bare(room.part, _0),
+        bare(room.words, _0), bare(room.depths, _0), bare(room.noise, _0), bare(room.margin, _0),
+        bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0), bare(room.listed, _0),
+    )  # fmt: skip
+
+
 @kernel
 def _pair(
     srgb: Srgb,
@@ -192,33 +254,46 @@ def _pair(
     limits_dn: tuple[float, float],
     origin: tuple[int, int],
     quantiles: tuple[Float, Float, Float],
+    room: Room,
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
     """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a two-parameter profile."""
     height, width = clean.shape
-    signal, unrounded, std = np.empty(RUN), np.zeros(RUN + BLOCK), np.empty(RUN + BLOCK)
-    drawn = np.empty(RUN + BLOCK, dtype=np.uint64)
+    codes, of_bytes = scene.products.shape[2], srgb.itemsize == 1
+    run, tally = _bare_room(room), bare(counts, _0)
+    law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
     site_gains, site_headroom = by_site(scene)
     for y in range(height):
-        even, odd = _products(scene, y)
-        gains, headroom = site_gains[y & 1], site_headroom[y & 1]
+        even = bare(scene.products, 3 * codes * scene.sites[y & 1, 0])
+        odd = bare(scene.products, 3 * codes * scene.sites[y & 1, 1])
         for start in range(0, width, RUN):
-            end = min(start + RUN, width)
-            first, after, block, blocks = blocks_of(origin[1] + start, end - start)
-            row, clean_dn, out = srgb[y, start:end], unrounded[first:after], clean[y, start:end]
+            length = min(RUN, width - start)
+            first, after, block, blocks = blocks_of(origin[1] + start, length)
+            at = y * width + start
             if scene.by_gray:
-                fill_signal(row, scene, y, signal)
+                fill_signal(srgb[y, start : start + length], scene, y, room.signal[first:after])
             else:
-                fill_camera(row, even, odd, signal)
-            if fill_dim(signal, gains, scene, clean_dn, out, counts):
-                fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
-            _fill_draws(key, block, blocks, np.uint64(origin[0] + y), scene, unrounded, std, drawn)
-            _add_noise(blocks * BLOCK, unrounded, drawn, quantiles, scene, std)
-            digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
-            if _may_be_still(scene):
-                counts[5] += _still(clean_dn, scene)
+                look_up(bare(srgb, 3 * at), even, odd, codes, length, of_bytes, bare(run.signal, first))
+            is_whole = length == blocks * BLOCK
+            gains = load(bare(site_gains, (y & 1) * CHUNK + (first & 1)), _0)
+            frame = bare(clean, at) if is_whole else run.clean
+            some_below, some_bright = _fill_clean(blocks, gains, scene, run, frame)
+            if not is_whole:
+                copy(length, bare(run.clean, first), bare(clean, at))
+            if some_below:
+                tally[0] += count_below(first, after, run.signal)
+            if some_bright:
+                of_row = site_gains[y & 1], site_headroom[y & 1]
+                here = room.unrounded[first:after], clean[y, start : start + length]
+                fill_bright(room.signal[first:after], *of_row, scene, *here, counts)
+                _split(blocks, run)
+            fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
+            frame = bare(noisy, at) if is_whole else run.noisy
+            _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
+            if not is_whole:
+                copy(length, bare(run.noisy, first), bare(noisy, at))
 
 
 @kernel
@@ -249,29 +324,33 @@ def _noisy(
     limits_dn: tuple[float, float],
     origin: tuple[int, int],
     quantiles: tuple[Float, Float, Float],
+    room: Room,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
     """Fill ``noisy`` and ``counts`` with the noisy frame of an unrounded clean one: the second half of `_pair`."""
     height, width = noisy.shape
-    unrounded, std = np.zeros(RUN + BLOCK), np.empty(RUN + BLOCK)
-    drawn = np.empty(RUN + BLOCK, dtype=np.uint64)
+    run, tally = _bare_room(room), bare(counts, _0)
+    law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
     for y in range(height):
         for start in range(0, width, RUN):
-            end = min(start + RUN, width)
-            first, after, block, blocks = blocks_of(origin[1] + start, end - start)
-            copy(clean_dn[y, start:end], unrounded[first:after])
-            _fill_draws(key, block, blocks, np.uint64(origin[0] + y), scene, unrounded, std, drawn)
-            _add_noise(blocks * BLOCK, unrounded, drawn, quantiles, scene, std)
-            digitise(std[first:after], limits_dn, noisy[y, start:end], counts)
-            if _may_be_still(scene):
-                counts[5] += _still(unrounded[first:after], scene)
+            length = min(RUN, width - start)
+            first, after, block, blocks = blocks_of(origin[1] + start, length)
+            at = y * width + start
+            copy(length, bare(clean_dn, at), bare(run.unrounded, first))
+            _split(blocks, run)
+            fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
+            is_whole = length == blocks * BLOCK
+            frame = bare(noisy, at) if is_whole else run.noisy
+            _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
+            if not is_whole:
+                copy(length, bare(run.noisy, first), bare(noisy, at))
 
 
-@kernel
-def copy(source: Float, target: Float) -> None:
-    """Copy a run; an assignment of slices would be compiled with a logarithm, for its error message."""
-    for x in range(target.shape[0]):
+@inner
+def copy(length: int, source: Numbers, target: Numbers) -> None:
+    """Copy some numbers."""
+    for x in range(length):
         target[x] = source[x]
 
 
@@ -314,30 +393,39 @@ def fill_signal(row: Srgb, scene: Scene, y: int, out: Float) -> None:
 @kernel
 def fill_camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
     """Linearise and apply the matrix, for the one channel that each site keeps."""
-    length = row.shape[0]
-    first = 0
-    if row.itemsize == 1:
-        first = _fill_camera_of_bytes(row, even, odd, out)
-    for pair in range(first, length // 2):
-        x = 2 * pair
-        out[x] = (even[0, row[x, 0]] + even[1, row[x, 1]]) + even[2, row[x, 2]]
-        out[x + 1] = (odd[0, row[x + 1, 0]] + odd[1, row[x + 1, 1]]) + odd[2, row[x + 1, 2]]
-    if length & 1:
-        x = length - 1
-        out[x] = (even[0, row[x, 0]] + even[1, row[x, 1]]) + even[2, row[x, 2]]
+    codes, of_bytes = even.shape[1], row.itemsize == 1
+    look_up(bare(row, _0), bare(even, _0), bare(odd, _0), codes, row.shape[0], of_bytes, bare(out, _0))
 
 
-@kernel
-def _fill_camera_of_bytes(row: Srgb, even: Float, odd: Float, out: Float) -> int:
-    """Do so for 8-bit codes and all pairs of pixels but the last, whose number is returned: see `eight_bytes`."""
-    pairs: int = max(row.shape[0] // 2 - 1, 0)
-    for pair in range(pairs):
-        x, codes = 2 * pair, eight_bytes(row, 6 * pair)
-        r0, g0, b0 = codes & _BYTE, (codes >> _8) & _BYTE, (codes >> _16) & _BYTE
-        r1, g1, b1 = (codes >> _24) & _BYTE, (codes >> _32) & _BYTE, (codes >> _40) & _BYTE
-        out[x] = (even[0, r0] + even[1, g0]) + even[2, b0]
-        out[x + 1] = (odd[0, r1] + odd[1, g1]) + odd[2, b1]
-    return pairs
+@inner
+def look_up(
+    row: Numbers, even: Numbers, odd: Numbers, codes: int, length: int, of_bytes: bool, signal: Numbers
+) -> None:
+    """Sum a row's products, ``codes`` of each channel, of its even and of its odd sites."""
+    done = 0
+    if of_bytes:
+        done = length // 4 * 4
+        _look_up_bytes(row, even, odd, done // 4, signal)
+    for x in range(done, length):
+        of_site = odd if x & 1 else even
+        r, g, b = row[3 * x], row[3 * x + 1], row[3 * x + 2]
+        signal[x] = (of_site[r] + of_site[codes + g]) + of_site[2 * codes + b]
+
+
+@inner
+def _look_up_bytes(row: Numbers, even: Numbers, odd: Numbers, fours: int, signal: Numbers) -> None:
+    """Do so for four pixels at a time, whose codes take three loads."""
+    for four in range(fours):
+        x = np.uint64(four) * _4
+        first, second, third = four_bytes(row, _3 * x), four_bytes(row, _3 * x + _4), four_bytes(row, _3 * x + _8)
+        r, g, b = first & _BYTE, (first >> _S8) & _BYTE, (first >> _S16) & _BYTE
+        signal[x] = (even[r] + even[_G + g]) + even[_B + b]
+        r, g, b = first >> _S24, second & _BYTE, (second >> _S8) & _BYTE
+        signal[x + _1] = (odd[r] + odd[_G + g]) + odd[_B + b]
+        r, g, b = (second >> _S16) & _BYTE, second >> _S24, third & _BYTE
+        signal[x + _2] = (even[r] + even[_G + g]) + even[_B + b]
+        r, g, b = (third >> _S8) & _BYTE, (third >> _S16) & _BYTE, third >> _S24
+        signal[x + _3] = (odd[r] + odd[_G + g]) + odd[_B + b]
 
 
 @kernel
@@ -397,6 +485,24 @@ def _fill_blocks(
             out[at + 3 * LANES + lane] = c3 & LOW32
 
 
+@inner
+def fill_words_of_normals(key: Key, first_block: int, blocks: int, y: np.uint64, out: Numbers) -> None:
+    """`_fill_blocks` of the one normal a site has, in half the memory."""
+    for block in range(blocks):
+        counter = np.uint64((first_block + block) * LANES)
+        at = block * BLOCK
+        for lane in range(LANES):
+            c0, c1, c2, c3 = counter + np.uint64(lane), y, HETEROSCEDASTIC | key[2], key[3]
+            k0, k1 = key[0], key[1]
+            for _ in range(ROUNDS):
+                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
+                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
+            out[at + lane] = np.uint32(c0 & LOW32)
+            out[at + LANES + lane] = np.uint32(c1 & LOW32)
+            out[at + 2 * LANES + lane] = np.uint32(c2 & LOW32)
+            out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
+
+
 @kernel
 def fill_words(
     key: Key,
@@ -435,6 +541,44 @@ def fill_normals(
         out[n] = q0[row] + t * (q1[row] + t * q2[row])
     for n in range(count):
         out_bits[n] = out_bits[n] ^ ((words[n] & _SIGN) << _32)
+
+
+@inner
+def _fill_clean(blocks: int, gains: Vector, scene: Scene, run: Room, clean: Numbers) -> tuple[bool, bool]:
+    """Do `fill_dim`, and `_split`; return whether a signal is below black, and whether one is bright."""
+    black, span, _ = scene.levels_dn
+    exposure = scene.exposure
+    lowest = highest = load(run.signal, _0)
+    for n in range(blocks * (BLOCK // WIDE)):
+        x = np.uint64(n) * _8
+        i = load(run.signal, x)
+        lowest, highest = least(lowest, i), greatest(highest, i)
+        dn = greatest(i * gains * exposure, 0.0) * span + black
+        whole = (dn + ROUND) - ROUND
+        store(run.unrounded, x, dn)
+        store(run.whole, x, to_float32(whole))
+        store(run.part, x, to_float32(dn - whole))
+        store(clean, x, to_uint32(to_float32(whole)))
+    return mask_of(below(lowest, 0.0)) != 0, mask_of(below(scene.dim, highest)) != 0
+
+
+@inner
+def _split(blocks: int, run: Room) -> None:
+    """Take the clean frame apart: whole DN, and what is left."""
+    for n in range(blocks * (BLOCK // WIDE)):
+        x = np.uint64(n) * _8
+        dn = load(run.unrounded, x)
+        whole = (dn + ROUND) - ROUND
+        store(run.whole, x, to_float32(whole))
+        store(run.part, x, to_float32(dn - whole))
+
+
+@inner
+def count_below(first: int, after: int, signal: Numbers) -> int:
+    count = 0
+    for x in range(first, after):
+        count += signal[x] < 0.0
+    return count
 
 
 @kernel
@@ -527,75 +671,151 @@ def fill_clean(light: Float, scene: Scene, unrounded: Float, clean: Raw, counts:
     counts[4] += saturated
 
 
-@kernel
-def _fill_draws(
-    key: Key,
-    first_block: int,
-    blocks: int,
-    y: np.uint64,
-    scene: Scene,
-    unrounded: Float,
-    std: Float,
-    drawn: NDArray[np.uint64],
-) -> None:
-    """Fill ``std`` with the noise's deviation, signed as the draw is, and ``drawn`` with the bits of its 2i + 1.
+class _Law(NamedTuple):
+    """The variance line and the limits of the noisy frame, for `_fill_noisy`."""
 
-    Both in one loop: roots keep the divider busy, Philox all the rest.
-    """
+    exact: tuple[float, float, float]  # a, b, black
+    a: np.float32
+    b: np.float32
+    black: np.float32
+    uncertain: np.float32  # variance below which rounding could have taken much of it
+    pinned_dn: float
+    low: np.float32
+    high: np.float32
+
+
+@inner
+def _law(scene: Scene, limits_dn: tuple[float, float]) -> _Law:
     a, b = scene.noise
     black = scene.levels_dn[0]
-    for block in range(blocks):
-        counter = np.uint64((first_block + block) * LANES)
-        at = block * BLOCK
-        for lane in range(LANES):
-            x0 = at + lane
-            x1, x2, x3 = x0 + LANES, x0 + 2 * LANES, x0 + 3 * LANES
-            std0 = np.sqrt(max(a * (unrounded[x0] - black) + b, 0.0))
-            std1 = np.sqrt(max(a * (unrounded[x1] - black) + b, 0.0))
-            std2 = np.sqrt(max(a * (unrounded[x2] - black) + b, 0.0))
-            std3 = np.sqrt(max(a * (unrounded[x3] - black) + b, 0.0))
-            c0, c1, c2, c3 = counter + np.uint64(lane), y, HETEROSCEDASTIC | key[2], key[3]
-            k0, k1 = key[0], key[1]
-            for _ in range(ROUNDS):
-                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
-                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
-            std[x0], drawn[x0] = _signed(std0, c0), _odd_double(c0)
-            std[x1], drawn[x1] = _signed(std1, c1), _odd_double(c1)
-            std[x2], drawn[x2] = _signed(std2, c2), _odd_double(c2)
-            std[x3], drawn[x3] = _signed(std3, c3), _odd_double(c3)
+    uncertain = abs(b) * CANCELS if min(a, b) < 0.0 else 0.0
+    f = np.float32
+    return _Law(
+        (a, b, black), f(a), f(b), f(black), f(uncertain), scene.pinned_dn, f(limits_dn[0]), f(limits_dn[1])
+    )  # fmt: skip
 
 
-@kernel
-def _signed(std: float, word: np.uint64) -> float:
-    """Return the number, at least 0, with the sign that a 32-bit word has."""
-    return np.uint64(np.float64(std).view(np.uint64) | ((word << _32) & _SIGN64)).view(np.float64)
+@inner
+def _bare_quadratics(quantiles: tuple[Float, Float, Float]) -> tuple[Numbers, Numbers, Numbers]:
+    return bare(quantiles[0], _0), bare(quantiles[1], _0), bare(quantiles[2], _0)
 
 
-@kernel
-def _odd_double(word: np.uint64) -> np.uint64:
-    """Return the bits of 2i + 1 as a double, i being the low 31 bits of a word."""
-    shifted = np.uint64(((word << _1) & _EVEN32) | _ODD_TWO52_BITS).view(np.float64)
-    return np.float64(shifted - TWO52).view(np.uint64)
-
-
-@kernel
-def _add_noise(
-    count: int,
-    clean_dn: Float,
-    drawn: NDArray[np.uint64],
-    quantiles: tuple[Float, Float, Float],
-    scene: Scene,
-    noisy_dn: Float,
+@inner
+def _fill_noisy(
+    blocks: int,
+    valid: tuple[int, int],
+    law: _Law,
+    quadratics: tuple[Numbers, Numbers, Numbers],
+    run: Room,
+    noisy: Numbers,
+    tally: Numbers,
 ) -> None:
-    """Replace signed deviations by the clean frame plus noise; the normal is that of `effects.normals`."""
-    q0, q1, q2 = quantiles
-    if scene.pinned_dn < np.inf:
-        for x in range(count):
-            noisy_dn[x] = 0.0 if clean_dn[x] >= scene.pinned_dn else noisy_dn[x]
-    for x in range(count):
-        row = (drawn[x] >> POSITION_BITS) - FIRST_ROW
-        t = np.uint64((drawn[x] & POSITION_MASK) | ONE_BITS).view(np.float64) - 1.0
-        noisy_dn[x] = clean_dn[x] + noisy_dn[x] * (q0[row] + t * (q1[row] + t * q2[row]))
+    """Fill a run's noisy frame, and count its sites: in float32, but those that could round otherwise exactly."""
+    count = blocks * BLOCK
+    fill_depths(count, run.words, run.depths)
+    _fill_noise(count, law, run)
+    listed, clips = _digitise(count, law, run, noisy)
+    if listed:
+        clips = _settle(listed, valid, law, quadratics, run, noisy) or clips
+    if law.pinned_dn < np.inf:
+        _pin(valid, law, run, noisy)
+    if clips:
+        _count_clipped(valid, law, run, tally)
+    if min(law.exact[0], law.exact[1]) <= 0.0:
+        tally[5] += _count_still(valid, law, run)
+
+
+@inner
+def _fill_noise(count: int, law: _Law, run: Room) -> None:
+    for n in range(count // WIDE):
+        x = np.uint64(n) * _8
+        part = load(run.part, x)
+        variance = ((load(run.whole, x) - law.black) + part) * law.a + law.b
+        std = root(greatest(variance, ZERO32))
+        noise = bits_of(std * fine_normal(load(run.depths, x))) ^ (load(run.words, x) & SIGN32)
+        store(run.noise, x, part + float_of(noise))
+        cancelled = below(float_of(bits_of(variance) & _UNSIGNED32), law.uncertain) & _ONE_BITS32
+        store(run.margin, x, greatest(std * NOISE_ERROR + PART_ERROR, float_of(cancelled)))
+
+
+@inner
+def _digitise(count: int, law: _Law, run: Room, noisy: Numbers) -> tuple[int, bool]:
+    """Round half to even, clip, cast; return how many eights are listed, and whether anything was clipped."""
+    listed, clips = 0, nothing()
+    for n in range(count // WIDE):
+        x = np.uint64(n) * _8
+        noise = load(run.noise, x)
+        rounded = (noise + ROUND32) - ROUND32
+        dn = load(run.whole, x) + rounded
+        clipped = least(greatest(dn, law.low), law.high)
+        store(run.noisy_dn, x, dn)
+        store(noisy, x, to_uint32(clipped))
+        clips = clips | (bits_of(clipped) ^ bits_of(dn))
+        from_edge = _HALF32 - float_of(bits_of(noise - rounded) & _UNSIGNED32)
+        near = mask_of(below(from_edge, load(run.margin, x)))
+        if near:
+            run.listed[listed] = x << _8 | np.uint64(near)
+            listed += 1
+    return listed, is_any(clips)
+
+
+@inner
+def is_any(bits: Vector) -> bool:
+    return mask_of(below(ZERO32, to_float32(bits >> _1_32))) != 0
+
+
+@inner
+def _settle(
+    listed: int,
+    valid: tuple[int, int],
+    law: _Law,
+    quadratics: tuple[Numbers, Numbers, Numbers],
+    run: Room,
+    noisy: Numbers,
+) -> bool:
+    """Digitise listed sites anew, by the reference's formulas; return whether any was clipped."""
+    clips = False
+    a, b, black = law.exact
+    for n in range(listed):
+        eight = run.listed[n] >> _8
+        for lane in range(WIDE):
+            x = np.int64(eight) + lane
+            if (run.listed[n] >> np.uint64(lane)) & _1 and valid[0] <= x < valid[1]:
+                std = np.sqrt(max(a * (run.unrounded[x] - black) + b, 0.0))
+                dn = (run.unrounded[x] + std * normal_of_word(run.words[x], quadratics) + ROUND) - ROUND
+                run.noisy_dn[x] = dn
+                noisy[x] = np.uint16(np.int64(min(max(dn, law.low), law.high)))
+                clips = clips or dn < law.low or dn > law.high
+    return clips
+
+
+@inner
+def _pin(valid: tuple[int, int], law: _Law, run: Room, noisy: Numbers) -> None:
+    for x in range(valid[0], valid[1]):
+        if run.unrounded[x] >= law.pinned_dn:
+            dn = (law.pinned_dn + ROUND) - ROUND
+            run.noisy_dn[x] = dn
+            noisy[x] = np.uint16(np.int64(min(max(dn, law.low), law.high)))
+
+
+@inner
+def _count_clipped(valid: tuple[int, int], law: _Law, run: Room, tally: Numbers) -> None:
+    low = high = 0
+    for x in range(valid[0], valid[1]):
+        low += run.noisy_dn[x] < law.low
+        high += run.noisy_dn[x] > law.high
+    tally[2] += low
+    tally[3] += high
+
+
+@inner
+def _count_still(valid: tuple[int, int], law: _Law, run: Room) -> int:
+    """Count sites without variance."""
+    a, b, black = law.exact
+    still = 0
+    for x in range(valid[0], valid[1]):
+        still += max(a * (run.unrounded[x] - black) + b, 0.0) == 0.0
+    return still
 
 
 @kernel
@@ -644,261 +864,3 @@ def read_out(
     digitise(noisy_dn, limits_dn, noisy, counts)
     if _may_be_still(scene):
         counts[5] += _still(unrounded, scene)
-
-
-# ----------------------------------------------------------------------------------------------- the form in float32
-
-RUN32 = 1024
-"""As `RUN`, of numbers half as long."""
-
-Single = NDArray[np.float32]
-Indices = NDArray[np.uint32]
-
-_ROUND32, _SIGN32 = np.float32(1.5 * 2.0**23), np.uint32(1 << 31)
-_LOW31_32, _HALF32 = np.uint32(0x7FFFFFFF), np.float32(0.5)
-_0F, _1F = np.float32(0), np.float32(1)
-_ROW_BITS, _FIRST_LINE = np.uint32(23 - SEGMENT_BITS), np.uint32(126 << SEGMENT_BITS)
-
-
-class _Scene32(NamedTuple):
-    """What of a `Scene` the loops in float32 need; DN count from black on, which is put on when they are whole."""
-
-    threshold: np.float32
-    above_threshold: np.float32  # 1 less the threshold
-    dim: np.float32
-    exposure: np.float32
-    limit: np.float32
-    brightest: np.float32
-    clipped: np.float32  # light above it counts as clipped: that of white is 1 but for the roundings
-    span: np.float32
-    black: np.uint32
-    a: np.float32
-    b: np.float32
-    pinned_dn: np.float32
-    low: np.float32
-    high: np.float32
-
-
-def scene32_of(scene: Scene, limits_dn: tuple[float, float]) -> _Scene32:
-    """Return what the loops in float32 need of a scene."""
-    black, span, _ = scene.levels_dn
-    f = np.float32
-    return _Scene32(
-        f(scene.threshold), f(1 - scene.threshold), f(scene.dim), f(scene.exposure),
-        f(np.inf if scene.exposure == 1 else 1),
-        f(scene.brightest), f(scene.brightest * (1 + 2.0**-20)), f(span), np.uint32(black),
-        f(scene.noise[0]), f(scene.noise[1]),
-        f(scene.pinned_dn - black), f(limits_dn[0] - black), f(limits_dn[1] - black),
-    )  # fmt: skip
-
-
-def _make_pair32(srgb: Srgb, plan: Plan, curve: Float, limits_dn: tuple[float, float], origin: tuple[int, int]) -> Pair:
-    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
-    noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
-    counts = np.zeros(6, dtype=np.int64)
-    scene = scene_of(plan, curve, srgb.shape, origin)
-    of_site = (np.ones(3) if scene.by_gray else scene.gains)[scene.sites], scene.headroom[scene.sites]
-    gains, headroom = (np.tile(one.astype(np.float32), (1, RUN32 // 2)) for one in of_site)
-    products = scene.products.astype(np.float32)
-    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    offsets, slopes = normal_lines()
-    _pair32(
-        np.ascontiguousarray(srgb), products, scene.sites, scene.gains.astype(np.float32), scene.by_gray,
-        scene32_of(scene, limits_dn), gains, headroom, key, origin, offsets, slopes, clean, noisy, counts,
-    )  # fmt: skip
-    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
-
-
-@kernel
-def _pair32(
-    srgb: Srgb,
-    products: Single,
-    sites: NDArray[np.int64],
-    channel_gains: Single,
-    by_gray: bool,
-    scene: _Scene32,
-    site_gains: Single,
-    site_headroom: Single,
-    key: Key,
-    origin: tuple[int, int],
-    offsets: Single,
-    slopes: Single,
-    clean: Raw,
-    noisy: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """`_pair` in float32."""
-    height, width = clean.shape
-    signal, clean_dn = np.zeros(RUN32, dtype=np.float32), np.zeros(RUN32 + BLOCK, dtype=np.float32)
-    std, index = np.empty(RUN32 + BLOCK, dtype=np.float32), np.empty(RUN32 + BLOCK, dtype=np.float32)
-    words = np.empty(RUN32 + BLOCK, dtype=np.uint32)
-    for y in range(height):
-        even, odd = products[sites[y & 1, 0]], products[sites[y & 1, 1]]
-        site, gains, headroom = sites[y & 1], site_gains[y & 1], site_headroom[y & 1]
-        for start in range(0, width, RUN32):
-            end = min(start + RUN32, width)
-            first, after, block, blocks = blocks_of(origin[1] + start, end - start)
-            if by_gray:
-                _fill_light_by_gray32(srgb[y, start:end], products, site, channel_gains, scene, signal)
-            else:
-                fill_camera(srgb[y, start:end], even, odd, signal)
-            unrounded, out = clean_dn[first:after], clean[y, start:end]
-            if fill_dim32(signal, gains, scene, unrounded, out, counts):
-                fill_bright32(signal, gains, headroom, scene, unrounded, out, counts)
-            fill_words32(key, block, blocks, np.uint64(origin[0] + y), words)
-            fill_draws32(blocks * BLOCK, words, clean_dn, scene, std, index)
-            add_noise32(blocks * BLOCK, clean_dn, index, offsets, slopes, std)
-            digitise32(std[first:after], scene, noisy[y, start:end], counts)
-            if scene.a < _0F or scene.b <= _0F:
-                counts[5] += _still32(unrounded, scene)
-
-
-@kernel
-def _fill_light_by_gray32(
-    row: Srgb, products: Single, site: NDArray[np.int64], gains: Single, scene: _Scene32, out: Single
-) -> None:
-    for x in range(row.shape[0]):
-        r, g, b = row[x, 0], row[x, 1], row[x, 2]
-        red = (products[0, 0, r] + products[0, 1, g]) + products[0, 2, b]
-        green = (products[1, 0, r] + products[1, 1, g]) + products[1, 2, b]
-        blue = (products[2, 0, r] + products[2, 1, g]) + products[2, 2, b]
-        m = max(((red + green) + blue) / np.float32(3) - scene.threshold, _0F) / scene.above_threshold
-        mask = m * m
-        c = site[x & 1]
-        i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * max(mask + (_1F - mask) * gains[c], gains[c])
-
-
-@kernel
-def fill_dim32(
-    signal: Single, gains: Single, scene: _Scene32, clean_dn: Single, clean: Raw, counts: NDArray[np.int64]
-) -> int:
-    """`fill_dim` in float32."""
-    dim, exposure, span, black = scene.dim, scene.exposure, scene.span, scene.black
-    bright, below = np.int32(0), np.int32(0)
-    for x in range(clean.shape[0]):
-        i = signal[x]
-        bright = np.int32(bright + (i > dim))
-        light = i * gains[x] * exposure
-        below = np.int32(below + (light < _0F))
-        dn = max(light, _0F) * span
-        clean[x] = _low16_32(dn + _ROUND32, black)
-        clean_dn[x] = dn
-    counts[0] += below
-    return int(bright)
-
-
-@kernel
-def fill_bright32(
-    signal: Single,
-    gains: Single,
-    headroom: Single,
-    scene: _Scene32,
-    clean_dn: Single,
-    clean: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """`fill_bright` in float32, and of all blocks."""
-    threshold, above_threshold, exposure, limit = scene.threshold, scene.above_threshold, scene.exposure, scene.limit
-    brightest, clipped, span, black = scene.brightest, scene.clipped, scene.span, scene.black
-    above, saturated = np.int32(0), np.int32(0)
-    last = span + _ROUND32
-    for x in range(clean.shape[0]):
-        i = signal[x]
-        m = max(i - threshold, _0F) / above_threshold
-        light = min(i * gains[x] + i * (m * m) * headroom[x], limit) * exposure
-        above = np.int32(above + (light > clipped))
-        dn = min(max(light, _0F), brightest) * span
-        saturated = np.int32(saturated + (dn + _ROUND32 == last))
-        clean[x] = _low16_32(dn + _ROUND32, black)
-        clean_dn[x] = dn
-    counts[1] += above
-    counts[4] += saturated
-
-
-@kernel
-def _low16_32(rounded: np.float32, black: np.uint32) -> np.uint16:
-    return np.uint16((np.float32(rounded).view(np.uint32) + black) & np.uint32(0xFFFF))
-
-
-@kernel
-def fill_words32(key: Key, first_block: int, blocks: int, y: np.uint64, out: Indices) -> None:
-    """`_fill_blocks` for half the memory."""
-    for block in range(blocks):
-        counter = np.uint64((first_block + block) * LANES)
-        at = block * BLOCK
-        for lane in range(LANES):
-            c0, c1, c2, c3 = counter + np.uint64(lane), y, HETEROSCEDASTIC | key[2], key[3]
-            k0, k1 = key[0], key[1]
-            for _ in range(ROUNDS):
-                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
-                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
-            out[at + lane] = np.uint32(c0 & LOW32)
-            out[at + LANES + lane] = np.uint32(c1 & LOW32)
-            out[at + 2 * LANES + lane] = np.uint32(c2 & LOW32)
-            out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
-
-
-@kernel
-def _index32(word: np.uint32) -> np.float32:
-    """Return the index of a word's uniform, and a half."""
-    return np.float32(np.int32(word & _LOW31_32)) + _HALF32
-
-
-@kernel
-def _line_of(index: np.float32) -> np.uint32:
-    """Return the row of `normal_lines`: the octave and segment are the leading bits of a float."""
-    return (np.float32(index).view(np.uint32) >> _ROW_BITS) - _FIRST_LINE
-
-
-@kernel
-def fill_line_normals(words: Indices, offsets: Single, slopes: Single, out: Single) -> None:
-    """Normals by straight lines, float32, of 32-bit words."""
-    for n in range(words.shape[0]):
-        index = _index32(words[n])
-        line = _line_of(index)
-        z = offsets[line] + slopes[line] * index
-        out[n] = -z if words[n] >> np.uint32(31) else z
-
-
-@kernel
-def fill_draws32(count: int, words: Indices, clean_dn: Single, scene: _Scene32, std: Single, index: Single) -> None:
-    """Fill ``std`` with the noise's deviation, signed as the draw is, and ``index`` with the draw's."""
-    a, b, pinned_dn = scene.a, scene.b, scene.pinned_dn
-    for x in range(count):
-        root = np.sqrt(max(a * clean_dn[x] + b, _0F))
-        root = _0F if clean_dn[x] >= pinned_dn else root
-        std[x] = np.uint32(np.float32(root).view(np.uint32) | (words[x] & _SIGN32)).view(np.float32)
-        index[x] = _index32(words[x])
-
-
-@kernel
-def add_noise32(count: int, clean_dn: Single, index: Single, offsets: Single, slopes: Single, noisy_dn: Single) -> None:
-    """Replace signed deviations by the clean frame plus noise."""
-    for x in range(count):
-        line = _line_of(index[x])
-        noisy_dn[x] = clean_dn[x] + noisy_dn[x] * (offsets[line] + slopes[line] * index[x])
-
-
-@kernel
-def digitise32(noisy_dn: Single, scene: _Scene32, noisy: Raw, counts: NDArray[np.int64]) -> None:
-    """Round half to even above black, clip, cast."""
-    low, high, black = scene.low, scene.high, scene.black
-    first, last = low + _ROUND32, high + _ROUND32
-    below, above = np.int32(0), np.int32(0)
-    for x in range(noisy.shape[0]):
-        rounded = min(max(noisy_dn[x], low - _1F), high + _1F) + _ROUND32
-        below = np.int32(below + (rounded < first))
-        above = np.int32(above + (rounded > last))
-        noisy[x] = _low16_32(min(max(rounded, first), last), black)
-    counts[2] += below
-    counts[3] += above
-
-
-@kernel
-def _still32(clean_dn: Single, scene: _Scene32) -> int:
-    a, b = scene.a, scene.b
-    still = 0
-    for x in range(clean_dn.shape[0]):
-        still += max(a * clean_dn[x] + b, _0F) == _0F
-    return still

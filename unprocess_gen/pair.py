@@ -12,7 +12,7 @@ from dataclasses import astuple, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen import effects, electrons, floats, fused
+from unprocess_gen import effects, electrons, floats, fused, single
 from unprocess_gen.bayer import pack
 from unprocess_gen.records import PACKED, Counts, Float, Frame, Normalised, Pair, Plan, Srgb
 from unprocess_gen.sensor import noisy_limits, normalise, quantise, to_dn
@@ -34,7 +34,7 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
         return _pair_laid_out(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
     if plan.normalised:
         return _float_pair(srgb, plan, origin)
-    maker = electrons.make_pair if plan.counts_electrons else fused.make_pair
+    maker = (electrons if plan.counts_electrons else single if plan.in_float32 else fused).make_pair
     return _pair_laid_out(maker(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin), plan, origin)
 
 
