@@ -31,9 +31,9 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Whether a kernel's machine code lies ready; True where that cannot be told."""
+    """Whether a kernel's machine code lies ready, here or from another process; True where that cannot be told."""
     try:
-        return bool(cast(Any, function)._cache._cache_file._load_index())
+        return bool(cast(Any, function).signatures or cast(Any, function)._cache._cache_file._load_index())
     except (AttributeError, OSError):
         return True
 
