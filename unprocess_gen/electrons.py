@@ -39,7 +39,6 @@ from unprocess_gen.fused import (
     fill_clean,
     fill_dim,
     fill_light,
-    fill_normals,
     fill_signal,
     fill_words,
     key_words,
@@ -230,17 +229,16 @@ def _responses(
     quantiles: tuple[Float, Float, Float],
     out: NDArray[np.float32],
 ) -> None:
-    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    normals = np.empty(CHUNK + BLOCK)
+    words, normals = np.empty(CHUNK + BLOCK, dtype=np.uint32), np.empty(CHUNK)
     for y in range(out.shape[0]):
         for start in range(0, out.shape[1], CHUNK):
             length = min(CHUNK, out.shape[1] - start)
             place = (origin[0] + y, origin[1] + start)
             offset = fill_words(key, place, PRNU, length, words)
-            fill_normals(words[: offset + length], quantiles, bits, normals)
             for x in range(length):
-                out[y, start + x] = np.float32(max(1 + prnu_std * normals[offset + x], 0.0))
+                normals[x] = exact_normal(words[offset + x], quantiles)
+            for x in range(length):
+                out[y, start + x] = np.float32(max(1 + prnu_std * normals[x], 0.0))
 
 
 # ------------------------------------------------------------------------------ shot and read noise, and little else
@@ -375,7 +373,7 @@ def _plain_pair(
                 for m in range(left):
                     x = listed[m]
                     dn = np.float64(electrons[x]) * dn_per_e + black
-                    dn = dn + read_std_dn * exact_normal(words[x], quadratics, pairs)
+                    dn = dn + read_std_dn * exact_normal(words[x], quadratics)
                     read[x] = np.float32(((dn + (row_dn + errors_dn[x])) + ROUND) - ROUND)
             _digitise_whole(read, limits_dn, noisy[y, start : start + n], counts)
 
@@ -694,7 +692,7 @@ def _digitise(
         for x in range(count):
             if abs(out[x] - ((out[x] + ROUND) - ROUND)) > near:
                 dn = min(electrons[x], full_well_e) * dn_per_e + black
-                exact_dn = dn + read_std_dn * exact_normal(words[x], read.quadratics, room.pairs)
+                exact_dn = dn + read_std_dn * exact_normal(words[x], read.quadratics)
                 out[x] = exact_dn + ((row_dn + columns_dn[x]) + errors_dn[x])
 
 
