@@ -21,9 +21,8 @@ def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndar
 
 @kernel
 def _exact(words: np.ndarray, quadratics: tuple[Float, Float, Float], out: np.ndarray) -> None:
-    bits = np.empty(1, dtype=np.uint64)
     for n in range(out.shape[0]):
-        out[n] = exact_normal(words[n], quadratics, bits)
+        out[n] = exact_normal(words[n], quadratics)
 
 
 def quick(words: np.ndarray, law: Quantiles) -> np.ndarray:

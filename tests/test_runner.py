@@ -460,7 +460,7 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(
 
 
 def test_the_first_run_of_a_machine_says_that_it_compiles_and_no_other(cli: Cli, tmp_path: Path) -> None:
-    line = "compiling the kernels first: 10 to 40 seconds, once on a machine"
+    line = "gen-dataset: 0/1 images, compiling kernels: 5 to 20 seconds, once on a machine"
     said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
 
     assert [line in one for one in said] == [True, False]

@@ -49,6 +49,42 @@ def test_every_golden_pair_proves_some_kernels() -> None:
     assert {name for names in selftest.PROVED_BY.values() for name in names} == set(selftest.GOLDEN)
 
 
+@pytest.mark.parametrize("name", selftest.GOLDEN)
+def test_a_golden_pair_proves_the_kernels_that_make_it(name: str) -> None:
+    assert name in selftest.PROVED_BY[selftest.kernels(selftest.GOLDEN_PLANS[name])]
+
+
+@pytest.mark.parametrize(
+    ("kernels", "settings"),
+    [
+        ("one_normal", ["noise=imx385_iso3200"]),
+        ("float32", ["noise=imx385_iso3200", "accuracy=fast"]),
+        ("readable", ["noise=imx385_iso3200", "accuracy=reference"]),
+        ("plain", ["noise=sony_a7s2", "scene=daylight"]),
+        ("physical", ["noise=sony_a7s2", "scene=daylight", "effects.all=on"]),
+    ],
+)
+def test_the_kernels_that_the_plans_need_are_proved_and_no_others(
+    kernels: str, settings: list[str], door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    proved: list[str] = []
+    monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
+
+    assert door("n_jobs=1", "source.limit=2", *settings).code == 0
+    assert set(proved) == {kernels}
+
+
+def test_kernels_are_proved_as_soon_as_a_plan_needs_them(door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the other levels of an image, too."""
+    proved: list[str] = []
+    monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
+    kinds = iter(["plain", "physical", "plain", "one_normal"])
+    monkeypatch.setattr(selftest, "kernels", lambda plan: next(kinds))
+
+    assert door("n_jobs=1", "source.limit=2", "noise.draws=2").code == 0
+    assert list(dict.fromkeys(proved)) == ["plain", "physical", "one_normal"]
+
+
 def test_the_golden_picture_meets_every_limit() -> None:
     """Clipped low and high, saturated, highlights of both kinds, every code of 8 bits."""
     picture = selftest.golden_picture()

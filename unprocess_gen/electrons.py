@@ -39,7 +39,6 @@ from unprocess_gen.fused import (
     fill_clean,
     fill_dim,
     fill_light,
-    fill_normals,
     fill_signal,
     fill_words,
     key_words,
@@ -90,7 +89,7 @@ def make_pair(
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
     body, tables, normal = _body(plan, srgb.shape, origin), poisson_tables(), normal_quantiles()
     pixels = np.ascontiguousarray(srgb)
-    if _is_plain(body, scene):
+    if is_plain(plan):
         given, plain = np.empty((0, 0)), _plain(body, scene)
         _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy, counts)
         return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
@@ -115,7 +114,7 @@ def make_noisy(
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
     body, tables, normal = _body(plan, unrounded.shape, origin), poisson_tables(), normal_quantiles()
     frame = np.ascontiguousarray(unrounded)
-    if _is_plain(body, scene):
+    if is_plain(plan):
         pixels, clean, plain = np.empty((0, 0, 3), dtype=np.uint8), np.empty((0, 0), np.uint16), _plain(body, scene)
         _plain_pair(pixels, frame, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy, counts)
         return noisy, counts
@@ -230,17 +229,16 @@ def _responses(
     quantiles: tuple[Float, Float, Float],
     out: NDArray[np.float32],
 ) -> None:
-    words = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    bits = np.empty(CHUNK + BLOCK, dtype=np.uint64)
-    normals = np.empty(CHUNK + BLOCK)
+    words, normals = np.empty(CHUNK + BLOCK, dtype=np.uint32), np.empty(CHUNK)
     for y in range(out.shape[0]):
         for start in range(0, out.shape[1], CHUNK):
             length = min(CHUNK, out.shape[1] - start)
             place = (origin[0] + y, origin[1] + start)
             offset = fill_words(key, place, PRNU, length, words)
-            fill_normals(words[: offset + length], quantiles, bits, normals)
             for x in range(length):
-                out[y, start + x] = np.float32(max(1 + prnu_std * normals[offset + x], 0.0))
+                normals[x] = exact_normal(words[offset + x], quantiles)
+            for x in range(length):
+                out[y, start + x] = np.float32(max(1 + prnu_std * normals[x], 0.0))
 
 
 # ------------------------------------------------------------------------------ shot and read noise, and little else
@@ -266,19 +264,21 @@ class _Plain(NamedTuple):
     reach: tuple[np.float32, np.float32]
 
 
-def _is_plain(body: _Body, scene: Scene) -> bool:
-    """Whether the noise is that of `_plain_pair`."""
-    _, span_dn, _ = scene.levels_dn
+OF_PLAIN = frozenset({"heteroscedastic", "shot", "read", "row", "black_error", "quantise"})
+
+
+def is_plain(plan: Plan) -> bool:
+    """Whether the noise is that of `_plain_pair`; else it is `_physical_pair`'s."""
+    (a_dn, b_dn2), physics = plan.variance_line, plan.physics
+    dn_per_e, read_std_dn = (a_dn, b_dn2) if physics is None else (physics.dn_per_e, physics.read_std_dn)
     return (
-        body.shot
-        and body.read_std_dn > 0
-        and not (body.responds or body.averaged or body.dark or body.hot_below or body.dead_below)
-        and body.full_well_e == np.inf
-        and scene.pinned_dn == np.inf
-        and not body.columns_dn.any()
-        and span_dn < MOST_E * body.dn_per_e
-        and scene.noise[0] >= 0
-        and scene.noise[1] > 0
+        OF_PLAIN.issuperset(plan.effects)
+        and not plan.averaged
+        and plan.saturated != "pinned"
+        and a_dn > 0
+        and b_dn2 > 0
+        and read_std_dn > 0
+        and plan.white_level_dn - plan.black_level_dn < MOST_E * dn_per_e
     )
 
 
@@ -373,7 +373,7 @@ def _plain_pair(
                 for m in range(left):
                     x = listed[m]
                     dn = np.float64(electrons[x]) * dn_per_e + black
-                    dn = dn + read_std_dn * exact_normal(words[x], quadratics, pairs)
+                    dn = dn + read_std_dn * exact_normal(words[x], quadratics)
                     read[x] = np.float32(((dn + (row_dn + errors_dn[x])) + ROUND) - ROUND)
             _digitise_whole(read, limits_dn, noisy[y, start : start + n], counts)
 
@@ -692,7 +692,7 @@ def _digitise(
         for x in range(count):
             if abs(out[x] - ((out[x] + ROUND) - ROUND)) > near:
                 dn = min(electrons[x], full_well_e) * dn_per_e + black
-                exact_dn = dn + read_std_dn * exact_normal(words[x], read.quadratics, room.pairs)
+                exact_dn = dn + read_std_dn * exact_normal(words[x], read.quadratics)
                 out[x] = exact_dn + ((row_dn + columns_dn[x]) + errors_dn[x])
 
 

@@ -65,9 +65,9 @@ from unprocess_gen.normals import (
     POSITION_MASK,
     TWO52,
     TWO52_BITS,
+    exact_normal,
     fill_depths,
     fine_normal,
-    normal_of_word,
     normal_quantiles,
 )
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
@@ -782,7 +782,7 @@ def _settle(
             x = np.int64(eight) + lane
             if (run.listed[n] >> np.uint64(lane)) & _1 and valid[0] <= x < valid[1]:
                 std = np.sqrt(max(a * (run.unrounded[x] - black) + b, 0.0))
-                dn = (run.unrounded[x] + std * normal_of_word(run.words[x], quadratics) + ROUND) - ROUND
+                dn = (run.unrounded[x] + std * exact_normal(run.words[x], quadratics) + ROUND) - ROUND
                 run.noisy_dn[x] = dn
                 noisy[x] = np.uint16(np.int64(min(max(dn, law.low), law.high)))
                 clips = clips or dn < law.low or dn > law.high

@@ -42,6 +42,7 @@ _LOW31, _SIGN, _HALF = np.uint32(0x7FFFFFFF), np.uint32(0x80000000), np.float32(
 _PIECE_SHIFT = np.uint32(23 - PIECE_BITS)
 _FIRST_PIECE = np.uint32(126 << PIECE_BITS)
 
+_LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 _LOW31_64, _SIGN_64, _1 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.uint64(1)
 TWO52_BITS, TWO52, ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
 POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
@@ -52,9 +53,9 @@ FIRST_ROW = np.uint64(1023 * SEGMENTS)
 class Quantiles(NamedTuple):
     """A symmetric law in both forms.
 
-    ``lines`` ``[4097]``: value at f = 0 and slope in f, two float32 side by side in eight bytes; the last is the
-    median, where f may round to. ``error``: no quick value is farther from the exact one. ``quadratics``: the columns
-    of the exact table (`tables.normal_table`).
+    ``lines`` ``[4097]``: value at f = 0 and slope in f, two float32 in the low and the high half of a number; the last
+    is the median, where f may round to. ``error``: no quick value is farther from the exact one. ``quadratics``: the
+    columns of the exact table (`tables.normal_table`).
     """
 
     lines: NDArray[np.uint64]
@@ -81,56 +82,47 @@ def quantiles(table: Float) -> Quantiles:
     slope = (z_high - z_low) / (f_high - f_low)
     start = z_low - slope * f_low + (z_middle - (z_low + z_high) / 2) / 2
     lines = np.stack([start, slope], axis=1).astype(np.float32)
+    low_bits, high_bits = lines.view(np.uint32).astype(np.uint64).T
     off = max(
         float(np.abs(z - (lines[:, 0].astype(np.float64) + lines[:, 1].astype(np.float64) * f)).max())
         for z, f in ((z_low, f_low), (z_middle, (f_low + f_high) / 2), (z_high, f_high))
     )
     farthest = float(np.abs(table[:, 0]).max() + np.abs(slope * f_high).max())
-    median = np.zeros((1, 2), dtype=np.float32)
+    median = np.zeros(1, dtype=np.uint64)
     q0, q1, q2 = (np.ascontiguousarray(column) for column in table.T)
-    return Quantiles(np.concatenate([lines, median]).view(np.uint64)[:, 0], off + ROUNDING * farthest, (q0, q1, q2))
+    both = np.concatenate([high_bits << _32 | low_bits, median])
+    return Quantiles(both, off + ROUNDING * farthest, (q0, q1, q2))
 
 
 @inner
 def quick_normals(
     words: NDArray[np.uint32], lines: NDArray[np.uint64], pairs: NDArray[np.uint64], out: Float32
 ) -> None:
-    """Fill ``out`` with the quick values of ``words``; ``pairs`` is room for the lines."""
+    """Fill ``out`` with the quick values of ``words``; ``pairs`` is room for the lines.
+
+    Numbers are seen as bits one by one: a view of an array takes Numba a quarter of a second to compile.
+    """
     count = out.shape[0]
-    out_bits = out.view(np.uint32)
-    halves = pairs.view(np.float32)
     for n in range(count):
         out[n] = np.float32(np.int32(words[n] & _LOW31)) + _HALF
     for n in range(count):
-        pairs[n] = lines[np.uint64((out_bits[n] >> _PIECE_SHIFT) - _FIRST_PIECE)]
+        pairs[n] = lines[np.uint64((np.float32(out[n]).view(np.uint32) >> _PIECE_SHIFT) - _FIRST_PIECE)]
     for n in range(count):
-        out[n] = halves[2 * n] + halves[2 * n + 1] * out[n]
+        start, slope = np.uint32(pairs[n] & _LOW32), np.uint32(pairs[n] >> _32)
+        out[n] = start.view(np.float32) + slope.view(np.float32) * out[n]
     for n in range(count):
-        out_bits[n] = out_bits[n] ^ (words[n] & _SIGN)
+        out[n] = np.uint32(np.float32(out[n]).view(np.uint32) ^ (words[n] & _SIGN)).view(np.float32)
 
 
 @inner
-def exact_normal(word: np.uint32, quadratics: tuple[Float, Float, Float], bits: NDArray[np.uint64]) -> float:
-    """Return the value of a word as `effects.by_inverse_cdf`; ``bits`` is room for one double."""
-    double = bits.view(np.float64)
-    bits[0] = ((np.uint64(word) & _LOW31_64) << _1 | _1) | TWO52_BITS
-    double[0] = double[0] - TWO52
-    row = (bits[0] >> POSITION_BITS) - FIRST_ROW
-    bits[0] = (bits[0] & POSITION_MASK) | ONE_BITS
-    t = double[0] - 1.0
-    z: float = quadratics[0][row] + t * (quadratics[1][row] + t * quadratics[2][row])
-    return -z if np.uint64(word) & _SIGN_64 else z
-
-
-@inner
-def normal_of_word(word: np.uint32, quadratics: tuple[Numbers, Numbers, Numbers]) -> float:
+def exact_normal(word: np.uint32, quadratics: tuple[Float, Float, Float]) -> float:
     """Return the value of a word as `effects.by_inverse_cdf`."""
     odd = np.uint64(((np.uint64(word) & _LOW31_64) << _1 | _1) | TWO52_BITS).view(np.float64) - TWO52
     bits = np.float64(odd).view(np.uint64)
     row = (bits >> POSITION_BITS) - FIRST_ROW
     t = np.uint64((bits & POSITION_MASK) | ONE_BITS).view(np.float64) - 1.0
     z: float = quadratics[0][row] + t * (quadratics[1][row] + t * quadratics[2][row])
-    return -z if np.uint64(word) & _SIGN_64 else z
+    return np.uint64(np.float64(z).view(np.uint64) ^ (np.uint64(word) & _SIGN_64) << _32).view(np.float64)
 
 
 # ------------------------------------------------------------------------------------------------------ polynomials

@@ -432,7 +432,7 @@ def settle(
     """Make the first ``left`` counts that are listed as open; ``room`` holds the quick normals."""
     highs, lows = _by_side(rates, room.listed, left, room.high, room.low)
     if highs > 0:
-        _by_exact_normal(words, rates, normal.quadratics, tables.tails, room.high[:highs], room.pairs, out)
+        _by_exact_normal(words, rates, normal.quadratics, tables.tails, room.high[:highs], out)
     if lows > 0:
         low, rows, offsets = room.low[:lows], room.rows, room.offsets
         cells = (tables.first, tables.least, tables.most, tables.middle)
@@ -506,13 +506,12 @@ def _by_exact_normal(
     quadratics: tuple[Float, Float, Float],
     tails: Float,
     high: NDArray[np.int64],
-    bits: NDArray[np.uint64],
     out: Float,
 ) -> None:
     """Fill in the counts listed in ``high``, in the order of the reference."""
     for n in high:
         tail = (np.float64(words[n] & _LOW31) + 0.5) * 2.0**-32
-        z = exact_normal(words[n], quadratics, bits)
+        z = exact_normal(words[n], quadratics)
         w = _sharpened(tail, abs(z), tails)
         out[n] = np.floor(_x(rates[n], -w if words[n] & _SIGN else w))
 
@@ -535,8 +534,10 @@ def _x(rate: float, w: float) -> float:
     """Return x, in the order of `expansion`."""
     root = np.sqrt(rate)
     s = w / root
-    c, d, e = _power_sum(2, s), _power_sum(3, s), _power_sum(4, s)
-    rest = w * w * _power_sum(0, s) + (_power_sum(1, s) + (c + (d + e / rate) / rate) / rate)
+    # Not plain numbers, for each of which Numba would compile a function.
+    a, b, c = _power_sum(np.int64(0), s), _power_sum(np.int64(1), s), _power_sum(np.int64(2), s)
+    d, e = _power_sum(np.int64(3), s), _power_sum(np.int64(4), s)
+    rest = w * w * a + (b + (c + (d + e / rate) / rate) / rate)
     return float(rate + (root * w + rest))
 
 

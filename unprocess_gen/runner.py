@@ -33,10 +33,9 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen import selftest
-from unprocess_gen.config import Config, budget, dataset_yaml, is_normalised, patch_law, source_kind, uses_physics
+from unprocess_gen.config import Config, dataset_yaml, patch_law, source_kind
 from unprocess_gen.errors import MachineError, SourceError
 from unprocess_gen.manifest import Row, failed_row, images, ok_row, pair_key, patch_key, row_json
-from unprocess_gen.methods import choose
 from unprocess_gen.pair import make_pairs
 from unprocess_gen.patches import cut, patches
 from unprocess_gen.photographs import list_photographs, load
@@ -52,6 +51,7 @@ PACKAGES = (
     *(("av",) if is_installed() else ()),
 )
 PARENT_POLL_S = 0.5
+COMPILING_POLL_S = 0.1
 PLAIN_LINE_S = 5.0
 """Seconds between progress lines where there is no terminal."""
 
@@ -120,8 +120,7 @@ def generate(config: Config) -> Summary:
         given_up: dict[int, Made] = {}
         warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
-            if todo and not selftest.are_compiled(_kernels(config)):
-                progress.say_compiling()
+            progress.say_compiling_once(_compiling_path(bench))
             for made in run_tasks(bench, todo, n_jobs):
                 if made.killer is None:
                     workspace.commit(made)
@@ -239,14 +238,14 @@ def _interrupts_ignored() -> Iterator[None]:
 def make_shard(bench: Bench, task: Task) -> Made:
     """Make one shard aside and return its rows; MachineError if the disk or the self-test fails."""
     _settle(bench.coordinator_pid)
-    failed = _self_test(bench.config)
+    failed: dict[str, None] = {}
     path = Path(bench.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     try:
         with ShardWriter(path, beside=bench.core_to_spare) as writer:
-            rows = tuple(_make_rows(bench, task, writer))
+            rows = tuple(_make_rows(bench, task, writer, failed))
         _busy_path(bench, task).unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
-            return Made(task.shard, str(path), writer.bytes, writer.sha256, rows, self_test=failed)
+            return Made(task.shard, str(path), writer.bytes, writer.sha256, rows, self_test="; ".join(failed) or None)
         path.unlink()
         return Made(task.shard, None, 0, None, rows)
     except MemoryError as error:
@@ -261,14 +260,18 @@ def make_shard(bench: Bench, task: Task) -> Made:
         raise machine_error(error, Path(bench.tmp)) from error
 
 
-def _make_rows(bench: Bench, task: Task, writer: ShardWriter) -> Iterator[Row]:
+def _make_rows(bench: Bench, task: Task, writer: ShardWriter, failed: dict[str, None]) -> Iterator[Row]:
     for source in task.sources:
         _busy_path(bench, task).write_text(str(source.index))
-        yield from make_image(bench.config, task.shard, source, writer)
+        yield from make_image(bench, task.shard, source, writer, failed)
 
 
-def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) -> list[Row]:
-    """Append one image to a shard, whole or patch by patch, and return its rows."""
+def make_image(bench: Bench, shard: int, source: Source, writer: ShardWriter, failed: dict[str, None]) -> list[Row]:
+    """Append one image to a shard, whole or patch by patch, and return its rows.
+
+    Puts what is wrong with this process, where it was told to go on with that, into ``failed``, each once.
+    """
+    config = bench.config
     try:
         sha256, photograph = load(config.source, source, config.output.layout)
     except SourceError as error:
@@ -280,6 +283,7 @@ def make_image(config: Config, shard: int, source: Source, writer: ShardWriter) 
     law = patch_law(config.source)
     facts = facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
+    failed |= dict.fromkeys(_self_test(bench, plans))
     rows: list[Row] = []
     height, width = photograph.srgb.shape[:2]
     for patch in patches(law, plans[0].stream_key, height, width, config.output.layout):
@@ -320,18 +324,24 @@ def _settle(coordinator_pid: int) -> None:
         threading.Thread(target=_end_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
 
 
-def _kernels(config: Config) -> str:
-    """Return which of `selftest.PROVED_BY` a run needs."""
-    counts, normalised = uses_physics(config.noise), is_normalised(config)
-    return selftest.kernels(counts, choose(budget(config.accuracy), counts, normalised), normalised)
+def _self_test(bench: Bench, plans: Sequence[Plan]) -> list[str]:
+    """Prove the kernels that an image's plans need, and no other, for each takes seconds to compile.
+
+    Returns what is wrong with this process; MachineError unless told to go on with it.
+    """
+    failed: list[str] = []
+    for kernels in dict.fromkeys(map(selftest.kernels, plans)):
+        if not selftest.are_compiled(kernels):
+            _compiling_path(bench).touch()
+        if bench.config.self_test == "stop":
+            selftest.check(kernels, ", or say self_test=go_on")
+        failed += selftest.failures(kernels)
+    return failed
 
 
-def _self_test(config: Config) -> str | None:
-    """Return what is wrong with this process, None where nothing is; MachineError unless told to go on."""
-    kernels = _kernels(config)
-    if config.self_test == "stop":
-        selftest.check(kernels, ", or say self_test=go_on")
-    return "; ".join(selftest.failures(kernels)) or None
+def _compiling_path(bench: Bench) -> Path:
+    """Return the file that is there as soon as a worker compiles kernels."""
+    return Path(bench.tmp) / "compiling"
 
 
 WATCHDOG = "unprocess_gen watchdog"
@@ -356,20 +366,28 @@ class Progress:
         terminal = sys.stderr.isatty()
         self._bar = tqdm(total=total, initial=done, unit="image", file=sys.stderr, disable=not terminal)
         self._plain = not terminal
+        self._over = threading.Event()
 
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._over.set()
         self._bar.close()
 
-    def say_compiling(self) -> None:
-        """Say why nothing happens yet."""
+    def say_compiling_once(self, marker: Path) -> None:
+        """Say why nothing happens, as soon as a file is there: which kernels a run needs only its workers know."""
+        threading.Thread(target=self._say_compiling, args=(marker,), daemon=True).start()
+
+    def _say_compiling(self, marker: Path) -> None:
+        while not marker.exists():
+            if self._over.wait(COMPILING_POLL_S):
+                return
         self._bar.set_postfix_str("compiling the kernels, once on a machine")
         if self._plain:
             print(
-                f"gen-dataset: {self._done}/{self._total} images, compiling the kernels first: 10 to 40 seconds, once "
-                "on a machine",
+                f"gen-dataset: {self._done}/{self._total} images, compiling kernels: 5 to 20 seconds, once on a "
+                "machine",
                 file=sys.stderr,
                 flush=True,
             )

@@ -11,7 +11,7 @@ curves are held to their digests when they are first read.
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -132,18 +132,19 @@ GOLDEN = {
 PROVED_BY = {
     "one_normal": ("per_channel", "gray_mean"),
     "float32": ("float32",),
-    "counts": ("physical", "plain", "near"),
+    "plain": ("plain", "near"),
+    "physical": ("physical",),
     "readable": ("readable",),
     "normalised": ("normalised",),
     "normalised_counts": ("normalised", "normalised_counts"),
 }
-"""Which golden pairs prove which kernels: those that are not needed would take seconds to compile."""
-
+"""Which golden pairs prove which kernels: those that a plan does not need would take seconds to compile."""
 
 OUTER = {
     "one_normal": (fused._pair,),
     "float32": (fused._pair32,),
-    "counts": (electrons._physical_pair, electrons._plain_pair),
+    "plain": (electrons._plain_pair,),
+    "physical": (electrons._physical_pair, electrons._responses),
     "readable": (),
     "normalised": (fused._unprocess, *floats.OF_NORMALS),
     "normalised_counts": (fused._unprocess, *floats.OF_NORMALS, *floats.OF_COUNTS),
@@ -156,15 +157,15 @@ def are_compiled(kernels: str) -> bool:
     return all(is_kept(kernel) for kernel in OUTER[kernels])
 
 
-def kernels(counts_electrons: bool, methods: Collection[str], normalised: bool = False) -> str:
-    """Return which of `PROVED_BY` make the pairs of a plan, by its methods and its dtype."""
-    if READABLE in methods:
+def kernels(plan: Plan) -> str:
+    """Return which of `PROVED_BY` make the pair of a plan."""
+    if plan.readable:
         return "readable"
-    if normalised:
-        return "normalised_counts" if counts_electrons else "normalised"
-    if counts_electrons:
-        return "counts"
-    return "float32" if IN_FLOAT32 in methods else "one_normal"
+    if plan.normalised:
+        return "normalised_counts" if plan.counts_electrons else "normalised"
+    if plan.counts_electrons:
+        return "plain" if electrons.is_plain(plan) else "physical"
+    return "float32" if plan.in_float32 else "one_normal"
 
 
 def check(kernels: str, way_out: str = "") -> None:
@@ -176,7 +177,7 @@ def check(kernels: str, way_out: str = "") -> None:
         )
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=len(PROVED_BY))
 def failures(kernels: str) -> tuple[str, ...]:
     """Return each proof of some of `PROVED_BY` that failed, in words; once in a process."""
     return tuple(_failures(kernels))

@@ -271,7 +271,7 @@ class Maker:
         if self._root is None and not _is_scene(row):
             raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
         plan = plan_of(row)
-        selftest.check(selftest.kernels(plan.counts_electrons, plan.methods, plan.normalised))
+        selftest.check(selftest.kernels(plan))
         try:
             sha256, photograph = self._load(row)
         except SourceError as error:
