@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import njit, types, version_info
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
@@ -41,9 +41,41 @@ def is_kept(function: Callable[..., Any]) -> bool:
 def _compiled(function: Callable[..., Any], **more: bool) -> Callable[..., Any]:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, **more}
     try:
-        return cast(Callable[..., Any], njit(cache=True, **options)(function))
+        compiled = njit(cache=True, **options)(function)
     except RuntimeError:
         return cast(Callable[..., Any], njit(**options)(function))
+    if version_info.short <= LOADED_ALONE:
+        _load_alone(cast(Any, compiled))
+    return cast(Callable[..., Any], compiled)
+
+
+LOADED_ALONE = (0, 68)
+"""The last Numba whose kernels were tried to run without its registries; tested with the one that is installed."""
+
+
+def _load_alone(compiled: Any) -> None:
+    """Have kept machine code loaded without Numba's registries: what only a compiler needs takes 0.4 s and 30 MB.
+
+    Numba imports them (SciPy among them, where it is installed) before it looks for kept code, whose only symbols are
+    those of the context and of the runtime. Where none lies ready, or Numba is another inside than it was, its own way
+    is gone.
+    """
+    try:
+        cache, its_own_way = compiled._cache, compiled._cache.load_overload
+    except AttributeError:
+        return
+
+    def load(signature: Any, target: Any) -> Any:
+        try:
+            from numba.core.runtime.nrt import rtsys
+
+            rtsys.initialize(target)
+            found = cache._load_overload(signature, target)
+        except Exception:
+            found = None
+        return its_own_way(signature, target) if found is None else found
+
+    cache.load_overload = load
 
 
 def eight_bytes(array: NDArray[Any], at: int) -> np.uint64:
