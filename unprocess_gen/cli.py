@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -162,7 +163,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def generate(arguments: list[str]) -> int:
     """``gen-dataset [overrides]``: make a dataset, or with ``-m`` one for every combination."""
-    return compose(arguments, _generate, sweep_csv=True)
+    return compose(arguments, _generate, sweep_csv=True, meanwhile=lambda: import_module("unprocess_gen.runner"))
 
 
 def _generate(config: Config) -> tuple[int, Summary]:
