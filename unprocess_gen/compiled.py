@@ -54,7 +54,7 @@ LOADED_ALONE = (0, 68)
 
 
 def _load_alone(compiled: Any) -> None:
-    """Have kept machine code loaded without Numba's registries: what only a compiler needs takes 0.4 s and 30 MB.
+    """Have kept machine code loaded without Numba's registries: what only a compiler needs takes 0.4 s and 25 MB.
 
     Numba imports them (SciPy among them, where it is installed) before it looks for kept code, whose only symbols are
     those of the context and of the runtime. Where none lies ready, or Numba is another inside than it was, its own way
