@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import itertools
 import os
+import pickle
 import re
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from unprocess_gen.errors import ConfigError, UnprocessGenError
 from unprocess_gen.sweep import Job, folder_name, overrides_text, worst, write_table
@@ -55,17 +59,21 @@ def conf_dir() -> Path:
     raise ConfigError(f"no conf/config.yaml in or beside {here}: the installation is not whole")
 
 
-def compose(arguments: list[str], task: Task, sweep_csv: bool = False) -> int:
+def compose(
+    arguments: list[str], task: Task, sweep_csv: bool = False, meanwhile: Callable[[], object] | None = None
+) -> int:
     """Compose the settings and run ``task`` on them, with ``-m`` on every combination; return the exit code.
 
-    ``sweep_csv`` says whether a sweep leaves its table in ``out``. Raises ConfigError for settings that Hydra or
+    ``sweep_csv`` says whether a sweep leaves its table in ``out``; ``meanwhile``, what a single run can do while Hydra
+    is busy, where there is a core for that (`compose_beside`). Raises ConfigError for settings that Hydra or
     `config.check` refuse, and whatever the task of a single run raises.
     """
     flags, overrides = _sort_arguments(arguments)
     swept = any(flag in SWEEP_FLAGS for flag in flags)
     flags = [flag for flag in flags if flag not in SWEEP_FLAGS]
     if not swept:
-        return compose_one(flags, overrides, task)
+        config = None if flags or meanwhile is None else compose_beside(overrides, meanwhile)
+        return compose_one(flags, overrides, task) if config is None else task(config)[0]
     jobs: list[Job] = []
     out: Path | None = None
     for job_overrides in expand(flags, overrides):
@@ -125,6 +133,60 @@ def compose_one(flags: list[str], overrides: list[str], task: Task) -> int:
             raise outcome
         return outcome
     return 0
+
+
+def compose_beside(overrides: list[str], meanwhile: Callable[[], object]) -> Config | None:
+    """Return the settings as a child of this process composed and checked them, while ``meanwhile`` ran here.
+
+    To import Hydra and compose takes as long as to import what makes pairs: 0.4 s. On two cores that is done at once,
+    and this process never holds what Hydra brings along. Raises ConfigError for settings that are refused. None where
+    there is no second core, where a fork is not safe or gains nothing, and where the child could not tell: then they
+    are to be composed here, where everything that can go wrong is told.
+    """
+    if not _may_fork():
+        return None
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        with os.fdopen(writing, "wb") as answer:
+            _tell_settings(overrides, answer)
+    try:
+        os.close(writing)
+        with os.fdopen(reading, "rb") as answer:
+            meanwhile()
+            told = answer.read()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    found: Config | ConfigError | None = None
+    with suppress(Exception):  # nothing was told, or not all of it
+        found = pickle.loads(told)
+    if isinstance(found, ConfigError):
+        raise found
+    return found
+
+
+def _may_fork() -> bool:
+    """Whether nothing is running or loaded yet that a fork would break or make useless, and a core is idle."""
+    single = threading.active_count() == 1 and not {"hydra", "numba", "cv2"} & set(sys.modules)
+    return single and sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
+
+
+def _tell_settings(overrides: list[str], answer: BinaryIO) -> NoReturn:
+    """Compose and check settings, write them or what is wrong with them, and end this process."""
+
+    def tell(config: Config) -> tuple[int, None]:
+        answer.write(pickle.dumps(config))
+        return 0, None
+
+    with suppress(BaseException):
+        try:
+            compose_one([], overrides, tell)
+        except ConfigError as error:
+            answer.write(pickle.dumps(error))
+        answer.flush()
+    os._exit(0)
 
 
 def expand(flags: list[str], overrides: list[str]) -> list[list[str]]:

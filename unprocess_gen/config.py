@@ -22,8 +22,6 @@ from pathlib import Path
 from typing import Any, Optional, TypeVar
 
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from unprocess_gen import bayer, colour
 from unprocess_gen.errors import ConfigError
@@ -911,6 +909,9 @@ def _canonical(value: Any) -> Any:
 
 def read_dataset_yaml(path: Path) -> tuple[Config, str]:
     """Return the settings a dataset was made with and its source kind; ConfigError where the file cannot be read."""
+    from omegaconf import OmegaConf  # heavy, and a run whose settings are composed elsewhere has no use for it
+    from omegaconf.errors import OmegaConfBaseException
+
     try:
         loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
         kind = str(loaded["source"].pop("kind"))
@@ -925,6 +926,8 @@ def read_dataset_yaml(path: Path) -> tuple[Config, str]:
 
 def read_option(path: Path, group: type[Option]) -> Option:
     """Return an option of a group as its file in ``conf/`` has it; ``group`` is the dataclass of the folder."""
+    from omegaconf import OmegaConf
+
     option = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(group), OmegaConf.load(path)))
     assert isinstance(option, group)
     return option

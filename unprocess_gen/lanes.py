@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
-from numba.core.datamodel import models
-from numba.core.datamodel.registry import register_default
+from numba import types
+from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import lower_builtin, type_callable
+from numba.extending import lower_builtin, models, register_model, type_callable
 from numpy.typing import NDArray
 
 WIDE = 8
@@ -148,7 +147,7 @@ def _vector(kind: Lanes) -> ir.VectorType:
     return ir.VectorType(_ELEMENTS[kind.of], WIDE)
 
 
-@register_default(Lanes)
+@register_model(Lanes)
 class _Model(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Lanes) -> None:
         super().__init__(manager, kind, _vector(kind))
@@ -256,7 +255,7 @@ class Bare(types.Type):
         super().__init__(name=f"bare({of})")
 
 
-@register_default(Bare)
+@register_model(Bare)
 class _Place(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Bare) -> None:
         super().__init__(manager, kind, manager.lookup(kind.of).get_data_type().as_pointer())

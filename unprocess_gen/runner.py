@@ -28,8 +28,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, cpu_count, delayed
-from joblib.externals.loky.process_executor import TerminatedWorkerError
 from tqdm import tqdm
 
 from unprocess_gen import selftest
@@ -116,7 +114,7 @@ def generate(config: Config) -> Summary:
         done = set(workspace.committed(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
         n_jobs = effective_jobs(config.n_jobs, len(todo))
-        bench = Bench(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < cpu_count())
+        bench = Bench(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < _own_cores())
         given_up: dict[int, Made] = {}
         warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
@@ -162,11 +160,28 @@ def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[Task]:
 
 def effective_jobs(n_jobs: int, tasks: int) -> int:
     """Return how many workers to use: -1 stands for the cores this process may use, never more than tasks."""
-    return max(1, min(cpu_count() if n_jobs == -1 else n_jobs, tasks))
+    if n_jobs == -1:
+        from joblib import cpu_count
+
+        n_jobs = cpu_count()
+    return max(1, min(n_jobs, tasks))
+
+
+def _own_cores() -> int:
+    """Return the cores this process may use, whatever share of their time its container grants."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
-    """Yield the shards as they are made: in order, but for those that are tried again after a worker died."""
+    """Yield the shards as they are made: in order, but for those that are tried again after a worker died.
+
+    One job needs no joblib, whose import takes 0.1 s and 8 MB.
+    """
+    if n_jobs == 1:
+        yield from (make_shard(bench, task) for task in tasks)
+        return
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
     waiting = list(tasks)
     while waiting:
         done: set[int] = set()
@@ -185,6 +200,8 @@ def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made
 
 def _run_alone(bench: Bench, task: Task) -> Iterator[Made]:
     """Yield a shard that is made by a worker with nobody beside it; given up where that worker dies too."""
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
     try:
         yield from _run_pool(bench, [task], n_jobs=2)  # with one job it would be the coordinator that dies
     except TerminatedWorkerError:
@@ -195,6 +212,8 @@ def _run_alone(bench: Bench, task: Task) -> Iterator[Made]:
 
 def _run_pool(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
     """Yield the shards in order as they are made; TerminatedWorkerError where a worker dies."""
+    from joblib import Parallel, delayed
+
     parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # of what an interrupt cancelled

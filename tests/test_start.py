@@ -1,0 +1,153 @@
+"""What a run loads before its first pair, and how settings are composed beside that."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from unprocess_gen import compose as room
+from unprocess_gen import config as settings_room
+from unprocess_gen import selftest
+from unprocess_gen.compose import compose, compose_beside
+from unprocess_gen.config import Config
+from unprocess_gen.errors import ConfigError
+
+RUN = """
+import os, sys
+cores, *sys.argv[1:] = sys.argv[1:]
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:int(cores)])
+from unprocess_gen import cli
+assert cli.main() == 0
+print(*sys.modules)
+"""
+
+NEVER = {"numba.np.linalg", "numba.np.arraymath", "scipy.linalg", "joblib", "asyncio", "matplotlib", "PIL", "av"}
+"""What a run of one job from a folder of photographs has no use for, and what is slow or large to load."""
+
+HYDRAS = {"hydra", "omegaconf", "antlr4"}
+
+two_cores = pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2, reason="needs two cores"
+)
+
+
+def run(cores: int, *arguments: str) -> set[str]:
+    """Run the tool in a process of its own, and return what it had loaded at the end."""
+    command = [sys.executable, "-c", RUN, str(cores), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split())
+
+
+@two_cores
+def test_a_run_loads_only_what_it_needs_and_the_same_dataset_comes_of_it(
+    photos: Path, tmp_path: Path, tree_hash: Callable[[Path], str]
+) -> None:
+    assert not selftest.failures("one_normal")  # compiles what is not kept
+    said = (f"source.root={photos}", "n_jobs=1")
+
+    beside, alone = (run(cores, f"out={tmp_path / str(cores)}", *said) for cores in (2, 1))
+
+    assert not beside & (NEVER | HYDRAS)
+    assert not alone & NEVER
+    assert alone >= HYDRAS
+    assert tree_hash(tmp_path / "2") == tree_hash(tmp_path / "1")
+
+
+# -------------------------------------------------------------------------------------- composed by a child, beside
+
+ForkedChildren = list[int]
+
+
+@pytest.fixture
+def children(monkeypatch: pytest.MonkeyPatch) -> ForkedChildren:
+    """Have settings composed by a child whatever this process has loaded, and return the children's ids."""
+    found: ForkedChildren = []
+    fork = os.fork
+
+    def told() -> int:
+        child = fork()
+        if child:
+            found.append(child)
+        return child
+
+    monkeypatch.setattr(room, "_may_fork", lambda: True)
+    monkeypatch.setattr(os, "fork", told)
+    return found
+
+
+def all_gone(children: ForkedChildren) -> bool:
+    for child in children:
+        with pytest.raises(ProcessLookupError):
+            os.kill(child, 0)
+    return bool(children)
+
+
+def test_a_child_composes_what_is_composed_here(children: ForkedChildren) -> None:
+    overrides, here, done = ["seed=3", "noise=sony_a7s2", "camera=choice", "source.patch=[grid,8]"], [], []
+    room.compose_one([], overrides, lambda config: (here.append(config) or 0, None))  # type: ignore[func-returns-value]
+
+    config = compose_beside(overrides, lambda: done.append("meanwhile"))
+
+    assert config == here[0]
+    assert done == ["meanwhile"]
+    assert all_gone(children)
+
+
+@pytest.mark.parametrize(
+    "override", ["seed=x", "seeds=1", "camera=none_such", "gains.red=-1", "out=[", "sensor.bits=0"]
+)
+def test_settings_that_a_child_refuses_are_refused_in_the_same_words(override: str, children: ForkedChildren) -> None:
+    with pytest.raises(ConfigError) as here:
+        room.compose_one([], [override], lambda config: (0, None))
+
+    with pytest.raises(ConfigError) as beside:
+        compose_beside([override], lambda: None)
+
+    assert str(beside.value) == str(here.value)
+    assert all_gone(children)
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, ImportError])
+def test_a_child_ends_with_what_ends_us_meanwhile(stop: type[BaseException], children: ForkedChildren) -> None:
+    def meanwhile() -> NoReturn:
+        raise stop
+
+    with pytest.raises(stop):
+        compose_beside([], meanwhile)
+
+    assert all_gone(children)
+
+
+def test_a_bug_is_told_here_where_a_child_met_it(children: ForkedChildren, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(config: Config) -> NoReturn:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(settings_room, "check", broken)
+
+    assert compose_beside([], lambda: None) is None
+    with pytest.raises(RuntimeError, match="a bug"):
+        compose([], lambda config: (0, None), meanwhile=lambda: None)
+    assert all_gone(children)
+
+
+@pytest.mark.parametrize("answer", [b"", b"\x80\x04\x95"], ids=["nothing", "half an answer"])
+def test_where_a_child_dies_settings_are_composed_here(
+    answer: bytes, children: ForkedChildren, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dies(overrides: list[str], stream: object) -> NoReturn:
+        os.write(stream.fileno(), answer)  # type: ignore[attr-defined]
+        os._exit(1)
+
+    monkeypatch.setattr(room, "_tell_settings", dies)
+    seeds: list[int] = []
+
+    code = compose(["seed=7"], lambda config: (seeds.append(config.seed) or 5, None), meanwhile=lambda: None)  # type: ignore[func-returns-value]
+
+    assert (code, seeds) == (5, [7])
+    assert all_gone(children)
