@@ -43,10 +43,11 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 
-from unprocess_gen import cli, electrons, floats, fused, poisson, selftest
+from unprocess_gen import cli, electrons, floats, fused, poisson, selftest, single
 from unprocess_gen.compiled import kernel
-from unprocess_gen.normals import normal_quantiles
+from unprocess_gen.normals import fill_coarse_normals, fill_fine_normals, normal_quantiles
 from unprocess_gen.pair import make_pair, make_pairs
+from unprocess_gen.tables import normal_table
 
 KERNELS = {
     f"{room}.{name}": value
@@ -148,6 +149,28 @@ def _digitise(counts: Any, words: Any, body: Any, out: Any) -> None:
     electrons._digitise(counts, words, body, (0, 0), 64.0, poisson.room_for(out.shape[0]), out)
 
 
+@kernel
+def _light(
+    codes: Any, products: Any, signal: Any, gains: Any, scene: Any,
+    camera: Any, gray: Any, lit: Any, dim: Any, unrounded: Any, clean: Any, tally: Any,
+) -> None:  # fmt: skip
+    fused.fill_camera(codes, products[0], products[1], camera)
+    fused._fill_light_by_gray(codes, products, scene.sites[0], scene.gains, 0.9, gray)
+    fused.fill_dim(signal, gains, scene, dim, clean, tally)
+    fused.fill_light(signal, gains, 1 - gains, scene, lit)
+    fused.fill_clean(lit, scene, unrounded, clean, tally)
+
+
+@kernel
+def _draws(key: Any, words: Any) -> None:
+    fused.fill_words(key, (3, 0), np.uint64(4), words.shape[0], words)
+
+
+@kernel
+def _round(dn: Any, noisy: Any, tally: Any) -> None:
+    fused.digitise(dn, (0.0, 4095.0), noisy, tally)
+
+
 def doubles() -> str:
     """A digest of what the kernels compute before anything is rounded to a DN, where one bit in the last place shows.
 
@@ -159,36 +182,28 @@ def doubles() -> str:
     tally = np.zeros(6, dtype=np.int64)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
     products = (np.arange(1, 9 * 256 + 1) / 1999.0).reshape(3, 3, 256)
-    camera, gray, lit, unrounded, normals, counts, digitised, std, dim = (np.empty(count) for _ in range(9))
-    bits, words = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
+    camera, gray, lit, unrounded, counts, digitised, dim = (np.empty(count) for _ in range(7))
+    words = np.empty(count, dtype=np.uint32)
     clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
-    fused.fill_camera(codes, products[0], products[1], camera)
-    fused._fill_light_by_gray(codes, products, np.array([0, 1]), np.array([0.37, 0.8, 0.47]), 0.9, gray)
     signal, gains = n / 999.0, np.full(count, 0.37)
     plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
     scene = fused.scene_of(plan, np.arange(256) / 255.0, (1, count), (0, 0))
-    fused.fill_light(signal, gains, 1 - gains, scene, lit)
-    fused.fill_clean(lit, scene, unrounded, clean, tally)
+    _light(codes, products, signal, gains, scene, camera, gray, lit, dim, unrounded, clean, tally)
     key = fused.key_words(2**33 + 1, 5, 6, 7)
-    fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
-    fused.fill_normals(words, normal_quantiles().quadratics, bits, normals)
-    fused._fill_blocks(key, 0, count // fused.BLOCK, np.uint64(3), np.uint64(4), words)
-    short = words.astype(np.uint32)
-    _draw(short, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), counts)
+    _draws(key, words)
+    normals = floats.by_inverse_cdf(words[None], normal_table())[0]
+    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), counts)
     body = electrons._body(plan, (1, count), (0, 0))
-    _digitise(counts, short, body, digitised)
-    level = replace(selftest.GOLDEN_PLAN, a_dn=0.0, b_dn2=2500.0)
-    half_way = (n % 9 + 0.5) - 50.0 * normals
-    still = fused.scene_of(level, np.arange(256) / 255.0, (1, count), (0, 0))
-    quantiles, blocks = normal_quantiles().quadratics, count // fused.BLOCK
-    fused._fill_draws(key, 0, blocks, np.uint64(3), still, half_way, std, words)
-    fused._add_noise(count, half_way, words, quantiles, still, std)
-    fused.digitise(std, (0.0, 4095.0), noisy, tally)
-    fused.fill_dim(signal, gains, scene, dim, clean, tally)
+    _digitise(counts, words, body, digitised)
+    _round(n % 9 + 0.5, noisy, tally)
+    deep, fine, coarse = np.empty((3, count), dtype=np.float32)
+    fill_fine_normals(words, deep, fine)
+    fill_coarse_normals(words, deep, coarse)
     return digest(
-        camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, std, noisy, tally
-    )
+        camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, fine, coarse, noisy,
+        tally,
+    )  # fmt: skip
 
 
 # Machine code ---------------------------------------------------------------------------------------------------------
@@ -225,7 +240,7 @@ def code() -> dict[str, Any]:
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
     black = np.zeros((2, 2, 3), dtype=np.uint8)
-    outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"), (fused, "_pair32"))
+    outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"), (single, "_pair32"))
     of_counts = ("_physical_pair", "_plain_pair", "_physical_noisy", "_responses")
     of_floats = ("_words", "_by_inverse_cdf", "_poisson")
     for room, name in (*outer, *((electrons, name) for name in of_counts), *((floats, name) for name in of_floats)):
@@ -236,8 +251,8 @@ def compile_kernels() -> None:
         plan = selftest.GOLDEN_PLANS[name]
         plan = replace(plan, effects=tuple(one for one in plan.effects if one != "full_well"))
         list(make_pairs(black, [plan] * 2))
-    single = (numba.float32[::1],) * 3
-    fused.fill_line_normals.compile((numba.uint32[::1], *single))
+    for normals in (fill_fine_normals, fill_coarse_normals):
+        normals.compile((numba.uint32[::1], numba.float32[::1], numba.float32[::1]))
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)

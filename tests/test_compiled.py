@@ -1,4 +1,4 @@
-"""Kernels that only kernels call are made machine code where they are called; kept code is loaded without a compiler."""
+"""Inner kernels are made machine code where they are called; kept code is loaded without what only a compiler needs."""
 
 from __future__ import annotations
 

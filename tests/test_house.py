@@ -12,8 +12,8 @@ import unprocess_gen
 HOUSE = Path(unprocess_gen.__file__).parent
 
 FLOORS = (
-    {"errors", "records"},
-    {"bayer", "colour", "compiled", "headers", "markup", "streams", "tables"},
+    {"errors", "records", "shortcuts"},
+    {"bayer", "colour", "compiled", "headers", "lanes", "markup", "streams", "tables"},
     {"normals"},
     {"methods", "poisson"},
     {
@@ -21,7 +21,7 @@ FLOORS = (
         *("sensor", "shards", "sources", "synthetic", "unprocess", "video"),
     },
     {"fused", "physics", "planner"},
-    {"electrons", "floats"},
+    {"electrons", "floats", "single"},
     {"pair", "photographs", "plan", "reader", "workspace"},
     {"selftest"},
     {"accuracy", "runner", "sweep", "transfer", "verify"},
@@ -37,8 +37,8 @@ ONLY_IN = {
     "hydra": {"compose"},
     "omegaconf": {"compose", "config"},
     "joblib": {"runner"},
-    "llvmlite": {"compiled"},
-    "numba": {"compiled"},
+    "llvmlite": {"lanes", "shortcuts"},
+    "numba": {"compiled", "lanes", "shortcuts"},
     "cv2": {"decode", "page", "preview", "process", "runner"},
     "PIL": {"decode"},
     "av": {"video"},

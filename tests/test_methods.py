@@ -99,7 +99,7 @@ def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
     own = budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
     stricter = budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
 
-    assert "normal:linear_float32" in choose(own, counts_electrons=False)
+    assert "normal:polynomial_float32" in choose(own, counts_electrons=False)
     assert "normal:quadratic_float64" in choose(stricter, counts_electrons=False)
 
 

@@ -7,7 +7,18 @@ import pytest
 
 from unprocess_gen import effects
 from unprocess_gen.compiled import kernel
-from unprocess_gen.normals import PIECES, Quantiles, exact_normal, normal_quantiles, quantiles, quick_normals
+from unprocess_gen.methods import method
+from unprocess_gen.normals import (
+    FINE_ERROR,
+    PIECES,
+    Quantiles,
+    exact_normal,
+    fill_coarse_normals,
+    fill_fine_normals,
+    normal_quantiles,
+    quantiles,
+    quick_normals,
+)
 from unprocess_gen.records import Float
 from unprocess_gen.tables import normal_table, tukey_table
 
@@ -76,3 +87,43 @@ def test_quick_normals_are_within_their_error_for_every_word() -> None:
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
         assert np.abs(quick(words, form) - exact(words, form)).max() <= form.error
+
+
+# Polynomials ----------------------------------------------------------------------------------------------------------
+
+POLYNOMIALS = {
+    "fine": (fill_fine_normals, FINE_ERROR),
+    "coarse": (fill_coarse_normals, method("normal", "polynomial_float32").normal_error),
+}
+
+
+def by_polynomial(words: np.ndarray, which: str) -> np.ndarray:
+    whole = np.resize(words, -(-words.size // 8) * 8)
+    depths, out = np.empty((2, whole.size), dtype=np.float32)
+    POLYNOMIALS[which][0](whole, depths, out)
+    return out[: words.size].astype(np.float64)
+
+
+@pytest.mark.parametrize("which", POLYNOMIALS)
+def test_normals_by_polynomials_are_as_near_as_they_say(which: str) -> None:
+    words, error = telling_words(), POLYNOMIALS[which][1]
+    off = np.abs(by_polynomial(words, which) - effects.normals(words))
+    assert 0.9 * error < off.max() <= error
+
+
+@pytest.mark.parametrize("which", POLYNOMIALS)
+def test_normals_by_polynomials_have_their_word_s_sign(which: str) -> None:
+    words = telling_words()
+    half = words.size // 2
+    made = by_polynomial(words, which)
+    assert (made[:half] == -made[half:]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", POLYNOMIALS)
+def test_normals_by_polynomials_are_as_near_as_they_say_for_every_word(which: str) -> None:
+    form, worst = normal_quantiles(), 0.0
+    for start in range(0, SIGN, 2**24):
+        words = np.arange(start, start + 2**24, dtype=np.uint32)
+        worst = max(worst, float(np.abs(by_polynomial(words, which) - exact(words, form)).max()))
+    assert worst <= POLYNOMIALS[which][1]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, effects, fused, synthetic
+from unprocess_gen import colour, single, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
 from unprocess_gen.effects import EFFECTS
@@ -20,7 +20,7 @@ from unprocess_gen.plan import plan_image
 from unprocess_gen.records import Pair, Plan
 from unprocess_gen.selftest import GOLDEN_PHYSICS
 from unprocess_gen.sensor import noisy_limits
-from unprocess_gen.tables import linear_table, normal_lines
+from unprocess_gen.tables import linear_table
 
 SENSORS = {8: (0, 255), 10: (64, 1023), 12: (240, 4095), 14: (1024, 16383), 16: (4096, 65535)}
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
@@ -203,7 +203,7 @@ def test_plans_of_different_clean_frames_are_refused_at_once(
 def in_float32(srgb: np.ndarray, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    return fused.make_pair(srgb, replace(plan, methods=("colour:fused_float32",)), curve, limits_dn, origin)
+    return single.make_pair(srgb, plan, curve, limits_dn, origin)
 
 
 def assert_within(differing: int, worst: int, sites: int) -> None:
@@ -307,33 +307,7 @@ def test_noise_far_beyond_16_bits_is_clipped_in_float32(plan: Plan) -> None:
 
     apart = np.abs(in_float32(gray, wide).noisy.astype(int) - make_pair(gray, wide).noisy)
 
-    assert apart.max() <= method("normal", "linear_float32").normal_error * np.sqrt(1e15)
-
-
-def error_of_the_lines(words: np.ndarray) -> float:
-    drawn = np.empty(words.size, dtype=np.float32)
-    fused.fill_line_normals(words, *normal_lines(), drawn)
-    return float(np.abs(drawn - effects.normals(words)).max())
-
-
-def test_normals_by_lines_are_as_near_as_they_say_on_a_dense_sample() -> None:
-    """Every 4093rd word, and both sides of every octave's and segment's edge."""
-    edges = [2**octave * (32 + segment) // 64 for octave in range(32) for segment in range(33)]
-    near = (np.array(edges)[:, None] + np.arange(-40, 41)).clip(0, 2**31 - 1).ravel().astype(np.uint32)
-    words = np.concatenate([np.arange(0, 2**32, 4093).astype(np.uint32), near, near | np.uint32(2**31)])
-
-    assert error_of_the_lines(words) <= method("normal", "linear_float32").normal_error
-
-
-@pytest.mark.slow
-def test_normals_by_lines_are_as_near_as_they_say_on_a_sixteenth_of_all_words() -> None:
-    chunk = 2**22
-    worst = max(
-        error_of_the_lines((np.arange(start, start + 16 * chunk, 16) + start // chunk // 16 % 16).astype(np.uint32))
-        for start in range(0, 2**32, 16 * chunk)
-    )
-
-    assert worst <= method("normal", "linear_float32").normal_error
+    assert apart.max() <= method("normal", "polynomial_float32").normal_error * np.sqrt(1e15)
 
 
 # Limits ---------------------------------------------------------------------------------------------------------------

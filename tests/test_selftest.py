@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import Door
 
-from unprocess_gen import compiled, effects, fused, selftest, streams, tables
+from unprocess_gen import effects, fused, selftest, streams, tables
 from unprocess_gen.errors import MachineError
 from unprocess_gen.pair import make_pair, reference_pair
 from unprocess_gen.shards import array_xxh3
@@ -138,21 +138,6 @@ def test_a_kernel_that_computes_otherwise_is_found(kernel: str, monkeypatch: pyt
         failed = selftest.failures("one_normal")
 
     assert any("the golden" in one for one in failed)
-
-
-@compiled.kernel
-def _loaded(array: np.ndarray, out: np.ndarray) -> None:
-    for at in range(out.shape[0]):
-        out[at] = compiled.eight_bytes(array, at)
-
-
-def test_eight_bytes_are_loaded_from_any_place() -> None:
-    codes = np.random.default_rng(0).integers(0, 256, (11, 3), dtype=np.uint8)
-    row, out = codes[1:], np.empty(23, dtype=np.uint64)
-    _loaded(row, out)
-
-    assert out.tolist() == [int.from_bytes(codes.tobytes()[3 + at : 11 + at], "little") for at in range(23)]
-    assert out.tolist() == [int(compiled.eight_bytes(row, at)) for at in range(23)]
 
 
 def test_a_fused_multiply_add_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,13 +43,13 @@ from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from unprocess_gen import colour, effects, electrons, fused
+from unprocess_gen import colour, effects, electrons, floats, single
 from unprocess_gen.compiled import kernel
 from unprocess_gen.config import (
     AccuracyConfig,
@@ -66,23 +66,22 @@ from unprocess_gen.config import (
 from unprocess_gen.errors import ConfigError, SourceError
 from unprocess_gen.fused import (
     CHUNK,
+    RUN,
     Scene,
     Single,
     by_site,
     digitise,
-    digitise32,
     fill_bright,
-    fill_bright32,
     fill_camera,
     fill_dim,
-    fill_dim32,
-    fill_line_normals,
-    fill_normals,
     fill_signal,
+    look_up,
 )
 from unprocess_gen.fused import scene_of as fused_scene
+from unprocess_gen.lanes import bare
+from unprocess_gen.lanes import load as load_lanes
 from unprocess_gen.methods import METHODS, STAGES, Budget, Method, choose, gaussian_from, of_stage
-from unprocess_gen.normals import Quantiles, normal_quantiles
+from unprocess_gen.normals import Quantiles, fill_coarse_normals, fill_fine_normals, normal_quantiles
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image
@@ -92,8 +91,8 @@ from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.poisson import poisson_tables, room_for
 from unprocess_gen.records import MOSAIC, Float, Frame, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import quantise, to_dn
-from unprocess_gen.streams import Words
-from unprocess_gen.tables import linear_table, normal_lines
+from unprocess_gen.streams import BLOCK, Words
+from unprocess_gen.tables import linear_table, normal_table
 from unprocess_gen.unprocess import camera_light, unprocess
 
 
@@ -510,17 +509,16 @@ def true_normals(words: Words) -> Float:
 
 
 def quadratic_normals(words: Words) -> Float:
-    """Return the compiled form's normals of uint32 words ``[n]``."""
-    out = np.empty(words.size)
-    fill_normals(words.astype(np.uint64), normal_quantiles().quadratics, np.empty(words.size, dtype=np.uint64), out)
-    return out
+    """Return the normals of uint32 words ``[n]`` that decide the compiled form's DN."""
+    return floats.by_inverse_cdf(words[None], normal_table())[0]
 
 
-def linear_normals(words: Words) -> Float:
+def polynomial_normals(words: Words) -> Float:
     """Return the float32 form's normals of uint32 words ``[n]``."""
-    out = np.empty(words.size, dtype=np.float32)
-    fill_line_normals(words, *normal_lines(), out)
-    return out.astype(np.float64)
+    whole = np.resize(words, -(-words.size // CHUNK) * CHUNK)
+    depths, out = np.empty((2, whole.size), dtype=np.float32)
+    fill_coarse_normals(whole, depths, out)
+    return out[: words.size].astype(np.float64)
 
 
 # -------------------------------------------------------------------------------------------------------- times
@@ -612,15 +610,9 @@ def _clean_ns(lab: Lab, method: Method, subject: Subject) -> float:
 
 def _clean32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     srgb, scene = _scene(lab, subject)
-    single = np.float32
-    of_site = scene.gains[scene.sites], scene.headroom[scene.sites]
-    gains, headroom = (np.tile(one.astype(single), (1, CHUNK // 2)) for one in of_site)
-    products, scene32 = scene.products.astype(single), fused.scene32_of(scene, LIMITS_DN)
-    buffers = np.empty(CHUNK, single), np.empty(CHUNK, single), np.empty(CHUNK, np.uint16), np.zeros(6, np.int64)
-    return clocked(
-        lambda: _cleans32(srgb, products, scene.sites, scene32, gains, headroom, *buffers),
-        srgb.shape[0] * srgb.shape[1],
-    )
+    of_scene = single.products_of(scene), single.sites_of(scene), single.light_of(scene, LIMITS_DN)
+    counts = np.zeros(6, dtype=np.int64)
+    return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room(), counts), srgb.shape[0] * srgb.shape[1])
 
 
 def _numpy_curve_ns(lab: Lab, method: Method, subject: Subject) -> float:
@@ -662,9 +654,9 @@ def _round_ns(lab: Lab, method: Method, subject: Subject) -> float:
 def _round32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     _, scene = _scene(lab, subject)
     doubles, turns = _chunks_of_dn(lab, subject)
-    chunks, scene32 = doubles.astype(np.float32), fused.scene32_of(scene, LIMITS_DN)
-    buffers = np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
-    return clocked(lambda: _digits32(chunks, turns, scene32, *buffers), turns * chunks.size)
+    chunks, light = doubles.astype(np.float32), single.light_of(scene, LIMITS_DN)
+    noisy = np.empty(CHUNK, dtype=np.uint16)
+    return clocked(lambda: _digits32(chunks, turns, light, noisy), turns * chunks.size)
 
 
 def _chunks_of_dn(lab: Lab, subject: Subject) -> tuple[Float, int]:
@@ -685,19 +677,20 @@ def _some_words(count: int) -> Words:
     return (np.arange(count, dtype=np.uint64) * np.uint64(2654435769)).astype(np.uint32)
 
 
-def _quadratics_ns(lab: Lab, method: Method, subject: Subject) -> float:
-    chunks = _some_words(BUFFERS * CHUNK).astype(np.uint64).reshape(BUFFERS, CHUNK)
-    turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
-    quantiles = normal_quantiles().quadratics
-    buffers = np.empty(CHUNK, dtype=np.uint64), np.empty(CHUNK, dtype=np.uint64), np.empty(CHUNK)
-    return clocked(lambda: _normals(chunks, turns, quantiles, *buffers), turns * chunks.size)
+def _normals_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    """Return the time of the quick normals, which stand in wherever the exact ones give the same DN."""
+    return _clocked_normals(_normals, subject)
 
 
-def _lines_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _normals32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+    return _clocked_normals(_normals32, subject)
+
+
+def _clocked_normals(kernel: Callable[..., None], subject: Subject) -> float:
     chunks = _some_words(BUFFERS * CHUNK).reshape(BUFFERS, CHUNK)
     turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
-    out = np.empty(CHUNK, dtype=np.float32)
-    return clocked(lambda: _normals32(chunks, turns, *normal_lines(), out), turns * chunks.size)
+    depths, out = np.empty((2, CHUNK), dtype=np.float32)
+    return clocked(lambda: kernel(chunks, turns, depths, out), turns * chunks.size)
 
 
 def _numpy_normals_ns(lab: Lab, method: Method, subject: Subject) -> float:
@@ -740,27 +733,22 @@ def _cleans(srgb: Srgb, scene: Scene, signal: Float, unrounded: Float, clean: Ra
 
 @kernel
 def _cleans32(
-    srgb: Srgb,
-    products: Single,
-    sites: NDArray[np.int64],
-    scene: Any,
-    site_gains: Single,
-    site_headroom: Single,
-    signal: Single,
-    unrounded: Single,
-    clean: Raw,
-    counts: NDArray[np.int64],
+    srgb: Srgb, products: Single, sites: Single, light: single.Light, room: single.Room, counts: NDArray[np.int64]
 ) -> None:
     """As `_cleans`, in float32."""
     height, width = srgb.shape[:2]
+    run = single.bare_room(room)
     for y in range(height):
-        even, odd = products[sites[y & 1, 0]], products[sites[y & 1, 1]]
-        gains, headroom = site_gains[y & 1], site_headroom[y & 1]
-        for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
-            fill_camera(srgb[y, start : start + n], even, odd, signal)
-            if fill_dim32(signal, gains, scene, unrounded, clean[:n], counts):
-                fill_bright32(signal, gains, headroom, scene, unrounded, clean[:n], counts)
+        even = bare(products, 3 * products.shape[2] * light.channels[y & 1, 0])
+        odd = bare(products, 3 * products.shape[2] * light.channels[y & 1, 1])
+        dims = load_lanes(bare(sites, (y & 1) * sites.shape[2]), 0)
+        for start in range(0, width, RUN):
+            n = min(RUN, width - start)
+            codes = bare(srgb, 3 * (y * width + start))
+            look_up(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, run.signal)
+            some_bright = single.fill_clean(-(-n // BLOCK), dims, light, run, run.clean)[1]
+            if some_bright:
+                single.fill_bright(room.signal[:n], sites[:, y & 1], light, room.clean_dn[:n], room.clean[:n], counts)
 
 
 @kernel
@@ -772,27 +760,19 @@ def _digits(chunks: Float, turns: int, limits_dn: tuple[float, float], noisy: Ra
 
 
 @kernel
-def _digits32(chunks: Single, turns: int, scene: Any, noisy: Raw, counts: NDArray[np.int64]) -> None:
+def _digits32(chunks: Single, turns: int, light: single.Light, noisy: Raw) -> None:
     """As `_digits`, in float32."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
-            digitise32(chunks[chunk], scene, noisy, counts)
+            single.digitise(chunks.shape[1], light, bare(chunks, chunk * chunks.shape[1]), bare(noisy, 0))
 
 
 @kernel
-def _normals(
-    chunks: NDArray[np.uint64],
-    turns: int,
-    quantiles: tuple[Float, Float, Float],
-    words: NDArray[np.uint64],
-    bits: NDArray[np.uint64],
-    out: Float,
-) -> None:
-    """Make normals of chunks of words in turns; each is copied first, since it is overwritten."""
+def _normals(chunks: Words, turns: int, depths: Single, out: Single) -> None:
+    """Make normals of chunks of words in turns."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
-            words[:] = chunks[chunk]
-            fill_normals(words, quantiles, bits, out)
+            fill_fine_normals(chunks[chunk], depths, out)
 
 
 @kernel
@@ -805,11 +785,11 @@ def _counts(rates: Float, turns: int, words: Words, normal: Quantiles, tables: P
 
 
 @kernel
-def _normals32(chunks: Words, turns: int, offsets: Single, slopes: Single, out: Single) -> None:
-    """As `_normals`, in float32."""
+def _normals32(chunks: Words, turns: int, depths: Single, out: Single) -> None:
+    """As `_normals`, for the form in float32."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
-            fill_line_normals(chunks[chunk], offsets, slopes, out)
+            fill_coarse_normals(chunks[chunk], depths, out)
 
 
 # --------------------------------------------------------------------------------------------- the table of both
@@ -852,8 +832,8 @@ MEASUREMENTS = (
     Measurement("mosaic:at_site_float32", _of_clean, _clean32_ns),
     Measurement("mosaic:at_site", _of_clean, _clean_ns),
     Measurement("mosaic:after_colour", _of_clean, _numpy_mosaic_ns),
-    Measurement("normal:linear_float32", _of_normals(linear_normals), _lines_ns),
-    Measurement("normal:quadratic_float64", _of_normals(quadratic_normals), _quadratics_ns),
+    Measurement("normal:linear_float32", _of_normals(polynomial_normals), _normals32_ns),
+    Measurement("normal:quadratic_float64", _of_normals(quadratic_normals), _normals_ns),
     Measurement("normal:numpy_float64", _of_normals(effects.normals), _numpy_normals_ns),
     Measurement("shot:gaussian_where_near", _of_shot, _near_ns),
     Measurement("shot:inversion", _of_shot, _counts_ns),

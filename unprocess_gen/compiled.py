@@ -11,7 +11,7 @@ from typing import Any, cast
 from numba import njit, version_info
 
 TRIED = (0, 68)
-"""The last Numba that `shortcuts` was tried with; tested with the one that is installed. A newer one goes its own way."""
+"""The last Numba that `shortcuts` was tried with; a newer one goes its own way."""
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -343,7 +343,7 @@ def _plain_pair(
             first, after, block, blocks = blocks_of(origin[1] + start, n)
             clean_dn = unrounded[first:after]
             if given.shape[0] > 0:
-                copy(given[y, start : start + n], clean_dn)
+                copy(n, given[y, start : start + n], clean_dn)
             else:
                 row, out = srgb[y, start : start + n], clean[y, start : start + n]
                 fill_signal(row, scene, y, signal)

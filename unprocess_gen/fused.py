@@ -59,12 +59,6 @@ from unprocess_gen.lanes import (
 )
 from unprocess_gen.normals import (
     FINE_ERROR,
-    FIRST_ROW,
-    ONE_BITS,
-    POSITION_BITS,
-    POSITION_MASK,
-    TWO52,
-    TWO52_BITS,
     exact_normal,
     fill_depths,
     fine_normal,
@@ -81,7 +75,6 @@ RUN = 512
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
 STEP0, STEP1 = (np.uint64(step) for step in KEY_STEPS)
 LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
-_LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
 _0, _1, _2, _3, _4, _8 = (np.uint64(number) for number in (0, 1, 2, 3, 4, 8))
 _LOW16 = np.uint64(0xFFFF)
 _BYTE, _S8, _S16, _S24 = (np.uint32(number) for number in (0xFF, 8, 16, 24))
@@ -238,7 +231,8 @@ def make_room() -> Room:
 
 
 @inner
-def _bare_room(room: Room) -> Room:
+def bare_room(room: Room) -> Room:
+    """Return the same, bare."""
     return Room(
         bare(room.signal, _0), bare(room.unrounded, _0), bare(room.whole, _0), bare(room.part, _0),
         bare(room.words, _0), bare(room.depths, _0), bare(room.noise, _0), bare(room.margin, _0),
@@ -262,7 +256,7 @@ def _pair(
     """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a two-parameter profile."""
     height, width = clean.shape
     codes, of_bytes = scene.products.shape[2], srgb.itemsize == 1
-    run, tally = _bare_room(room), bare(counts, _0)
+    run, tally = bare_room(room), bare(counts, _0)
     law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
     site_gains, site_headroom = by_site(scene)
     for y in range(height):
@@ -279,7 +273,7 @@ def _pair(
             is_whole = length == blocks * BLOCK
             gains = load(bare(site_gains, (y & 1) * CHUNK + (first & 1)), _0)
             frame = bare(clean, at) if is_whole else run.clean
-            some_below, some_bright = _fill_clean(blocks, gains, scene, run, frame)
+            some_below, some_bright = fill_clean_apart(blocks, gains, scene, run, frame)
             if not is_whole:
                 copy(length, bare(run.clean, first), bare(clean, at))
             if some_below:
@@ -330,7 +324,7 @@ def _noisy(
 ) -> None:
     """Fill ``noisy`` and ``counts`` with the noisy frame of an unrounded clean one: the second half of `_pair`."""
     height, width = noisy.shape
-    run, tally = _bare_room(room), bare(counts, _0)
+    run, tally = bare_room(room), bare(counts, _0)
     law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
     for y in range(height):
         for start in range(0, width, RUN):
@@ -354,7 +348,7 @@ def copy(length: int, source: Numbers, target: Numbers) -> None:
         target[x] = source[x]
 
 
-@kernel
+@inner
 def blocks_of(x: int, length: int) -> tuple[int, int, int, int]:
     """Return where in its blocks a run from pixel ``x`` on begins and ends, and number and count of the blocks."""
     first = x % BLOCK
@@ -362,13 +356,13 @@ def blocks_of(x: int, length: int) -> tuple[int, int, int, int]:
     return first, after, x // BLOCK, (after + BLOCK - 1) // BLOCK
 
 
-@kernel
+@inner
 def _products(scene: Scene, y: int) -> tuple[Float, Float]:
     """Return the products of the even and of the odd sites of a row."""
     return scene.products[scene.sites[y & 1, 0]], scene.products[scene.sites[y & 1, 1]]
 
 
-@kernel
+@inner
 def by_site(scene: Scene) -> tuple[Float, Float]:
     """Return gains and headroom for each pixel of an even and of an odd row, so that loops over them vectorise."""
     gains = np.empty((2, CHUNK))
@@ -380,7 +374,7 @@ def by_site(scene: Scene) -> tuple[Float, Float]:
     return gains, headroom
 
 
-@kernel
+@inner
 def fill_signal(row: Srgb, scene: Scene, y: int, out: Float) -> None:
     """Linearise and apply the matrix; by gray, invert the gains too."""
     if scene.by_gray:
@@ -390,7 +384,7 @@ def fill_signal(row: Srgb, scene: Scene, y: int, out: Float) -> None:
         fill_camera(row, even, odd, out)
 
 
-@kernel
+@inner
 def fill_camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
     """Linearise and apply the matrix, for the one channel that each site keeps."""
     codes, of_bytes = even.shape[1], row.itemsize == 1
@@ -428,7 +422,7 @@ def _look_up_bytes(row: Numbers, even: Numbers, odd: Numbers, fours: int, signal
         signal[x + _3] = (odd[r] + odd[_G + g]) + odd[_B + b]
 
 
-@kernel
+@inner
 def _fill_light_by_gray(
     row: Srgb, products: Float, site: NDArray[np.int64], gains: Float, threshold: float, out: Float
 ) -> None:
@@ -448,7 +442,7 @@ def _fill_light_by_gray(
 _Block = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 
 
-@kernel
+@inner
 def philox_round(c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64) -> _Block:
     """One round of Philox4x32: four words, each in the low half of what goes in and comes out; the high half is chaff.
 
@@ -460,7 +454,7 @@ def philox_round(c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0:
     return (p1 >> _32) ^ (c1 ^ k0), p1, (p0 >> _32) ^ (c3 ^ k1), p0
 
 
-@kernel
+@inner
 def _fill_blocks(
     key: Key,
     first_block: int,
@@ -503,7 +497,7 @@ def fill_words_of_normals(key: Key, first_block: int, blocks: int, y: np.uint64,
             out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
 
 
-@kernel
+@inner
 def fill_words(
     key: Key,
     place: tuple[int, int],
@@ -518,33 +512,8 @@ def fill_words(
     return int(offset)
 
 
-@kernel
-def fill_normals(
-    words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
-) -> None:
-    """Normals by inverse CDF, as `effects.normals`; overwrites the low bits of ``words``."""
-    q0, q1, q2 = quantiles
-    count = words.shape[0]
-    doubles = bits.view(np.float64)
-    out_bits = out.view(np.uint64)
-    for n in range(count):
-        bits[n] = ((words[n] & _LOW31) << _1 | _1) | TWO52_BITS
-    for n in range(count):
-        doubles[n] = doubles[n] - TWO52
-    for n in range(count):
-        b = bits[n]
-        words[n] = (words[n] & _SIGN) | ((b >> POSITION_BITS) - FIRST_ROW)
-        bits[n] = (b & POSITION_MASK) | ONE_BITS
-    for n in range(count):
-        row = words[n] & _LOW31
-        t = doubles[n] - 1.0
-        out[n] = q0[row] + t * (q1[row] + t * q2[row])
-    for n in range(count):
-        out_bits[n] = out_bits[n] ^ ((words[n] & _SIGN) << _32)
-
-
 @inner
-def _fill_clean(blocks: int, gains: Vector, scene: Scene, run: Room, clean: Numbers) -> tuple[bool, bool]:
+def fill_clean_apart(blocks: int, gains: Vector, scene: Scene, run: Room, clean: Numbers) -> tuple[bool, bool]:
     """Do `fill_dim`, and `_split`; return whether a signal is below black, and whether one is bright."""
     black, span, _ = scene.levels_dn
     exposure = scene.exposure
@@ -575,13 +544,14 @@ def _split(blocks: int, run: Room) -> None:
 
 @inner
 def count_below(first: int, after: int, signal: Numbers) -> int:
+    """Count signals below black."""
     count = 0
     for x in range(first, after):
         count += signal[x] < 0.0
     return count
 
 
-@kernel
+@inner
 def fill_dim(signal: Float, gains: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> int:
     """Do `fill_light` and `fill_clean` of signals that are not bright, and return how many are: see `fill_bright`."""
     black, span, _ = scene.levels_dn
@@ -599,7 +569,7 @@ def fill_dim(signal: Float, gains: Float, scene: Scene, unrounded: Float, clean:
     return bright
 
 
-@kernel
+@inner
 def fill_bright(
     signal: Float,
     gains: Float,
@@ -635,13 +605,13 @@ def fill_bright(
     counts[4] += saturated
 
 
-@kernel
+@inner
 def _low16(rounded: float) -> np.uint16:
     """Return the whole number that `ROUND` was added to."""
     return np.uint16(np.float64(rounded).view(np.uint64) & _LOW16)
 
 
-@kernel
+@inner
 def fill_light(signal: Float, gains: Float, headroom: Float, scene: Scene, out: Float) -> None:
     """Invert the gains, highlights kept by channel (or not, where ``headroom`` is 0), and darken the scene."""
     threshold, exposure = scene.threshold, scene.exposure
@@ -652,7 +622,7 @@ def fill_light(signal: Float, gains: Float, headroom: Float, scene: Scene, out: 
         out[x] = min(i * gains[x] + i * (m * m) * headroom[x], limit) * exposure
 
 
-@kernel
+@inner
 def fill_clean(light: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
     """Clip, go to DN, round."""
     black, span, white = scene.levels_dn
@@ -756,11 +726,11 @@ def _digitise(count: int, law: _Law, run: Room, noisy: Numbers) -> tuple[int, bo
         if near:
             run.listed[listed] = x << _8 | np.uint64(near)
             listed += 1
-    return listed, is_any(clips)
+    return listed, _is_any(clips)
 
 
 @inner
-def is_any(bits: Vector) -> bool:
+def _is_any(bits: Vector) -> bool:
     return mask_of(below(ZERO32, to_float32(bits >> _1_32))) != 0
 
 
@@ -818,7 +788,7 @@ def _count_still(valid: tuple[int, int], law: _Law, run: Room) -> int:
     return still
 
 
-@kernel
+@inner
 def digitise(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts: NDArray[np.int64]) -> None:
     """Round half to even, clip, cast."""
     low, high = limits_dn[0] + ROUND, limits_dn[1] + ROUND
@@ -832,12 +802,12 @@ def digitise(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts
     counts[3] += above
 
 
-@kernel
+@inner
 def _may_be_still(scene: Scene) -> bool:
     return bool(scene.noise[0] < 0.0 or scene.noise[1] <= 0.0)
 
 
-@kernel
+@inner
 def _still(clean_dn: Float, scene: Scene) -> int:
     """Count sites without variance."""
     a, b = scene.noise
@@ -848,7 +818,7 @@ def _still(clean_dn: Float, scene: Scene) -> int:
     return still
 
 
-@kernel
+@inner
 def read_out(
     unrounded: Float,
     noisy_dn: Float,

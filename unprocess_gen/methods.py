@@ -76,7 +76,7 @@ FORMS = ("float32", "float64", "numpy")
 """Forms of a whole pair, cheapest first: the stages of one kernel are computed in its precision, all or none."""
 
 FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE = 1.0, 5e-4
-QUADRATIC_NORMAL, LINEAR_NORMAL = 1.5e-7, 3e-5
+QUADRATIC_NORMAL, POLYNOMIAL_NORMAL = 1.5e-7, 5.8e-4
 
 
 def _clean32(stage: str, name: str, meaning: str) -> Method:
@@ -93,8 +93,20 @@ METHODS = (
     Method("mosaic", "at_site_float32", "float32", "no other channel than the site's is computed"),
     Method("mosaic", "at_site", "float64", "the same"),
     Method("mosaic", "after_colour", "numpy", "the site's channel is taken from the three"),
-    Method("normal", "linear_float32", "float32", "inverse CDF by 1024 straight lines", normal_error=LINEAR_NORMAL),
-    Method("normal", "quadratic_float64", "float64", "inverse CDF by 1024 quadratics", normal_error=QUADRATIC_NORMAL),
+    Method(
+        "normal",
+        "polynomial_float32",
+        "float32",
+        "inverse CDF by a polynomial in √(-log p)",
+        normal_error=POLYNOMIAL_NORMAL,
+    ),
+    Method(
+        "normal",
+        "quadratic_float64",
+        "float64",
+        "inverse CDF by 1024 quadratics, or whatever gives the same DN",
+        normal_error=QUADRATIC_NORMAL,
+    ),
     Method("normal", "numpy_float64", "numpy", "the same, NumPy", normal_error=QUADRATIC_NORMAL),
     Method(
         "shot", "gaussian_where_near", "float64", "a normal where that law is near, else counts", approximates_law=True

@@ -1,7 +1,8 @@
 """Two things that Numba does at every start or compilation and that these kernels do not need, left out.
 
-They reach inside Numba, so they are asked for with versions alone that they were tried with (`compiled.TRIED`). Measured:
-the registries take 0.4 s of every start and 25 MB; machine code of inner kernels a sixth of the time of a first run.
+They reach inside Numba, so they are asked for with versions alone that they were tried with (`compiled.TRIED`).
+Measured: the registries take 0.4 s of every start and 25 MB; machine code of inner kernels a sixth of the time of a
+first run.
 """
 
 from __future__ import annotations
@@ -84,6 +85,7 @@ class InnerCompiler(CompilerBase):
     """Numba's own steps, but for the library."""
 
     def define_pipelines(self) -> list[Any]:
+        """Return them."""
         passes = cast(Any, DefaultPassBuilder).define_nopython_pipeline(self.state)
         passes.add_pass_after(_IntoInnerLibrary, NopythonTypeInference)
         passes.finalize()

@@ -150,7 +150,8 @@ def make_room() -> Room:
 
 
 @inner
-def _bare_room(room: Room) -> Room:
+def bare_room(room: Room) -> Room:
+    """Return the same, bare."""
     return Room(
         bare(room.signal, _0), bare(room.clean_dn, _0), bare(room.words, _0), bare(room.depths, _0),
         bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0),
@@ -173,7 +174,7 @@ def _pair32(
     """`fused._pair` in float32."""
     height, width = clean.shape
     codes, of_bytes = products.shape[2], srgb.itemsize == 1
-    run, tally = _bare_room(room), bare(counts, _0)
+    run, tally = bare_room(room), bare(counts, _0)
     for y in range(height):
         even = bare(products, 3 * codes * light.channels[y & 1, 0])
         odd = bare(products, 3 * codes * light.channels[y & 1, 1])
@@ -187,14 +188,14 @@ def _pair32(
                 look_up(bare(srgb, 3 * at), even, odd, codes, length, of_bytes, bare(run.signal, first))
             dims = load(bare(sites, (y & 1) * sites.shape[2] + (first & 1)), _0)
             frame = bare(clean, at) if is_whole else run.clean
-            some_below, some_bright = _fill_clean(blocks, dims, light, run, frame)
+            some_below, some_bright = fill_clean(blocks, dims, light, run, frame)
             if not is_whole:
                 copy(length, bare(run.clean, first), bare(clean, at))
             if some_below:
                 tally[0] += count_below(first, after, run.signal)
             if some_bright:
                 here = room.clean_dn[first:after], clean[y, start : start + length]
-                _fill_bright(room.signal[first:after], sites[:, y & 1], light, *here, counts)
+                fill_bright(room.signal[first:after], sites[:, y & 1], light, *here, counts)
             fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
             frame = bare(noisy, at) if is_whole else run.noisy
             _fill_noisy(blocks * BLOCK, (first, after), light, run, frame, tally)
@@ -202,7 +203,7 @@ def _pair32(
                 copy(length, bare(run.noisy, first), bare(noisy, at))
 
 
-@kernel
+@inner
 def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: Single) -> None:
     """`fused._fill_light_by_gray`, to DN."""
     for x in range(row.shape[0]):
@@ -218,7 +219,7 @@ def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: 
 
 
 @inner
-def _fill_clean(blocks: int, dims: Vector, light: Light, run: Room, clean: Numbers) -> tuple[bool, bool]:
+def fill_clean(blocks: int, dims: Vector, light: Light, run: Room, clean: Numbers) -> tuple[bool, bool]:
     """`fused._fill_clean` of signals that are DN; return whether one is below black, and whether one is bright."""
     lowest = highest = load(run.signal, _0)
     for n in range(blocks * (BLOCK // WIDE)):
@@ -231,8 +232,8 @@ def _fill_clean(blocks: int, dims: Vector, light: Light, run: Room, clean: Numbe
     return mask_of(below(lowest, ZERO32)) != 0, mask_of(below(dims, highest)) != 0
 
 
-@kernel
-def _fill_bright(
+@inner
+def fill_bright(
     signal: Single, sites: Single, light: Light, clean_dn: Single, clean: Raw, counts: NDArray[np.int64]
 ) -> None:
     """`fused.fill_bright`; ``sites`` is that of the row."""
@@ -267,13 +268,11 @@ def _low16(rounded: np.float32, black: np.uint32) -> np.uint16:
 
 
 @inner
-def _fill_noisy(
-    count: int, valid: tuple[int, int], light: Light, run: Room, noisy: Numbers, tally: Numbers
-) -> None:
+def _fill_noisy(count: int, valid: tuple[int, int], light: Light, run: Room, noisy: Numbers, tally: Numbers) -> None:
     """`fused._fill_noisy` in float32."""
     fill_coarse_depths(count, run.words, run.depths)
     _fill_noise(count, light, run)
-    some_clipped = _digitise(count, light, run, noisy)
+    some_clipped = digitise(count, light, run.noisy_dn, noisy)
     if light.pinned_dn < _INFINITY:
         _pin(valid, light, run, noisy)
     if some_clipped:
@@ -293,12 +292,12 @@ def _fill_noise(count: int, light: Light, run: Room) -> None:
 
 
 @inner
-def _digitise(count: int, light: Light, run: Room, noisy: Numbers) -> bool:
+def digitise(count: int, light: Light, noisy_dn: Numbers, noisy: Numbers) -> bool:
     """Clip, round half to even, cast; return whether anything was clipped."""
-    lowest = highest = load(run.noisy_dn, _0)
+    lowest = highest = load(noisy_dn, _0)
     for n in range(count // WIDE):
         x = np.uint64(n) * _8
-        dn = load(run.noisy_dn, x)
+        dn = load(noisy_dn, x)
         lowest, highest = least(lowest, dn), greatest(highest, dn)
         store(noisy, x, bits_of(least(greatest(dn, light.low), light.high) + ROUND32) + light.black)
     return mask_of(below(lowest, light.low) | below(light.high, highest)) != 0

@@ -26,7 +26,6 @@ from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unprocess_gen.errors import MachineError
 from unprocess_gen.records import Float
@@ -76,26 +75,6 @@ def normal_table() -> Float:
     the table does not come out as published.
     """
     return _normal_table()
-
-
-@functools.lru_cache(maxsize=1)
-def normal_lines() -> NDArray[np.float32]:
-    """Return straight lines for the normal quantile, float32 ``[2, 1025]``, read-only: offsets, then slopes.
-
-    Segments as in `normal_table`, but in f = j / 2, the index of a uniform and a half: the quantile is about offset +
-    slope * f. Each line meets the segment's quadratic at the two nodes of Chebyshev. The last column goes on where f
-    was rounded up to 2**31.
-    """
-    c0, c1, c2 = normal_table().T
-    near, far = 0.5 / SEGMENTS - math.sqrt(0.125) / SEGMENTS, 0.5 / SEGMENTS + math.sqrt(0.125) / SEGMENTS
-    slope = c1 + c2 * (near + far)
-    at_start = c0 - c2 * (near * far)
-    row = np.arange(OCTAVES * SEGMENTS)
-    per_f = np.ldexp(slope, 1 - row // SEGMENTS)
-    offset = at_start - slope * (1 + row % SEGMENTS / SEGMENTS)
-    lines = np.stack([np.append(offset, offset[-1]), np.append(per_f, per_f[-1])]).astype(np.float32)
-    lines.flags.writeable = False
-    return lines
 
 
 # ---------------------------------------------------------------------------------------------------------- curves
