@@ -95,7 +95,7 @@ def test_the_reference_reads_like_the_method(settings: Settings) -> None:
 
 
 def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
-    said = ("accuracy.name=mine", "accuracy.normal_error=1e-4", "accuracy.clean_dn=1")
+    said = ("accuracy.name=mine", "accuracy.normal_error=6e-4", "accuracy.clean_dn=1")
     own = budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
     stricter = budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
 
