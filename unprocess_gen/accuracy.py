@@ -510,7 +510,8 @@ def true_normals(words: Words) -> Float:
 
 def quadratic_normals(words: Words) -> Float:
     """Return the normals of uint32 words ``[n]`` that decide the compiled form's DN."""
-    return floats.by_inverse_cdf(words[None], normal_table())[0]
+    normals: Float = floats.by_inverse_cdf(words[None], normal_table())[0]
+    return normals
 
 
 def polynomial_normals(words: Words) -> Float:
@@ -733,7 +734,7 @@ def _cleans(srgb: Srgb, scene: Scene, signal: Float, unrounded: Float, clean: Ra
 
 @kernel
 def _cleans32(
-    srgb: Srgb, products: Single, sites: Single, light: single.Light, room: single.Room, counts: NDArray[np.int64]
+    srgb: Srgb, products: Single, sites: Single, light: single.Light, room: single.Room32, counts: NDArray[np.int64]
 ) -> None:
     """As `_cleans`, in float32."""
     height, width = srgb.shape[:2]
@@ -832,7 +833,7 @@ MEASUREMENTS = (
     Measurement("mosaic:at_site_float32", _of_clean, _clean32_ns),
     Measurement("mosaic:at_site", _of_clean, _clean_ns),
     Measurement("mosaic:after_colour", _of_clean, _numpy_mosaic_ns),
-    Measurement("normal:linear_float32", _of_normals(polynomial_normals), _normals32_ns),
+    Measurement("normal:polynomial_float32", _of_normals(polynomial_normals), _normals32_ns),
     Measurement("normal:quadratic_float64", _of_normals(quadratic_normals), _normals_ns),
     Measurement("normal:numpy_float64", _of_normals(effects.normals), _numpy_normals_ns),
     Measurement("shot:gaussian_where_near", _of_shot, _near_ns),

@@ -227,7 +227,10 @@ def make_room() -> Room:
     size = RUN + BLOCK
     doubles, singles = np.zeros((2, size)), np.zeros((6, size), dtype=np.float32)
     raw, words = np.zeros((2, size), dtype=np.uint16), np.zeros(size, dtype=np.uint32)
-    return Room(*doubles, *singles[:2], words, *singles[2:], *raw, np.zeros(size // WIDE, dtype=np.uint64))
+    listed = np.zeros(size // WIDE, dtype=np.uint64)
+    whole, part, depths, noise, margin, noisy_dn = singles
+    frames = raw[0], raw[1]
+    return Room(doubles[0], doubles[1], whole, part, words, depths, noise, margin, noisy_dn, *frames, listed)
 
 
 @inner
@@ -731,7 +734,7 @@ def _digitise(count: int, law: _Law, run: Room, noisy: Numbers) -> tuple[int, bo
 
 @inner
 def _is_any(bits: Vector) -> bool:
-    return mask_of(below(ZERO32, to_float32(bits >> _1_32))) != 0
+    return bool(mask_of(below(ZERO32, to_float32(bits >> _1_32))) != 0)
 
 
 @inner
@@ -754,9 +757,14 @@ def _settle(
                 std = np.sqrt(max(a * (run.unrounded[x] - black) + b, 0.0))
                 dn = (run.unrounded[x] + std * exact_normal(run.words[x], quadratics) + ROUND) - ROUND
                 run.noisy_dn[x] = dn
-                noisy[x] = np.uint16(np.int64(min(max(dn, law.low), law.high)))
+                noisy[x] = _clipped(dn, law)
                 clips = clips or dn < law.low or dn > law.high
     return clips
+
+
+@inner
+def _clipped(dn: float, law: _Law) -> np.uint16:
+    return np.uint16(np.int64(min(max(dn, float(law.low)), float(law.high))))
 
 
 @inner
@@ -765,7 +773,7 @@ def _pin(valid: tuple[int, int], law: _Law, run: Room, noisy: Numbers) -> None:
         if run.unrounded[x] >= law.pinned_dn:
             dn = (law.pinned_dn + ROUND) - ROUND
             run.noisy_dn[x] = dn
-            noisy[x] = np.uint16(np.int64(min(max(dn, law.low), law.high)))
+            noisy[x] = _clipped(dn, law)
 
 
 @inner

@@ -30,9 +30,10 @@ Vector = NDArray[Any]
 """Eight lanes, as Python sees them."""
 Numbers = NDArray[Any]
 """What `bare` returns, as Python sees it."""
+Index = int | np.integer[Any]
 
 
-def bare(array: NDArray[Any], at: int) -> Numbers:
+def bare(array: NDArray[Any], at: Index) -> Numbers:
     """Return the numbers of an array in one piece, from the flat index ``at`` on.
 
     Compiled it is their place in memory and no more: nobody checks an index, and nobody counts that the array is in
@@ -42,40 +43,41 @@ def bare(array: NDArray[Any], at: int) -> Numbers:
     return array.reshape(-1)[at:]
 
 
-def load(numbers: Numbers, at: int) -> Vector:
+def load(numbers: Numbers, at: Index) -> Vector:
     """Return numbers ``at`` to ``at + 7``."""
     return numbers[at : at + WIDE].copy()
 
 
-def store(numbers: Numbers, at: int, lanes: Vector) -> None:
+def store(numbers: Numbers, at: Index, lanes: Vector) -> None:
     """Put eight lanes where `load` would take them from; uint32 lanes go among uint16 by their low halves."""
     numbers[at : at + WIDE] = lanes.astype(numbers.dtype)
 
 
-def four_bytes(numbers: Numbers, at: int) -> np.uint32:
+def four_bytes(numbers: Numbers, at: Index) -> np.uint32:
     """Return bytes ``at`` to ``at + 3`` as one number, the first in its lowest bits: one load where it is compiled."""
     return np.uint32(int.from_bytes(numbers[at : at + 4].tobytes(), "little"))
 
 
 def greatest(x: Vector, y: Any) -> Vector:
     """Return ``x`` where it is above ``y``, else ``y``."""
-    return np.where(x > y, x, y).astype(x.dtype)
+    return np.asarray(np.where(x > y, x, y), dtype=x.dtype)
 
 
 def least(x: Vector, y: Any) -> Vector:
     """Return ``x`` where it is below ``y``, else ``y``."""
-    return np.where(x < y, x, y).astype(x.dtype)
+    return np.asarray(np.where(x < y, x, y), dtype=x.dtype)
 
 
 def below(x: Any, y: Any) -> Vector:
     """Return all bits set where ``x`` is below ``y``, none elsewhere: unsigned lanes as wide as theirs."""
     lanes = np.asarray(x if np.ndim(x) else y)
-    return np.where(x < y, _unsigned(lanes).type(2 ** (8 * lanes.itemsize) - 1), _unsigned(lanes).type(0))
+    every_bit = 2 ** (8 * lanes.itemsize) - 1
+    return np.asarray(np.where(x < y, every_bit, 0), dtype=_unsigned(lanes))
 
 
 def root(x: Vector) -> Vector:
     """Return the square roots."""
-    return np.sqrt(x)
+    return np.asarray(np.sqrt(x))
 
 
 def bits_of(x: Vector) -> Vector:
@@ -98,18 +100,9 @@ def to_uint32(x: Vector) -> Vector:
     return x.astype(np.uint32)
 
 
-def prefetch(numbers: Numbers, at: int) -> None:
-    """Have the line of memory that holds a number fetched, to be written; changes nothing."""
-
-
 def nothing() -> Vector:
     """Return uint32 lanes of 0."""
     return np.zeros(WIDE, dtype=np.uint32)
-
-
-def nothing64() -> Vector:
-    """Return uint64 lanes of 0."""
-    return np.zeros(WIDE, dtype=np.uint64)
 
 
 def mask_of(x: Vector) -> np.uint32:
@@ -139,7 +132,7 @@ _ELEMENTS: dict[types.Number, ir.Type] = {
     types.uint32: ir.IntType(32),
     types.uint64: ir.IntType(64),
 }
-_OF_BITS = {types.float32: types.uint32, types.float64: types.uint64}
+_OF_BITS: dict[types.Number, types.Number] = {types.float32: types.uint32, types.float64: types.uint64}
 _HALF = ir.IntType(16)
 
 
@@ -148,7 +141,7 @@ def _vector(kind: Lanes) -> ir.VectorType:
 
 
 @register_model(Lanes)
-class _Model(models.PrimitiveModel):  # type: ignore[misc]
+class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Lanes) -> None:
         super().__init__(manager, kind, _vector(kind))
 
@@ -256,7 +249,7 @@ class Bare(types.Type):
 
 
 @register_model(Bare)
-class _Place(models.PrimitiveModel):  # type: ignore[misc]
+class _Place(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Bare) -> None:
         super().__init__(manager, kind, manager.lookup(kind.of).get_data_type().as_pointer())
 
@@ -273,8 +266,9 @@ def _at(builder: Any, place: Any, at: Any, pointee: ir.Type) -> Any:
 
 
 def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    place = _at(builder, *arguments, _vector(signature.return_type))
-    return builder.load(place, align=signature.args[0].of.bitwidth // 8)
+    place, at = arguments
+    lanes = _at(builder, place, at, _vector(signature.return_type))
+    return builder.load(lanes, align=signature.args[0].of.bitwidth // 8)
 
 
 def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -288,17 +282,9 @@ def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return context.get_dummy_value()
 
 
-def _prefetch(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
-    kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-    fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-    to_write, near, data = (ir.Constant(number, value) for value in (1, 3, 1))
-    builder.call(fetch, [_at(builder, *arguments, ir.IntType(8)), to_write, near, data])
-    return context.get_dummy_value()
-
-
 def _four_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    number = builder.load(_at(builder, *arguments, ir.IntType(32)), align=1)
+    place, at = arguments
+    number = builder.load(_at(builder, place, at, ir.IntType(32)), align=1)
     return builder.bswap(number) if sys.byteorder == "big" else number
 
 
@@ -339,12 +325,10 @@ _define(float_of, lambda bits: Lanes(types.float32), _reinterpreted)
 _define(to_float32, lambda x: Lanes(types.float32), _to_float32)
 _define(to_uint32, lambda x: Lanes(types.uint32), _to_uint32)
 _define(nothing, lambda: Lanes(types.uint32), _nothing)
-_define(nothing64, lambda: Lanes(types.uint64), _nothing)
 _define(mask_of, lambda x: types.uint32, _mask_of)
 _define(bare, lambda array, at: Bare(array.dtype) if isinstance(array, types.Array) else array, _bare)
 _define(load, lambda numbers, at: Lanes(numbers.of), _load)
 _define(store, lambda numbers, at, lanes: types.none, _store)
-_define(prefetch, lambda numbers, at: types.none, _prefetch)
 _define(four_bytes, lambda numbers, at: types.uint32, _four_bytes)
 
 
@@ -354,7 +338,7 @@ def _type_of_get(context: Any) -> Callable[..., Any]:
 
 
 @infer_global(operator.setitem)
-class _TypeOfSet(AbstractTemplate):  # type: ignore[misc]
+class _TypeOfSet(AbstractTemplate):
     def generic(self, arguments: Any, keywords: Any) -> Any:
         numbers, at, number = arguments
         return signature(types.none, numbers, at, number) if isinstance(numbers, Bare) else None

@@ -186,13 +186,15 @@ def _taken_apart(words: Vector) -> tuple[Vector, Vector]:
 def _fine_log2(m: Vector) -> Vector:
     c = _FINE_LOG2
     m2 = m * m
-    return ((c[0] + c[1] * m) + (c[2] + c[3] * m) * m2) + ((c[4] + c[5] * m) + c[6] * m2) * (m2 * m2)
+    log2: Vector = ((c[0] + c[1] * m) + (c[2] + c[3] * m) * m2) + ((c[4] + c[5] * m) + c[6] * m2) * (m2 * m2)
+    return log2
 
 
 @inner
 def _coarse_log2(m: Vector) -> Vector:
     c = _COARSE_LOG2
-    return (c[0] + c[1] * m) + (c[2] + c[3] * m) * (m * m)
+    log2: Vector = (c[0] + c[1] * m) + (c[2] + c[3] * m) * (m * m)
+    return log2
 
 
 @inner
@@ -203,7 +205,8 @@ def fine_normal(depths: Vector) -> Vector:
     t2 = t * t
     t4 = t2 * t2
     low = ((c[0] + c[1] * t) + (c[2] + c[3] * t) * t2) + ((c[4] + c[5] * t) + (c[6] + c[7] * t) * t2) * t4
-    return low + (c[8] + c[9] * t) * (t4 * t4)
+    normal: Vector = low + (c[8] + c[9] * t) * (t4 * t4)
+    return normal
 
 
 @inner
@@ -211,7 +214,9 @@ def coarse_normal(depths: Vector) -> Vector:
     """Do so to within `methods.POLYNOMIAL_NORMAL`."""
     c, t = _COARSE_QUANTILE, depths
     t2 = t * t
-    return ((c[0] + c[1] * t) + (c[2] + c[3] * t) * t2) + ((c[4] + c[5] * t) + (c[6] + c[7] * t) * t2) * (t2 * t2)
+    low = (c[0] + c[1] * t) + (c[2] + c[3] * t) * t2
+    normal: Vector = low + ((c[4] + c[5] * t) + (c[6] + c[7] * t) * t2) * (t2 * t2)
+    return normal
 
 
 @kernel

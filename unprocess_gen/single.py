@@ -55,6 +55,9 @@ from unprocess_gen.streams import BLOCK
 _0, _8 = np.uint64(0), np.uint64(8)
 _1F, _INFINITY = np.float32(1), np.float32(np.inf)
 
+ROUNDINGS = 2.0**-18
+"""What light in float32 is off by, at most, as a share of it: a quarter DN of 16 bits."""
+
 
 def make_pair(
     srgb: Srgb,
@@ -93,6 +96,7 @@ class Light(NamedTuple):
     a: np.float32
     b: np.float32
     pinned_dn: np.float32
+    saturated_dn: np.float32  # from which on a site is pinned: white is `pinned_dn` but for the roundings
     low: np.float32
     high: np.float32
 
@@ -104,9 +108,10 @@ def light_of(scene: Scene, limits_dn: tuple[float, float]) -> Light:
     return Light(
         scene.by_gray, scene.sites, scene.gains.astype(f), f(scene.exposure * span),
         f(scene.threshold), f(1 - scene.threshold), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
-        f(scene.brightest), f(scene.brightest * (1 + 2.0**-18)), f(span), np.uint32(black),
+        f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black),
         f(scene.noise[0]), f(scene.noise[1]),
-        f(scene.pinned_dn - black), f(limits_dn[0] - black), f(limits_dn[1] - black),
+        f(scene.pinned_dn - black), f((scene.pinned_dn - black) * (1 - ROUNDINGS)),
+        f(limits_dn[0] - black), f(limits_dn[1] - black),
     )  # fmt: skip
 
 
@@ -130,8 +135,11 @@ def sites_of(scene: Scene) -> Single:
     return np.ascontiguousarray(np.tile(rows, (1, 1, RUN // 2 + 1)))
 
 
-class Room(NamedTuple):
-    """As `fused.Room`; DN count from black on."""
+class Room32(NamedTuple):
+    """As `fused.Room`; DN count from black on.
+
+    Not of that name: Numba tells tuples apart by it when it is called, and is slow where two share one.
+    """
 
     signal: Single  # DN already
     clean_dn: Single
@@ -142,17 +150,18 @@ class Room(NamedTuple):
     noisy: Raw
 
 
-def make_room() -> Room:
+def make_room() -> Room32:
     """Return room for a run."""
     size = RUN + BLOCK
     singles, raw = np.zeros((4, size), dtype=np.float32), np.zeros((2, size), dtype=np.uint16)
-    return Room(*singles[:2], np.zeros(size, dtype=np.uint32), *singles[2:], *raw)
+    signal, clean_dn, depths, noisy_dn = singles
+    return Room32(signal, clean_dn, np.zeros(size, dtype=np.uint32), depths, noisy_dn, raw[0], raw[1])
 
 
 @inner
-def bare_room(room: Room) -> Room:
+def bare_room(room: Room32) -> Room32:
     """Return the same, bare."""
-    return Room(
+    return Room32(
         bare(room.signal, _0), bare(room.clean_dn, _0), bare(room.words, _0), bare(room.depths, _0),
         bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0),
     )  # fmt: skip
@@ -166,7 +175,7 @@ def _pair32(
     light: Light,
     key: Key,
     origin: tuple[int, int],
-    room: Room,
+    room: Room32,
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
@@ -219,7 +228,7 @@ def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: 
 
 
 @inner
-def fill_clean(blocks: int, dims: Vector, light: Light, run: Room, clean: Numbers) -> tuple[bool, bool]:
+def fill_clean(blocks: int, dims: Vector, light: Light, run: Room32, clean: Numbers) -> tuple[bool, bool]:
     """`fused._fill_clean` of signals that are DN; return whether one is below black, and whether one is bright."""
     lowest = highest = load(run.signal, _0)
     for n in range(blocks * (BLOCK // WIDE)):
@@ -268,7 +277,7 @@ def _low16(rounded: np.float32, black: np.uint32) -> np.uint16:
 
 
 @inner
-def _fill_noisy(count: int, valid: tuple[int, int], light: Light, run: Room, noisy: Numbers, tally: Numbers) -> None:
+def _fill_noisy(count: int, valid: tuple[int, int], light: Light, run: Room32, noisy: Numbers, tally: Numbers) -> None:
     """`fused._fill_noisy` in float32."""
     fill_coarse_depths(count, run.words, run.depths)
     _fill_noise(count, light, run)
@@ -282,7 +291,7 @@ def _fill_noisy(count: int, valid: tuple[int, int], light: Light, run: Room, noi
 
 
 @inner
-def _fill_noise(count: int, light: Light, run: Room) -> None:
+def _fill_noise(count: int, light: Light, run: Room32) -> None:
     for n in range(count // WIDE):
         x = np.uint64(n) * _8
         clean_dn = load(run.clean_dn, x)
@@ -300,19 +309,19 @@ def digitise(count: int, light: Light, noisy_dn: Numbers, noisy: Numbers) -> boo
         dn = load(noisy_dn, x)
         lowest, highest = least(lowest, dn), greatest(highest, dn)
         store(noisy, x, bits_of(least(greatest(dn, light.low), light.high) + ROUND32) + light.black)
-    return mask_of(below(lowest, light.low) | below(light.high, highest)) != 0
+    return bool(mask_of(below(lowest, light.low) | below(light.high, highest)) != 0)
 
 
 @inner
-def _pin(valid: tuple[int, int], light: Light, run: Room, noisy: Numbers) -> None:
+def _pin(valid: tuple[int, int], light: Light, run: Room32, noisy: Numbers) -> None:
     for x in range(valid[0], valid[1]):
-        if run.clean_dn[x] >= light.pinned_dn:
+        if run.clean_dn[x] >= light.saturated_dn:
             run.noisy_dn[x] = light.pinned_dn
             noisy[x] = _low16(min(max(light.pinned_dn, light.low), light.high) + ROUND32, light.black)
 
 
 @inner
-def _count_clipped(valid: tuple[int, int], light: Light, run: Room, tally: Numbers) -> None:
+def _count_clipped(valid: tuple[int, int], light: Light, run: Room32, tally: Numbers) -> None:
     low, high = light.low, light.high
     below_low, above_high = 0, 0
     for x in range(valid[0], valid[1]):
@@ -324,7 +333,7 @@ def _count_clipped(valid: tuple[int, int], light: Light, run: Room, tally: Numbe
 
 
 @inner
-def _count_still(valid: tuple[int, int], light: Light, run: Room) -> int:
+def _count_still(valid: tuple[int, int], light: Light, run: Room32) -> int:
     still = 0
     for x in range(valid[0], valid[1]):
         still += max(light.a * run.clean_dn[x] + light.b, ZERO32) == ZERO32
