@@ -1,32 +1,31 @@
 """The fast form of a pair whose noise is one normal a site: one pass, one channel a site, no full-resolution RGB.
 
 Must give the DN of `pair.reference_pair` everywhere, on every machine. Hence Numba without fastmath (no reordering, no
-fused multiply-add), float64, only + - × ÷ √, comparisons, integers and table look-ups, and each formula in the
-reference's order of operations.
+fused multiply-add), only + - × ÷ √, comparisons, integers and table look-ups, and each formula in the reference's order
+of operations. The clean frame is float64 throughout. The noise is made in float32, eight sites at a time (`lanes`), of
+normals that polynomials give to within `FINE_ERROR` (`normals`); beside every value stands what it can be off by, and
+the sites that could round otherwise than the reference's, some 1 % at a σ of 100 DN, are made again in float64 of the
+exact normal (`_settle`). So the quick form decides only what it decides alike.
 
 How it is fast: a row is worked through in runs of `RUN` pixels whose buffers stay in the first-level cache, and each
-stage is a loop of its own, so that it becomes vector code. Doubles are taken apart and put together through views of
-their bits: 2**52 | j is j as a double, and adding 1.5·2**52 rounds half to even and leaves a whole number in the low
-bits; all of it vectorises where the conversion instructions do not exist below AVX-512. What is bright (highlights,
-clipped, saturated) is done anew for its blocks of 64, so that all else needs neither the division nor its counts. The
-noise's square roots are taken in the loop of Philox, which leaves the divider idle.
+stage is a loop of its own: a processor overlaps short chains of operations better than long ones, and half of the
+loops would not become vector code together. What is bright (highlights, clipped, saturated) is done anew for its blocks
+of 64, so that all else needs neither the division nor its counts; clipped and noiseless sites are counted in runs alone
+that have some. Runs of whole blocks are written where they belong, others by way of the room.
 
-Nanoseconds a pixel, AVX2 (Zen 3), one thread of a busy machine: table look-ups and matrix 0.7, the clean frame 0.45
-(where it is bright, 1.2 more), Philox with the roots 1.3 (Philox alone 0.8, the roots alone 0.7), normals 1.05, the
-read-out 0.3; in all 4.3, where the first form took 6.9. In float32 with straight lines for the normals: a third
-less.
+Doubles are rounded by adding 1.5·2**52, singles by adding 1.5·2**23: half to even, and the whole number is left in the
+low bits, which vectorises where conversions do not exist below AVX-512. Codes of four pixels are had by three loads of
+four bytes, as loads are what the look-ups wait for: three and three quarters a pixel, at two a cycle.
 
-Codes of two pixels are loaded at once, 0.2 less than six loads of a byte: loads are what the look-ups wait for.
+Nanoseconds a pixel, AVX2 (Zen 3, 3.15 GHz), one thread: look-ups and matrix 0.7, the clean frame 0.1 (where it is
+bright, 0.5 more), Philox 0.65, depths of the draws 0.4, noise and read-out 0.6, sites made again 0.1 to 0.5 by their σ;
+in all 3.4 to 4.4.
 
-Tried, in nanoseconds a pixel: normals in float32 without tables (polynomials in √(32 - log2 f) of ninth degree, in the
-mantissa of sixth) and the few DN that lie near a rounding edge made again, 4.15 where this form takes 4.4, in the
-float32 form 2.9 instead of 3.2: too little for a second form of the noise; normals and read-out in one loop, 2.5
-(scalar code) where two take 1.4; the row and the position of a normal stored by Philox's loop instead of one word,
-+0.25; Philox on two vectors at once, no gain; runs of 256 pixels, +0.3, as every array that is handed on between
-kernels is counted by an atomic addition: slices are made in the outer kernel alone, and inner ones make none (+1.5
-before that was seen); the ten rounds of Philox in a function of its own, which is not inlined, +2.8. Before: one loop
-for everything (scalar code), a [1024, 4] table instead of three columns for the quadratics, +1; chunks in the outer
-loop and rows in the inner, +0.6.
+Tried, in nanoseconds a pixel: quadratics from tables for the normals, eight lanes of float64 then, 4.4 to 5.6 in all;
+straight lines from a table, 0.8 more than polynomials; one long loop for the noise, or Philox in lanes, no gain;
+look-ups in the loop of the depths, no gain; runs of 256 pixels, the same, since kernels hand on bare pointers (with
+arrays, which are counted by locked additions, +0.3); Philox in a function of its own that is not inlined, +2.8. Before:
+one loop for everything (scalar code), chunks in the outer loop and rows in the inner, 6.9.
 """
 
 from __future__ import annotations
@@ -405,7 +404,7 @@ def look_up(
         _look_up_bytes(row, even, odd, done // 4, signal)
     for x in range(done, length):
         of_site = odd if x & 1 else even
-        r, g, b = row[3 * x], row[3 * x + 1], row[3 * x + 2]
+        r, g, b = np.int64(row[3 * x]), np.int64(row[3 * x + 1]), np.int64(row[3 * x + 2])
         signal[x] = (of_site[r] + of_site[codes + g]) + of_site[2 * codes + b]
 
 
