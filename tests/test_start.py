@@ -92,7 +92,7 @@ def test_a_child_composes_what_is_composed_here(children: ForkedChildren) -> Non
     overrides, here, done = ["seed=3", "noise=sony_a7s2", "camera=choice", "source.patch=[grid,8]"], [], []
     room.compose_one([], overrides, lambda config: (here.append(config) or 0, None))  # type: ignore[func-returns-value]
 
-    config = compose_beside(overrides, lambda: done.append("meanwhile"))
+    config = compose_beside(overrides, [lambda: done.append("meanwhile")])
 
     assert config == here[0]
     assert done == ["meanwhile"]
@@ -107,9 +107,19 @@ def test_settings_that_a_child_refuses_are_refused_in_the_same_words(override: s
         room.compose_one([], [override], lambda config: (0, None))
 
     with pytest.raises(ConfigError) as beside:
-        compose_beside([override], lambda: None)
+        compose_beside([override], [lambda: None])
 
     assert str(beside.value) == str(here.value)
+    assert all_gone(children)
+
+
+def test_what_was_to_be_done_meanwhile_is_left_undone_once_settings_are_refused(children: ForkedChildren) -> None:
+    done = []
+
+    with pytest.raises(ConfigError):
+        compose_beside(["seed=x"], [lambda: os.waitid(os.P_PID, children[0], os.WEXITED | os.WNOWAIT), done.append])
+
+    assert done == []
     assert all_gone(children)
 
 
@@ -119,7 +129,7 @@ def test_a_child_ends_with_what_ends_us_meanwhile(stop: type[BaseException], chi
         raise stop
 
     with pytest.raises(stop):
-        compose_beside([], meanwhile)
+        compose_beside([], [meanwhile])
 
     assert all_gone(children)
 
@@ -130,9 +140,9 @@ def test_a_bug_is_told_here_where_a_child_met_it(children: ForkedChildren, monke
 
     monkeypatch.setattr(settings_room, "check", broken)
 
-    assert compose_beside([], lambda: None) is None
+    assert compose_beside([], [lambda: None]) is None
     with pytest.raises(RuntimeError, match="a bug"):
-        compose([], lambda config: (0, None), meanwhile=lambda: None)
+        compose([], lambda config: (0, None), meanwhile=[lambda: None])
     assert all_gone(children)
 
 
@@ -147,7 +157,7 @@ def test_where_a_child_dies_settings_are_composed_here(
     monkeypatch.setattr(room, "_tell_settings", dies)
     seeds: list[int] = []
 
-    code = compose(["seed=7"], lambda config: (seeds.append(config.seed) or 5, None), meanwhile=lambda: None)  # type: ignore[func-returns-value]
+    code = compose(["seed=7"], lambda config: (seeds.append(config.seed) or 5, None), meanwhile=[lambda: None])  # type: ignore[func-returns-value]
 
     assert (code, seeds) == (5, [7])
     assert all_gone(children)

@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -163,7 +164,8 @@ def run(arguments: Sequence[str]) -> int:
 
 def generate(arguments: list[str]) -> int:
     """``gen-dataset [overrides]``: make a dataset, or with ``-m`` one for every combination."""
-    return compose(arguments, _generate, sweep_csv=True, meanwhile=lambda: import_module("unprocess_gen.runner"))
+    steps = [partial(import_module, name) for name in ("numpy", "cv2", "numba", "unprocess_gen.runner")]
+    return compose(arguments, _generate, sweep_csv=True, meanwhile=steps)
 
 
 def _generate(config: Config) -> tuple[int, Summary]:

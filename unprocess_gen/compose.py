@@ -11,6 +11,7 @@ import itertools
 import os
 import pickle
 import re
+import select
 import signal
 import sys
 import threading
@@ -60,19 +61,19 @@ def conf_dir() -> Path:
 
 
 def compose(
-    arguments: list[str], task: Task, sweep_csv: bool = False, meanwhile: Callable[[], object] | None = None
+    arguments: list[str], task: Task, sweep_csv: bool = False, meanwhile: Sequence[Callable[[], object]] = ()
 ) -> int:
     """Compose the settings and run ``task`` on them, with ``-m`` on every combination; return the exit code.
 
-    ``sweep_csv`` says whether a sweep leaves its table in ``out``; ``meanwhile``, what a single run can do while Hydra
-    is busy, where there is a core for that (`compose_beside`). Raises ConfigError for settings that Hydra or
-    `config.check` refuse, and whatever the task of a single run raises.
+    ``sweep_csv`` says whether a sweep leaves its table in ``out``; ``meanwhile``, what a single run can do, step by
+    step, while Hydra is busy, where there is a core for that (`compose_beside`). Raises ConfigError for settings that
+    Hydra or `config.check` refuse, and whatever the task of a single run raises.
     """
     flags, overrides = _sort_arguments(arguments)
     swept = any(flag in SWEEP_FLAGS for flag in flags)
     flags = [flag for flag in flags if flag not in SWEEP_FLAGS]
     if not swept:
-        config = None if flags or meanwhile is None else compose_beside(overrides, meanwhile)
+        config = None if flags or not meanwhile else compose_beside(overrides, meanwhile)
         return compose_one(flags, overrides, task) if config is None else task(config)[0]
     jobs: list[Job] = []
     out: Path | None = None
@@ -135,18 +136,18 @@ def compose_one(flags: list[str], overrides: list[str], task: Task) -> int:
     return 0
 
 
-def compose_beside(overrides: list[str], meanwhile: Callable[[], object]) -> Config | None:
-    """Return the settings as a child of this process composed and checked them, while ``meanwhile`` ran here.
+def compose_beside(overrides: list[str], meanwhile: Sequence[Callable[[], object]]) -> Config | None:
+    """Return the settings as a child of this process composed and checked them, while the steps of ``meanwhile`` ran.
 
     To import Hydra and compose takes as long as to import what makes pairs: 0.4 s. On two cores that is done at once,
-    and this process never holds what Hydra brings along. Raises ConfigError for settings that are refused. None where
-    there is no second core, where a fork is not safe or gains nothing, and where the child could not tell: then they
-    are to be composed here, where everything that can go wrong is told.
+    and this process never holds what Hydra brings along. Raises ConfigError for settings that are refused, before the
+    next step. None where there is no second core, where a fork is not safe or gains nothing, and where the child could
+    not tell: then they are to be composed here, where everything that can go wrong is told.
     """
     if not _may_fork():
         return None
     reading, writing = os.pipe()
-    child = os.fork()
+    child, told = os.fork(), b""
     if child == 0:
         os.close(reading)
         with os.fdopen(writing, "wb") as answer:
@@ -154,11 +155,20 @@ def compose_beside(overrides: list[str], meanwhile: Callable[[], object]) -> Con
     try:
         os.close(writing)
         with os.fdopen(reading, "rb") as answer:
-            meanwhile()
-            told = answer.read()
+            for step in meanwhile:
+                if not told and select.select([answer], [], [], 0)[0]:
+                    told = answer.read()
+                    _settings_in(told)
+                step()
+            told = told or answer.read()
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+    return _settings_in(told)
+
+
+def _settings_in(told: bytes) -> Config | None:
+    """Return the settings that a child told, None where it did not; raise what it refused them with."""
     found: Config | ConfigError | None = None
     with suppress(Exception):  # nothing was told, or not all of it
         found = pickle.loads(told)
