@@ -1,39 +1,45 @@
-"""How fast a pair is made, as a ratio: the fast form and a yardstick in turns, in one process, one thread.
+"""How fast a pair is made, as a ratio: two tiers of accuracy and a yardstick in turns, in one process, one thread.
 
     python tests/bench_pair.py PHOTO [PHOTO ...] [--yardstick naive.py] [--rounds 5]
 
-Prints, for each photograph, nanoseconds a pixel of both (medians) and the median of the ratios round by round. The
-yardstick is `algorithm1` beside this file, or any module with the functions unprocess(rgb, dtype), add_noise(raw) and
-to_dn(raw).
+Prints, for each photograph, nanoseconds a pixel (medians), and how many times as fast a tier is (medians of the ratios
+round by round). The yardstick is `algorithm1` beside this file, or any module with the functions unprocess(rgb, dtype),
+add_noise(raw) and to_dn(raw).
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
-import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
+from omegaconf import OmegaConf
 
 sys.path.insert(0, str(Path(__file__).parent))
 import algorithm1
 
-from unprocess_gen.config import Config, GainsConfig, NoiseConfig
+from unprocess_gen.config import AccuracyConfig, Config, GainsConfig, NoiseConfig
 from unprocess_gen.decode import decode
 from unprocess_gen.manifest import ok_row
 from unprocess_gen.pair import make_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.records import Patch, Plan, Source
 
+TIERS = ("exact", "fast")
 
-def fixed_plan() -> Plan:
+
+def fixed_plan(tier: str) -> Plan:
     noise = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
-    return plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise), "0" * 64)
+    budget = OmegaConf.load(Path(__file__).parents[1] / "conf" / "accuracy" / f"{tier}.yaml")
+    accuracy = OmegaConf.to_object(OmegaConf.merge(AccuracyConfig, budget))
+    assert isinstance(accuracy, AccuracyConfig)
+    return plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise, accuracy=accuracy), "0" * 64)
 
 
 def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
@@ -76,21 +82,23 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    plan = fixed_plan()
-    naive = other_yardstick(options.yardstick) if options.yardstick else own_yardstick(plan)
-    ratios = []
+    plans = {tier: fixed_plan(tier) for tier in TIERS}
+    naive = other_yardstick(options.yardstick) if options.yardstick else own_yardstick(plans["exact"])
+    found = []
     for photo in options.photos:
         rgb = decode(Path(photo).read_bytes(), max_pixels=2**26, icc="ignore").srgb
-        make_pair(rgb, plan)
-        rounds = [
-            (seconds(lambda: naive(rgb)), seconds(lambda: make_pair(rgb, plan)))  # noqa: B023
-            for _ in range(options.rounds)
-        ]
-        ours, theirs = (statistics.median(column) for column in zip(*((b, a) for a, b in rounds), strict=True))
-        ratios.append(statistics.median(a / b for a, b in rounds))
-        scale = 1e9 / (rgb.shape[0] * rgb.shape[1])
-        print(f"{Path(photo).name}: {theirs * scale:.0f} and {ours * scale:.2f} ns a pixel, ratio {ratios[-1]:.1f}")
-    print(f"median ratio {statistics.median(ratios):.1f}, lowest {min(ratios):.1f}")
+        calls = [partial(naive, rgb), *(partial(make_pair, rgb, plan) for plan in plans.values())]
+        for call in calls[1:]:
+            call()
+        rounds = np.array([[seconds(call) for call in calls] for _ in range(options.rounds)])
+        times_ns = np.median(rounds, axis=0) * 1e9 / (rgb.shape[0] * rgb.shape[1])
+        found.append(np.median(rounds[:, :1] / rounds[:, 1:], axis=0))
+        tiers = (
+            f"{tier} {ns:.2f} ({ratio:.1f})" for tier, ns, ratio in zip(TIERS, times_ns[1:], found[-1], strict=True)
+        )
+        print(f"{Path(photo).name}: yardstick {times_ns[0]:.0f} ns a pixel,", ", ".join(tiers))
+    for tier, ratios in zip(TIERS, np.transpose(found), strict=True):
+        print(f"{tier}: median ratio {np.median(ratios):.1f}, {ratios.min():.1f} to {ratios.max():.1f}")
 
 
 if __name__ == "__main__":
