@@ -67,15 +67,18 @@ from unprocess_gen.errors import ConfigError, SourceError
 from unprocess_gen.fused import (
     CHUNK,
     RUN,
+    Room,
     Scene,
     Single,
+    bare_room,
     by_site,
     digitise,
     fill_bright,
     fill_camera,
-    fill_dim,
+    fill_clean_apart,
     fill_signal,
     look_up,
+    make_room,
 )
 from unprocess_gen.fused import scene_of as fused_scene
 from unprocess_gen.lanes import bare
@@ -605,15 +608,14 @@ def _look_up32_ns(lab: Lab, method: Method, subject: Subject) -> float:
 
 def _clean_ns(lab: Lab, method: Method, subject: Subject) -> float:
     srgb, scene = _scene(lab, subject)
-    buffers = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
-    return clocked(lambda: _cleans(srgb, scene, *buffers), srgb.shape[0] * srgb.shape[1])
+    counts = np.zeros(6, dtype=np.int64)
+    return clocked(lambda: _cleans(srgb, scene, make_room(), counts), srgb.shape[0] * srgb.shape[1])
 
 
 def _clean32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     srgb, scene = _scene(lab, subject)
     of_scene = single.products_of(scene), single.sites_of(scene), single.light_of(scene, LIMITS_DN)
-    counts = np.zeros(6, dtype=np.int64)
-    return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room(), counts), srgb.shape[0] * srgb.shape[1])
+    return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room()), srgb.shape[0] * srgb.shape[1])
 
 
 def _numpy_curve_ns(lab: Lab, method: Method, subject: Subject) -> float:
@@ -719,37 +721,39 @@ def _signals32(srgb: Srgb, products: Single, sites: NDArray[np.int64], out: Sing
 
 
 @kernel
-def _cleans(srgb: Srgb, scene: Scene, signal: Float, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+def _cleans(srgb: Srgb, scene: Scene, room: Room, counts: NDArray[np.int64]) -> None:
     """Go from codes to the clean frame."""
+    run = bare_room(room)
     site_gains, site_headroom = by_site(scene)
     height, width = srgb.shape[:2]
     for y in range(height):
         gains, headroom = site_gains[y & 1], site_headroom[y & 1]
-        for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
-            fill_signal(srgb[y, start : start + n], scene, y, signal)
-            if fill_dim(signal, gains, scene, unrounded, clean[:n], counts):
-                fill_bright(signal, gains, headroom, scene, unrounded, clean[:n], counts)
+        eight_gains = load_lanes(bare(gains, 0), 0)
+        for start in range(0, width, RUN):
+            n = min(RUN, width - start)
+            fill_signal(srgb[y, start : start + n], scene, y, room.signal)
+            if fill_clean_apart(-(-n // BLOCK), eight_gains, scene, run, run.clean)[1]:
+                here = room.unrounded[:n], room.clean[:n]
+                fill_bright(room.signal[:n], gains, headroom, scene, *here, counts)
 
 
 @kernel
-def _cleans32(
-    srgb: Srgb, products: Single, sites: Single, light: single.Light, room: single.Room32, counts: NDArray[np.int64]
-) -> None:
+def _cleans32(srgb: Srgb, products: Single, sites: Single, light: single.Light, room: single.Room32) -> None:
     """As `_cleans`, in float32."""
     height, width = srgb.shape[:2]
     run = single.bare_room(room)
     for y in range(height):
         even = bare(products, 3 * products.shape[2] * light.channels[y & 1, 0])
         odd = bare(products, 3 * products.shape[2] * light.channels[y & 1, 1])
-        dims = load_lanes(bare(sites, (y & 1) * sites.shape[2]), 0)
+        of_sites = single.bright_sites(sites, y & 1, 0)
         for start in range(0, width, RUN):
             n = min(RUN, width - start)
             codes = bare(srgb, 3 * (y * width + start))
             look_up(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, run.signal)
-            some_bright = single.fill_clean(-(-n // BLOCK), dims, light, run, run.clean)[1]
+            blocks = -(-n // BLOCK)
+            some_bright = single.fill_clean(blocks, of_sites[0], light, run, run.clean)[1]
             if some_bright:
-                single.fill_bright(room.signal[:n], sites[:, y & 1], light, room.clean_dn[:n], room.clean[:n], counts)
+                single.fill_bright(blocks, of_sites, light, run, run.clean)
 
 
 @kernel

@@ -86,7 +86,7 @@ class Light(NamedTuple):
     gains: Single  # of the channels
     scale: np.float32  # from light to DN
     threshold: np.float32
-    above_threshold: np.float32  # 1 less the threshold
+    steepness: np.float32  # of the highlight term: 1 / (1 - threshold)
     exposure: np.float32
     limit: np.float32
     brightest: np.float32
@@ -107,7 +107,7 @@ def light_of(scene: Scene, limits_dn: tuple[float, float]) -> Light:
     f = np.float32
     return Light(
         scene.by_gray, scene.sites, scene.gains.astype(f), f(scene.exposure * span),
-        f(scene.threshold), f(1 - scene.threshold), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
+        f(scene.threshold), f(1 / (1 - scene.threshold)), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
         f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black),
         f(scene.noise[0]), f(scene.noise[1]),
         f(scene.pinned_dn - black), f((scene.pinned_dn - black) * (1 - ROUNDINGS)),
@@ -128,11 +128,11 @@ def products_of(scene: Scene) -> Single:
 
 
 def sites_of(scene: Scene) -> Single:
-    """Return ``[4, 2, RUN + 2]``: for each pixel of an even and of an odd row dim DN, signal per DN, gain, headroom."""
+    """Return ``[4, 2, WIDE + 2]``: for pixels of an even and of an odd row dim DN, signal per DN, gain, headroom."""
     gains = np.ones(3) if scene.by_gray else scene.gains
     of_channels = scene.dim * _dn_of_signal(scene), 1 / _dn_of_signal(scene), gains, scene.headroom
     rows = np.stack([one[scene.sites] for one in of_channels]).astype(np.float32)
-    return np.ascontiguousarray(np.tile(rows, (1, 1, RUN // 2 + 1)))
+    return np.ascontiguousarray(np.tile(rows, (1, 1, WIDE // 2 + 1)))
 
 
 class Room32(NamedTuple):
@@ -143,6 +143,7 @@ class Room32(NamedTuple):
 
     signal: Single  # DN already
     clean_dn: Single
+    lit: Single  # light of what is bright
     words: Indices
     depths: Single
     noisy_dn: Single  # neither rounded nor clipped
@@ -153,17 +154,18 @@ class Room32(NamedTuple):
 def make_room() -> Room32:
     """Return room for a run."""
     size = RUN + BLOCK
-    singles, raw = np.zeros((4, size), dtype=np.float32), np.zeros((2, size), dtype=np.uint16)
-    signal, clean_dn, depths, noisy_dn = singles
-    return Room32(signal, clean_dn, np.zeros(size, dtype=np.uint32), depths, noisy_dn, raw[0], raw[1])
+    singles, raw = np.zeros((5, size), dtype=np.float32), np.zeros((2, size), dtype=np.uint16)
+    signal, clean_dn, lit, depths, noisy_dn = singles
+    words = np.zeros(size, dtype=np.uint32)
+    return Room32(signal, clean_dn, lit, words, depths, noisy_dn, raw[0], raw[1])
 
 
 @inner
 def bare_room(room: Room32) -> Room32:
     """Return the same, bare."""
     return Room32(
-        bare(room.signal, _0), bare(room.clean_dn, _0), bare(room.words, _0), bare(room.depths, _0),
-        bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0),
+        bare(room.signal, _0), bare(room.clean_dn, _0), bare(room.lit, _0), bare(room.words, _0),
+        bare(room.depths, _0), bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0),
     )  # fmt: skip
 
 
@@ -195,16 +197,16 @@ def _pair32(
                 _fill_light_by_gray(srgb[y, start : start + length], products, y, light, room.signal[first:after])
             else:
                 look_up(bare(srgb, 3 * at), even, odd, codes, length, of_bytes, bare(run.signal, first))
-            dims = load(bare(sites, (y & 1) * sites.shape[2] + (first & 1)), _0)
+            of_sites = bright_sites(sites, y & 1, first)
             frame = bare(clean, at) if is_whole else run.clean
-            some_below, some_bright = fill_clean(blocks, dims, light, run, frame)
-            if not is_whole:
-                copy(length, bare(run.clean, first), bare(clean, at))
+            some_below, some_bright = fill_clean(blocks, of_sites[0], light, run, frame)
             if some_below:
                 tally[0] += count_below(first, after, run.signal)
             if some_bright:
-                here = room.clean_dn[first:after], clean[y, start : start + length]
-                fill_bright(room.signal[first:after], sites[:, y & 1], light, *here, counts)
+                fill_bright(blocks, of_sites, light, run, frame)
+                _count_bright((first, after), light, run, tally)
+            if not is_whole:
+                copy(length, bare(run.clean, first), bare(clean, at))
             fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
             frame = bare(noisy, at) if is_whole else run.noisy
             _fill_noisy(blocks * BLOCK, (first, after), light, run, frame, tally)
@@ -220,7 +222,7 @@ def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: 
         red = (products[0, 0, r] + products[0, 1, g]) + products[0, 2, b]
         green = (products[1, 0, r] + products[1, 1, g]) + products[1, 2, b]
         blue = (products[2, 0, r] + products[2, 1, g]) + products[2, 2, b]
-        m = max(((red + green) + blue) / np.float32(3) - light.threshold, ZERO32) / light.above_threshold
+        m = max(((red + green) + blue) / np.float32(3) - light.threshold, ZERO32) * light.steepness
         mask = m * m
         c = light.channels[y & 1, x & 1]
         i = red if c == 0 else green if c == 1 else blue
@@ -242,33 +244,52 @@ def fill_clean(blocks: int, dims: Vector, light: Light, run: Room32, clean: Numb
 
 
 @inner
+def bright_sites(sites: Single, row: int, first: int) -> tuple[Vector, Vector, Vector, Vector]:
+    """Return what `fill_bright` takes of `sites_of`: dim DN, signal per DN, gain and headroom of eights of a row."""
+    width = sites.shape[2]
+    at = row * width + (first & 1)
+    return (
+        load(bare(sites, at), _0),
+        load(bare(sites, 2 * width + at), _0),
+        load(bare(sites, 4 * width + at), _0),
+        load(bare(sites, 6 * width + at), _0),
+    )
+
+
+@inner
 def fill_bright(
-    signal: Single, sites: Single, light: Light, clean_dn: Single, clean: Raw, counts: NDArray[np.int64]
+    blocks: int,
+    sites: tuple[Vector, Vector, Vector, Vector],
+    light: Light,
+    run: Room32,
+    clean: Numbers,
 ) -> None:
-    """`fused.fill_bright`; ``sites`` is that of the row."""
-    threshold, above_threshold, exposure, limit = light.threshold, light.above_threshold, light.exposure, light.limit
-    brightest, clipped, span, black = light.brightest, light.clipped, light.span, light.black
-    dims, per_dn, gains, headroom = sites[0], sites[1], sites[2], sites[3]
-    above, saturated = 0, 0
-    last = span + ROUND32
-    for start in range(0, clean.shape[0], BLOCK):
-        end = min(start + BLOCK, clean.shape[0])
-        bright = 0
-        for x in range(start, end):
-            bright += signal[x] > dims[x]
-        if bright == 0:
+    """`fused.fill_bright` of a run's eights that have something bright in them; light goes to ``run.lit``, else 0."""
+    dims, per_dn, gains, headroom = sites
+    for n in range(blocks * (BLOCK // WIDE)):
+        x = np.uint64(n) * _8
+        signal = load(run.signal, x)
+        if mask_of(below(dims, signal)) == 0:
+            store(run.lit, x, signal * ZERO32)
             continue
-        for x in range(start, end):
-            i = signal[x] * per_dn[x]
-            m = max(i - threshold, ZERO32) / above_threshold
-            lit = min(i * gains[x] + i * (m * m) * headroom[x], limit) * exposure
-            above += lit > clipped
-            dn = min(max(lit, ZERO32), brightest) * span
-            saturated += dn + ROUND32 == last
-            clean[x] = _low16(dn + ROUND32, black)
-            clean_dn[x] = dn
-    counts[1] += above
-    counts[4] += saturated
+        i = signal * per_dn
+        m = greatest(i - light.threshold, ZERO32) * light.steepness
+        lit = least(i * gains + i * (m * m) * headroom, light.limit) * light.exposure
+        dn = least(greatest(lit, ZERO32), light.brightest) * light.span
+        store(run.lit, x, lit)
+        store(run.clean_dn, x, dn)
+        store(clean, x, bits_of(dn + ROUND32) + light.black)
+
+
+@inner
+def _count_bright(valid: tuple[int, int], light: Light, run: Room32, tally: Numbers) -> None:
+    above = saturated = 0
+    last = light.span + ROUND32
+    for x in range(valid[0], valid[1]):
+        above += run.lit[x] > light.clipped
+        saturated += run.clean_dn[x] + ROUND32 == last
+    tally[1] += above
+    tally[4] += saturated
 
 
 @inner
