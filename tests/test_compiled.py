@@ -86,6 +86,44 @@ def test_what_a_process_compiled_another_takes_into_other_kernels(tmp_path: Path
     assert process("first") == "3.0 0 0 1"
 
 
+NEIGHBOUR = """
+import sys
+from unprocess_gen import compiled
+compiled._sources = lambda: sys.argv[1]
+import room
+print(room.first(8.0), len(room.first.stats.cache_hits))
+"""
+
+
+@pytest.mark.skipif(version_info.short > compiled.TRIED, reason="an untried Numba keeps its own way")
+def test_what_was_kept_of_other_sources_is_not_taken(tmp_path: Path) -> None:
+    (tmp_path / "room.py").write_text(ROOM)
+
+    def process(sources: str) -> str:
+        path = f"{tmp_path}:{Path(__file__).parents[1]}"
+        env = {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path)}
+        command = [sys.executable, "-c", NEIGHBOUR, sources]
+        return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert [process(sources) for sources in ("these", "these", "others", "others")] == [
+        "3.0 0",
+        "3.0 1",
+        "3.0 0",
+        "3.0 1",
+    ]
+
+
+def test_another_file_of_the_package_is_another_source(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
+    sources = cast(Any, compiled._sources).__wrapped__
+    (tmp_path / "one.py").write_text("x = 1")
+    before = sources()
+
+    assert sources() == before
+    (tmp_path / "one.py").write_text("x = 10")
+    assert sources() != before
+
+
 def test_a_kernel_that_this_process_has_compiled_is_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cast(Any, _never)._cache._cache_file, "_load_index", dict)  # as if none were kept
     assert not is_kept(_never)

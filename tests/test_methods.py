@@ -212,3 +212,17 @@ def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
 def test_a_method_is_named_once() -> None:
     assert len({one.spelled for one in METHODS}) == len(METHODS)
     assert all(replace(one, meaning="") != one for one in METHODS)
+
+
+@pytest.mark.parametrize(
+    "steep",
+    ["gains.threshold=0.999", "gains.red=0.05", "camera=custom camera.xyz2cam=[1,0,0,0,0,1,1,-0.94,0]"],
+)
+def test_what_float32_would_blow_up_is_computed_in_float64(settings: Settings, steep: str) -> None:
+    chosen = [
+        plan_image(settings("accuracy=fast", "noise=imx385_iso3200", *words), "0" * 64).methods
+        for words in ([], steep.split())
+    ]
+
+    assert "colour:fused_float32" in chosen[0]
+    assert "colour:fused_float64" in chosen[1]

@@ -7,14 +7,14 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, single, synthetic
+from unprocess_gen import colour, fused, single, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
 from unprocess_gen.effects import EFFECTS
-from unprocess_gen.methods import POLYNOMIAL_NORMAL, method
+from unprocess_gen.methods import POLYNOMIAL_NORMAL, is_steep, method
 from unprocess_gen.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.plan import plan_image
 from unprocess_gen.records import Pair, Plan
@@ -283,6 +283,42 @@ def test_the_noisy_frame_in_float32_is_near_the_reference_and_counts_alike(
         assert abs(one - other) <= 0.002 * apart.size
 
 
+@settings(max_examples=60)
+@given(
+    threshold=st.floats(0, 0.99),
+    entries=st.lists(st.floats(-3, 3), min_size=6, max_size=6),
+    gains=st.tuples(st.floats(0.3, 5), st.floats(0.3, 5), st.floats(0.2, 2)),
+    highlight=st.sampled_from(HIGHLIGHTS),
+    bits=st.sampled_from([14, 16]),
+)
+def test_float32_holds_what_it_states_wherever_it_is_chosen(
+    plan: Plan,
+    threshold: float,
+    entries: list[float],
+    gains: tuple[float, float, float],
+    highlight: str,
+    bits: int,
+) -> None:
+    rows = [(*pair, 1 - sum(pair)) for pair in zip(entries[::2], entries[1::2], strict=True)]
+    made = replace(
+        with_sensor(plan, bits),
+        **dict(zip(("red_gain", "blue_gain", "inverse_rgb_gain"), gains, strict=True)),
+        rgb2cam=tuple(itertools.chain(*rows)),
+        highlight=highlight,
+        highlight_threshold=threshold,
+    )
+    assume(not is_steep(made))
+    codes = np.random.Generator(np.random.Philox(key=5)).integers(0, 256, (128, 256, 3)).astype(np.uint8)
+
+    with np.errstate(under="ignore"):
+        apart = np.abs(in_float32(codes, made).clean.astype(int) - make_pair(codes, made).clean)
+
+    stated = method("colour", "fused_float32")
+    assert apart.max() <= stated.clean_dn
+    if bits == 14 and min(map(abs, made.rgb2cam)) > 0.02:  # else a site has 256 values, of which each is many sites
+        assert (apart > 0).mean() <= 1e-3
+
+
 @pytest.mark.parametrize("bits", SENSORS)
 def test_white_is_white_and_black_is_black_in_float32(plan: Plan, bits: int) -> None:
     ends = np.array([[[255] * 3, [0] * 3], [[0] * 3, [255] * 3]], dtype=np.uint8)
@@ -301,6 +337,15 @@ def test_a_tile_in_float32_is_the_same_cut_out_of_the_frame(plan: Plan, scene: n
         tile = in_float32(scene[top : top + height, left : left + width], plan, (top, left))
         np.testing.assert_array_equal(tile.clean, whole.clean[top : top + height, left : left + width])
         np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
+
+
+def test_a_clean_frame_cut_out_of_another_gets_noise_of_its_own_sites(plan: Plan, scene: np.ndarray) -> None:
+    curve, limits_dn = linear_table(plan.tone, plan.gamma, 256), noisy_limits(plan.bits, plan.black_level_dn, "sensor")
+    unrounded = fused.unprocess(scene, plan, curve)[0]
+
+    cut_out = fused.make_noisy(unrounded[8:40, 64:128], plan, limits_dn, (8, 64))[0]
+
+    np.testing.assert_array_equal(cut_out, fused.make_noisy(unrounded, plan, limits_dn)[0][8:40, 64:128])
 
 
 def test_noise_far_beyond_16_bits_is_clipped_in_float32(plan: Plan) -> None:

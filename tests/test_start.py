@@ -113,6 +113,36 @@ def test_settings_that_a_child_refuses_are_refused_in_the_same_words(override: s
     assert all_gone(children)
 
 
+def test_where_no_child_can_be_made_settings_are_composed_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused() -> NoReturn:
+        raise BlockingIOError("no more processes")
+
+    monkeypatch.setattr(os, "fork", refused)
+    before = os.listdir("/proc/self/fd")
+
+    assert compose_beside([], [lambda: None]) is None
+    assert os.listdir("/proc/self/fd") == before
+
+
+IGNORING = """
+import signal, sys
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+from unprocess_gen.cli import main
+sys.argv = ["gen-dataset", *sys.argv[1:]]
+sys.exit(main())
+"""
+
+
+def test_where_ended_children_are_not_kept_settings_are_composed_here(tmp_path: Path) -> None:
+    """As below a supervisor that ignores SIGCHLD, which its children inherit."""
+    command = [sys.executable, "-c", IGNORING, "seed=x"]
+
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert done.stderr.startswith("gen-dataset: seed=x")
+
+
 def test_what_was_to_be_done_meanwhile_is_left_undone_once_settings_are_refused(children: ForkedChildren) -> None:
     done = []
 

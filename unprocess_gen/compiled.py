@@ -5,13 +5,17 @@ No fastmath: nothing is reordered and no multiply-add is fused, so every process
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 from numba import njit, version_info
 
 TRIED = (0, 68)
-"""The last Numba that `shortcuts` was tried with; a newer one goes its own way."""
+"""The last Numba that `shortcuts` was tried with, from the oldest allowed on; a newer one goes its own way."""
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -44,6 +48,14 @@ def is_kept(function: Callable[..., Any]) -> bool:
         return True
 
 
+@functools.cache
+def _sources() -> str:
+    """Return what tells the package's files from what they were: a kernel is made of those that it calls, too."""
+    files = [file for file in os.scandir(Path(__file__).parent) if file.name.endswith(".py")]
+    stamps = sorted((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
+    return hashlib.sha256(repr(stamps).encode()).hexdigest()
+
+
 def _compiled(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, **more}
     try:
@@ -51,7 +63,8 @@ def _compiled(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
     except RuntimeError:
         return cast(Callable[..., Any], njit(**options)(function))
     if version_info.short <= TRIED:
-        from unprocess_gen.shortcuts import load_alone
+        from unprocess_gen.shortcuts import keep_for, load_alone
 
+        keep_for(cast(Any, compiled), _sources())
         load_alone(cast(Any, compiled))
     return cast(Callable[..., Any], compiled)

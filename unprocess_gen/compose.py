@@ -147,7 +147,13 @@ def compose_beside(overrides: list[str], meanwhile: Sequence[Callable[[], object
     if not _may_fork():
         return None
     reading, writing = os.pipe()
-    child, told = os.fork(), b""
+    try:
+        child = os.fork()
+    except OSError:
+        os.close(reading)
+        os.close(writing)
+        return None
+    told = b""
     if child == 0:
         os.close(reading)
         with os.fdopen(writing, "wb") as answer:
@@ -178,9 +184,17 @@ def _settings_in(told: bytes) -> Config | None:
 
 
 def _may_fork() -> bool:
-    """Whether nothing is running or loaded yet that a fork would break or make useless, and a core is idle."""
+    """Whether nothing is running or loaded yet that a fork would break or make useless, and a core is idle.
+
+    Where SIGCHLD is ignored, a child that ended is gone, and its number may be another's: then it cannot be ended.
+    """
     single = threading.active_count() == 1 and not {"hydra", "numba", "cv2"} & set(sys.modules)
-    return single and sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
+    return (
+        single
+        and signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL
+        and sys.platform == "linux"
+        and len(os.sched_getaffinity(0)) > 1
+    )
 
 
 def _tell_settings(overrides: list[str], answer: BinaryIO) -> NoReturn:

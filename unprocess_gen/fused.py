@@ -69,7 +69,7 @@ from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, 
 CHUNK = 1024
 """Pixels worked on at a time at most."""
 RUN = 512
-"""Pixels worked on at a time where a site has one normal: four buffers of 4 kB, beside the tables."""
+"""Pixels worked on at a time where a site has one normal: buffers of 27 kB, few of them in use at once."""
 
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
 STEP0, STEP1 = (np.uint64(step) for step in KEY_STEPS)
@@ -143,7 +143,8 @@ def make_noisy(
     counts = np.zeros(6, dtype=np.int64)
     scene = scene_of(plan, np.zeros(1), unrounded.shape, origin)  # no code is looked up
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    _noisy(unrounded, scene, key, limits_dn, origin, normal_quantiles().quadratics, make_room(), noisy, counts)
+    given = np.ascontiguousarray(unrounded)
+    _noisy(given, scene, key, limits_dn, origin, normal_quantiles().quadratics, make_room(), noisy, counts)
     return noisy, counts
 
 

@@ -5,13 +5,13 @@ numbers of one lane beside it, and the functions below. Compiled it is a vector 
 registers a processor has: two of four lanes, one of eight, half of one of sixteen. Where nothing is compiled it is a
 NumPy array of eight, so that a kernel reads, and computes, the same either way.
 
-Every operation rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused.
+Every operation rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused. Bytes and bits
+are counted from the low end, as on every machine that Numba serves.
 """
 
 from __future__ import annotations
 
 import operator
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -37,8 +37,8 @@ def bare(array: NDArray[Any], at: Index) -> Numbers:
     """Return the numbers of an array in one piece, from the flat index ``at`` on.
 
     Compiled it is their place in memory and no more: nobody checks an index, and nobody counts that the array is in
-    use, which costs a locked instruction each time that one is handed on. So the array must be an argument of the
-    kernel that Python calls: those live until it returns.
+    use, which costs a locked instruction each time that one is handed on. So the array must live until the last use: an
+    argument of the kernel that Python calls does, and what the same function uses again below.
     """
     return array.reshape(-1)[at:]
 
@@ -284,8 +284,7 @@ def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 def _four_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     place, at = arguments
-    number = builder.load(_at(builder, place, at, ir.IntType(32)), align=1)
-    return builder.bswap(number) if sys.byteorder == "big" else number
+    return builder.load(_at(builder, place, at, ir.IntType(32)), align=1)
 
 
 def _one(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from unprocess_gen.errors import ConfigError
+from unprocess_gen.records import Plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,18 +130,38 @@ OF_INTEGERS = frozenset({"quantise"})
 """Stages that only frames of whole DN have."""
 
 
-def choose(budget: Budget, counts_electrons: bool, normalised: bool = False) -> tuple[str, ...]:
+MOST_GROWTH, MOST_GROWTH_OF_HIGHLIGHTS = 8.0, 64.0
+"""What rounding takes of a look-up may grow to on its way to the clean frame, for the errors of float32 to hold: 3 and
+20 with known cameras, the gains of `conf/` and the default threshold."""
+
+
+def is_steep(plan: Plan) -> bool:
+    """Whether a plan's matrix, gains, darkening or highlight term make more than that of it.
+
+    The light of a channel is i · (gain + headroom · m²), where m = (i - threshold) / (1 - threshold), and i a sum of
+    look-ups times the row of the matrix.
+    """
+    rows = [sum(abs(entry) for entry in plan.rgb2cam[at : at + 3]) * plan.exposure for at in (0, 3, 6)]
+    highlights = 0.0 if plan.highlight == "none" else 1 + 2 / (1 - plan.highlight_threshold)
+    return any(
+        row * gain > MOST_GROWTH or row * (gain + max(1 - gain, 0.0) * highlights) > MOST_GROWTH_OF_HIGHLIGHTS
+        for row, gain in zip(rows, plan.inverse_gains, strict=True)
+    )
+
+
+def choose(budget: Budget, counts_electrons: bool, normalised: bool = False, steep: bool = False) -> tuple[str, ...]:
     """Return the methods of the first form that fits, as a row names them; ConfigError where none does.
 
-    Noise made of counts has no form in float32. Frames that are ``normalised``, and so not rounded, are exact under any
-    budget: beside the readable form they have one alone (`floats`), whose effects are the readable ones.
+    Noise made of counts has no form in float32, nor has what is ``steep`` (`is_steep`). Frames that are ``normalised``,
+    and so not rounded, are exact under any budget: beside the readable form they have one alone (`floats`), whose
+    effects are the readable ones.
     """
     stages = [stage for stage in STAGES if counts_electrons or stage not in OF_COUNTS]
     forms: Sequence[str] = FORMS
     if normalised:
         stages = [stage for stage in stages if stage not in OF_INTEGERS]
         forms, budget = FORMS[1:], replace(budget, law_distance=0.0)
-    for form in forms:
+    for form in FORMS[1:] if steep else forms:
         chosen = [_first(stage, "numpy" if normalised and stage == "effects" else form, budget) for stage in stages]
         if None not in chosen:
             return tuple(method.spelled for method in chosen if method is not None)

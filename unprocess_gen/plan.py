@@ -26,7 +26,7 @@ from unprocess_gen.config import (
     uses_physics,
 )
 from unprocess_gen.draws import draw
-from unprocess_gen.methods import choose
+from unprocess_gen.methods import choose, is_steep
 from unprocess_gen.physics import plan_physics
 from unprocess_gen.planner import NOT_ROUNDED, Prediction, decide, light_of
 from unprocess_gen.records import Facts, Plan
@@ -123,7 +123,7 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
     a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
     span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
     effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
-    return Plan(
+    plan = Plan(
         seed=config.seed,
         stream_key=key,
         downscale=config.source.downscale,
@@ -153,12 +153,14 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         effects=effects,
         skipped=skipped,
         accuracy=config.accuracy.name,
-        methods=choose(budget(config.accuracy), uses_physics(config.noise), is_normalised(config)),
+        methods=(),
         law_distance=config.accuracy.law_distance,
         level=level,
         dtype=config.output.dtype,
         layout=config.output.layout,
     )
+    counts_electrons, normalised = uses_physics(config.noise), is_normalised(config)
+    return replace(plan, methods=choose(budget(config.accuracy), counts_electrons, normalised, is_steep(plan)))
 
 
 # ---------------------------------------------------------------------------------------------------------- camera

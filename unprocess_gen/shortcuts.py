@@ -1,6 +1,8 @@
-"""Two things that Numba does at every start or compilation and that these kernels do not need, left out.
+"""Two things that Numba does at every start or compilation and that these kernels do not need, left out; one it lacks.
 
-They reach inside Numba, so they are asked for with versions alone that they were tried with (`compiled.TRIED`).
+They reach inside Numba, so they are asked for with versions alone that they were tried with: up to `compiled.TRIED`,
+the oldest and the newest of those by `tests/test_everywhere.py`.
+
 Measured: the registries take 0.4 s of every start and 25 MB; machine code of inner kernels a sixth of the time of a
 first run.
 """
@@ -14,6 +16,19 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.typed_passes import NopythonTypeInference
+
+
+def keep_for(compiled: Any, sources: str) -> None:
+    """Have machine code kept for these sources alone, not for any that leave the kernel's own file as it was.
+
+    They go where Numba compares its version, before it reads anything else: what was kept of other sources may hold
+    types that are gone. Where Numba is another inside than it was, it minds the kernel's own file.
+    """
+    try:
+        file = compiled._cache._cache_file
+        file._version = f"{file._version} of {sources}"
+    except AttributeError:
+        return
 
 
 def load_alone(compiled: Any) -> None:

@@ -56,7 +56,8 @@ _0, _8 = np.uint64(0), np.uint64(8)
 _1F, _INFINITY = np.float32(1), np.float32(np.inf)
 
 ROUNDINGS = 2.0**-18
-"""What light in float32 is off by, at most, as a share of it: a quarter DN of 16 bits."""
+"""What white is off by in float32, at most, as a share of it: a quarter DN of 16 bits. Light that is above white by no
+more is not counted as clipped."""
 
 
 def make_pair(
@@ -105,11 +106,12 @@ def light_of(scene: Scene, limits_dn: tuple[float, float]) -> Light:
     """Return what the loops need of a scene."""
     black, span, _ = scene.levels_dn
     f = np.float32
+    with np.errstate(over="ignore"):  # a variance beyond float32 is infinite, and its site clipped
+        a, b = f(scene.noise[0]), f(scene.noise[1])
     return Light(
         scene.by_gray, scene.sites, scene.gains.astype(f), f(scene.exposure * span),
         f(scene.threshold), f(1 / (1 - scene.threshold)), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
-        f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black),
-        f(scene.noise[0]), f(scene.noise[1]),
+        f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black), a, b,
         f(scene.pinned_dn - black), f((scene.pinned_dn - black) * (1 - ROUNDINGS)),
         f(limits_dn[0] - black), f(limits_dn[1] - black),
     )  # fmt: skip
@@ -231,7 +233,7 @@ def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: 
 
 @inner
 def fill_clean(blocks: int, dims: Vector, light: Light, run: Room32, clean: Numbers) -> tuple[bool, bool]:
-    """`fused._fill_clean` of signals that are DN; return whether one is below black, and whether one is bright."""
+    """`fused.fill_clean_apart` of signals that are DN; return whether one is below black, and whether one is bright."""
     lowest = highest = load(run.signal, _0)
     for n in range(blocks * (BLOCK // WIDE)):
         x = np.uint64(n) * _8
