@@ -236,8 +236,14 @@ def make_room() -> Room:
 @inner
 def bare_room(room: Room) -> Room:
     """Return the same, bare."""
+    return _with_unrounded(room, bare(room.unrounded, _0))
+
+
+@inner
+def _with_unrounded(room: Room, unrounded: Numbers) -> Room:
+    """Return the same, bare, with another clean frame before rounding."""
     return Room(
-        bare(room.signal, _0), bare(room.unrounded, _0), bare(room.whole, _0), bare(room.part, _0),
+        bare(room.signal, _0), unrounded, bare(room.whole, _0), bare(room.part, _0),
         bare(room.words, _0), bare(room.depths, _0), bare(room.noise, _0), bare(room.margin, _0),
         bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0), bare(room.listed, _0),
     )  # fmt: skip
@@ -327,17 +333,19 @@ def _noisy(
 ) -> None:
     """Fill ``noisy`` and ``counts`` with the noisy frame of an unrounded clean one: the second half of `_pair`."""
     height, width = noisy.shape
-    run, tally = bare_room(room), bare(counts, _0)
+    kept, tally = bare(room.unrounded, _0), bare(counts, _0)
     law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
     for y in range(height):
         for start in range(0, width, RUN):
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
             at = y * width + start
-            copy(length, bare(clean_dn, at), bare(run.unrounded, first))
+            is_whole = length == blocks * BLOCK
+            if not is_whole:
+                copy(length, bare(clean_dn, at), bare(kept, first))
+            run = _with_unrounded(room, bare(clean_dn, at) if is_whole else kept)
             _split(blocks, run)
             fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
-            is_whole = length == blocks * BLOCK
             frame = bare(noisy, at) if is_whole else run.noisy
             _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
             if not is_whole:
