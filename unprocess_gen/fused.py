@@ -236,7 +236,8 @@ def make_room() -> Room:
 @inner
 def bare_room(room: Room) -> Room:
     """Return the same, bare."""
-    return _with_unrounded(room, bare(room.unrounded, _0))
+    whole: Room = _with_unrounded(room, bare(room.unrounded, _0))
+    return whole
 
 
 @inner
