@@ -4,15 +4,16 @@
 
 Copies the photographs under other names and, in turns, makes datasets of them and does only what no tool can leave
 out (the floor: `cv2.imdecode`, one SHA-256, one write and one fdatasync of as many bytes, one thread). Times are from
-the first pair to the last; ratios are medians over the rounds. Prints a Markdown table: one worker with a core to
-spare, one worker pinned to one core, two workers and five noise levels against that, the start (from the process's to
-the first bytes in a shard, which are written when its first pair is made; the least of several), and the peak memory of
-a worker.
+the first pair to the last, the floor's those before and after a run; ratios are medians over the rounds. Prints a
+Markdown table: one worker with a core to spare, one worker pinned to one core, two workers and five noise levels
+against that, the start (from the process's to the first bytes in a shard, which are written when its first pair is
+made; the least of several), and the peak memory of a worker.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import shutil
@@ -133,17 +134,19 @@ def main() -> None:
     against = {"core to spare": "", "one core": "", "two workers": "one core", "five levels": "one core"}
     run(all_cores, "source.limit=1", f"out={options.to / 'warm'}", said[0], "n_jobs=1")
     times: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
-    floors: list[float] = []
+    floors: dict[str, list[float]] = {name: [] for name, other in against.items() if not other}
     for _ in range(options.rounds):
-        floors.append(floor(names, options.to / "floor.bin"))
         for name, (cores, more) in runs.items():
+            around = [] if against[name] else [floor(names, options.to / "floor.bin")]
             times[name].append(run(cores, *said, *more))
             shutil.rmtree(out)
+            if around:
+                floors[name].append(statistics.mean([*around, floor(names, options.to / "floor.bin")]))
     print("| run | seconds | ratio | to |\n|---|--:|--:|---|")
-    print(f"| floor | {statistics.median(floors):.2f} | | |")
+    print(f"| floor | {statistics.median(itertools.chain(*floors.values())):.2f} | | |")
     for name, other in against.items():
         own = [one["seconds"] for one in times[name]]
-        beside = [one["seconds"] for one in times[other]] if other else floors
+        beside = [one["seconds"] for one in times[other]] if other else floors[name]
         ratio = statistics.median(a / b for a, b in zip(own, beside, strict=True))
         print(f"| {name} | {statistics.median(own):.2f} | {ratio:.3f} | {other or 'floor'} |")
     peak = max(one["kib"] for one in times["one core"])
