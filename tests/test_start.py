@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -48,8 +49,8 @@ def run(cores: int, *arguments: str) -> set[str]:
 def test_a_run_loads_only_what_it_needs_and_the_same_dataset_comes_of_it(
     photos: Path, tmp_path: Path, tree_hash: Callable[[Path], str]
 ) -> None:
-    assert not selftest.failures("one_normal")  # compiles what is not kept
     said = (f"source.root={photos}", "n_jobs=1")
+    run(1, f"out={tmp_path / 'before'}", *said)  # compiles what is not kept
 
     beside, alone = (run(cores, f"out={tmp_path / str(cores)}", *said) for cores in (2, 1))
 
@@ -191,3 +192,27 @@ def test_where_a_child_dies_settings_are_composed_here(
 
     assert (code, seeds) == (5, [7])
     assert all_gone(children)
+
+
+KEEPING = """
+import resource, sys
+import numpy as np
+from unprocess_gen import runner
+if sys.argv[1] == "keep":
+    runner._keep_memory()
+faults = [resource.getrusage(resource.RUSAGE_SELF).ru_minflt]
+for _ in range(9):
+    array = np.ones(40_000_000, dtype=np.uint8)
+    del array
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+print(faults[-1] - faults[1])
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have their own way")
+def test_memory_of_one_image_is_that_of_the_next() -> None:
+    def faults(how: str) -> int:
+        command = [sys.executable, "-c", KEEPING, how]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+    assert faults("keep") < 40 <= faults("give back") / 4

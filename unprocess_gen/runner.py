@@ -14,6 +14,7 @@ one job the coordinator is the worker, and dies itself.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
 import signal
@@ -52,6 +53,10 @@ PARENT_POLL_S = 0.5
 COMPILING_POLL_S = 0.1
 PLAIN_LINE_S = 5.0
 """Seconds between progress lines where there is no terminal."""
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
+"""What glibc's mallopt goes by (malloc.h)."""
+KEPT_BYTES = 2**29
+"""Freed memory that a worker keeps: what an image of 50 megapixels takes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,13 +339,26 @@ def _is_there(config: Config, source: Source) -> bool:
 
 
 def _settle(coordinator_pid: int) -> None:
-    """Keep OpenCV to one thread; keep a worker from answering Ctrl-C, and from outliving its coordinator."""
+    """Keep OpenCV to one thread, and memory; keep a worker from answering Ctrl-C and from outliving its coordinator."""
     import cv2
 
     cv2.setNumThreads(1)
+    _keep_memory()
     if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=_end_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
+
+
+def _keep_memory() -> None:
+    """Have freed memory kept for the next image, up to `KEPT_BYTES` of it.
+
+    By itself glibc gives large arrays back at once, and the system hands them out again page by page, cleared: a tenth
+    of a run. Other C libraries have their own way.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_MAX, 0)
+        mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
 
 
 def _self_test(bench: Bench, plans: Sequence[Plan]) -> list[str]:
