@@ -14,7 +14,6 @@ import pytest
 
 from unprocess_gen import compose as room
 from unprocess_gen import config as settings_room
-from unprocess_gen import selftest
 from unprocess_gen.compose import compose, compose_beside
 from unprocess_gen.config import Config
 from unprocess_gen.errors import ConfigError
