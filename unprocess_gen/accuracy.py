@@ -70,6 +70,7 @@ from unprocess_gen.fused import (
     Room,
     Scene,
     Single,
+    bare_products,
     bare_room,
     by_site,
     digitise,
@@ -743,8 +744,7 @@ def _cleans32(srgb: Srgb, products: Single, sites: Single, light: single.Light, 
     height, width = srgb.shape[:2]
     run = single.bare_room(room)
     for y in range(height):
-        even = bare(products, 3 * products.shape[2] * light.channels[y & 1, 0])
-        odd = bare(products, 3 * products.shape[2] * light.channels[y & 1, 1])
+        even, odd = bare_products(products, light.channels, y)
         of_sites = single.bright_sites(sites, y & 1, 0)
         for start in range(0, width, RUN):
             n = min(RUN, width - start)

@@ -35,6 +35,7 @@ from unprocess_gen.fused import (
     blocks_of,
     by_site,
     copy,
+    empty_frames,
     fill_bright,
     fill_clean,
     fill_dim,
@@ -42,6 +43,7 @@ from unprocess_gen.fused import (
     fill_signal,
     fill_words,
     key_words,
+    pair_of,
     philox_round,
     read_out,
     scene_of,
@@ -61,7 +63,7 @@ from unprocess_gen.poisson import (
 )
 from unprocess_gen.poisson import Tables as PoissonTables
 from unprocess_gen.poisson import draw as draw_counts
-from unprocess_gen.records import Counts, Float, Pair, Physics, Plan, Raw, Srgb
+from unprocess_gen.records import Float, Pair, Physics, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, LANES, ROUNDS, purpose
 from unprocess_gen.tables import exponential_levels
 
@@ -82,19 +84,17 @@ def make_pair(
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
     """Make a pair of a physical profile, or of a two-parameter one by counts; arguments as for `fused.make_pair`."""
-    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
-    noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
-    counts = np.zeros(6, dtype=np.int64)
+    frames = empty_frames(srgb)
     scene = scene_of(plan, curve, srgb.shape, origin)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
     body, tables, normal = _body(plan, srgb.shape, origin), poisson_tables(), normal_quantiles()
     pixels = np.ascontiguousarray(srgb)
     if is_plain(plan):
         given, plain = np.empty((0, 0)), _plain(body, scene)
-        _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy, counts)
-        return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
-    _physical_pair(pixels, scene, key, limits_dn, origin, body, tables, normal, clean, noisy, counts)
-    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+        _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, tables, normal, *frames)
+    else:
+        _physical_pair(pixels, scene, key, limits_dn, origin, body, tables, normal, *frames)
+    return pair_of(*frames)
 
 
 def make_noisy(

@@ -14,28 +14,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from unprocess_gen.compiled import inner, kernel
+from unprocess_gen.compiled import kernel
 from unprocess_gen.effects import Draws
 from unprocess_gen.fused import CHUNK, Key, fill_words, key_words
-from unprocess_gen.normals import (
-    FIRST_ROW,
-    ONE_BITS,
-    POSITION_BITS,
-    POSITION_MASK,
-    TWO52,
-    TWO52_BITS,
-    Quantiles,
-    normal_quantiles,
-)
+from unprocess_gen.normals import Quantiles, exact_normal, normal_quantiles
 from unprocess_gen.poisson import Tables, poisson_tables, room_for
 from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.records import Float
 from unprocess_gen.streams import BLOCK, Words, purpose
-
-_LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
-_1, _32 = np.uint64(1), np.uint64(32)
 
 BAND, PIECE = 2**20, 2**16
 """Sites unprocessed at once: 8 MB of float64; and those that noise is added to: half a megabyte."""
@@ -99,41 +86,9 @@ def _words(key: Key, purpose_word: np.uint64, origin: tuple[int, int], out: Word
 @kernel
 def _by_inverse_cdf(uniforms: Words, quadratics: tuple[Float, Float, Float], out: Float) -> None:
     height, width = out.shape
-    run, bits = np.empty(CHUNK, dtype=np.uint64), np.empty(CHUNK, dtype=np.uint64)
-    values = np.empty(CHUNK)
     for y in range(height):
-        for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
-            for x in range(n):
-                run[x] = uniforms[y, start + x]
-            _fill_normals(run[:n], quadratics, bits, values)
-            for x in range(n):
-                out[y, start + x] = values[x]
-
-
-@inner
-def _fill_normals(
-    words: NDArray[np.uint64], quantiles: tuple[Float, Float, Float], bits: NDArray[np.uint64], out: Float
-) -> None:
-    """Normals by inverse CDF, as `effects.normals`; overwrites the low bits of ``words``."""
-    q0, q1, q2 = quantiles
-    count = words.shape[0]
-    doubles = bits.view(np.float64)
-    out_bits = out.view(np.uint64)
-    for n in range(count):
-        bits[n] = ((words[n] & _LOW31) << _1 | _1) | TWO52_BITS
-    for n in range(count):
-        doubles[n] = doubles[n] - TWO52
-    for n in range(count):
-        b = bits[n]
-        words[n] = (words[n] & _SIGN) | ((b >> POSITION_BITS) - FIRST_ROW)
-        bits[n] = (b & POSITION_MASK) | ONE_BITS
-    for n in range(count):
-        row = words[n] & _LOW31
-        t = doubles[n] - 1.0
-        out[n] = q0[row] + t * (q1[row] + t * q2[row])
-    for n in range(count):
-        out_bits[n] = out_bits[n] ^ ((words[n] & _SIGN) << _32)
+        for x in range(width):
+            out[y, x] = exact_normal(uniforms[y, x], quadratics)
 
 
 @kernel

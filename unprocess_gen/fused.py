@@ -30,7 +30,7 @@ one loop for everything (scalar code), chunks in the outer loop and rows in the 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,7 @@ from unprocess_gen.normals import (
     fill_depths,
     fine_normal,
     normal_quantiles,
+    signed,
 )
 from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS, purpose
@@ -83,7 +84,7 @@ ROUND = 1.5 * 2.0**52
 Single = NDArray[np.float32]
 Indices = NDArray[np.uint32]
 
-ROUND32, SIGN32, _UNSIGNED32 = np.float32(1.5 * 2.0**23), np.uint32(1 << 31), np.uint32(0x7FFFFFFF)
+ROUND32, _UNSIGNED32 = np.float32(1.5 * 2.0**23), np.uint32(0x7FFFFFFF)
 ZERO32, _HALF32, _1_32, _ONE_BITS32 = np.float32(0), np.float32(0.5), np.uint32(1), np.uint32(0x3F800000)
 
 NOISE_ERROR, PART_ERROR = np.float32(FINE_ERROR + 2.0**-16), np.float32(2.0**-22)
@@ -106,15 +107,27 @@ def make_pair(
     Arguments as for `pair.make_pair`, with the curve of the source's codes, and the lowest and highest DN of the noisy
     frame.
     """
-    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
-    noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
-    counts = np.zeros(6, dtype=np.int64)
+    frames = empty_frames(srgb)
     scene = scene_of(plan, curve, srgb.shape, origin)
-    frames = (clean, noisy, counts)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
     quadratics = normal_quantiles().quadratics
     _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, quadratics, make_room(), *frames)
-    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+    return pair_of(*frames)
+
+
+Frames = tuple[Raw, Raw, NDArray[np.int64]]
+"""The clean and the noisy frame of a pair, and the numbers of `Counts` in their order, as kernels fill them."""
+
+
+def empty_frames(srgb: Srgb) -> Frames:
+    """Return frames for a photograph's pair that hold nothing yet, and counts of 0."""
+    shape = srgb.shape[:2]
+    return np.empty(shape, dtype=np.uint16), np.empty(shape, dtype=np.uint16), np.zeros(6, dtype=np.int64)
+
+
+def pair_of(clean: Raw, noisy: Raw, counts: NDArray[np.int64]) -> Pair:
+    """Return the pair that a kernel filled `Frames` with."""
+    return Pair(clean, noisy, Counts(*counts.tolist()))
 
 
 def unprocess(
@@ -270,8 +283,7 @@ def _pair(
     law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
     site_gains, site_headroom = by_site(scene)
     for y in range(height):
-        even = bare(scene.products, 3 * codes * scene.sites[y & 1, 0])
-        odd = bare(scene.products, 3 * codes * scene.sites[y & 1, 1])
+        even, odd = bare_products(scene.products, scene.sites, y)
         for start in range(0, width, RUN):
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
@@ -293,7 +305,7 @@ def _pair(
                 here = room.unrounded[first:after], clean[y, start : start + length]
                 fill_bright(room.signal[first:after], *of_row, scene, *here, counts)
                 _split(blocks, run)
-            fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
+            fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
             frame = bare(noisy, at) if is_whole else run.noisy
             _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
             if not is_whole:
@@ -346,7 +358,7 @@ def _noisy(
                 copy(length, bare(clean_dn, at), bare(kept, first))
             run = _with_unrounded(room, bare(clean_dn, at) if is_whole else kept)
             _split(blocks, run)
-            fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
+            fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
             frame = bare(noisy, at) if is_whole else run.noisy
             _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
             if not is_whole:
@@ -372,6 +384,13 @@ def blocks_of(x: int, length: int) -> tuple[int, int, int, int]:
 def _products(scene: Scene, y: int) -> tuple[Float, Float]:
     """Return the products of the even and of the odd sites of a row."""
     return scene.products[scene.sites[y & 1, 0]], scene.products[scene.sites[y & 1, 1]]
+
+
+@inner
+def bare_products(products: NDArray[Any], sites: NDArray[np.int64], y: int) -> tuple[Numbers, Numbers]:
+    """Return the same, bare, in any precision."""
+    of_channel = 3 * products.shape[2]
+    return bare(products, of_channel * sites[y & 1, 0]), bare(products, of_channel * sites[y & 1, 1])
 
 
 @inner
@@ -467,38 +486,13 @@ def philox_round(c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0:
 
 
 @inner
-def _fill_blocks(
-    key: Key,
-    first_block: int,
-    blocks: int,
-    y: np.uint64,
-    purpose_word: np.uint64,
-    out: NDArray[np.uint64],
-) -> None:
-    """Philox in the layout of `streams`: one 32-bit word a pixel, whole blocks."""
+def fill_blocks(key: Key, first_block: int, blocks: int, y: np.uint64, purpose_word: np.uint64, out: Numbers) -> None:
+    """Philox in the layout of `streams`: one 32-bit word a pixel, whole blocks; ``out`` is of uint32."""
     for block in range(blocks):
         counter = np.uint64((first_block + block) * LANES)
         at = block * BLOCK
         for lane in range(LANES):
             c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word | key[2], key[3]
-            k0, k1 = key[0], key[1]
-            for _ in range(ROUNDS):
-                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
-                k0, k1 = (k0 + STEP0) & LOW32, (k1 + STEP1) & LOW32
-            out[at + lane] = c0 & LOW32
-            out[at + LANES + lane] = c1 & LOW32
-            out[at + 2 * LANES + lane] = c2 & LOW32
-            out[at + 3 * LANES + lane] = c3 & LOW32
-
-
-@inner
-def fill_words_of_normals(key: Key, first_block: int, blocks: int, y: np.uint64, out: Numbers) -> None:
-    """`_fill_blocks` of the one normal a site has, in half the memory."""
-    for block in range(blocks):
-        counter = np.uint64((first_block + block) * LANES)
-        at = block * BLOCK
-        for lane in range(LANES):
-            c0, c1, c2, c3 = counter + np.uint64(lane), y, HETEROSCEDASTIC | key[2], key[3]
             k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
                 c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
@@ -515,12 +509,12 @@ def fill_words(
     place: tuple[int, int],
     purpose_word: np.uint64,
     length: int,
-    words: NDArray[np.uint64],
+    words: Indices,
 ) -> int:
     """Fill ``words`` with those of a run of pixels from ``place`` on, and return where in it the first one stands."""
     offset = place[1] % BLOCK
     blocks = (offset + length + BLOCK - 1) // BLOCK
-    _fill_blocks(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
+    fill_blocks(key, place[1] // BLOCK, blocks, np.uint64(place[0]), purpose_word, words)
     return int(offset)
 
 
@@ -535,11 +529,8 @@ def fill_clean_apart(blocks: int, gains: Vector, scene: Scene, run: Room, clean:
         i = load(run.signal, x)
         lowest, highest = least(lowest, i), greatest(highest, i)
         dn = greatest(i * gains * exposure, 0.0) * span + black
-        whole = (dn + ROUND) - ROUND
         store(run.unrounded, x, dn)
-        store(run.whole, x, to_float32(whole))
-        store(run.part, x, to_float32(dn - whole))
-        store(clean, x, to_uint32(to_float32(whole)))
+        store(clean, x, to_uint32(_store_apart(dn, x, run)))
     return mask_of(below(lowest, 0.0)) != 0, mask_of(below(scene.dim, highest)) != 0
 
 
@@ -548,10 +539,17 @@ def _split(blocks: int, run: Room) -> None:
     """Take the clean frame apart: whole DN, and what is left."""
     for n in range(blocks * (BLOCK // WIDE)):
         x = np.uint64(n) * _8
-        dn = load(run.unrounded, x)
-        whole = (dn + ROUND) - ROUND
-        store(run.whole, x, to_float32(whole))
-        store(run.part, x, to_float32(dn - whole))
+        _store_apart(load(run.unrounded, x), x, run)
+
+
+@inner
+def _store_apart(dn: Vector, x: np.uint64, run: Room) -> Vector:
+    """Store whole DN and what is left; return the whole."""
+    rounded = (dn + ROUND) - ROUND
+    whole = to_float32(rounded)
+    store(run.whole, x, whole)
+    store(run.part, x, to_float32(dn - rounded))
+    return whole
 
 
 @inner
@@ -703,8 +701,7 @@ def _fill_noisy(
         _pin(valid, law, run, noisy)
     if clips:
         _count_clipped(valid, law, run, tally)
-    if min(law.exact[0], law.exact[1]) <= 0.0:
-        tally[5] += _count_still(valid, law, run)
+    tally[5] += count_still(valid, law.exact, run.unrounded)
 
 
 @inner
@@ -714,8 +711,7 @@ def _fill_noise(count: int, law: _Law, run: Room) -> None:
         part = load(run.part, x)
         variance = ((load(run.whole, x) - law.black) + part) * law.a + law.b
         std = root(greatest(variance, ZERO32))
-        noise = bits_of(std * fine_normal(load(run.depths, x))) ^ (load(run.words, x) & SIGN32)
-        store(run.noise, x, part + float_of(noise))
+        store(run.noise, x, part + signed(std * fine_normal(load(run.depths, x)), load(run.words, x)))
         cancelled = below(float_of(bits_of(variance) & _UNSIGNED32), law.uncertain) & _ONE_BITS32
         store(run.margin, x, greatest(std * NOISE_ERROR + PART_ERROR, float_of(cancelled)))
 
@@ -796,16 +792,6 @@ def _count_clipped(valid: tuple[int, int], law: _Law, run: Room, tally: Numbers)
 
 
 @inner
-def _count_still(valid: tuple[int, int], law: _Law, run: Room) -> int:
-    """Count sites without variance."""
-    a, b, black = law.exact
-    still = 0
-    for x in range(valid[0], valid[1]):
-        still += max(a * (run.unrounded[x] - black) + b, 0.0) == 0.0
-    return still
-
-
-@inner
 def digitise(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts: NDArray[np.int64]) -> None:
     """Round half to even, clip, cast."""
     low, high = limits_dn[0] + ROUND, limits_dn[1] + ROUND
@@ -820,18 +806,13 @@ def digitise(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts
 
 
 @inner
-def _may_be_still(scene: Scene) -> bool:
-    return bool(scene.noise[0] < 0.0 or scene.noise[1] <= 0.0)
-
-
-@inner
-def _still(clean_dn: Float, scene: Scene) -> int:
-    """Count sites without variance."""
-    a, b = scene.noise
-    black = scene.levels_dn[0]
+def count_still(valid: tuple[int, int], line: tuple[Any, Any, Any], clean_dn: Numbers) -> int:
+    """Count sites without variance; ``line`` is a, b and the black level."""
+    a, b, black = line
     still = 0
-    for x in range(clean_dn.shape[0]):
-        still += max(a * (clean_dn[x] - black) + b, 0.0) == 0.0
+    if min(a, b) <= 0.0:
+        for x in range(valid[0], valid[1]):
+            still += a * (clean_dn[x] - black) + b <= 0.0
     return still
 
 
@@ -849,5 +830,5 @@ def read_out(
         for x in range(unrounded.shape[0]):
             noisy_dn[x] = scene.pinned_dn if unrounded[x] >= scene.pinned_dn else noisy_dn[x]
     digitise(noisy_dn, limits_dn, noisy, counts)
-    if _may_be_still(scene):
-        counts[5] += _still(unrounded, scene)
+    line = scene.noise[0], scene.noise[1], scene.levels_dn[0]
+    counts[5] += count_still((0, unrounded.shape[0]), line, unrounded)

@@ -44,10 +44,10 @@ _FIRST_PIECE = np.uint32(126 << PIECE_BITS)
 
 _LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
 _LOW31_64, _SIGN_64, _1 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.uint64(1)
-TWO52_BITS, TWO52, ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
-POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
-POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
-FIRST_ROW = np.uint64(1023 * SEGMENTS)
+_TWO52_BITS, _TWO52, _ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
+_POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
+_POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
+_FIRST_ROW = np.uint64(1023 * SEGMENTS)
 
 
 class Quantiles(NamedTuple):
@@ -117,10 +117,10 @@ def quick_normals(
 @inner
 def exact_normal(word: np.uint32, quadratics: tuple[Float, Float, Float]) -> float:
     """Return the value of a word as `effects.by_inverse_cdf`."""
-    odd = np.uint64(((np.uint64(word) & _LOW31_64) << _1 | _1) | TWO52_BITS).view(np.float64) - TWO52
+    odd = np.uint64(((np.uint64(word) & _LOW31_64) << _1 | _1) | _TWO52_BITS).view(np.float64) - _TWO52
     bits = np.float64(odd).view(np.uint64)
-    row = (bits >> POSITION_BITS) - FIRST_ROW
-    t = np.uint64((bits & POSITION_MASK) | ONE_BITS).view(np.float64) - 1.0
+    row = (bits >> _POSITION_BITS) - _FIRST_ROW
+    t = np.uint64((bits & _POSITION_MASK) | _ONE_BITS).view(np.float64) - 1.0
     z: float = quadratics[0][row] + t * (quadratics[1][row] + t * quadratics[2][row])
     return np.uint64(np.float64(z).view(np.uint64) ^ (np.uint64(word) & _SIGN_64) << _32).view(np.float64)
 
@@ -219,6 +219,12 @@ def coarse_normal(depths: Vector) -> Vector:
     return normal
 
 
+@inner
+def signed(x: Vector, words: Vector) -> Vector:
+    """Return numbers with the signs that their words draw."""
+    return float_of(bits_of(x) ^ (words & _SIGN))
+
+
 @kernel
 def fill_fine_normals(words: NDArray[np.uint32], depths: Float32, out: Float32) -> None:
     """Fill ``out`` with the normals of ``words``, to within `FINE_ERROR`; their number is one of whole vectors."""
@@ -226,7 +232,7 @@ def fill_fine_normals(words: NDArray[np.uint32], depths: Float32, out: Float32) 
     fill_depths(words.size, drawn, deep)
     for n in range(words.size // WIDE):
         x = np.uint64(n) * _EIGHT
-        store(made, x, float_of(bits_of(fine_normal(load(deep, x))) ^ (load(drawn, x) & _SIGN)))
+        store(made, x, signed(fine_normal(load(deep, x)), load(drawn, x)))
 
 
 @kernel
@@ -236,4 +242,4 @@ def fill_coarse_normals(words: NDArray[np.uint32], depths: Float32, out: Float32
     fill_coarse_depths(words.size, drawn, deep)
     for n in range(words.size // WIDE):
         x = np.uint64(n) * _EIGHT
-        store(made, x, float_of(bits_of(coarse_normal(load(deep, x))) ^ (load(drawn, x) & _SIGN)))
+        store(made, x, signed(coarse_normal(load(deep, x)), load(drawn, x)))

@@ -17,20 +17,24 @@ from numpy.typing import NDArray
 
 from unprocess_gen.compiled import inner, kernel
 from unprocess_gen.fused import (
+    HETEROSCEDASTIC,
     ROUND32,
     RUN,
-    SIGN32,
     ZERO32,
     Indices,
     Key,
     Scene,
     Single,
+    bare_products,
     blocks_of,
     copy,
     count_below,
-    fill_words_of_normals,
+    count_still,
+    empty_frames,
+    fill_blocks,
     key_words,
     look_up,
+    pair_of,
     scene_of,
 )
 from unprocess_gen.lanes import (
@@ -40,7 +44,6 @@ from unprocess_gen.lanes import (
     bare,
     below,
     bits_of,
-    float_of,
     greatest,
     least,
     load,
@@ -48,8 +51,8 @@ from unprocess_gen.lanes import (
     root,
     store,
 )
-from unprocess_gen.normals import coarse_normal, fill_coarse_depths
-from unprocess_gen.records import Counts, Float, Pair, Plan, Raw, Srgb
+from unprocess_gen.normals import coarse_normal, fill_coarse_depths, signed
+from unprocess_gen.records import Float, Pair, Plan, Raw, Srgb
 from unprocess_gen.streams import BLOCK
 
 _0, _8 = np.uint64(0), np.uint64(8)
@@ -68,15 +71,12 @@ def make_pair(
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
     """Make a pair of a two-parameter profile with normal noise; arguments as for `fused.make_pair`."""
-    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
-    noisy = np.empty(srgb.shape[:2], dtype=np.uint16)
-    counts = np.zeros(6, dtype=np.int64)
+    frames = empty_frames(srgb)
     scene = scene_of(plan, curve, srgb.shape, origin)
     of_light, sites = light_of(scene, limits_dn), sites_of(scene)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    frames = (clean, noisy, counts)
     _pair32(np.ascontiguousarray(srgb), products_of(scene), sites, of_light, key, origin, make_room(), *frames)
-    return Pair(clean, noisy, Counts(*(int(count) for count in counts)))
+    return pair_of(*frames)
 
 
 class Light(NamedTuple):
@@ -189,8 +189,7 @@ def _pair32(
     codes, of_bytes = products.shape[2], srgb.itemsize == 1
     run, tally = bare_room(room), bare(counts, _0)
     for y in range(height):
-        even = bare(products, 3 * codes * light.channels[y & 1, 0])
-        odd = bare(products, 3 * codes * light.channels[y & 1, 1])
+        even, odd = bare_products(products, light.channels, y)
         for start in range(0, width, RUN):
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
@@ -209,7 +208,7 @@ def _pair32(
                 _count_bright((first, after), light, run, tally)
             if not is_whole:
                 copy(length, bare(run.clean, first), bare(clean, at))
-            fill_words_of_normals(key, block, blocks, np.uint64(origin[0] + y), run.words)
+            fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
             frame = bare(noisy, at) if is_whole else run.noisy
             _fill_noisy(blocks * BLOCK, (first, after), light, run, frame, tally)
             if not is_whole:
@@ -309,8 +308,7 @@ def _fill_noisy(count: int, valid: tuple[int, int], light: Light, run: Room32, n
         _pin(valid, light, run, noisy)
     if some_clipped:
         _count_clipped(valid, light, run, tally)
-    if min(light.a, light.b) <= ZERO32:
-        tally[5] += _count_still(valid, light, run)
+    tally[5] += count_still(valid, (light.a, light.b, ZERO32), run.clean_dn)
 
 
 @inner
@@ -319,8 +317,7 @@ def _fill_noise(count: int, light: Light, run: Room32) -> None:
         x = np.uint64(n) * _8
         clean_dn = load(run.clean_dn, x)
         std = root(greatest(clean_dn * light.a + light.b, ZERO32))
-        noise = bits_of(std * coarse_normal(load(run.depths, x))) ^ (load(run.words, x) & SIGN32)
-        store(run.noisy_dn, x, clean_dn + float_of(noise))
+        store(run.noisy_dn, x, clean_dn + signed(std * coarse_normal(load(run.depths, x)), load(run.words, x)))
 
 
 @inner
@@ -353,11 +350,3 @@ def _count_clipped(valid: tuple[int, int], light: Light, run: Room32, tally: Num
         above_high += rounded > high
     tally[2] += below_low
     tally[3] += above_high
-
-
-@inner
-def _count_still(valid: tuple[int, int], light: Light, run: Room32) -> int:
-    still = 0
-    for x in range(valid[0], valid[1]):
-        still += max(light.a * run.clean_dn[x] + light.b, ZERO32) == ZERO32
-    return still
