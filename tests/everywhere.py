@@ -96,7 +96,7 @@ def facts(given: str) -> dict[str, Any]:
 
 def listen() -> Any:
     """Have whatever the outer kernel is given from now on hashed, to the last bit; what it fills comes last."""
-    kernel, heard = fused._pair, hashlib.sha256()
+    kernel, heard = fused._pairs, hashlib.sha256()
 
     def told(*arguments: Any) -> None:
         for argument in arguments[:-3]:
@@ -104,7 +104,7 @@ def listen() -> Any:
                 heard.update(np.asarray(one).tobytes())
         kernel(*arguments)
 
-    fused._pair = told
+    fused._pairs = told
     return heard
 
 
@@ -240,7 +240,7 @@ def code() -> dict[str, Any]:
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
     black = np.zeros((2, 2, 3), dtype=np.uint8)
-    outer = ((fused, "_pair"), (fused, "_unprocess"), (fused, "_noisy"), (single, "_pair32"))
+    outer = ((fused, "_pairs"), (fused, "_unprocess"), (single, "_pairs32"))
     of_counts = ("_physical_pair", "_plain_pair", "_physical_noisy", "_responses")
     of_floats = ("_words", "_by_inverse_cdf", "_poisson")
     for room, name in (*outer, *((electrons, name) for name in of_counts), *((floats, name) for name in of_floats)):

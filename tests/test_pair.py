@@ -10,14 +10,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, fused, single, synthetic
+from unprocess_gen import colour, single, synthetic
 from unprocess_gen.bayer import PATTERNS
 from unprocess_gen.config import Config, GainsConfig, NoiseConfig
 from unprocess_gen.effects import EFFECTS
 from unprocess_gen.methods import POLYNOMIAL_NORMAL, is_steep, method
-from unprocess_gen.pair import make_pair, make_pairs, reference_pair
+from unprocess_gen.pair import AT_ONCE, make_pair, make_pairs, reference_pair
 from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Pair, Plan
+from unprocess_gen.records import IN_FLOAT32, Pair, Plan
 from unprocess_gen.selftest import GOLDEN_PHYSICS
 from unprocess_gen.sensor import noisy_limits
 from unprocess_gen.tables import linear_table
@@ -119,7 +119,8 @@ def test_a_frame_comes_out_pixel_by_pixel(plan: Plan, scene: np.ndarray) -> None
 
 # Several noise levels of one clean frame ------------------------------------------------------------------------------
 
-NOISES = ((0.5, 2.0), (8.0034, -122.69544), (0.0, 0.0), (80.0, 2e4))
+NOISES = ((0.5, 2.0), (8.0034, -122.69544), (0.0, 0.0), (80.0, 2e4), (3.0, 0.0), (9.0, 0.25), (2.0, 64.0))
+assert len(NOISES) > AT_ONCE
 
 
 def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
@@ -135,7 +136,10 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
         {"highlight": "gray_mean", "sensor_clip": "black"},
         {"dequantize": "dither"},
         {"exposure_ratio": 3.0, "frame": 5},
+        {"methods": (IN_FLOAT32,)},
+        {"methods": (IN_FLOAT32,), "highlight": "gray_mean", "saturated": "pinned"},
         {"noise_law": "poisson", "b_dn2": 3.0},
+        {"noise_law": "poisson", "b_dn2": 3.0, "methods": (IN_FLOAT32,)},
         {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
         {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
     ],
@@ -154,6 +158,19 @@ def test_levels_of_one_clean_frame_are_the_pairs_that_are_made_alone(
         np.testing.assert_array_equal(pair.clean, alone.clean)
         np.testing.assert_array_equal(pair.noisy, alone.noisy)
         assert pair.counts == alone.counts
+
+
+def test_levels_that_differ_in_more_than_the_line_are_the_pairs_that_are_made_alone(
+    scene: np.ndarray, plan: Plan
+) -> None:
+    others = ({"saturated": "pinned"}, {"sensor_clip": "black"}, {"noise_law": "poisson", "b_dn2": 3.0}, {})
+    for kinds in (others[:2], others):
+        plans = [replace(plan, level=n, **other) for n, other in enumerate(kinds)]  # type: ignore[arg-type]
+
+        for one, pair in zip(plans, make_pairs(scene, plans), strict=True):
+            alone = make_pair(scene, one)
+            np.testing.assert_array_equal(pair.noisy, alone.noisy)
+            assert pair.counts == alone.counts
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 1025), (3, 1024), (513, 1)])
@@ -337,15 +354,6 @@ def test_a_tile_in_float32_is_the_same_cut_out_of_the_frame(plan: Plan, scene: n
         tile = in_float32(scene[top : top + height, left : left + width], plan, (top, left))
         np.testing.assert_array_equal(tile.clean, whole.clean[top : top + height, left : left + width])
         np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
-
-
-def test_a_clean_frame_cut_out_of_another_gets_noise_of_its_own_sites(plan: Plan, scene: np.ndarray) -> None:
-    curve, limits_dn = linear_table(plan.tone, plan.gamma, 256), noisy_limits(plan.bits, plan.black_level_dn, "sensor")
-    unrounded = fused.unprocess(scene, plan, curve)[0]
-
-    cut_out = fused.make_noisy(unrounded[8:40, 64:128], plan, limits_dn, (8, 64))[0]
-
-    np.testing.assert_array_equal(cut_out, fused.make_noisy(unrounded, plan, limits_dn)[0][8:40, 64:128])
 
 
 def test_noise_far_beyond_16_bits_is_clipped_in_float32(plan: Plan) -> None:

@@ -615,7 +615,7 @@ def _clean_ns(lab: Lab, method: Method, subject: Subject) -> float:
 
 def _clean32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     srgb, scene = _scene(lab, subject)
-    of_scene = single.products_of(scene), single.sites_of(scene), single.light_of(scene, LIMITS_DN)
+    of_scene = single.products_of(scene), single.sites_of(scene), single.light_of(scene)
     return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room()), srgb.shape[0] * srgb.shape[1])
 
 
@@ -656,11 +656,11 @@ def _round_ns(lab: Lab, method: Method, subject: Subject) -> float:
 
 
 def _round32_ns(lab: Lab, method: Method, subject: Subject) -> float:
-    _, scene = _scene(lab, subject)
+    plan, _ = _clean_plan(lab, subject.compiled, subject)
     doubles, turns = _chunks_of_dn(lab, subject)
-    chunks, light = doubles.astype(np.float32), single.light_of(scene, LIMITS_DN)
-    noisy = np.empty(CHUNK, dtype=np.uint16)
-    return clocked(lambda: _digits32(chunks, turns, light, noisy), turns * chunks.size)
+    chunks, law = doubles.astype(np.float32), single.law_of(plan, LIMITS_DN)
+    black, noisy = np.uint32(plan.black_level_dn), np.empty(CHUNK, dtype=np.uint16)
+    return clocked(lambda: _digits32(chunks, turns, law, black, noisy), turns * chunks.size)
 
 
 def _chunks_of_dn(lab: Lab, subject: Subject) -> tuple[Float, int]:
@@ -765,11 +765,11 @@ def _digits(chunks: Float, turns: int, limits_dn: tuple[float, float], noisy: Ra
 
 
 @kernel
-def _digits32(chunks: Single, turns: int, light: single.Light, noisy: Raw) -> None:
+def _digits32(chunks: Single, turns: int, law: single.Law32, black: np.uint32, noisy: Raw) -> None:
     """As `_digits`, in float32."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
-            single.digitise(chunks.shape[1], light, bare(chunks, chunk * chunks.shape[1]), bare(noisy, 0))
+            single.digitise(chunks.shape[1], law, black, bare(chunks, chunk * chunks.shape[1]), bare(noisy, 0))
 
 
 @kernel

@@ -43,7 +43,7 @@ from unprocess_gen.fused import (
     fill_signal,
     fill_words,
     key_words,
-    pair_of,
+    pairs_of,
     philox_round,
     read_out,
     scene_of,
@@ -84,17 +84,17 @@ def make_pair(
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
     """Make a pair of a physical profile, or of a two-parameter one by counts; arguments as for `fused.make_pair`."""
-    frames = empty_frames(srgb)
+    clean, noisy, counts = frames = empty_frames(srgb)
     scene = scene_of(plan, curve, srgb.shape, origin)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
     body, tables, normal = _body(plan, srgb.shape, origin), poisson_tables(), normal_quantiles()
     pixels = np.ascontiguousarray(srgb)
     if is_plain(plan):
         given, plain = np.empty((0, 0)), _plain(body, scene)
-        _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, tables, normal, *frames)
+        _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy[0], counts[0])
     else:
-        _physical_pair(pixels, scene, key, limits_dn, origin, body, tables, normal, *frames)
-    return pair_of(*frames)
+        _physical_pair(pixels, scene, key, limits_dn, origin, body, tables, normal, clean, noisy[0], counts[0])
+    return pairs_of(*frames)[0]
 
 
 def make_noisy(

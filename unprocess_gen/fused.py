@@ -30,6 +30,7 @@ one loop for everything (scalar code), chunks in the outer loop and rows in the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,27 +108,42 @@ def make_pair(
     Arguments as for `pair.make_pair`, with the curve of the source's codes, and the lowest and highest DN of the noisy
     frame.
     """
-    frames = empty_frames(srgb)
-    scene = scene_of(plan, curve, srgb.shape, origin)
-    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    quadratics = normal_quantiles().quadratics
-    _pair(np.ascontiguousarray(srgb), scene, key, limits_dn, origin, quadratics, make_room(), *frames)
-    return pair_of(*frames)
+    return make_pairs(srgb, [plan], curve, [limits_dn], origin)[0]
+
+
+def make_pairs(
+    srgb: Srgb,
+    plans: Sequence[Plan],
+    curve: Float,
+    limits_dn: Sequence[tuple[float, float]],
+    origin: tuple[int, int] = (0, 0),
+) -> list[Pair]:
+    """Make the pairs of plans that differ in the noise alone: all at once, of one clean frame."""
+    frames = empty_frames(srgb, len(plans))
+    scene = scene_of(plans[0], curve, srgb.shape, origin)
+    laws = np.array([_law_of(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
+    keys, quadratics = keys_of(plans), normal_quantiles().quadratics
+    _pairs(np.ascontiguousarray(srgb), scene, laws, keys, origin, quadratics, make_room(), *frames)
+    return pairs_of(*frames)
 
 
 Frames = tuple[Raw, Raw, NDArray[np.int64]]
-"""The clean and the noisy frame of a pair, and the numbers of `Counts` in their order, as kernels fill them."""
+"""A clean frame ``[H, W]``, noisy ones of it ``[N, H, W]``, and the numbers of `Counts` in their order ``[N, 6]``, as
+kernels fill them: those of the clean frame stand in the first row alone."""
+OF_CLEAN = [0, 1, 4]
 
 
-def empty_frames(srgb: Srgb) -> Frames:
-    """Return frames for a photograph's pair that hold nothing yet, and counts of 0."""
-    shape = srgb.shape[:2]
-    return np.empty(shape, dtype=np.uint16), np.empty(shape, dtype=np.uint16), np.zeros(6, dtype=np.int64)
+def empty_frames(srgb: Srgb, noisy: int = 1) -> Frames:
+    """Return frames for a photograph's pairs that hold nothing yet, and counts of 0."""
+    height, width = srgb.shape[:2]
+    frames = np.empty((height, width), dtype=np.uint16), np.empty((noisy, height, width), dtype=np.uint16)
+    return *frames, np.zeros((noisy, 6), dtype=np.int64)
 
 
-def pair_of(clean: Raw, noisy: Raw, counts: NDArray[np.int64]) -> Pair:
-    """Return the pair that a kernel filled `Frames` with."""
-    return Pair(clean, noisy, Counts(*counts.tolist()))
+def pairs_of(clean: Raw, noisy: Raw, counts: NDArray[np.int64]) -> list[Pair]:
+    """Return the pairs that a kernel filled `Frames` with."""
+    counts[1:, OF_CLEAN] = counts[0, OF_CLEAN]
+    return [Pair(clean, one, Counts(*of_one)) for one, of_one in zip(noisy, counts.tolist(), strict=True)]
 
 
 def unprocess(
@@ -143,22 +159,6 @@ def unprocess(
     counts = np.zeros(6, dtype=np.int64)
     _unprocess(np.ascontiguousarray(srgb), scene_of(plan, curve, srgb.shape, origin), unrounded, clean, counts)
     return unrounded, clean, counts
-
-
-def make_noisy(
-    unrounded: Float, plan: Plan, limits_dn: tuple[float, float], origin: tuple[int, int] = (0, 0)
-) -> tuple[Raw, NDArray[np.int64]]:
-    """Make the noisy frame of a clean one that `unprocess` made, by any plan that shares it.
-
-    Returns it and the numbers of `Counts` in their order, of which those of the clean frame are 0.
-    """
-    noisy = np.empty(unrounded.shape, dtype=np.uint16)
-    counts = np.zeros(6, dtype=np.int64)
-    scene = scene_of(plan, np.zeros(1), unrounded.shape, origin)  # no code is looked up
-    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    given = np.ascontiguousarray(unrounded)
-    _noisy(given, scene, key, limits_dn, origin, normal_quantiles().quadratics, make_room(), noisy, counts)
-    return noisy, counts
 
 
 class Scene(NamedTuple):
@@ -196,9 +196,14 @@ def scene_of(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int
         plan.exposure,
         plan.brightest,
         (black_dn, float(plan.white_level_dn - plan.black_level_dn), white_dn),
-        plan.brightest_dn if plan.saturated == "pinned" else np.inf,
+        pinned_dn(plan),
         plan.variance_line,
     )
+
+
+def pinned_dn(plan: Plan) -> float:
+    """Return the DN that saturated sites are pinned to; infinity where they are not."""
+    return plan.brightest_dn if plan.saturated == "pinned" else np.inf
 
 
 def _dim(plan: Plan, highest_gain: float, has_highlights: bool) -> float:
@@ -216,6 +221,17 @@ Key = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 def key_words(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Key:
     """Return the words of a stream's key and counter, as the kernels take them."""
     return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
+
+
+def keys_of(plans: Sequence[Plan]) -> NDArray[np.uint64]:
+    """Return ``[N, 4]``: the key words of the plans' streams, for `key_of`."""
+    return np.array([key_words(plan.stream_key, plan.level, plan.draw, plan.frame) for plan in plans])
+
+
+@inner
+def key_of(keys: NDArray[np.uint64], plan: int) -> Key:
+    """Return the key words of one of several plans."""
+    return keys[plan, 0], keys[plan, 1], keys[plan, 2], keys[plan, 3]
 
 
 class Room(NamedTuple):
@@ -249,26 +265,19 @@ def make_room() -> Room:
 @inner
 def bare_room(room: Room) -> Room:
     """Return the same, bare."""
-    whole: Room = _with_unrounded(room, bare(room.unrounded, _0))
-    return whole
-
-
-@inner
-def _with_unrounded(room: Room, unrounded: Numbers) -> Room:
-    """Return the same, bare, with another clean frame before rounding."""
     return Room(
-        bare(room.signal, _0), unrounded, bare(room.whole, _0), bare(room.part, _0),
+        bare(room.signal, _0), bare(room.unrounded, _0), bare(room.whole, _0), bare(room.part, _0),
         bare(room.words, _0), bare(room.depths, _0), bare(room.noise, _0), bare(room.margin, _0),
         bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0), bare(room.listed, _0),
     )  # fmt: skip
 
 
 @kernel
-def _pair(
+def _pairs(
     srgb: Srgb,
     scene: Scene,
-    key: Key,
-    limits_dn: tuple[float, float],
+    laws: Float,
+    keys: NDArray[np.uint64],
     origin: tuple[int, int],
     quantiles: tuple[Float, Float, Float],
     room: Room,
@@ -276,11 +285,10 @@ def _pair(
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a two-parameter profile."""
+    """Fill ``clean``, ``noisy`` and ``counts`` with the pairs of a two-parameter profile."""
     height, width = clean.shape
     codes, of_bytes = scene.products.shape[2], srgb.itemsize == 1
-    run, tally = bare_room(room), bare(counts, _0)
-    law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
+    run, quadratics = bare_room(room), _bare_quadratics(quantiles)
     site_gains, site_headroom = by_site(scene)
     for y in range(height):
         even, odd = bare_products(scene.products, scene.sites, y)
@@ -299,22 +307,25 @@ def _pair(
             if not is_whole:
                 copy(length, bare(run.clean, first), bare(clean, at))
             if some_below:
-                tally[0] += count_below(first, after, run.signal)
+                counts[0, 0] += count_below(first, after, run.signal)
             if some_bright:
                 of_row = site_gains[y & 1], site_headroom[y & 1]
                 here = room.unrounded[first:after], clean[y, start : start + length]
-                fill_bright(room.signal[first:after], *of_row, scene, *here, counts)
+                fill_bright(room.signal[first:after], *of_row, scene, *here, counts[0])
                 _split(blocks, run)
-            fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
-            frame = bare(noisy, at) if is_whole else run.noisy
-            _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
-            if not is_whole:
-                copy(length, bare(run.noisy, first), bare(noisy, at))
+            for plan in range(noisy.shape[0]):
+                key, law = key_of(keys, plan), _law(laws, plan, scene.levels_dn[0])
+                fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
+                to = plan * height * width + at
+                frame = bare(noisy, to) if is_whole else run.noisy
+                _fill_noisy(blocks, (first, after), law, quadratics, run, frame, bare(counts, 6 * plan))
+                if not is_whole:
+                    copy(length, bare(run.noisy, first), bare(noisy, to))
 
 
 @kernel
 def _unprocess(srgb: Srgb, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
-    """Fill ``unrounded``, ``clean`` and ``counts`` with the clean frame: the first half of `_pair`."""
+    """Fill ``unrounded``, ``clean`` and ``counts`` with the clean frame: the first half of `_pairs`."""
     height, width = clean.shape
     signal = np.empty(RUN)
     site_gains, site_headroom = by_site(scene)
@@ -330,39 +341,6 @@ def _unprocess(srgb: Srgb, scene: Scene, unrounded: Float, clean: Raw, counts: N
                 fill_camera(row, even, odd, signal)
             if fill_dim(signal, gains, scene, clean_dn, out, counts):
                 fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
-
-
-@kernel
-def _noisy(
-    clean_dn: Float,
-    scene: Scene,
-    key: Key,
-    limits_dn: tuple[float, float],
-    origin: tuple[int, int],
-    quantiles: tuple[Float, Float, Float],
-    room: Room,
-    noisy: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Fill ``noisy`` and ``counts`` with the noisy frame of an unrounded clean one: the second half of `_pair`."""
-    height, width = noisy.shape
-    kept, tally = bare(room.unrounded, _0), bare(counts, _0)
-    law, quadratics = _law(scene, limits_dn), _bare_quadratics(quantiles)
-    for y in range(height):
-        for start in range(0, width, RUN):
-            length = min(RUN, width - start)
-            first, after, block, blocks = blocks_of(origin[1] + start, length)
-            at = y * width + start
-            is_whole = length == blocks * BLOCK
-            if not is_whole:
-                copy(length, bare(clean_dn, at), bare(kept, first))
-            run = _with_unrounded(room, bare(clean_dn, at) if is_whole else kept)
-            _split(blocks, run)
-            fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
-            frame = bare(noisy, at) if is_whole else run.noisy
-            _fill_noisy(blocks, (first, after), law, quadratics, run, frame, tally)
-            if not is_whole:
-                copy(length, bare(run.noisy, first), bare(noisy, at))
 
 
 @inner
@@ -664,15 +642,17 @@ class _Law(NamedTuple):
     high: np.float32
 
 
+def _law_of(plan: Plan, limits_dn: tuple[float, float]) -> tuple[float, ...]:
+    """Return slope and intercept of the variance, the DN saturated sites are pinned to, and the lowest and highest."""
+    return *plan.variance_line, pinned_dn(plan), *limits_dn
+
+
 @inner
-def _law(scene: Scene, limits_dn: tuple[float, float]) -> _Law:
-    a, b = scene.noise
-    black = scene.levels_dn[0]
+def _law(laws: Float, plan: int, black: float) -> _Law:
+    a, b, pinned_dn, low, high = laws[plan, 0], laws[plan, 1], laws[plan, 2], laws[plan, 3], laws[plan, 4]
     uncertain = abs(b) * CANCELS if min(a, b) < 0.0 else 0.0
     f = np.float32
-    return _Law(
-        (a, b, black), f(a), f(b), f(black), f(uncertain), scene.pinned_dn, f(limits_dn[0]), f(limits_dn[1])
-    )  # fmt: skip
+    return _Law((a, b, black), f(a), f(b), f(black), f(uncertain), pinned_dn, f(low), f(high))
 
 
 @inner

@@ -141,8 +141,8 @@ PROVED_BY = {
 """Which golden pairs prove which kernels: those that a plan does not need would take seconds to compile."""
 
 OUTER = {
-    "one_normal": (fused._pair,),
-    "float32": (single._pair32,),
+    "one_normal": (fused._pairs,),
+    "float32": (single._pairs32,),
     "plain": (electrons._plain_pair,),
     "physical": (electrons._physical_pair, electrons._responses),
     "readable": (),

@@ -10,6 +10,7 @@ read-out 0.65. Tried: straight lines in place of polynomials for the normals, wh
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,6 @@ from unprocess_gen.fused import (
     RUN,
     ZERO32,
     Indices,
-    Key,
     Scene,
     Single,
     bare_products,
@@ -32,9 +32,11 @@ from unprocess_gen.fused import (
     count_still,
     empty_frames,
     fill_blocks,
-    key_words,
+    key_of,
+    keys_of,
     look_up,
-    pair_of,
+    pairs_of,
+    pinned_dn,
     scene_of,
 )
 from unprocess_gen.lanes import (
@@ -71,12 +73,23 @@ def make_pair(
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
     """Make a pair of a two-parameter profile with normal noise; arguments as for `fused.make_pair`."""
-    frames = empty_frames(srgb)
-    scene = scene_of(plan, curve, srgb.shape, origin)
-    of_light, sites = light_of(scene, limits_dn), sites_of(scene)
-    key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)
-    _pair32(np.ascontiguousarray(srgb), products_of(scene), sites, of_light, key, origin, make_room(), *frames)
-    return pair_of(*frames)
+    return make_pairs(srgb, [plan], curve, [limits_dn], origin)[0]
+
+
+def make_pairs(
+    srgb: Srgb,
+    plans: Sequence[Plan],
+    curve: Float,
+    limits_dn: Sequence[tuple[float, float]],
+    origin: tuple[int, int] = (0, 0),
+) -> list[Pair]:
+    """Make the pairs of plans that differ in the noise alone: all at once, of one clean frame."""
+    frames = empty_frames(srgb, len(plans))
+    scene = scene_of(plans[0], curve, srgb.shape, origin)
+    laws = np.array([law_of(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
+    of_scene = products_of(scene), sites_of(scene), light_of(scene)
+    _pairs32(np.ascontiguousarray(srgb), *of_scene, laws, keys_of(plans), origin, make_room(), *frames)
+    return pairs_of(*frames)
 
 
 class Light(NamedTuple):
@@ -94,6 +107,22 @@ class Light(NamedTuple):
     clipped: np.float32  # light above it counts as clipped: that of white is 1 but for the roundings
     span: np.float32
     black: np.uint32
+
+
+def light_of(scene: Scene) -> Light:
+    """Return what the loops need of a scene."""
+    black, span, _ = scene.levels_dn
+    f = np.float32
+    return Light(
+        scene.by_gray, scene.sites, scene.gains.astype(f), f(scene.exposure * span),
+        f(scene.threshold), f(1 / (1 - scene.threshold)), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
+        f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black),
+    )  # fmt: skip
+
+
+class Law32(NamedTuple):
+    """The variance line and the limits of a noisy frame; DN count from black on."""
+
     a: np.float32
     b: np.float32
     pinned_dn: np.float32
@@ -102,19 +131,20 @@ class Light(NamedTuple):
     high: np.float32
 
 
-def light_of(scene: Scene, limits_dn: tuple[float, float]) -> Light:
-    """Return what the loops need of a scene."""
-    black, span, _ = scene.levels_dn
+def law_of(plan: Plan, limits_dn: tuple[float, float]) -> Law32:
+    """Return the law of a plan's noise."""
+    black, pinned = plan.black_level_dn, pinned_dn(plan)
     f = np.float32
     with np.errstate(over="ignore"):  # a variance beyond float32 is infinite, and its site clipped
-        a, b = f(scene.noise[0]), f(scene.noise[1])
-    return Light(
-        scene.by_gray, scene.sites, scene.gains.astype(f), f(scene.exposure * span),
-        f(scene.threshold), f(1 / (1 - scene.threshold)), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
-        f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black), a, b,
-        f(scene.pinned_dn - black), f((scene.pinned_dn - black) * (1 - ROUNDINGS)),
-        f(limits_dn[0] - black), f(limits_dn[1] - black),
-    )  # fmt: skip
+        a, b = (f(one) for one in plan.variance_line)
+    pinned_at = f(pinned - black), f((pinned - black) * (1 - ROUNDINGS))
+    return Law32(a, b, *pinned_at, f(limits_dn[0] - black), f(limits_dn[1] - black))
+
+
+@inner
+def _law(laws: Single, plan: int) -> Law32:
+    """Return one of several plans'."""
+    return Law32(laws[plan, 0], laws[plan, 1], laws[plan, 2], laws[plan, 3], laws[plan, 4], laws[plan, 5])
 
 
 def _dn_of_signal(scene: Scene) -> Float:
@@ -172,19 +202,20 @@ def bare_room(room: Room32) -> Room32:
 
 
 @kernel
-def _pair32(
+def _pairs32(
     srgb: Srgb,
     products: Single,
     sites: Single,
     light: Light,
-    key: Key,
+    laws: Single,
+    keys: NDArray[np.uint64],
     origin: tuple[int, int],
     room: Room32,
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """`fused._pair` in float32."""
+    """`fused._pairs` in float32."""
     height, width = clean.shape
     codes, of_bytes = products.shape[2], srgb.itemsize == 1
     run, tally = bare_room(room), bare(counts, _0)
@@ -208,11 +239,14 @@ def _pair32(
                 _count_bright((first, after), light, run, tally)
             if not is_whole:
                 copy(length, bare(run.clean, first), bare(clean, at))
-            fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
-            frame = bare(noisy, at) if is_whole else run.noisy
-            _fill_noisy(blocks * BLOCK, (first, after), light, run, frame, tally)
-            if not is_whole:
-                copy(length, bare(run.noisy, first), bare(noisy, at))
+            for plan in range(noisy.shape[0]):
+                key, law = key_of(keys, plan), _law(laws, plan)
+                fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
+                to = plan * height * width + at
+                frame = bare(noisy, to) if is_whole else run.noisy
+                _fill_noisy(blocks * BLOCK, (first, after), law, light.black, run, frame, bare(counts, 6 * plan))
+                if not is_whole:
+                    copy(length, bare(run.noisy, first), bare(noisy, to))
 
 
 @inner
@@ -299,50 +333,52 @@ def _low16(rounded: np.float32, black: np.uint32) -> np.uint16:
 
 
 @inner
-def _fill_noisy(count: int, valid: tuple[int, int], light: Light, run: Room32, noisy: Numbers, tally: Numbers) -> None:
+def _fill_noisy(
+    count: int, valid: tuple[int, int], law: Law32, black: np.uint32, run: Room32, noisy: Numbers, tally: Numbers
+) -> None:
     """`fused._fill_noisy` in float32."""
     fill_coarse_depths(count, run.words, run.depths)
-    _fill_noise(count, light, run)
-    some_clipped = digitise(count, light, run.noisy_dn, noisy)
-    if light.pinned_dn < _INFINITY:
-        _pin(valid, light, run, noisy)
+    _fill_noise(count, law, run)
+    some_clipped = digitise(count, law, black, run.noisy_dn, noisy)
+    if law.pinned_dn < _INFINITY:
+        _pin(valid, law, black, run, noisy)
     if some_clipped:
-        _count_clipped(valid, light, run, tally)
-    tally[5] += count_still(valid, (light.a, light.b, ZERO32), run.clean_dn)
+        _count_clipped(valid, law, run, tally)
+    tally[5] += count_still(valid, (law.a, law.b, ZERO32), run.clean_dn)
 
 
 @inner
-def _fill_noise(count: int, light: Light, run: Room32) -> None:
+def _fill_noise(count: int, law: Law32, run: Room32) -> None:
     for n in range(count // WIDE):
         x = np.uint64(n) * _8
         clean_dn = load(run.clean_dn, x)
-        std = root(greatest(clean_dn * light.a + light.b, ZERO32))
+        std = root(greatest(clean_dn * law.a + law.b, ZERO32))
         store(run.noisy_dn, x, clean_dn + signed(std * coarse_normal(load(run.depths, x)), load(run.words, x)))
 
 
 @inner
-def digitise(count: int, light: Light, noisy_dn: Numbers, noisy: Numbers) -> bool:
+def digitise(count: int, law: Law32, black: np.uint32, noisy_dn: Numbers, noisy: Numbers) -> bool:
     """Clip, round half to even, cast; return whether anything was clipped."""
     lowest = highest = load(noisy_dn, _0)
     for n in range(count // WIDE):
         x = np.uint64(n) * _8
         dn = load(noisy_dn, x)
         lowest, highest = least(lowest, dn), greatest(highest, dn)
-        store(noisy, x, bits_of(least(greatest(dn, light.low), light.high) + ROUND32) + light.black)
-    return bool(mask_of(below(lowest, light.low) | below(light.high, highest)) != 0)
+        store(noisy, x, bits_of(least(greatest(dn, law.low), law.high) + ROUND32) + black)
+    return bool(mask_of(below(lowest, law.low) | below(law.high, highest)) != 0)
 
 
 @inner
-def _pin(valid: tuple[int, int], light: Light, run: Room32, noisy: Numbers) -> None:
+def _pin(valid: tuple[int, int], law: Law32, black: np.uint32, run: Room32, noisy: Numbers) -> None:
     for x in range(valid[0], valid[1]):
-        if run.clean_dn[x] >= light.saturated_dn:
-            run.noisy_dn[x] = light.pinned_dn
-            noisy[x] = _low16(min(max(light.pinned_dn, light.low), light.high) + ROUND32, light.black)
+        if run.clean_dn[x] >= law.saturated_dn:
+            run.noisy_dn[x] = law.pinned_dn
+            noisy[x] = _low16(min(max(law.pinned_dn, law.low), law.high) + ROUND32, black)
 
 
 @inner
-def _count_clipped(valid: tuple[int, int], light: Light, run: Room32, tally: Numbers) -> None:
-    low, high = light.low, light.high
+def _count_clipped(valid: tuple[int, int], law: Law32, run: Room32, tally: Numbers) -> None:
+    low, high = law.low, law.high
     below_low, above_high = 0, 0
     for x in range(valid[0], valid[1]):
         rounded = (min(max(run.noisy_dn[x], low - _1F), high + _1F) + ROUND32) - ROUND32
