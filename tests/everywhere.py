@@ -45,8 +45,10 @@ import numpy as np
 
 from unprocess_gen import cli, electrons, floats, fused, poisson, selftest, single
 from unprocess_gen.compiled import kernel
+from unprocess_gen.lanes import bare, load
 from unprocess_gen.normals import fill_coarse_normals, fill_fine_normals, normal_quantiles
 from unprocess_gen.pair import make_pair, make_pairs
+from unprocess_gen.streams import BLOCK
 from unprocess_gen.tables import normal_table
 
 KERNELS = {
@@ -140,25 +142,29 @@ def kernels() -> dict[str, Any]:
 
 
 @kernel
-def _draw(words: Any, rates: Any, normal: Any, tables: Any, out: Any) -> None:
-    poisson.draw(words, rates, normal, tables, poisson.room_for((out.shape[0] + 7) // 8 * 8), out)
+def _draw(words: Any, rates: Any, normal: Any, tables: Any, room: Any, out: Any) -> None:
+    poisson.draw(words, rates, normal, tables, room, out)
 
 
 @kernel
-def _digitise(counts: Any, words: Any, body: Any, out: Any) -> None:
-    electrons._digitise(counts, words, body, (0, 0), 64.0, poisson.room_for(out.shape[0]), out)
+def _digitise(counts: Any, words: Any, body: Any, room: Any, out: Any) -> None:
+    electrons._digitise(counts, words, body, (0, 0), 64.0, room, out)
 
 
 @kernel
 def _light(
-    codes: Any, products: Any, signal: Any, gains: Any, scene: Any,
-    camera: Any, gray: Any, lit: Any, dim: Any, unrounded: Any, clean: Any, tally: Any,
+    codes: Any, scene: Any, room: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean: Any,
+    tally: Any,
 ) -> None:  # fmt: skip
-    fused.fill_camera(codes, products[0], products[1], camera)
-    fused._fill_light_by_gray(codes, products, scene.sites[0], scene.gains, 0.9, gray)
-    fused.fill_dim(signal, gains, scene, dim, clean, tally)
-    fused.fill_light(signal, gains, 1 - gains, scene, lit)
-    fused.fill_clean(lit, scene, unrounded, clean, tally)
+    count, of_photograph, run = clean.shape[0], fused.bare_scene(scene), fused.bare_room(room)
+    gains, headroom = load(bare(scene.site_gains, 0), 0), load(bare(scene.site_headroom, 0), 0)
+    fused.fill_signal(bare(codes, 0), True, 0, count, of_photograph, bare(camera, 0))
+    fused._fill_light_by_gray(bare(codes, 0), 0, count, of_photograph, bare(gray, 0))
+    fused.fill_dim(count // BLOCK, gains, of_photograph, run, run.clean)
+    fused.copy(count, run.unrounded, dim)
+    fused.fill_bright(count // BLOCK, gains, headroom, of_photograph, run, run.clean)
+    fused.fill_light(room.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
+    fused.fill_clean_of_light(lit, scene, unrounded, clean, tally)
 
 
 @kernel
@@ -181,28 +187,28 @@ def doubles() -> str:
     n = np.arange(count)
     tally = np.zeros(6, dtype=np.int64)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
-    products = (np.arange(1, 9 * 256 + 1) / 1999.0).reshape(3, 3, 256)
     camera, gray, lit, unrounded, counts, digitised, dim = (np.empty(count) for _ in range(7))
     words = np.empty(count, dtype=np.uint32)
     clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
-    signal, gains = n / 999.0, np.full(count, 0.37)
+    room, of_counts = fused.make_room(count), poisson.room_for(count)
+    room.signal[:count] = n / 999.0
     plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
     scene = fused.scene_of(plan, np.arange(256) / 255.0, (1, count), (0, 0))
-    _light(codes, products, signal, gains, scene, camera, gray, lit, dim, unrounded, clean, tally)
+    _light(codes, scene, room, camera, gray, dim, lit, unrounded, clean, tally)
     key = fused.key_words(2**33 + 1, 5, 6, 7)
     _draws(key, words)
     normals = floats.by_inverse_cdf(words[None], normal_table())[0]
-    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), counts)
+    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), of_counts, counts)
     body = electrons._body(plan, (1, count), (0, 0))
-    _digitise(counts, words, body, digitised)
+    _digitise(counts, words, body, of_counts, digitised)
     _round(n % 9 + 0.5, noisy, tally)
     deep, fine, coarse = np.empty((3, count), dtype=np.float32)
     fill_fine_normals(words, deep, fine)
     fill_coarse_normals(words, deep, coarse)
     return digest(
         camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, fine, coarse, noisy,
-        tally,
+        tally, room.unrounded[:count], room.lit[:count],
     )  # fmt: skip
 
 
@@ -256,7 +262,7 @@ def compile_kernels() -> None:
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)
-    given = words, doubles, normal_quantiles(), poisson.poisson_tables(), doubles
+    given = words, doubles, normal_quantiles(), poisson.poisson_tables(), poisson.room_for(8), doubles
     _draw.compile(tuple(map(numba.typeof, given)))
 
 

@@ -44,6 +44,7 @@ def _arithmetic(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     store(made, 32, greatest(a, b))
     store(made, 40, least(a, NUMBER))
     store(made, 48, root(greatest(a, ZERO)))
+    store(made, 56, a / greatest(b, NUMBER))
 
 
 @kernel
@@ -89,7 +90,7 @@ def _one_by_one(codes: np.ndarray, wide: np.ndarray, out: np.ndarray) -> None:
 
 DOUBLES = np.array([1.1, -2.5e-11, 2.5e-10, 3.5e-10, 1e300, -0.0, 12345.678901234, 0.5e-10])
 CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
-    "arithmetic": (_arithmetic, (SINGLES, OTHERS), np.zeros(56, dtype=np.float32)),
+    "arithmetic": (_arithmetic, (SINGLES, OTHERS), np.zeros(64, dtype=np.float32)),
     "bits": (_bits, (SINGLES, WORDS), np.zeros(48, dtype=np.uint32)),
     "doubles": (_doubles, (DOUBLES,), np.zeros(16, dtype=np.float32)),
     "masks": (_masks, (OTHERS, WORDS), np.zeros(3, dtype=np.uint32)),

@@ -18,7 +18,7 @@ from unprocess_gen.compiled import kernel
 from unprocess_gen.effects import normals
 from unprocess_gen.errors import MachineError
 from unprocess_gen.normals import Quantiles, normal_quantiles, quick_normals
-from unprocess_gen.poisson import LIMIT, Tables, draw, poisson, poisson_tables, room_for
+from unprocess_gen.poisson import LIMIT, Counting, Tables, draw, poisson, poisson_tables, room_for
 
 WORDS = 2**32
 SIGN = 2**31
@@ -33,13 +33,16 @@ Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def fast(words: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """The compiled form, called as `poisson` is."""
     out = np.full(words.shape, np.nan)
-    _draw(words.astype(np.uint32), rates, normal_quantiles(), poisson_tables(), out)
+    room = room_for((len(words) + 7) // 8 * 8)
+    _draw(words.astype(np.uint32), rates, normal_quantiles(), poisson_tables(), room, out)
     return out
 
 
 @kernel
-def _draw(words: np.ndarray, rates: np.ndarray, normal: Quantiles, tables: Tables, out: np.ndarray) -> None:
-    draw(words, rates, normal, tables, room_for((len(words) + 7) // 8 * 8), out)
+def _draw(
+    words: np.ndarray, rates: np.ndarray, normal: Quantiles, tables: Tables, room: Counting, out: np.ndarray
+) -> None:
+    draw(words, rates, normal, tables, room, out)
 
 
 def word(rank: np.ndarray) -> np.ndarray:

@@ -122,7 +122,7 @@ def test_a_philox_with_another_constant_is_found(monkeypatch: pytest.MonkeyPatch
 
 
 KERNELS = (
-    *("look_up", "_fill_light_by_gray", "fill_clean_apart", "fill_bright", "fill_blocks"),
+    *("look_up", "_fill_light_by_gray", "fill_dim", "fill_bright", "fill_blocks"),
     *("fill_depths", "_fill_noise", "_digitise", "_settle"),
 )
 

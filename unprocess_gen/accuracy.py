@@ -70,29 +70,26 @@ from unprocess_gen.fused import (
     Room,
     Scene,
     Single,
-    bare_products,
     bare_room,
-    by_site,
+    bare_scene,
     digitise,
-    fill_bright,
-    fill_camera,
-    fill_clean_apart,
+    fill_clean,
     fill_signal,
     look_up,
     make_room,
+    products_of,
 )
 from unprocess_gen.fused import scene_of as fused_scene
 from unprocess_gen.lanes import bare
-from unprocess_gen.lanes import load as load_lanes
 from unprocess_gen.methods import METHODS, STAGES, Budget, Method, choose, gaussian_from, of_stage
 from unprocess_gen.normals import Quantiles, fill_coarse_normals, fill_fine_normals, normal_quantiles
 from unprocess_gen.pair import make_pair
 from unprocess_gen.photographs import list_photographs, load, spread
 from unprocess_gen.plan import plan_image
 from unprocess_gen.planner import facts_for
+from unprocess_gen.poisson import Counting, poisson_tables, room_for
 from unprocess_gen.poisson import Tables as PoissonTables
 from unprocess_gen.poisson import draw as draw_counts
-from unprocess_gen.poisson import poisson_tables, room_for
 from unprocess_gen.records import MOSAIC, Float, Frame, Pair, Plan, Raw, Srgb
 from unprocess_gen.sensor import quantise, to_dn
 from unprocess_gen.streams import BLOCK, Words
@@ -567,7 +564,7 @@ def _counts_ns(lab: Lab, method: Method, subject: Subject) -> float:
     rates = np.resize(np.clip(light, 0, 1) * plan.exposure * span_dn / physics.dn_per_e, (BUFFERS, CHUNK))
     words = _some_words(rates.size).reshape(rates.shape)
     turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // rates.size)
-    given = normal_quantiles(), poisson_tables(), np.empty(CHUNK)
+    given = normal_quantiles(), poisson_tables(), room_for(CHUNK), np.empty(CHUNK)
     return clocked(lambda: _counts(rates, turns, words, *given), turns * rates.size)
 
 
@@ -615,7 +612,7 @@ def _clean_ns(lab: Lab, method: Method, subject: Subject) -> float:
 
 def _clean32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     srgb, scene = _scene(lab, subject)
-    of_scene = single.products_of(scene), single.sites_of(scene), single.light_of(scene)
+    of_scene = single.products32_of(scene), single.sites_of(scene), single.light_of(scene)
     return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room()), srgb.shape[0] * srgb.shape[1])
 
 
@@ -706,9 +703,11 @@ def _numpy_normals_ns(lab: Lab, method: Method, subject: Subject) -> float:
 def _signals(srgb: Srgb, scene: Scene, out: Float) -> None:
     """Look up the codes, the matrix folded into the curve."""
     height, width = srgb.shape[:2]
+    bared = bare_scene(scene)
     for y in range(height):
         for start in range(0, width, CHUNK):
-            fill_signal(srgb[y, start : min(start + CHUNK, width)], scene, y, out)
+            n = min(CHUNK, width - start)
+            fill_signal(bare(srgb, 3 * (y * width + start)), srgb.itemsize == 1, y, n, bared, bare(out, 0))
 
 
 @kernel
@@ -716,26 +715,21 @@ def _signals32(srgb: Srgb, products: Single, sites: NDArray[np.int64], out: Sing
     """As `_signals`, in float32."""
     height, width = srgb.shape[:2]
     for y in range(height):
-        even, odd = products[sites[y & 1, 0]], products[sites[y & 1, 1]]
+        even, odd = products_of(bare(products, 0), products.shape[2], bare(sites, 0), y)
         for start in range(0, width, CHUNK):
-            fill_camera(srgb[y, start : min(start + CHUNK, width)], even, odd, out)
+            n, codes = min(CHUNK, width - start), bare(srgb, 3 * (y * width + start))
+            look_up(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, bare(out, 0))
 
 
 @kernel
 def _cleans(srgb: Srgb, scene: Scene, room: Room, counts: NDArray[np.int64]) -> None:
     """Go from codes to the clean frame."""
-    run = bare_room(room)
-    site_gains, site_headroom = by_site(scene)
+    run, bared, tally = bare_room(room), bare_scene(scene), bare(counts, 0)
     height, width = srgb.shape[:2]
     for y in range(height):
-        gains, headroom = site_gains[y & 1], site_headroom[y & 1]
-        eight_gains = load_lanes(bare(gains, 0), 0)
         for start in range(0, width, RUN):
-            n = min(RUN, width - start)
-            fill_signal(srgb[y, start : start + n], scene, y, room.signal)
-            if fill_clean_apart(-(-n // BLOCK), eight_gains, scene, run, run.clean)[1]:
-                here = room.unrounded[:n], room.clean[:n]
-                fill_bright(room.signal[:n], gains, headroom, scene, *here, counts)
+            n, codes = min(RUN, width - start), bare(srgb, 3 * (y * width + start))
+            fill_clean(codes, srgb.itemsize == 1, y, 0, n, bared, run, run.clean, tally)
 
 
 @kernel
@@ -744,7 +738,7 @@ def _cleans32(srgb: Srgb, products: Single, sites: Single, light: single.Light, 
     height, width = srgb.shape[:2]
     run = single.bare_room(room)
     for y in range(height):
-        even, odd = bare_products(products, light.channels, y)
+        even, odd = products_of(bare(products, 0), products.shape[2], bare(light.channels, 0), y)
         of_sites = single.bright_sites(sites, y & 1, 0)
         for start in range(0, width, RUN):
             n = min(RUN, width - start)
@@ -781,9 +775,10 @@ def _normals(chunks: Words, turns: int, depths: Single, out: Single) -> None:
 
 
 @kernel
-def _counts(rates: Float, turns: int, words: Words, normal: Quantiles, tables: PoissonTables, out: Float) -> None:
+def _counts(
+    rates: Float, turns: int, words: Words, normal: Quantiles, tables: PoissonTables, room: Counting, out: Float
+) -> None:
     """Draw counts of chunks of rates in turns."""
-    room = room_for(CHUNK)
     for _ in range(turns):
         for chunk in range(rates.shape[0]):
             draw_counts(words[chunk], rates[chunk], normal, tables, room, out)

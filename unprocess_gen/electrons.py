@@ -31,27 +31,30 @@ from unprocess_gen.fused import (
     STEP0,
     STEP1,
     Key,
+    Room,
     Scene,
+    bare_room,
+    bare_scene,
     blocks_of,
-    by_site,
     copy,
     empty_frames,
-    fill_bright,
     fill_clean,
-    fill_dim,
+    fill_clean_of_light,
     fill_light,
     fill_signal,
     fill_words,
     key_words,
+    make_room,
     pairs_of,
     philox_round,
     read_out,
     scene_of,
 )
+from unprocess_gen.lanes import bare
 from unprocess_gen.methods import gaussian_from
 from unprocess_gen.normals import Quantiles, exact_normal, normal_quantiles, quantiles, quick_normals
 from unprocess_gen.poisson import (
-    Room,
+    Counting,
     all_near_normal,
     flag,
     list_open,
@@ -90,10 +93,11 @@ def make_pair(
     body, tables, normal = _body(plan, srgb.shape, origin), poisson_tables(), normal_quantiles()
     pixels = np.ascontiguousarray(srgb)
     if is_plain(plan):
-        given, plain = np.empty((0, 0)), _plain(body, scene)
-        _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy[0], counts[0])
+        given, plain, drawn = np.empty((0, 0)), _plain(body, scene), (tables, normal, _make_desk())
+        _plain_pair(pixels, given, scene, key, limits_dn, origin, plain, *drawn, clean, noisy[0], counts[0])
     else:
-        _physical_pair(pixels, scene, key, limits_dn, origin, body, tables, normal, clean, noisy[0], counts[0])
+        of_body = body, tables, normal, _make_buffers()
+        _physical_pair(pixels, scene, key, limits_dn, origin, *of_body, clean, noisy[0], counts[0])
     return pairs_of(*frames)[0]
 
 
@@ -116,9 +120,10 @@ def make_noisy(
     frame = np.ascontiguousarray(unrounded)
     if is_plain(plan):
         pixels, clean, plain = np.empty((0, 0, 3), dtype=np.uint8), np.empty((0, 0), np.uint16), _plain(body, scene)
-        _plain_pair(pixels, frame, scene, key, limits_dn, origin, plain, tables, normal, clean, noisy, counts)
+        desk = _make_desk()
+        _plain_pair(pixels, frame, scene, key, limits_dn, origin, plain, tables, normal, desk, clean, noisy, counts)
         return noisy, counts
-    _physical_noisy(frame, scene, key, limits_dn, origin, body, tables, normal, noisy, counts)
+    _physical_noisy(frame, scene, key, limits_dn, origin, body, tables, normal, _make_buffers(), noisy, counts)
     return noisy, counts
 
 
@@ -298,6 +303,30 @@ def _plain(body: _Body, scene: Scene) -> _Plain:
     )
 
 
+class _Desk(NamedTuple):
+    """What a run of pixels is worked on in, by whole blocks; see `poisson.Counting`."""
+
+    clean: Room  # of which ``unrounded`` is what noise is made of
+    rates: Float
+    whole: NDArray[np.float32]
+    part: NDArray[np.float32]
+    root: NDArray[np.float32]
+    inverse: NDArray[np.float32]
+    near: NDArray[np.float32]
+    read: NDArray[np.float32]
+    base: NDArray[np.float32]
+    shot_words: NDArray[np.uint32]
+    read_words: NDArray[np.uint32]
+    counting: Counting
+
+
+def _make_desk() -> _Desk:
+    size = CHUNK + BLOCK
+    whole, part, root, inverse, near, read, base = np.zeros((7, size), dtype=np.float32)
+    words, clean, rates = np.zeros((2, size), dtype=np.uint32), make_room(CHUNK), np.zeros(size)
+    return _Desk(clean, rates, whole, part, root, inverse, near, read, base, words[0], words[1], room_for(CHUNK))
+
+
 @kernel
 def _plain_pair(
     srgb: Srgb,
@@ -309,46 +338,32 @@ def _plain_pair(
     plain: _Plain,
     tables: PoissonTables,
     normal: Quantiles,
+    desk: _Desk,
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
     """Fill ``clean``, ``noisy`` and ``counts``; only the last two where an unrounded clean frame is ``given``."""
     height, width = noisy.shape
-    signal, unrounded, rates = np.empty(CHUNK), np.zeros(CHUNK + BLOCK), np.zeros(CHUNK + BLOCK)
-    whole, part, root, inverse, near, read, base = (
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-        np.zeros(CHUNK + BLOCK, dtype=np.float32),
-    )
-    shot_words, read_words = np.zeros(CHUNK + BLOCK, dtype=np.uint32), np.zeros(CHUNK + BLOCK, dtype=np.uint32)
-    room = room_for(CHUNK)
+    run, bared, tally, room = bare_room(desk.clean), bare_scene(scene), bare(counts, 0), desk.counting
+    unrounded, rates = desk.clean.unrounded, desk.rates
+    whole, part, root, inverse, near = desk.whole, desk.part, desk.root, desk.inverse, desk.near
+    read, base, shot_words, read_words = desk.read, desk.base, desk.shot_words, desk.read_words
     normals, lines, read_lines = room.normals, normal.lines, plain.read.lines
     pairs, flags, eights, listed, quadratics = room.pairs, room.open, room.eights, room.listed, plain.read.quadratics
-    site_gains, site_headroom = by_site(scene)
     black, purposes = scene.levels_dn[0], (SHOT | key[2], plain.read_purpose | key[2])
     dn_per_e, read_std_dn, reach = plain.dn_per_e, plain.read_std_dn, plain.reach
     for y in range(height):
-        gains, headroom, errors_dn, row_dn = (
-            site_gains[y & 1], site_headroom[y & 1], plain.errors_dn[y & 1], plain.rows_dn[y]
-        )  # fmt: skip
+        errors_dn, row_dn = plain.errors_dn[y & 1], plain.rows_dn[y]
         for x in range(CHUNK):
             base[x] = np.float32(black + (row_dn + errors_dn[x]))
         for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
+            n, at = min(CHUNK, width - start), y * width + start
             first, after, block, blocks = blocks_of(origin[1] + start, n)
-            clean_dn = unrounded[first:after]
             if given.shape[0] > 0:
-                copy(n, given[y, start : start + n], clean_dn)
+                copy(n, bare(given, at), bare(run.unrounded, first))
             else:
-                row, out = srgb[y, start : start + n], clean[y, start : start + n]
-                fill_signal(row, scene, y, signal)
-                if fill_dim(signal, gains, scene, clean_dn, out, counts):
-                    fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
+                fill_clean(bare(srgb, 3 * at), srgb.itemsize == 1, y, first, n, bared, run, bare(clean, at), tally)
             _fill_draws(
                 key, block, blocks, np.uint64(origin[0] + y), purposes, black, dn_per_e, unrounded,
                 rates, whole, part, root, inverse, shot_words, read_words,
@@ -480,26 +495,24 @@ def _physical_pair(
     body: _Body,
     tables: PoissonTables,
     normal: Quantiles,
+    buffers: _Buffers,
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
     """Fill ``clean``, ``noisy`` and ``counts`` with the pair of a physical profile, row by row."""
     height, width = clean.shape
-    light = np.empty(CHUNK)
-    unrounded = np.empty(CHUNK)
-    buffers = _buffers()
-    site_gains, site_headroom = by_site(scene)
+    light, unrounded, bared = buffers.light, buffers.unrounded, bare_scene(scene)
     for y in range(height):
         for start in range(0, width, CHUNK):
             n = min(CHUNK, width - start)
-            fill_signal(srgb[y, start : start + n], scene, y, light)
-            fill_light(light[:n], site_gains[y & 1], site_headroom[y & 1], scene, light)
+            fill_signal(bare(srgb, 3 * (y * width + start)), srgb.itemsize == 1, y, n, bared, bare(light, 0))
+            fill_light(light[:n], scene.site_gains[y & 1], scene.site_headroom[y & 1], scene, light)
             if body.responds and body.averaged:
                 for x in range(n):
                     light[x] = light[x] * body.response[y, start + x]
             saturated = counts[4]
-            fill_clean(light[:n], scene, unrounded, clean[y, start : start + n], counts)
+            fill_clean_of_light(light[:n], scene, unrounded, clean[y, start : start + n], counts)
             _fill_noisy(
                 unrounded[:n], (y, start), origin, scene, key, limits_dn, body, tables, normal, buffers,
                 noisy[y, start : start + n], counts,
@@ -521,12 +534,12 @@ def _physical_noisy(
     body: _Body,
     tables: PoissonTables,
     normal: Quantiles,
+    buffers: _Buffers,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
     """Fill ``noisy`` and ``counts`` with the noisy frame of a clean one."""
     height, width = noisy.shape
-    buffers = _buffers()
     for y in range(height):
         for start in range(0, width, CHUNK):
             end = min(start + CHUNK, width)
@@ -539,6 +552,8 @@ def _physical_noisy(
 class _Buffers(NamedTuple):
     """What a run of pixels is worked on in; words have room for whole blocks around it."""
 
+    light: Float
+    unrounded: Float
     signal: Float
     rates: Float
     drawn: Float
@@ -547,22 +562,14 @@ class _Buffers(NamedTuple):
     hot_e: Float
     dead: NDArray[np.bool_]
     words: NDArray[np.uint32]
-    room: Room
+    room: Counting
 
 
-@inner
-def _buffers() -> _Buffers:
-    return _Buffers(
-        np.empty(CHUNK),
-        np.empty(CHUNK),
-        np.empty(CHUNK),
-        np.empty(CHUNK),
-        np.empty(CHUNK),
-        np.empty(CHUNK),
-        np.empty(CHUNK, dtype=np.bool_),
-        np.empty(CHUNK + BLOCK, dtype=np.uint32),
-        room_for(CHUNK),
-    )
+def _make_buffers() -> _Buffers:
+    light, unrounded, signal, rates, drawn, electrons, noisy_dn, hot_e = np.zeros((8, CHUNK))
+    words, dead = np.zeros(CHUNK + BLOCK, dtype=np.uint32), np.zeros(CHUNK, dtype=np.bool_)
+    of_counts = words, room_for(CHUNK)
+    return _Buffers(light, unrounded, signal, rates, drawn, electrons, noisy_dn, hot_e, dead, *of_counts)
 
 
 @inner
@@ -668,7 +675,7 @@ def _digitise(
     body: _Body,
     at: tuple[int, int],
     black: float,
-    room: Room,
+    room: Counting,
     out: Float,
 ) -> None:
     """Go from electrons to DN, and add what is added there: read noise, rows, columns, black errors.

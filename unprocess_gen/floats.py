@@ -19,7 +19,7 @@ from unprocess_gen.compiled import kernel
 from unprocess_gen.effects import Draws
 from unprocess_gen.fused import CHUNK, Key, fill_words, key_words
 from unprocess_gen.normals import Quantiles, exact_normal, normal_quantiles
-from unprocess_gen.poisson import Tables, poisson_tables, room_for
+from unprocess_gen.poisson import Counting, Tables, poisson_tables, room_for
 from unprocess_gen.poisson import draw as draw_counts
 from unprocess_gen.records import Float
 from unprocess_gen.streams import BLOCK, Words, purpose
@@ -64,7 +64,7 @@ def by_inverse_cdf(uniforms: Words, table: Float) -> Float:
 def poisson(uniforms: Words, rate: Float) -> Float:
     """Return what `poisson.poisson` does."""
     out = np.empty(uniforms.shape)
-    _poisson(uniforms, np.ascontiguousarray(rate), normal_quantiles(), poisson_tables(), out)
+    _poisson(uniforms, np.ascontiguousarray(rate), normal_quantiles(), poisson_tables(), room_for(CHUNK), out)
     return out
 
 
@@ -92,9 +92,8 @@ def _by_inverse_cdf(uniforms: Words, quadratics: tuple[Float, Float, Float], out
 
 
 @kernel
-def _poisson(uniforms: Words, rates: Float, normal: Quantiles, tables: Tables, out: Float) -> None:
+def _poisson(uniforms: Words, rates: Float, normal: Quantiles, tables: Tables, room: Counting, out: Float) -> None:
     height, width = out.shape
-    room = room_for(CHUNK)
     for y in range(height):
         for start in range(0, width, CHUNK):
             end = min(start + CHUNK, width)

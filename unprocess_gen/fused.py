@@ -24,8 +24,9 @@ in all 3.4 to 4.4.
 Tried, in nanoseconds a pixel: quadratics from tables for the normals, eight lanes of float64 then, 4.4 to 5.6 in all;
 straight lines from a table, 0.8 more than polynomials; one long loop for the noise, or Philox in lanes, no gain;
 look-ups in the loop of the depths, no gain; runs of 256 pixels, the same, since kernels hand on bare pointers (with
-arrays, which are counted by locked additions, +0.3); Philox in a function of its own that is not inlined, +2.8. Before:
-one loop for everything (scalar code), chunks in the outer loop and rows in the inner, 6.9.
+arrays, which are counted by locked additions at every call, +0.3 in the room and +0.5 in the scene); Philox in a
+function of its own that is not inlined, +2.8. Before: one loop for everything (scalar code), chunks in the outer loop
+and rows in the inner, 6.9. Room is made in Python: to compile it took half a second.
 """
 
 from __future__ import annotations
@@ -157,7 +158,8 @@ def unprocess(
     unrounded = np.empty(srgb.shape[:2])
     clean = np.empty(srgb.shape[:2], dtype=np.uint16)
     counts = np.zeros(6, dtype=np.int64)
-    _unprocess(np.ascontiguousarray(srgb), scene_of(plan, curve, srgb.shape, origin), unrounded, clean, counts)
+    scene = scene_of(plan, curve, srgb.shape, origin)
+    _unprocess(np.ascontiguousarray(srgb), scene, make_room(), unrounded, clean, counts)
     return unrounded, clean, counts
 
 
@@ -165,6 +167,7 @@ class Scene(NamedTuple):
     """What the clean frame is made with: small arrays and numbers, as the kernels take them."""
 
     products: Float  # [c, j, k]: matrix entry (c, j) times the curve at code k
+    codes: int
     sites: NDArray[np.int64]  # [2, 2]: the channel of each site
     gains: Float
     headroom: Float  # the highlight term, where it applies at all; "gray_mean" has a function of its own
@@ -176,18 +179,21 @@ class Scene(NamedTuple):
     levels_dn: tuple[float, float, float]  # black, white less black, white
     pinned_dn: float  # saturated sites are pinned to it; infinity: they are not
     noise: tuple[float, float]  # variance line
+    site_gains: Float  # [2, CHUNK]: of the pixels of an even and of an odd row, so that loops over them vectorise
+    site_headroom: Float
 
 
 def scene_of(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int, int]) -> Scene:
     """Gather what the clean frame of a plan is made with; ``curve`` is that of the source's codes."""
-    gains = np.array(plan.inverse_gains)
+    gains, sites = np.array(plan.inverse_gains), np.array(tile(plan.pattern, origin))
     ccm = np.array(plan.rgb2cam).reshape(3, 3)
     headroom = np.maximum(1 - gains, 0) if plan.highlight == "per_channel" else np.zeros(3)
     by_gray = plan.highlight == "gray_mean"
     black_dn, white_dn = float(plan.black_level_dn), float(plan.white_level_dn)
     return Scene(
         ccm[:, :, None] * curve,
-        np.array(tile(plan.pattern, origin)),
+        len(curve),
+        sites,
         gains,
         headroom,
         by_gray,
@@ -198,7 +204,23 @@ def scene_of(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int
         (black_dn, float(plan.white_level_dn - plan.black_level_dn), white_dn),
         pinned_dn(plan),
         plan.variance_line,
+        _by_site(np.ones(3) if by_gray else gains, sites),  # by gray they are inverted already
+        _by_site(headroom, sites),
     )
+
+
+@inner
+def bare_scene(scene: Scene) -> Scene:
+    """Return the same, its arrays bare."""
+    return Scene(
+        bare(scene.products, _0), scene.codes, bare(scene.sites, _0), bare(scene.gains, _0), bare(scene.headroom, _0),
+        scene.by_gray, scene.threshold, scene.dim, scene.exposure, scene.brightest, scene.levels_dn, scene.pinned_dn,
+        scene.noise, bare(scene.site_gains, _0), bare(scene.site_headroom, _0),
+    )  # fmt: skip
+
+
+def _by_site(channels: Float, sites: NDArray[np.int64]) -> Float:
+    return np.tile(channels[sites], (1, CHUNK // 2))
 
 
 def pinned_dn(plan: Plan) -> float:
@@ -238,6 +260,7 @@ class Room(NamedTuple):
     """Where runs of pixels are worked on, by whole blocks. Python makes it; kernels hand it on bare (`lanes.bare`)."""
 
     signal: Float
+    lit: Float  # light of what is bright
     unrounded: Float
     whole: Single  # DN of the clean frame, rounded
     part: Single  # what rounding took
@@ -251,22 +274,23 @@ class Room(NamedTuple):
     listed: NDArray[np.uint64]  # eights with a site to settle, and the bits that tell which
 
 
-def make_room() -> Room:
+def make_room(run: int = RUN) -> Room:
     """Return room for a run; what a part of a block leaves over is computed with as well, and so must be numbers."""
-    size = RUN + BLOCK
-    doubles, singles = np.zeros((2, size)), np.zeros((6, size), dtype=np.float32)
+    size = run + BLOCK
+    doubles, singles = np.zeros((3, size)), np.zeros((6, size), dtype=np.float32)
     raw, words = np.zeros((2, size), dtype=np.uint16), np.zeros(size, dtype=np.uint32)
     listed = np.zeros(size // WIDE, dtype=np.uint64)
+    signal, lit, unrounded = doubles
     whole, part, depths, noise, margin, noisy_dn = singles
     frames = raw[0], raw[1]
-    return Room(doubles[0], doubles[1], whole, part, words, depths, noise, margin, noisy_dn, *frames, listed)
+    return Room(signal, lit, unrounded, whole, part, words, depths, noise, margin, noisy_dn, *frames, listed)
 
 
 @inner
 def bare_room(room: Room) -> Room:
     """Return the same, bare."""
     return Room(
-        bare(room.signal, _0), bare(room.unrounded, _0), bare(room.whole, _0), bare(room.part, _0),
+        bare(room.signal, _0), bare(room.lit, _0), bare(room.unrounded, _0), bare(room.whole, _0), bare(room.part, _0),
         bare(room.words, _0), bare(room.depths, _0), bare(room.noise, _0), bare(room.margin, _0),
         bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0), bare(room.listed, _0),
     )  # fmt: skip
@@ -287,32 +311,15 @@ def _pairs(
 ) -> None:
     """Fill ``clean``, ``noisy`` and ``counts`` with the pairs of a two-parameter profile."""
     height, width = clean.shape
-    codes, of_bytes = scene.products.shape[2], srgb.itemsize == 1
-    run, quadratics = bare_room(room), _bare_quadratics(quantiles)
-    site_gains, site_headroom = by_site(scene)
+    run, quadratics, bared = bare_room(room), _bare_quadratics(quantiles), bare_scene(scene)
     for y in range(height):
-        even, odd = bare_products(scene.products, scene.sites, y)
         for start in range(0, width, RUN):
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
             at = y * width + start
-            if scene.by_gray:
-                fill_signal(srgb[y, start : start + length], scene, y, room.signal[first:after])
-            else:
-                look_up(bare(srgb, 3 * at), even, odd, codes, length, of_bytes, bare(run.signal, first))
             is_whole = length == blocks * BLOCK
-            gains = load(bare(site_gains, (y & 1) * CHUNK + (first & 1)), _0)
-            frame = bare(clean, at) if is_whole else run.clean
-            some_below, some_bright = fill_clean_apart(blocks, gains, scene, run, frame)
-            if not is_whole:
-                copy(length, bare(run.clean, first), bare(clean, at))
-            if some_below:
-                counts[0, 0] += count_below(first, after, run.signal)
-            if some_bright:
-                of_row = site_gains[y & 1], site_headroom[y & 1]
-                here = room.unrounded[first:after], clean[y, start : start + length]
-                fill_bright(room.signal[first:after], *of_row, scene, *here, counts[0])
-                _split(blocks, run)
+            codes, frame = bare(srgb, 3 * at), bare(clean, at)
+            fill_clean(codes, srgb.itemsize == 1, y, first, length, bared, run, frame, bare(counts, 0))
             for plan in range(noisy.shape[0]):
                 key, law = key_of(keys, plan), _law(laws, plan, scene.levels_dn[0])
                 fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
@@ -324,23 +331,16 @@ def _pairs(
 
 
 @kernel
-def _unprocess(srgb: Srgb, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+def _unprocess(srgb: Srgb, scene: Scene, room: Room, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
     """Fill ``unrounded``, ``clean`` and ``counts`` with the clean frame: the first half of `_pairs`."""
     height, width = clean.shape
-    signal = np.empty(RUN)
-    site_gains, site_headroom = by_site(scene)
+    run, bared = bare_room(room), bare_scene(scene)
     for y in range(height):
-        even, odd = _products(scene, y)
-        gains, headroom = site_gains[y & 1], site_headroom[y & 1]
         for start in range(0, width, RUN):
-            end = min(start + RUN, width)
-            row, clean_dn, out = srgb[y, start:end], unrounded[y, start:end], clean[y, start:end]
-            if scene.by_gray:
-                fill_signal(row, scene, y, signal)
-            else:
-                fill_camera(row, even, odd, signal)
-            if fill_dim(signal, gains, scene, clean_dn, out, counts):
-                fill_bright(signal, gains, headroom, scene, clean_dn, out, counts)
+            length, at = min(RUN, width - start), y * width + start
+            codes, frame = bare(srgb, 3 * at), bare(clean, at)
+            fill_clean(codes, srgb.itemsize == 1, y, 0, length, bared, run, frame, bare(counts, 0))
+            copy(length, run.unrounded, bare(unrounded, at))
 
 
 @inner
@@ -359,45 +359,22 @@ def blocks_of(x: int, length: int) -> tuple[int, int, int, int]:
 
 
 @inner
-def _products(scene: Scene, y: int) -> tuple[Float, Float]:
-    """Return the products of the even and of the odd sites of a row."""
-    return scene.products[scene.sites[y & 1, 0]], scene.products[scene.sites[y & 1, 1]]
+def products_of(products: Numbers, codes: int, sites: Numbers, y: int) -> tuple[Numbers, Numbers]:
+    """Return the products of the even and of the odd sites of a row, in any precision."""
+    return bare(products, 3 * codes * sites[2 * (y & 1)]), bare(products, 3 * codes * sites[2 * (y & 1) + 1])
 
 
 @inner
-def bare_products(products: NDArray[Any], sites: NDArray[np.int64], y: int) -> tuple[Numbers, Numbers]:
-    """Return the same, bare, in any precision."""
-    of_channel = 3 * products.shape[2]
-    return bare(products, of_channel * sites[y & 1, 0]), bare(products, of_channel * sites[y & 1, 1])
+def fill_signal(codes: Numbers, of_bytes: bool, y: int, length: int, scene: Scene, out: Numbers) -> None:
+    """Linearise and apply the matrix, for the one channel that each site keeps; by gray, invert the gains too.
 
-
-@inner
-def by_site(scene: Scene) -> tuple[Float, Float]:
-    """Return gains and headroom for each pixel of an even and of an odd row, so that loops over them vectorise."""
-    gains = np.empty((2, CHUNK))
-    headroom = np.empty((2, CHUNK))
-    for y in range(2):
-        for x in range(CHUNK):
-            gains[y, x] = 1.0 if scene.by_gray else scene.gains[scene.sites[y, x & 1]]  # by gray: inverted already
-            headroom[y, x] = scene.headroom[scene.sites[y, x & 1]]
-    return gains, headroom
-
-
-@inner
-def fill_signal(row: Srgb, scene: Scene, y: int, out: Float) -> None:
-    """Linearise and apply the matrix; by gray, invert the gains too."""
+    As everything that takes runs of a photograph, with a `bare_scene`.
+    """
     if scene.by_gray:
-        _fill_light_by_gray(row, scene.products, scene.sites[y & 1], scene.gains, scene.threshold, out)
+        _fill_light_by_gray(codes, y, length, scene, out)
     else:
-        even, odd = _products(scene, y)
-        fill_camera(row, even, odd, out)
-
-
-@inner
-def fill_camera(row: Srgb, even: Float, odd: Float, out: Float) -> None:
-    """Linearise and apply the matrix, for the one channel that each site keeps."""
-    codes, of_bytes = even.shape[1], row.itemsize == 1
-    look_up(bare(row, _0), bare(even, _0), bare(odd, _0), codes, row.shape[0], of_bytes, bare(out, _0))
+        even, odd = products_of(scene.products, scene.codes, scene.sites, y)
+        look_up(codes, even, odd, scene.codes, length, of_bytes, out)
 
 
 @inner
@@ -432,18 +409,18 @@ def _look_up_bytes(row: Numbers, even: Numbers, odd: Numbers, fours: int, signal
 
 
 @inner
-def _fill_light_by_gray(
-    row: Srgb, products: Float, site: NDArray[np.int64], gains: Float, threshold: float, out: Float
-) -> None:
+def _fill_light_by_gray(codes: Numbers, y: int, length: int, scene: Scene, out: Numbers) -> None:
     """Linearise, apply the matrix and invert the gains, highlights kept by the mean of the three channels."""
-    for x in range(row.shape[0]):
-        r, g, b = row[x, 0], row[x, 1], row[x, 2]
-        red = (products[0, 0, r] + products[0, 1, g]) + products[0, 2, b]
-        green = (products[1, 0, r] + products[1, 1, g]) + products[1, 2, b]
-        blue = (products[2, 0, r] + products[2, 1, g]) + products[2, 2, b]
+    products, gains, threshold, channel = scene.products, scene.gains, scene.threshold, 3 * scene.codes
+    for x in range(length):
+        r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
+        g, b = scene.codes + g, 2 * scene.codes + b
+        red = (products[r] + products[g]) + products[b]
+        green = (products[channel + r] + products[channel + g]) + products[channel + b]
+        blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
         m = max(((red + green) + blue) / 3.0 - threshold, 0.0) / (1.0 - threshold)
         mask = m * m
-        c = site[x & 1]
+        c = scene.sites[2 * (y & 1) + (x & 1)]
         i = red if c == 0 else green if c == 1 else blue
         out[x] = i * max(mask + (1.0 - mask) * gains[c], gains[c])
 
@@ -497,8 +474,33 @@ def fill_words(
 
 
 @inner
-def fill_clean_apart(blocks: int, gains: Vector, scene: Scene, run: Room, clean: Numbers) -> tuple[bool, bool]:
-    """Do `fill_dim`, and `_split`; return whether a signal is below black, and whether one is bright."""
+def fill_clean(
+    codes: Numbers, of_bytes: bool, y: int, first: int, length: int, scene: Scene, run: Room, clean: Numbers,
+    tally: Numbers,
+) -> None:  # fmt: skip
+    """Make a run of the clean frame of row ``y``, before rounding and rounded, and count its sites.
+
+    It stands in the room from ``first`` on, of whole blocks, and rounded in ``clean`` as well.
+    """
+    after, blocks = first + length, (first + length + BLOCK - 1) // BLOCK
+    fill_signal(codes, of_bytes, y, length, scene, bare(run.signal, first))
+    of_row = (y & 1) * CHUNK + (first & 1)
+    gains = load(bare(scene.site_gains, of_row), _0)
+    is_whole = length == blocks * BLOCK
+    frame = clean if is_whole else run.clean
+    some_below, some_bright = fill_dim(blocks, gains, scene, run, frame)
+    if some_below:
+        tally[0] += count_below(first, after, run.signal)
+    if some_bright:
+        fill_bright(blocks, gains, load(bare(scene.site_headroom, of_row), _0), scene, run, frame)
+        _count_bright((first, after), scene, run, tally)
+    if not is_whole:
+        copy(length, bare(run.clean, first), clean)
+
+
+@inner
+def fill_dim(blocks: int, gains: Vector, scene: Scene, run: Room, clean: Numbers) -> tuple[bool, bool]:
+    """Go from signals that are not bright to the clean frame; return whether one is below black, and one is bright."""
     black, span, _ = scene.levels_dn
     exposure = scene.exposure
     lowest = highest = load(run.signal, _0)
@@ -506,28 +508,56 @@ def fill_clean_apart(blocks: int, gains: Vector, scene: Scene, run: Room, clean:
         x = np.uint64(n) * _8
         i = load(run.signal, x)
         lowest, highest = least(lowest, i), greatest(highest, i)
-        dn = greatest(i * gains * exposure, 0.0) * span + black
-        store(run.unrounded, x, dn)
-        store(clean, x, to_uint32(_store_apart(dn, x, run)))
+        _store_clean(greatest(i * gains * exposure, 0.0) * span + black, x, run, clean)
     return mask_of(below(lowest, 0.0)) != 0, mask_of(below(scene.dim, highest)) != 0
 
 
 @inner
-def _split(blocks: int, run: Room) -> None:
-    """Take the clean frame apart: whole DN, and what is left."""
-    for n in range(blocks * (BLOCK // WIDE)):
-        x = np.uint64(n) * _8
-        _store_apart(load(run.unrounded, x), x, run)
+def fill_bright(blocks: int, gains: Vector, headroom: Vector, scene: Scene, run: Room, clean: Numbers) -> None:
+    """Do `fill_light` and `fill_clean_of_light` of a run's eights that have something bright in them.
+
+    Their light goes to ``run.lit``, which is 0 elsewhere.
+    """
+    black, span, _ = scene.levels_dn
+    threshold, exposure, brightest = scene.threshold, scene.exposure, scene.brightest
+    limit = np.inf if exposure == 1.0 else 1.0
+    for block in range(blocks):
+        highest = load(run.signal, np.uint64(block * BLOCK))
+        for n in range(block * (BLOCK // WIDE), (block + 1) * (BLOCK // WIDE)):
+            highest = greatest(highest, load(run.signal, np.uint64(n) * _8))
+        is_bright = mask_of(below(scene.dim, highest)) != 0
+        for n in range(block * (BLOCK // WIDE), (block + 1) * (BLOCK // WIDE)):
+            x = np.uint64(n) * _8
+            i = load(run.signal, x)
+            if is_bright:
+                m = greatest(i - threshold, 0.0) / (1.0 - threshold)
+                light = least(i * gains + i * (m * m) * headroom, limit) * exposure
+                store(run.lit, x, light)
+                _store_clean(least(greatest(light, 0.0), brightest) * span + black, x, run, clean)
+            else:
+                store(run.lit, x, i * 0.0)
 
 
 @inner
-def _store_apart(dn: Vector, x: np.uint64, run: Room) -> Vector:
-    """Store whole DN and what is left; return the whole."""
+def _count_bright(valid: tuple[int, int], scene: Scene, run: Room, tally: Numbers) -> None:
+    last, brightest = scene.levels_dn[2] + ROUND, scene.brightest
+    above = saturated = 0
+    for x in range(valid[0], valid[1]):
+        above += run.lit[x] > brightest
+        saturated += run.unrounded[x] + ROUND == last
+    tally[1] += above
+    tally[4] += saturated
+
+
+@inner
+def _store_clean(dn: Vector, x: np.uint64, run: Room, clean: Numbers) -> None:
+    """Store eight sites: as they are, taken apart, and rounded."""
     rounded = (dn + ROUND) - ROUND
     whole = to_float32(rounded)
+    store(run.unrounded, x, dn)
     store(run.whole, x, whole)
     store(run.part, x, to_float32(dn - rounded))
-    return whole
+    store(clean, x, to_uint32(whole))
 
 
 @inner
@@ -537,60 +567,6 @@ def count_below(first: int, after: int, signal: Numbers) -> int:
     for x in range(first, after):
         count += signal[x] < 0.0
     return count
-
-
-@inner
-def fill_dim(signal: Float, gains: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> int:
-    """Do `fill_light` and `fill_clean` of signals that are not bright, and return how many are: see `fill_bright`."""
-    black, span, _ = scene.levels_dn
-    dim, exposure = scene.dim, scene.exposure
-    bright, below = 0, 0
-    for x in range(clean.shape[0]):
-        i = signal[x]
-        bright += i > dim
-        light = i * gains[x] * exposure
-        below += light < 0.0
-        dn = max(light, 0.0) * span + black
-        clean[x] = _low16(dn + ROUND)
-        unrounded[x] = dn
-    counts[0] += below
-    return bright
-
-
-@inner
-def fill_bright(
-    signal: Float,
-    gains: Float,
-    headroom: Float,
-    scene: Scene,
-    unrounded: Float,
-    clean: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Do `fill_light` and `fill_clean` anew for the blocks of a run that have something bright in them."""
-    black, span, white = scene.levels_dn
-    threshold, dim, exposure, brightest = scene.threshold, scene.dim, scene.exposure, scene.brightest
-    limit = np.inf if exposure == 1.0 else 1.0
-    last = white + ROUND
-    above, saturated = 0, 0
-    for start in range(0, clean.shape[0], BLOCK):
-        end = min(start + BLOCK, clean.shape[0])
-        bright = 0
-        for x in range(start, end):
-            bright += signal[x] > dim
-        if bright == 0:
-            continue
-        for x in range(start, end):
-            i = signal[x]
-            m = max(i - threshold, 0.0) / (1.0 - threshold)
-            light = min(i * gains[x] + i * (m * m) * headroom[x], limit) * exposure
-            above += light > brightest
-            dn = min(max(light, 0.0), brightest) * span + black
-            saturated += dn + ROUND == last
-            clean[x] = _low16(dn + ROUND)
-            unrounded[x] = dn
-    counts[1] += above
-    counts[4] += saturated
 
 
 @inner
@@ -611,7 +587,7 @@ def fill_light(signal: Float, gains: Float, headroom: Float, scene: Scene, out: 
 
 
 @inner
-def fill_clean(light: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
+def fill_clean_of_light(light: Float, scene: Scene, unrounded: Float, clean: Raw, counts: NDArray[np.int64]) -> None:
     """Clip, go to DN, round."""
     black, span, white = scene.levels_dn
     brightest = scene.brightest

@@ -1,6 +1,6 @@
 """Eight neighbours at a time, as kernels write them where a loop over single numbers would not become vector code.
 
-A value of eight lanes is what a kernel loads, computes with and stores: ``+ - * & | ^ >> <<`` lane by lane, with
+A value of eight lanes is what a kernel loads, computes with and stores: ``+ - * / & | ^ >> <<`` lane by lane, with
 numbers of one lane beside it, and the functions below. Compiled it is a vector of LLVM, which lays it out on whatever
 registers a processor has: two of four lanes, one of eight, half of one of sixteen. Where nothing is compiled it is a
 NumPy array of eight, so that a kernel reads, and computes, the same either way.
@@ -305,6 +305,7 @@ for _sign, _of_floats, _of_integers in (
     (operator.add, "fadd", "add"),
     (operator.sub, "fsub", "sub"),
     (operator.mul, "fmul", "mul"),
+    (operator.truediv, "fdiv", ""),
     (operator.and_, "", "and_"),
     (operator.or_, "", "or_"),
     (operator.xor, "", "xor"),

@@ -294,8 +294,8 @@ _LEAST_ROOT = np.float32(np.sqrt(SHORT_LEAST * 1.000001))
 _OPEN, _CLOSED = np.float32(9.0), np.float32(-1.0)
 
 
-class Room(NamedTuple):
-    """What a run of counts is made in."""
+class Counting(NamedTuple):
+    """What a run of counts is made in. Python makes it: in a kernel each array takes a twentieth second to compile."""
 
     normals: NDArray[np.float32]
     pairs: NDArray[np.uint64]
@@ -312,29 +312,20 @@ class Room(NamedTuple):
     offsets: Float
 
 
-@inner
-def room_for(count: int) -> Room:
+def room_for(count: int) -> Counting:
     """Return the room for runs of up to ``count`` counts, a multiple of 8."""
-    flags = np.zeros(count + 8, dtype=np.uint8)
-    return Room(
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.uint64),
-        np.empty(count),
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        flags,
-        flags.view(np.uint64),
-        np.empty(count + 8, dtype=np.int64),
-        np.empty(count + 8, dtype=np.int64),
-        np.empty(count + 8, dtype=np.int64),
-        np.empty(count, dtype=np.int64),
-        np.empty(count),
-    )
+    normals, part, rate, near = np.zeros((4, count), dtype=np.float32)
+    whole, offsets = np.zeros((2, count))
+    listed, high, low, rows = np.zeros((4, count + 8), dtype=np.int64)
+    pairs, flags = np.zeros(count, dtype=np.uint64), np.zeros(count + 8, dtype=np.uint8)
+    eights = flags.view(np.uint64)
+    return Counting(normals, pairs, whole, part, rate, near, flags, eights, listed, high, low, rows, offsets)
 
 
 @inner
-def draw(words: NDArray[np.uint32], rates: Float, normal: Quantiles, tables: Tables, room: Room, out: Float) -> None:
+def draw(
+    words: NDArray[np.uint32], rates: Float, normal: Quantiles, tables: Tables, room: Counting, out: Float
+) -> None:
     """Fill ``out`` with what `poisson` gives, all ``[n]``.
 
     ``rates`` are means in counts up to 1e9 (the caller sees to that); ``out`` may not lie where they do.
@@ -425,7 +416,7 @@ def settle(
     rates: Float,
     normal: Quantiles,
     tables: Tables,
-    room: Room,
+    room: Counting,
     left: int,
     out: Float | NDArray[np.float32],
 ) -> None:
@@ -441,7 +432,7 @@ def settle(
 
 
 @inner
-def _short(rates: Float, room: Room, out: Float) -> None:
+def _short(rates: Float, room: Counting, out: Float) -> None:
     """Fill ``out`` with floor(x) by the short form, and flag where that is not certain; no branches.
 
     In single precision, of which the rate as a whole number is kept out. No light is certain to give none.

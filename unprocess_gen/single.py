@@ -25,7 +25,6 @@ from unprocess_gen.fused import (
     Indices,
     Scene,
     Single,
-    bare_products,
     blocks_of,
     copy,
     count_below,
@@ -37,6 +36,7 @@ from unprocess_gen.fused import (
     look_up,
     pairs_of,
     pinned_dn,
+    products_of,
     scene_of,
 )
 from unprocess_gen.lanes import (
@@ -87,7 +87,7 @@ def make_pairs(
     frames = empty_frames(srgb, len(plans))
     scene = scene_of(plans[0], curve, srgb.shape, origin)
     laws = np.array([law_of(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
-    of_scene = products_of(scene), sites_of(scene), light_of(scene)
+    of_scene = products32_of(scene), sites_of(scene), light_of(scene)
     _pairs32(np.ascontiguousarray(srgb), *of_scene, laws, keys_of(plans), origin, make_room(), *frames)
     return pairs_of(*frames)
 
@@ -153,7 +153,7 @@ def _dn_of_signal(scene: Scene) -> Float:
     return gains * scene.exposure * scene.levels_dn[1]
 
 
-def products_of(scene: Scene) -> Single:
+def products32_of(scene: Scene) -> Single:
     """Return the products as DN above black; by gray, where the three channels are compared, as they are."""
     scale = np.ones(3) if scene.by_gray else _dn_of_signal(scene)
     return (scene.products * scale[:, None, None]).astype(np.float32)
@@ -220,7 +220,7 @@ def _pairs32(
     codes, of_bytes = products.shape[2], srgb.itemsize == 1
     run, tally = bare_room(room), bare(counts, _0)
     for y in range(height):
-        even, odd = bare_products(products, light.channels, y)
+        even, odd = products_of(bare(products, _0), codes, bare(light.channels, _0), y)
         for start in range(0, width, RUN):
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
@@ -266,7 +266,7 @@ def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: 
 
 @inner
 def fill_clean(blocks: int, dims: Vector, light: Light, run: Room32, clean: Numbers) -> tuple[bool, bool]:
-    """`fused.fill_clean_apart` of signals that are DN; return whether one is below black, and whether one is bright."""
+    """`fused.fill_dim` of signals that are DN; return whether one is below black, and whether one is bright."""
     lowest = highest = load(run.signal, _0)
     for n in range(blocks * (BLOCK // WIDE)):
         x = np.uint64(n) * _8
