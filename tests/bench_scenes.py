@@ -1,13 +1,14 @@
 """What scenes cost, and what leaving effects out saves and loses: one process, one thread, in turns.
 
-    python tests/bench_scenes.py PHOTO [PHOTO ...] [--profiles sony_a7s2,imx385] [--rounds 5] [--costs]
+    python tests/bench_scenes.py PHOTO [PHOTO ...] [--profiles sony_a7s2,imx385] [--rounds 5] [--costs | --daylight]
 
 Prints a Markdown table, a line for each scene and physical profile: nanoseconds of processor time a pixel under
 ``effects=auto`` and with everything on that has a number (assumed numbers count as sourced ones, so that auto decides
 about all), their ratio, the ratio of auto to the two-parameter profile imx385_iso3200, all as medians over photographs
 and rounds; and the error accepted: what auto left out, RMS over the noise that hides it, in the worst statistic
 (`omission`), measured on a cut-out of each photograph, all together, by the reference forms. With ``--costs``: what
-each effect adds, all others being on.
+each effect adds, all others being on. With ``--daylight``: every profile as it stands, assumed numbers left out, beside
+the two-parameter model of the same tier.
 """
 
 from __future__ import annotations
@@ -39,10 +40,11 @@ from unprocess_gen.sensor import to_dn
 from unprocess_gen.unprocess import unprocess
 
 SCENES = ("daylight", "indoor", "low_light", "night", "video_night", "long_exposure")
+PROFILES = ("sony_a7s2", "nikon_d850", "imx385", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")
 COST_SCENES = ("daylight", "night")
 """Many electrons a pixel, and few: counts below 64 are the dearer ones."""
 
-ISOS = (1600, 3200, 6400)
+ISOS = ("noise.iso=1600", "noise.iso=3200", "noise.iso=6400")
 """What is taken, in turn, where a profile was not calibrated at the scene's ISO."""
 
 CUT = (384, 512)
@@ -60,18 +62,16 @@ def settings(*overrides: str) -> Config:
     return config
 
 
-def physical(scene: str, noise: str, *overrides: str) -> Config:
+def physical(*said: str) -> Config:
     """Settings of a scene and a profile, at the scene's ISO if the profile has it."""
-    said = (f"scene={scene}", f"noise={noise}", "noise.assumed=[]", *overrides)
-    try:
-        return settings(*said)
-    except ConfigError:
-        return settings(*said, f"noise.iso={next(iso for iso in ISOS if calibrated(said, iso))}")
+    if not are_taken(*said):
+        said = (*said, next(iso for iso in ISOS if are_taken(*said, iso)))
+    return settings(*said)
 
 
-def calibrated(said: tuple[str, ...], iso: int) -> bool:
+def are_taken(*said: str) -> bool:
     try:
-        settings(*said, f"noise.iso={iso}")
+        settings(*said)
     except ConfigError:
         return False
     return True
@@ -139,7 +139,8 @@ def in_turns(calls: dict[str, Callable[[], float]], rounds: int) -> dict[str, li
 
 
 def line(scene: str, noise: str, photos: list[Srgb], rounds: int) -> str:
-    config, two = physical(scene, noise), settings("noise=imx385_iso3200")
+    config = physical(f"scene={scene}", f"noise={noise}", "noise.assumed=[]")
+    two = settings("noise=imx385_iso3200")
     ratios, times, left_out = [], {"two": [], "auto": [], "on": []}, set()
     squares: dict[str, list[Float]] = {"": [np.zeros(1)]}
     for number, srgb in enumerate(photos):
@@ -170,13 +171,33 @@ def line(scene: str, noise: str, photos: list[Srgb], rounds: int) -> str:
     )
 
 
+def daylight(photos: list[Srgb], rounds: int) -> None:
+    """Print what the profiles' pairs take beside the two-parameter model's, median and most of the photographs'."""
+    print("| profile | `exact` | `fast` |\n|---|--:|--:|")
+    for noise in PROFILES:
+        told = []
+        for tier in ("exact", "fast"):
+            ours = physical("scene=daylight", f"noise={noise}", f"accuracy={tier}")
+            two = settings("noise=imx385_iso3200", f"accuracy={tier}")
+            ratios = []
+            for number, srgb in enumerate(photos):
+                plans = {"ours": planned(ours, srgb, "auto", number), "two": plan_image(two, f"{number:064x}")}
+                taken = in_turns(
+                    {name: lambda plan=plan: nanoseconds(srgb, plan) for name, plan in plans.items()},  # noqa: B023
+                    rounds,
+                )
+                ratios.append(min(taken["ours"]) / min(taken["two"]))
+            told.append(f"{statistics.median(ratios):.2f} ({max(ratios):.2f})")
+        print(f"| {noise} | {told[0]} | {told[1]} |", flush=True)
+
+
 def costs(photo: Srgb, rounds: int) -> None:
     """Print what each effect adds to a pair with all the others, on the photograph at 2880x2160: shortest times."""
     srgb = cv2.resize(photo, (2880, 2160), interpolation=cv2.INTER_AREA)
     print("| effect | " + " | ".join(COST_SCENES) + " |\n|---|" + "--:|" * len(COST_SCENES))
     table: dict[str, list[float]] = {effect: [] for effect in EFFECTS}
     for scene in COST_SCENES:
-        config = physical(scene, "nikon_d850", "noise.full_well_e=60000")
+        config = physical(f"scene={scene}", "noise=nikon_d850", "noise.assumed=[]", "noise.full_well_e=60000")
         plan = planned(config, srgb, "on", 0)
         assert plan.physics is not None
         plan = replace(plan, effects=EFFECTS, physics=replace(plan.physics, column_std_dn=0.1))
@@ -196,11 +217,15 @@ def main() -> None:
     parser.add_argument("--profiles", default="sony_a7s2,nikon_d850,imx385")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--costs", action="store_true")
+    parser.add_argument("--daylight", action="store_true")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     photos = [decode(Path(photo).read_bytes(), max_pixels=2**26, icc="ignore").srgb for photo in options.photos]
     if options.costs:
         costs(photos[0], options.rounds)
+        return
+    if options.daylight:
+        daylight(photos, options.rounds)
         return
     print(
         "| scene | profile | auto, ns/pixel | all on | auto / all | auto / two-parameter | left out | error accepted |"
