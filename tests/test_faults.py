@@ -276,8 +276,8 @@ def with_large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return source
 
 
-LEVELS = "noise.levels=2"
-"""Pairs of one clean frame, which is kept unrounded: 96 MB of a large photograph."""
+LEVELS = "noise.levels=5"
+"""Pairs that are made together: 144 MB of a large photograph."""
 
 
 @pytest.fixture(scope="module")
