@@ -17,7 +17,6 @@ import argparse
 import math
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,13 +127,13 @@ def cut(srgb: Srgb) -> Srgb:
     return np.ascontiguousarray(srgb[top : top + CUT[0], left : left + CUT[1]])
 
 
-def in_turns(calls: dict[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
-    for call in calls.values():
-        call()
-    taken: dict[str, list[float]] = {name: [] for name in calls}
+def in_turns(srgb: Srgb, plans: dict[str, Plan], rounds: int) -> dict[str, list[float]]:
+    for plan in plans.values():
+        nanoseconds(srgb, plan)
+    taken: dict[str, list[float]] = {name: [] for name in plans}
     for _ in range(rounds):
-        for name, call in calls.items():
-            taken[name].append(call())
+        for name, plan in plans.items():
+            taken[name].append(nanoseconds(srgb, plan))
     return taken
 
 
@@ -147,10 +146,7 @@ def line(scene: str, noise: str, photos: list[Srgb], rounds: int) -> str:
         plans = {"two": plan_image(two, f"{number:064x}")}
         plans |= {switch: planned(config, srgb, switch, number) for switch in ("auto", "on")}
         left_out |= set(plans["on"].effects) - set(plans["auto"].effects)
-        taken = in_turns(
-            {name: lambda plan=plan: nanoseconds(srgb, plan) for name, plan in plans.items()},  # noqa: B023
-            rounds,
-        )
+        taken = in_turns(srgb, plans, rounds)
         for name, seconds in taken.items():
             times[name] += seconds
         ratios += zip(taken["on"], taken["auto"], taken["two"], strict=True)
@@ -182,10 +178,7 @@ def daylight(photos: list[Srgb], rounds: int) -> None:
             ratios = []
             for number, srgb in enumerate(photos):
                 plans = {"ours": planned(ours, srgb, "auto", number), "two": plan_image(two, f"{number:064x}")}
-                taken = in_turns(
-                    {name: lambda plan=plan: nanoseconds(srgb, plan) for name, plan in plans.items()},  # noqa: B023
-                    rounds,
-                )
+                taken = in_turns(srgb, plans, rounds)
                 ratios.append(min(taken["ours"]) / min(taken["two"]))
             told.append(f"{statistics.median(ratios):.2f} ({max(ratios):.2f})")
         print(f"| {noise} | {told[0]} | {told[1]} |", flush=True)
@@ -204,7 +197,7 @@ def costs(photo: Srgb, rounds: int) -> None:
         plans = {"all": plan} | {
             effect: replace(plan, effects=tuple(other for other in EFFECTS if other != effect)) for effect in EFFECTS
         }
-        taken = in_turns({name: lambda one=one: nanoseconds(srgb, one) for name, one in plans.items()}, rounds)
+        taken = in_turns(srgb, plans, rounds)
         for effect in EFFECTS:
             table[effect].append(min(taken["all"]) - min(taken[effect]))
     for effect, values in table.items():

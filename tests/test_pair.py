@@ -220,7 +220,7 @@ def test_plans_of_different_clean_frames_are_refused_at_once(
 def in_float32(srgb: np.ndarray, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    return single.make_pair(srgb, plan, curve, limits_dn, origin)
+    return single.make_pairs(srgb, [plan], curve, [limits_dn], origin)[0]
 
 
 def assert_within(differing: int, worst: int, sites: int) -> None:

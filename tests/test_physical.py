@@ -283,6 +283,16 @@ def test_the_noisy_frame_alone_is_that_of_the_pair_for_the_poisson_form(settings
     assert_noisy_alone(np.random.default_rng(6).integers(0, 256, (3, 2049, 3)).astype(np.uint8), plan, (5, 9))
 
 
+def test_a_clean_frame_cut_out_of_another_gets_noise_of_its_own_sites(everything: Plan) -> None:
+    clean_dn = np.random.default_rng(7).uniform(100, 4000, (60, 200))
+    for some in (WITHOUT_WELL, ("shot", "read", "row", "quantise")):
+        plan = replace(everything, effects=some)
+
+        cut_out = electrons.make_noisy(clean_dn[8:40, 64:128], plan, (0.0, 4095.0), (8, 64))[0]
+
+        np.testing.assert_array_equal(cut_out, electrons.make_noisy(clean_dn, plan, (0.0, 4095.0))[0][8:40, 64:128])
+
+
 def test_a_clean_frame_that_depends_on_the_level_has_no_noisy_frame_alone(everything: Plan) -> None:
     for plan in (everything, replace(averaged(everything), effects=WITHOUT_WELL)):
         with pytest.raises(ValueError, match="another at every noise level"):

@@ -86,7 +86,10 @@ def make_pair(
     limits_dn: tuple[float, float],
     origin: tuple[int, int] = (0, 0),
 ) -> Pair:
-    """Make a pair of a physical profile, or of a two-parameter one by counts; arguments as for `fused.make_pair`."""
+    """Make a pair of a physical profile, or of a two-parameter one by counts.
+
+    Arguments as for `fused.make_pairs`, of the one plan.
+    """
     clean, noisy, counts = frames = empty_frames(srgb)
     scene = scene_of(plan, curve, srgb.shape, origin)
     key = key_words(plan.stream_key, plan.level, plan.draw, plan.frame)

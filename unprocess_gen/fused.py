@@ -102,21 +102,6 @@ _MANY = _BITS.sum(axis=1).astype(np.uint32)
 HETEROSCEDASTIC = np.uint64(purpose("heteroscedastic"))
 
 
-def make_pair(
-    srgb: Srgb,
-    plan: Plan,
-    curve: Float,
-    limits_dn: tuple[float, float],
-    origin: tuple[int, int] = (0, 0),
-) -> Pair:
-    """Make a pair of a two-parameter profile with normal noise.
-
-    Arguments as for `pair.make_pair`, with the curve of the source's codes, and the lowest and highest DN of the noisy
-    frame.
-    """
-    return make_pairs(srgb, [plan], curve, [limits_dn], origin)[0]
-
-
 def make_pairs(
     srgb: Srgb,
     plans: Sequence[Plan],
@@ -124,7 +109,11 @@ def make_pairs(
     limits_dn: Sequence[tuple[float, float]],
     origin: tuple[int, int] = (0, 0),
 ) -> list[Pair]:
-    """Make the pairs of plans that differ in the noise alone: all at once, of one clean frame."""
+    """Make the pairs of two-parameter profiles with normal noise, whose plans differ in that alone: all at once.
+
+    Arguments as for `pair.make_pairs`, with the curve of the source's codes, and for each plan the lowest and highest
+    DN of the noisy frame.
+    """
     frames = empty_frames(srgb, len(plans))
     scene = scene_of(plans[0], curve, srgb.shape, origin)
     laws = np.array([_law_of(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
@@ -155,7 +144,7 @@ def pairs_of(clean: Raw, noisy: Raw, counts: NDArray[np.int64]) -> list[Pair]:
 def unprocess(
     srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)
 ) -> tuple[Float, Raw, NDArray[np.int64]]:
-    """Make the clean frame alone, for several noisy ones; arguments as for `make_pair`.
+    """Make the clean frame alone, for several noisy ones; arguments as for `make_pairs`.
 
     Returns it before rounding, float64 ``[H, W]`` DN, and rounded; and the numbers of `Counts` in their order, of which
     those of the noisy frame are 0.

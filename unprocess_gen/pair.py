@@ -34,15 +34,18 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
         return _pair_laid_out(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
     if plan.normalised:
         return _float_pair(srgb, plan, origin)
-    maker = (electrons if plan.counts_electrons else single if plan.in_float32 else fused).make_pair
-    return _pair_laid_out(maker(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin), plan, origin)
+    if plan.counts_electrons:
+        return _pair_laid_out(
+            electrons.make_pair(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin), plan, origin
+        )
+    return next(_pairs_of_one_normal(srgb, [plan], origin))
 
 
 def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> Iterator[Pair]:
     """Make the pairs of plans that share the clean frame: levels and draws of its noise, one after the other.
 
-    Each is what `make_pair` gives, byte for byte, but the photograph is unprocessed once and the clean array is one.
-    Raises ValueError where the plans do not share it.
+    Each is what `make_pair` gives, byte for byte, but the photograph is unprocessed once for several of them, and the
+    clean array is one. Raises ValueError where the plans do not share it.
     """
     for plan in plans:
         _check(srgb, plan)
@@ -52,7 +55,8 @@ def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 
     if len(plans) < 2 or not all(map(_is_made_of_the_clean_frame, plans)) or len(of_kinds) > 1:
         return (make_pair(srgb, plan, origin) for plan in plans)
     of_one_normal = (False, False) in of_kinds
-    return (_pairs_of_one_normal if of_one_normal else _pairs_of_one_clean_frame)(srgb, plans, origin)
+    makers = _pairs_of_one_normal if of_one_normal else _pairs_of_one_clean_frame
+    return makers(_dequantised(srgb, plans[0], origin), plans, origin)
 
 
 AT_ONCE = 5
@@ -61,7 +65,7 @@ AT_ONCE = 5
 
 def _pairs_of_one_normal(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
     """Make the noisy frames some at a time: to make the clean one anew for each few costs less than to keep it."""
-    srgb, first = _dequantised(srgb, plans[0], origin), plans[0]
+    first = plans[0]
     maker, curve = single.make_pairs if first.in_float32 else fused.make_pairs, _curve(srgb, first)
     clean: Frame | None = None
     for start in range(0, len(plans), AT_ONCE):
@@ -73,7 +77,6 @@ def _pairs_of_one_normal(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, i
 
 def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
     first = plans[0]
-    srgb = _dequantised(srgb, first, origin)
     unrounded, rounded, of_clean = fused.unprocess(srgb, first, _curve(srgb, first), origin)
     if first.normalised:
         del rounded

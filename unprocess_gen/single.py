@@ -65,17 +65,6 @@ ROUNDINGS = 2.0**-18
 more is not counted as clipped."""
 
 
-def make_pair(
-    srgb: Srgb,
-    plan: Plan,
-    curve: Float,
-    limits_dn: tuple[float, float],
-    origin: tuple[int, int] = (0, 0),
-) -> Pair:
-    """Make a pair of a two-parameter profile with normal noise; arguments as for `fused.make_pair`."""
-    return make_pairs(srgb, [plan], curve, [limits_dn], origin)[0]
-
-
 def make_pairs(
     srgb: Srgb,
     plans: Sequence[Plan],
@@ -83,7 +72,7 @@ def make_pairs(
     limits_dn: Sequence[tuple[float, float]],
     origin: tuple[int, int] = (0, 0),
 ) -> list[Pair]:
-    """Make the pairs of plans that differ in the noise alone: all at once, of one clean frame."""
+    """Make the pairs of `fused.make_pairs`, of which all is the same but the precision."""
     frames = empty_frames(srgb, len(plans))
     scene = scene_of(plans[0], curve, srgb.shape, origin)
     laws = np.array([law_of(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
