@@ -14,8 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from unprocess_gen.accuracy import Row
-from unprocess_gen.report import markdown
+from unprocess_gen.reports.benchmark.measure import Row
+from unprocess_gen.reports.benchmark.report import markdown
 
 HERE = Path(__file__).parent
 README = HERE.parent / "README.md"

@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from unprocess_gen import RawPairs, synthetic
+from unprocess_gen import RawPairs
+from unprocess_gen.sources.scenes import synthetic
 
 SCENE = "highlights-0"
 CROP = (slice(260, 340), slice(100, 220))  # rows and columns, even: the Bayer phase is kept

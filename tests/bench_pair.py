@@ -24,12 +24,12 @@ from omegaconf import OmegaConf
 sys.path.insert(0, str(Path(__file__).parent))
 import algorithm1
 
-from unprocess_gen.config import AccuracyConfig, Config, GainsConfig, NoiseConfig
-from unprocess_gen.decode import decode
-from unprocess_gen.manifest import ok_row
-from unprocess_gen.pair import make_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Patch, Plan, Source
+from unprocess_gen.config.schema import AccuracyConfig, Config, GainsConfig, NoiseConfig
+from unprocess_gen.core.types import Patch, Plan, Source
+from unprocess_gen.dataset.manifest import ok_row
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.sources.image.decode import decode
 
 TIERS = ("exact", "fast")
 

@@ -31,7 +31,8 @@ import json, os, resource, sys, time
 cores = json.loads(sys.argv[1])
 if cores:
     os.sched_setaffinity(0, cores)
-from unprocess_gen import cli, workspace
+from unprocess_gen.cli import main as cli
+from unprocess_gen.pipeline import workspace
 committed = []
 commit = workspace.Workspace.commit
 def told(self, made):

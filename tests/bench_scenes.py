@@ -26,17 +26,19 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from unprocess_gen import effects, electrons, planner
-from unprocess_gen.compose import conf_dir
-from unprocess_gen.config import Config, check
-from unprocess_gen.decode import decode
-from unprocess_gen.effects import EFFECTS
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.pair import make_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Float, Plan, Srgb
-from unprocess_gen.sensor import to_dn
-from unprocess_gen.unprocess import unprocess
+from unprocess_gen.cli.hydra_app import conf_dir
+from unprocess_gen.config.schema import Config, check
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.planning import effect_selection as planner
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.kernels import physical as electrons
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.sensor import to_dn
+from unprocess_gen.simulation.reference.unprocess import unprocess
+from unprocess_gen.sources.image.decode import decode
 
 SCENES = ("daylight", "indoor", "low_light", "night", "video_night", "long_exposure")
 PROFILES = ("sony_a7s2", "nikon_d850", "imx385", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")

@@ -21,11 +21,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from unprocess_gen import synthetic
+from unprocess_gen.sources.scenes import synthetic
 
 RUN = """
 import json, os, resource, sys, time
-from unprocess_gen import cli, runner, selftest, workspace
+from unprocess_gen.cli import main as cli
+from unprocess_gen.pipeline import generate as runner, workspace
+from unprocess_gen.simulation import self_test as selftest
 selftest.check("one_normal")
 spent = {}
 make = runner.make_shard

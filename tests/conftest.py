@@ -22,9 +22,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
-from unprocess_gen import cli as door_room
-from unprocess_gen import runner
-from unprocess_gen.config import Config, check
+from unprocess_gen.cli import main as door_room
+from unprocess_gen.config.schema import Config, check
+from unprocess_gen.pipeline import generate as runner
 
 COMMAND = Path(sys.executable).with_name("gen-dataset")
 

@@ -43,13 +43,19 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 
-from unprocess_gen import cli, electrons, floats, fused, poisson, selftest, single
-from unprocess_gen.compiled import kernel
-from unprocess_gen.lanes import bare, load
-from unprocess_gen.normals import fill_coarse_normals, fill_fine_normals, normal_quantiles
-from unprocess_gen.pair import make_pair, make_pairs
-from unprocess_gen.streams import BLOCK
-from unprocess_gen.tables import normal_table
+from unprocess_gen.cli import main as cli
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.core.lookup_tables import normal_table
+from unprocess_gen.core.random_streams import BLOCK
+from unprocess_gen.simulation import self_test as selftest
+from unprocess_gen.simulation.kernels import float_draws as floats
+from unprocess_gen.simulation.kernels import gaussian as fused
+from unprocess_gen.simulation.kernels import gaussian_float32 as single
+from unprocess_gen.simulation.kernels import physical as electrons
+from unprocess_gen.simulation.kernels import poisson
+from unprocess_gen.simulation.kernels.normal import fill_coarse_normals, fill_fine_normals, normal_quantiles
+from unprocess_gen.simulation.kernels.simd import bare, load
+from unprocess_gen.simulation.pair import make_pair, make_pairs
 
 KERNELS = {
     f"{room}.{name}": value
@@ -79,7 +85,7 @@ TARGETS = {
 def facts(given: str) -> dict[str, Any]:
     import cv2  # reads its settings when it is first imported, which is up to the run
 
-    from unprocess_gen import runner
+    from unprocess_gen.pipeline import generate as runner
 
     features = np._core._multiarray_umath.__cpu_features__
     return {

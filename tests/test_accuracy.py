@@ -16,13 +16,25 @@ from conftest import Door, fill
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import accuracy, effects, report
-from unprocess_gen.accuracy import BY_NAME, EXACT, MEASUREMENTS, REFERENCE, TIER_STAGES, Beside, Effort, Report, Row
-from unprocess_gen.compose import conf_dir
-from unprocess_gen.config import AccuracyConfig, Config, NoiseConfig, SensorConfig, budget, check, read_option
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.forecast import forecast, text
-from unprocess_gen.methods import METHODS, STAGES, choose, gaussian_distance
+from unprocess_gen.cli.hydra_app import conf_dir
+from unprocess_gen.config.accuracy import METHODS, STAGES, choose, gaussian_distance
+from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig, budget, check, read_option
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.reports.benchmark import measure as accuracy
+from unprocess_gen.reports.benchmark import report
+from unprocess_gen.reports.benchmark.measure import (
+    BY_NAME,
+    EXACT,
+    MEASUREMENTS,
+    REFERENCE,
+    TIER_STAGES,
+    Beside,
+    Effort,
+    Report,
+    Row,
+)
+from unprocess_gen.reports.estimate import forecast, text
+from unprocess_gen.simulation.reference import noise as effects
 
 Settings = Callable[..., Config]
 

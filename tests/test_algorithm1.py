@@ -11,10 +11,19 @@ import cv2
 import numpy as np
 import pytest
 
-from unprocess_gen import RawPairs, synthetic
-from unprocess_gen.config import CameraConfig, Config, GainsConfig, IspConfig, NoiseConfig, SensorConfig, SourceConfig
-from unprocess_gen.runner import generate
-from unprocess_gen.shards import array_xxh3
+from unprocess_gen import RawPairs
+from unprocess_gen.config.schema import (
+    CameraConfig,
+    Config,
+    GainsConfig,
+    IspConfig,
+    NoiseConfig,
+    SensorConfig,
+    SourceConfig,
+)
+from unprocess_gen.dataset.shards import array_xxh3
+from unprocess_gen.pipeline.generate import generate
+from unprocess_gen.sources.scenes import synthetic
 
 NOISE = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
 BROOKS = (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["truncated_normal", 0.8, 0.1, 0.5, 1.1])

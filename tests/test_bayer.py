@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.bayer import PATTERNS, mosaic, tile
+from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic, tile
 
 R, G, B = 0, 1, 2
 

@@ -15,7 +15,9 @@ import pytest
 import yaml
 from conftest import COMMAND, fill
 
-from unprocess_gen import RawPairs, __version__, cli, compose
+from unprocess_gen import RawPairs, __version__
+from unprocess_gen.cli import hydra_app as compose
+from unprocess_gen.cli import main as cli
 
 Door = Callable[..., Any]
 Cli = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from unprocess_gen import colour
-from unprocess_gen.colour import CAMERAS, IDENTITY, RGB2XYZ, Matrix
+from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.colour import CAMERAS, IDENTITY, RGB2XYZ, Matrix
 
 U = Fraction(1, 2**53)
 """Half a unit in the last place of 1: what one operation may be off, relatively."""

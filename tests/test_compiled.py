@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from numba import version_info
 
-from unprocess_gen import compiled, selftest, shortcuts
-from unprocess_gen.compiled import inner, is_kept, kernel
+from unprocess_gen.core import jit as compiled
+from unprocess_gen.core import shortcuts
+from unprocess_gen.core.jit import inner, is_kept, kernel
+from unprocess_gen.simulation import self_test as selftest
 
 SQUARES = """
 @inner
@@ -40,7 +42,7 @@ def test_a_kernel_that_only_kernels_call_is_made_machine_code_in_them_alone() ->
 
 
 ROOM = """
-from unprocess_gen.compiled import inner, kernel
+from unprocess_gen.core.jit import inner, kernel
 
 @inner
 def half(x):
@@ -88,7 +90,7 @@ def test_what_a_process_compiled_another_takes_into_other_kernels(tmp_path: Path
 
 NEIGHBOUR = """
 import sys
-from unprocess_gen import compiled
+from unprocess_gen.core import jit as compiled
 compiled._sources = lambda: sys.argv[1]
 import room
 print(room.first(8.0), len(room.first.stats.cache_hits))
@@ -138,7 +140,7 @@ def _never(x: np.ndarray) -> None:
 
 LOADED = """
 import sys
-from unprocess_gen import selftest
+from unprocess_gen.simulation import self_test as selftest
 assert not selftest.failures(sys.argv[1])
 kernels = [one for one in selftest.OUTER[sys.argv[1]] if one.overloads]
 assert kernels and not any(one.stats.cache_misses for one in kernels), "a kernel was compiled"

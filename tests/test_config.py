@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from unprocess_gen import compose, draws, tables, unprocess
-from unprocess_gen.config import (
+from unprocess_gen.cli import hydra_app as compose
+from unprocess_gen.config import distributions as draws
+from unprocess_gen.config.schema import (
     HIGHLIGHTS,
     LAW_NUMBERS,
     NOT_DATA,
@@ -28,9 +29,11 @@ from unprocess_gen.config import (
     read_dataset_yaml,
     source_kind,
 )
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Law
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Law
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.reference import unprocess
 
 Settings = Callable[..., Config]
 FILES = sorted(
@@ -110,7 +113,7 @@ def test_defaults_are_those_of_the_contract(settings: Settings) -> None:
 
 @pytest.mark.parametrize("name", ["photo.jpg", "photo.JPEG", "photo.png", "a.tif", "a.tiff", "a.webp", "a.bmp"])
 def test_default_globs_match_every_kind_of_photograph(name: str, settings: Settings, tmp_path: Path) -> None:
-    from unprocess_gen.sources import list_folder
+    from unprocess_gen.sources.listing import list_folder
 
     (tmp_path / name).write_bytes(b"x")
     assert len(list_folder(str(tmp_path), settings().source.include, True, None).sources) == 1

@@ -20,8 +20,8 @@ import pytest
 import tifffile
 from PIL import Image, ImageCms
 
-from unprocess_gen.decode import CV2_MAX_PIXELS, Header, decode, probe
-from unprocess_gen.errors import SourceError
+from unprocess_gen.core.errors import SourceError
+from unprocess_gen.sources.image.decode import CV2_MAX_PIXELS, Header, decode, probe
 
 SIZES = [(1, 1), (1, 9), (9, 1), (2, 2), (7, 13), (40, 61)]
 

@@ -24,14 +24,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs, dng, synthetic
-from unprocess_gen.colour import CAMERAS
-from unprocess_gen.errors import ConfigError, DamageError
-from unprocess_gen.manifest import plan_of
-from unprocess_gen.process import apply_gains
-from unprocess_gen.records import Plan
-from unprocess_gen.unprocess import camera_light, linear_light
-from unprocess_gen.verify import verify
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.types import Plan
+from unprocess_gen.dataset import dng
+from unprocess_gen.dataset.manifest import plan_of
+from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.simulation.reference.colour import CAMERAS
+from unprocess_gen.simulation.reference.isp import apply_gains
+from unprocess_gen.simulation.reference.unprocess import camera_light, linear_light
+from unprocess_gen.sources.scenes import synthetic
 
 Tags = dict[str, Any]
 D65_XY = (0.3127, 0.3290)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from unprocess_gen.cli import HELP, VERBS
-from unprocess_gen.config import RATES, BranchConfig, Config
-from unprocess_gen.errors import REASONS
-from unprocess_gen.manifest import COLUMNS
-from unprocess_gen.physics import FORMS
+from unprocess_gen.cli.main import HELP, VERBS
+from unprocess_gen.config.schema import RATES, BranchConfig, Config
+from unprocess_gen.core.errors import REASONS
+from unprocess_gen.dataset.manifest import COLUMNS
+from unprocess_gen.planning.noise_profile import FORMS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

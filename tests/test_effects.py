@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moments import REACH, SAMPLER_ERROR, bernstein
 
-from unprocess_gen import tables
-from unprocess_gen.config import Config, GainsConfig, NoiseConfig
-from unprocess_gen.effects import heteroscedastic, noise_variance, normals
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Plan
-from unprocess_gen.streams import words
+from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core.random_streams import words
+from unprocess_gen.core.types import Plan
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.reference.noise import heteroscedastic, noise_variance, normals
 
 SIGN = np.uint32(1 << 31)
 LAST = 2**31 - 1

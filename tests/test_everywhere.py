@@ -36,7 +36,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 from PIL import Image
 
-from unprocess_gen.decode import decode
+from unprocess_gen.sources.image.decode import decode
 
 ROOT = Path(__file__).parents[1]
 SCRIPT = Path(everywhere.__file__)
@@ -180,8 +180,8 @@ def test_no_setting_of_opencv_moves_a_byte(name: str, value: str, make: Make, pl
 
 SHORT_OF_MEMORY = """
 import resource, sys
-from unprocess_gen.decode import decode
-from unprocess_gen.errors import SourceError
+from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.core.errors import SourceError
 small, large = (open(path, "rb").read() for path in sys.argv[1:])
 decode(small, max_pixels=2**26, icc="ignore")
 taken = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()

@@ -29,10 +29,10 @@ from conftest import Cli, fill, pixels
 from PIL import Image
 from test_resume import LOKY_TRACKER, ONE, Killed, assert_whole, committed, running, session, wait_for, workers
 
-from unprocess_gen import verify
-from unprocess_gen.errors import ConfigError, MachineError, UnprocessGenError
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.workspace import Workspace
+from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import verify
+from unprocess_gen.pipeline.workspace import Workspace
 
 Make = Callable[..., Any]
 Door = Callable[..., Any]
@@ -652,7 +652,7 @@ def test_a_signal_after_the_last_word_leaves_no_trace(
 
 IN_A_CALLBACK = """
 import ctypes, os, signal, sys, time
-from unprocess_gen import cli
+from unprocess_gen.cli import main as cli
 
 def slow(arguments):
     @ctypes.CFUNCTYPE(None)

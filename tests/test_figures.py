@@ -12,11 +12,14 @@ import pytest
 from conftest import Door, Settings, pixels
 from PIL import Image
 
-from unprocess_gen import compose, figures, report, synthetic
-from unprocess_gen.bayer import PATTERNS
-from unprocess_gen.config import GainsConfig, NoiseConfig, read_option
-from unprocess_gen.figures import READINGS, Counted, Drawn, Recipes, Saturation
-from unprocess_gen.pair import reference_pair
+from unprocess_gen.cli import hydra_app as compose
+from unprocess_gen.config.schema import GainsConfig, NoiseConfig, read_option
+from unprocess_gen.reports import paper_figures as figures
+from unprocess_gen.reports.benchmark import report
+from unprocess_gen.reports.paper_figures import READINGS, Counted, Drawn, Recipes, Saturation
+from unprocess_gen.simulation.pair import reference_pair
+from unprocess_gen.simulation.reference.cfa import PATTERNS
+from unprocess_gen.sources.scenes import synthetic
 
 FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
 

@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 from moments import REACH, SAMPLER_ERROR, Moments, bernstein, moments, shares
 
-from unprocess_gen.config import Config, check
-from unprocess_gen.pair import make_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Plan
-from unprocess_gen.sensor import noisy_limits
+from unprocess_gen.config.schema import Config, check
+from unprocess_gen.core.types import Plan
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 Settings = Callable[..., Config]
 Law = Callable[[Plan, float], tuple[float, float]]

@@ -17,17 +17,24 @@ from conftest import Door, Make, Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import RawPairs, bayer, effects, floats, poisson, selftest, streams, transfer
-from unprocess_gen.config import check
-from unprocess_gen.forecast import forecast
-from unprocess_gen.methods import Budget, choose
-from unprocess_gen.pair import make_pair, make_pairs
-from unprocess_gen.plan import plan_image, plan_pairs
-from unprocess_gen.planner import facts_for
-from unprocess_gen.records import READABLE, Frame, Plan
-from unprocess_gen.sensor import in_dn
-from unprocess_gen.tables import tukey_table
-from unprocess_gen.verify import replay, verify
+from unprocess_gen import RawPairs
+from unprocess_gen.config.accuracy import Budget, choose
+from unprocess_gen.config.schema import check
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.lookup_tables import tukey_table
+from unprocess_gen.core.types import READABLE, Frame, Plan
+from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.plan import plan_image, plan_pairs
+from unprocess_gen.reports import photon_transfer as transfer
+from unprocess_gen.reports.estimate import forecast
+from unprocess_gen.simulation import self_test as selftest
+from unprocess_gen.simulation.kernels import float_draws as floats
+from unprocess_gen.simulation.kernels import poisson
+from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.simulation.reference import cfa as bayer
+from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference.sensor import in_dn
 
 FLOATS = ("output.dtype=float32", "output.layout=packed", "sensor.clip=none")
 ORIGIN = 1, 57
@@ -326,7 +333,7 @@ def test_cropped_planes_are_the_cut_out_of_the_whole_mosaic(packed: Path, photos
 
 
 def test_every_byte_is_checked_and_every_pair_made_again(packed: Path, photos: Path) -> None:
-    from unprocess_gen.manifest import read_rows
+    from unprocess_gen.dataset.manifest import read_rows
 
     assert verify(packed) == []
     again = list(replay(read_rows(packed / "manifest.csv"), str(photos)))

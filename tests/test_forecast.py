@@ -13,11 +13,11 @@ from conftest import Door, fill
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.effects import EFFECTS
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.forecast import SAMPLE, forecast, text
-from unprocess_gen.photographs import spread
-from unprocess_gen.records import Source
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Source
+from unprocess_gen.reports.estimate import SAMPLE, forecast, text
+from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.sources.loader import spread
 
 Settings = Callable[..., Any]
 

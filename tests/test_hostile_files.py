@@ -35,14 +35,14 @@ from conftest import COMMAND, Settings, environment, pixels
 from corpus import DAMAGES, MATCHED
 from PIL import Image
 
-from unprocess_gen.config import Config
-from unprocess_gen.decode import decode
-from unprocess_gen.errors import REASONS, SourceError
-from unprocess_gen.pair import make_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Source
-from unprocess_gen.runner import Bench, Task, make_shard
-from unprocess_gen.sources import decode_name, encode_name, list_folder, read_bytes
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import REASONS, SourceError
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.generate import Bench, Task, make_shard
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.listing import decode_name, encode_name, list_folder, read_bytes
 
 MAX_PIXELS = 2**26
 MAX_SECONDS = 10

@@ -27,9 +27,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.records import Source
-from unprocess_gen.sources import decode_name, encode_name, list_folder, read_bytes
-from unprocess_gen.verify import choose, replay
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.verify import choose, replay
+from unprocess_gen.sources.listing import decode_name, encode_name, list_folder, read_bytes
 
 FORMULA_STARTS = tuple("=+-@\t\r")
 UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")

@@ -91,11 +91,14 @@ def test_the_import_test_sees_an_upward_import(tmp_path: Path) -> None:
     room = tmp_path / "bayer.py"
     room.write_text("def late():\n    from unprocess_gen import cli\n    import unprocess_gen.runner\n")
 
-    assert imported(room) == ["unprocess_gen.cli", "unprocess_gen.runner"]
+    assert imported(room) == ["unprocess_gen.cli.main", "unprocess_gen.pipeline.generate"]
 
 
 def test_no_fast_math_on_the_way_to_the_output() -> None:
-    from unprocess_gen import electrons, fused, normals, poisson
+    from unprocess_gen.simulation.kernels import gaussian as fused
+    from unprocess_gen.simulation.kernels import normal as normals
+    from unprocess_gen.simulation.kernels import physical as electrons
+    from unprocess_gen.simulation.kernels import poisson
 
     kernels = [value for room in (electrons, fused, normals, poisson) for value in vars(room).values()]
     kernels = [value for value in kernels if hasattr(value, "targetoptions")]

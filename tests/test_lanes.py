@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from unprocess_gen.compiled import kernel
-from unprocess_gen.lanes import (
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.simulation.kernels.simd import (
     WIDE,
     bare,
     below,

@@ -15,10 +15,10 @@ from conftest import Door, Make, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config import Config, check
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.verify import replay, verify
+from unprocess_gen.config.schema import Config, check
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.verify import replay, verify
 
 Settings = Callable[..., Config]
 

@@ -17,10 +17,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config import RATES
-from unprocess_gen.effects import EFFECTS
-from unprocess_gen.errors import REASONS, DamageError
-from unprocess_gen.manifest import (
+from unprocess_gen.config.accuracy import STAGES, of_stage
+from unprocess_gen.config.schema import RATES
+from unprocess_gen.core.errors import REASONS, DamageError
+from unprocess_gen.core.types import Counts, Facts, Pair, Patch, Physics, Plan, Source
+from unprocess_gen.dataset.manifest import (
     COLUMNS,
     JSON_BYTES,
     NAMES,
@@ -35,10 +36,9 @@ from unprocess_gen.manifest import (
     row_json,
     write_rows,
 )
-from unprocess_gen.methods import STAGES, of_stage
-from unprocess_gen.plan import plan_image, plan_with_reasons
-from unprocess_gen.planner import STATISTICS
-from unprocess_gen.records import Counts, Facts, Pair, Patch, Physics, Plan, Source
+from unprocess_gen.planning.effect_selection import STATISTICS
+from unprocess_gen.planning.plan import plan_image, plan_with_reasons
+from unprocess_gen.simulation.reference.noise import EFFECTS
 
 CONTRACT = [
     "key",

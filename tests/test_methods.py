@@ -11,10 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import synthetic
-from unprocess_gen.config import Config, budget, check
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.methods import (
+from unprocess_gen.config.accuracy import (
     FORMS,
     METHODS,
     STAGES,
@@ -25,9 +22,12 @@ from unprocess_gen.methods import (
     method,
     of_stage,
 )
-from unprocess_gen.pair import make_pair, reference_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.planner import facts_for
+from unprocess_gen.config.schema import Config, budget, check
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.sources.scenes import synthetic
 
 Settings = Callable[..., Config]
 
@@ -148,7 +148,7 @@ def test_the_reference_tier_takes_the_curve_from_its_exact_table(
 ) -> None:
     """The formulas' last bit differs between machines."""
     plan = plan_image(settings("accuracy=reference"), "ab" * 32)
-    monkeypatch.setattr("unprocess_gen.unprocess.linear_light", None)
+    monkeypatch.setattr("unprocess_gen.simulation.reference.unprocess.linear_light", None)
 
     make_pair(scene[:4, :4], plan)
     with pytest.raises(TypeError):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unprocess_gen import effects
-from unprocess_gen.compiled import kernel
-from unprocess_gen.methods import method
-from unprocess_gen.normals import (
+from unprocess_gen.config.accuracy import method
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.core.lookup_tables import normal_table, tukey_table
+from unprocess_gen.core.types import Float
+from unprocess_gen.simulation.kernels.normal import (
     FINE_ERROR,
     PIECES,
     Quantiles,
@@ -19,8 +20,7 @@ from unprocess_gen.normals import (
     quantiles,
     quick_normals,
 )
-from unprocess_gen.records import Float
-from unprocess_gen.tables import normal_table, tukey_table
+from unprocess_gen.simulation.reference import noise as effects
 
 SIGN = 2**31
 

@@ -28,11 +28,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs, markup, page, plan, report, transfer
-from unprocess_gen.manifest import Row, read_rows, write_rows
-from unprocess_gen.page import PARAMETERS, WORDS, Histogram, Tally, Words
-from unprocess_gen.verify import file_sha256, verify
-from unprocess_gen.workspace import dataset_facts, dataset_text, read_dataset
+from unprocess_gen import RawPairs
+from unprocess_gen.dataset.manifest import Row, read_rows, write_rows
+from unprocess_gen.pipeline.verify import file_sha256, verify
+from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
+from unprocess_gen.planning import plan
+from unprocess_gen.reports import dataset_report as page
+from unprocess_gen.reports import markup
+from unprocess_gen.reports import photon_transfer as transfer
+from unprocess_gen.reports.benchmark import report
+from unprocess_gen.reports.dataset_report import PARAMETERS, WORDS, Histogram, Tally, Words
 
 TreeHash = Callable[[Path], str]
 

@@ -10,17 +10,19 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, single, synthetic
-from unprocess_gen.bayer import PATTERNS
-from unprocess_gen.config import Config, GainsConfig, NoiseConfig
-from unprocess_gen.effects import EFFECTS
-from unprocess_gen.methods import POLYNOMIAL_NORMAL, is_steep, method
-from unprocess_gen.pair import AT_ONCE, make_pair, make_pairs, reference_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import IN_FLOAT32, Pair, Plan
-from unprocess_gen.selftest import GOLDEN_PHYSICS
-from unprocess_gen.sensor import noisy_limits
-from unprocess_gen.tables import linear_table
+from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL, is_steep, method
+from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
+from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.types import IN_FLOAT32, Pair, Plan
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.kernels import gaussian_float32 as single
+from unprocess_gen.simulation.pair import AT_ONCE, make_pair, make_pairs, reference_pair
+from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.cfa import PATTERNS
+from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.sensor import noisy_limits
+from unprocess_gen.simulation.self_test import GOLDEN_PHYSICS
+from unprocess_gen.sources.scenes import synthetic
 
 SENSORS = {8: (0, 255), 10: (64, 1023), 12: (240, 4095), 14: (1024, 16383), 16: (4096, 65535)}
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")

@@ -18,15 +18,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs, photographs, repair, runner, transfer
-from unprocess_gen import patches as room
-from unprocess_gen.config import Config, check, dataset_yaml, read_dataset_yaml
-from unprocess_gen.errors import ConfigError, SourceError
-from unprocess_gen.forecast import forecast, text
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.patches import patches, pixels_in_none
-from unprocess_gen.records import Patch, PatchLaw
-from unprocess_gen.verify import replay, verify
+from unprocess_gen import RawPairs
+from unprocess_gen.config.schema import Config, check, dataset_yaml, read_dataset_yaml
+from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.types import Patch, PatchLaw
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline import repair
+from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.reports import photon_transfer as transfer
+from unprocess_gen.reports.estimate import forecast, text
+from unprocess_gen.sources import loader as photographs
+from unprocess_gen.sources import patches as room
+from unprocess_gen.sources.patches import patches, pixels_in_none
 
 Settings = Callable[..., Config]
 Hash = Callable[[Path], str]

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen.config import SourceConfig
-from unprocess_gen.errors import SourceError
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.pair import make_pair, reference_pair
-from unprocess_gen.photographs import downscaled, list_photographs, load
-from unprocess_gen.plan import plan_image
-from unprocess_gen.tables import linear_table
-from unprocess_gen.unprocess import dequantise
-from unprocess_gen.verify import replay
+from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.core.errors import SourceError
+from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.verify import replay
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.reference.unprocess import dequantise
+from unprocess_gen.sources.loader import downscaled, list_photographs, load
 
 
 @given(side=st.integers(1, 9), seed=st.integers(0, 99), deep=st.booleans())

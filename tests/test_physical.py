@@ -25,21 +25,23 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from moments import REACH, SAMPLER_ERROR, bernstein
 
-from unprocess_gen import effects, electrons, synthetic
-from unprocess_gen.bayer import PATTERNS
-from unprocess_gen.colour import IDENTITY
-from unprocess_gen.config import Config, branch_of, check
-from unprocess_gen.effects import EFFECTS
-from unprocess_gen.manifest import ok_row, plan_of, read_rows, write_rows
-from unprocess_gen.methods import gaussian_from
-from unprocess_gen.pair import make_pair, reference_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.planner import facts_of
-from unprocess_gen.records import Patch, Physics, Plan, Source, Srgb
-from unprocess_gen.sensor import noisy_limits, to_dn
-from unprocess_gen.streams import words
-from unprocess_gen.tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
-from unprocess_gen.unprocess import unprocess
+from unprocess_gen.config.accuracy import gaussian_from
+from unprocess_gen.config.schema import Config, branch_of, check
+from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
+from unprocess_gen.core.random_streams import words
+from unprocess_gen.core.types import Patch, Physics, Plan, Source, Srgb
+from unprocess_gen.dataset.manifest import ok_row, plan_of, read_rows, write_rows
+from unprocess_gen.planning.effect_selection import facts_of
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.kernels import physical as electrons
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference.cfa import PATTERNS
+from unprocess_gen.simulation.reference.colour import IDENTITY
+from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.sensor import noisy_limits, to_dn
+from unprocess_gen.simulation.reference.unprocess import unprocess
+from unprocess_gen.sources.scenes import synthetic
 
 Settings = Callable[..., Config]
 SHA256 = "7" * 64

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config import BranchConfig, Config, check
-from unprocess_gen.errors import ConfigError
-from unprocess_gen.physics import number, plan_physics
-from unprocess_gen.plan import PARAMETERS, plan_image
-from unprocess_gen.records import Facts, Physics
+from unprocess_gen.config.schema import BranchConfig, Config, check
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Facts, Physics
+from unprocess_gen.planning.noise_profile import number, plan_physics
+from unprocess_gen.planning.plan import PARAMETERS, plan_image
 
 Settings = Callable[..., Config]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from unprocess_gen.config import check, read_dataset_yaml
-from unprocess_gen.runner import generate
+from unprocess_gen.config.schema import check, read_dataset_yaml
+from unprocess_gen.pipeline.generate import generate
 
 PINNED = Path(__file__).parents[1] / "manifests"
 NAMES = sorted(path.stem for path in PINNED.glob("*.yaml"))

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from moments import bernstein
 
-from unprocess_gen import poisson as poissons
-from unprocess_gen import streams, tables
-from unprocess_gen.compiled import kernel
-from unprocess_gen.effects import normals
-from unprocess_gen.errors import MachineError
-from unprocess_gen.normals import Quantiles, normal_quantiles, quick_normals
-from unprocess_gen.poisson import LIMIT, Counting, Tables, draw, poisson, poisson_tables, room_for
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.simulation.kernels import poisson as poissons
+from unprocess_gen.simulation.kernels.normal import Quantiles, normal_quantiles, quick_normals
+from unprocess_gen.simulation.kernels.poisson import LIMIT, Counting, Tables, draw, poisson, poisson_tables, room_for
+from unprocess_gen.simulation.reference.noise import normals
 
 WORDS = 2**32
 SIGN = 2**31

@@ -14,12 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs, preview, process, unprocess
-from unprocess_gen.bayer import PATTERNS, mosaic
-from unprocess_gen.errors import ConfigError, DamageError, MachineError
-from unprocess_gen.manifest import plan_of
-from unprocess_gen.photographs import downscaled
-from unprocess_gen.tables import linear_table
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
+from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.dataset.manifest import plan_of
+from unprocess_gen.reports import contact_sheet as preview
+from unprocess_gen.simulation.reference import isp as process
+from unprocess_gen.simulation.reference import unprocess
+from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic
+from unprocess_gen.sources.loader import downscaled
 
 HEIGHT, WIDTH = 60, 90
 """Of the first photograph, which a panel holds as a whole, one to one."""

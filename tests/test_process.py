@@ -16,13 +16,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, process, synthetic, unprocess
-from unprocess_gen.bayer import PATTERNS, mosaic
-from unprocess_gen.config import Config, GainsConfig, NoiseConfig
-from unprocess_gen.pair import make_pair
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Plan
-from unprocess_gen.sensor import quantise, to_dn
+from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
+from unprocess_gen.core.types import Plan
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference import colour, unprocess
+from unprocess_gen.simulation.reference import isp as process
+from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic
+from unprocess_gen.simulation.reference.sensor import quantise, to_dn
+from unprocess_gen.sources.scenes import synthetic
 
 EPS = 2.0**-52
 GAINS = {

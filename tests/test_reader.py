@@ -18,17 +18,17 @@ from conftest import fill
 
 import unprocess_gen
 from unprocess_gen import RawPairs
-from unprocess_gen.errors import DamageError
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.pair import make_pair
-from unprocess_gen.photographs import load
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Source
-from unprocess_gen.shards import array_xxh3
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.types import Source
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.shards import array_xxh3
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.sources.loader import load
 
 
 def test_raw_pairs_is_the_name_of_the_package() -> None:
-    assert unprocess_gen.RawPairs.__module__ == "unprocess_gen.reader"
+    assert unprocess_gen.RawPairs.__module__ == "unprocess_gen.dataset.reader"
 
 
 def test_a_name_the_package_lacks_is_an_attribute_error() -> None:

@@ -10,11 +10,12 @@ import pytest
 from conftest import CRVD, Door, Make, Settings, fill, pixels
 from PIL import Image
 
-from unprocess_gen import RawPairs, synthetic
-from unprocess_gen.compose import RECIPE, conf_dir
-from unprocess_gen.config import check, read_dataset_yaml
-from unprocess_gen.photographs import downscaled
-from unprocess_gen.records import Srgb
+from unprocess_gen import RawPairs
+from unprocess_gen.cli.hydra_app import RECIPE, conf_dir
+from unprocess_gen.config.schema import check, read_dataset_yaml
+from unprocess_gen.core.types import Srgb
+from unprocess_gen.sources.loader import downscaled
+from unprocess_gen.sources.scenes import synthetic
 
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml"))
 NO_CLIPS = {"crvd_like": ("source.clips=false",)}

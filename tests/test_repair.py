@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from conftest import Door, Make
 
-from unprocess_gen import repair as room
-from unprocess_gen.verify import verify
+from unprocess_gen.pipeline import repair as room
+from unprocess_gen.pipeline.verify import verify
 
 FILES = ("config.yaml", "manifest.csv", "dataset.json", *(f"shards/shard-0000{number}.tar" for number in range(4)))
 Hash = Callable[[Path], str]

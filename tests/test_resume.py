@@ -19,10 +19,11 @@ import pytest
 from conftest import COMMAND, Cli, environment, fill, pixels
 from PIL import Image
 
-from unprocess_gen import RawPairs, runner
-from unprocess_gen.errors import ConfigError, DamageError, LockedError, MachineError
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.workspace import read_dataset
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import ConfigError, DamageError, LockedError, MachineError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.workspace import read_dataset
 
 Make = Callable[..., Any]
 Door = Callable[..., Any]
@@ -619,9 +620,9 @@ def test_an_out_that_vanishes_is_the_machines_failure(
 MERGE = """
 import json, os, resource, sys
 from pathlib import Path
-from unprocess_gen.manifest import NAMES, read_rows
-from unprocess_gen.runner import tally
-from unprocess_gen.workspace import Workspace
+from unprocess_gen.dataset.manifest import NAMES, read_rows
+from unprocess_gen.pipeline.generate import tally
+from unprocess_gen.pipeline.workspace import Workspace
 
 out, shards = Path(sys.argv[1]), int(sys.argv[2])
 row = next(read_rows(Path(sys.argv[3])))

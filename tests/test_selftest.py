@@ -12,10 +12,15 @@ import numpy as np
 import pytest
 from conftest import Door
 
-from unprocess_gen import effects, fused, normals, selftest, streams, tables
-from unprocess_gen.errors import MachineError
-from unprocess_gen.pair import make_pair, reference_pair
-from unprocess_gen.shards import array_xxh3
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.dataset.shards import array_xxh3
+from unprocess_gen.simulation import self_test as selftest
+from unprocess_gen.simulation.kernels import gaussian as fused
+from unprocess_gen.simulation.kernels import normal as normals
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.reference import noise as effects
 
 
 @pytest.fixture(autouse=True)
@@ -213,7 +218,7 @@ def test_only_the_shards_of_the_failing_process_are_named(
     whole = ("n_jobs=1", "source.limit=4", "output.pairs_per_shard=2", "self_test=go_on")
     assert door(*whole, "out=other").code == 0
     with monkeypatch.context() as patched:
-        patched.setattr("unprocess_gen.workspace.Workspace.finish", interrupted)
+        patched.setattr("unprocess_gen.pipeline.workspace.Workspace.finish", interrupted)
         assert door(*whole).code == 130
     (tmp_path / "ds" / ".work" / "rows" / "00001.json").unlink()
     (tmp_path / "ds" / "shards" / "shard-00001.tar").unlink()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.sensor import noise_in_dn, noisy_limits, quantise, to_dn
+from unprocess_gen.simulation.reference.sensor import noise_in_dn, noisy_limits, quantise, to_dn
 
 IMX385, GENERIC_14 = (240, 4095), (1024, 16383)
 

@@ -20,10 +20,11 @@ import xxhash
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import RawPairs, shards
-from unprocess_gen.errors import DamageError
-from unprocess_gen.records import Counts, Pair
-from unprocess_gen.shards import (
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.types import Counts, Pair
+from unprocess_gen.dataset import shards
+from unprocess_gen.dataset.shards import (
     Form,
     Member,
     ShardWriter,

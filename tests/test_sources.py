@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import sources
-from unprocess_gen.errors import ConfigError, MachineError, SourceError
-from unprocess_gen.records import Source
-from unprocess_gen.sources import Listing, decode_name, encode_name, list_folder, number_twins, read_bytes
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.types import Source
+from unprocess_gen.sources import listing as sources
+from unprocess_gen.sources.listing import Listing, decode_name, encode_name, list_folder, number_twins, read_bytes
 
 
 def listed(root: Path, *include: str, recursive: bool = True, limit: int | None = None) -> Listing:

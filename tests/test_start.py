@@ -12,17 +12,17 @@ from typing import NoReturn
 
 import pytest
 
-from unprocess_gen import compose as room
-from unprocess_gen import config as settings_room
-from unprocess_gen.compose import compose, compose_beside
-from unprocess_gen.config import Config
-from unprocess_gen.errors import ConfigError
+from unprocess_gen.cli import hydra_app as room
+from unprocess_gen.cli.hydra_app import compose, compose_beside
+from unprocess_gen.config import schema as settings_room
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import ConfigError
 
 RUN = """
 import os, sys
 cores, *sys.argv[1:] = sys.argv[1:]
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:int(cores)])
-from unprocess_gen import cli
+from unprocess_gen.cli import main as cli
 assert cli.main() == 0
 print(*sys.modules)
 """
@@ -127,7 +127,7 @@ def test_where_no_child_can_be_made_settings_are_composed_here(monkeypatch: pyte
 IGNORING = """
 import signal, sys
 signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-from unprocess_gen.cli import main
+from unprocess_gen.cli.main import main
 sys.argv = ["gen-dataset", *sys.argv[1:]]
 sys.exit(main())
 """
@@ -196,7 +196,7 @@ def test_where_a_child_dies_settings_are_composed_here(
 KEEPING = """
 import resource, sys
 import numpy as np
-from unprocess_gen import runner
+from unprocess_gen.pipeline import generate as runner
 if sys.argv[1] == "keep":
     runner._keep_memory()
 faults = [resource.getrusage(resource.RUSAGE_SELF).ru_minflt]

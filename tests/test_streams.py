@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moments import FALSE_ALARM, bernstein
 
-from unprocess_gen import streams
-from unprocess_gen.streams import (
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.random_streams import (
     STREAMS,
     body_key,
     parameter_uniforms,

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from unprocess_gen.synthetic import KINDS, NAMES, listing, scene
+from unprocess_gen.sources.scenes.synthetic import KINDS, NAMES, listing, scene
 
 GOLDEN = {
     "dead_leaves-0": "99cf3d0cb2632018",
@@ -81,7 +81,7 @@ def test_a_name_that_is_no_scene_is_refused(name: str) -> None:
 
 def test_scenes_do_not_depend_on_the_vector_units() -> None:
     code = (
-        "import hashlib, sys; from unprocess_gen.synthetic import NAMES, scene;"
+        "import hashlib, sys; from unprocess_gen.sources.scenes.synthetic import NAMES, scene;"
         "print(*[hashlib.sha256(scene(name).tobytes()).hexdigest()[:16] for name in NAMES])"
     )
     features = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR AVX2 AVX512F FMA3"

@@ -18,8 +18,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from unprocess_gen import tables
-from unprocess_gen.errors import MachineError
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core.errors import MachineError
 
 CURVES_8 = [key[:2] for key in tables.PINNED if key[2] == 256]
 CURVES_16 = [key[:2] for key in tables.PINNED if key[2] == 65536]
@@ -266,8 +266,8 @@ def test_the_cache_is_below_the_home_folder_unless_told_otherwise(monkeypatch: p
 TWINS = f"""
 import sys, time
 from pathlib import Path
-from unprocess_gen import tables
-from unprocess_gen.errors import MachineError
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core.errors import MachineError
 here, me = Path(sys.argv[1]), sys.argv[2]
 build = tables._build
 def slow(*curve):

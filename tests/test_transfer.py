@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from conftest import Door, Make
 
-from unprocess_gen import RawPairs, transfer
+from unprocess_gen import RawPairs
+from unprocess_gen.reports import photon_transfer as transfer
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen import colour, unprocess
-from unprocess_gen.config import Config, GainsConfig, NoiseConfig
-from unprocess_gen.plan import plan_image
-from unprocess_gen.records import Plan
-from unprocess_gen.sensor import to_dn
+from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
+from unprocess_gen.core.types import Plan
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.reference import colour, unprocess
+from unprocess_gen.simulation.reference.sensor import to_dn
 
 EPS = 2.0**-52
 

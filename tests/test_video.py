@@ -20,14 +20,15 @@ import pytest
 from conftest import COMMAND, Door, Make, Settings, environment, pixels
 from PIL import Image
 
-from unprocess_gen import RawPairs, photographs
-from unprocess_gen.errors import ConfigError, MachineError, SourceError
-from unprocess_gen.manifest import read_rows
-from unprocess_gen.photographs import list_photographs, load
-from unprocess_gen.verify import replay, verify
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.sources import loader as photographs
+from unprocess_gen.sources.loader import list_photographs, load
 
 av = pytest.importorskip("av")
-from unprocess_gen.video import CODECS, FORMATS, Video  # noqa: E402
+from unprocess_gen.sources.video.decode import CODECS, FORMATS, Video  # noqa: E402
 
 Planes = Sequence[np.ndarray]
 
@@ -374,7 +375,7 @@ import av
 from pathlib import Path
 if sys.argv[2] != "all":
     ctypes.CDLL(glob.glob(str(Path(av.__path__[0]).parent / "av.libs" / "libavutil*"))[0]).av_force_cpu_flags(0)
-from unprocess_gen.video import Video
+from unprocess_gen.sources.video.decode import Video
 for path in sorted(Path(sys.argv[1]).iterdir()):
     video = Video(path.open("rb", buffering=0))
     found = hashlib.sha256(b"".join(video.frame(n, 2**40, "ignore")[0].tobytes() for n in range(len(video))))
@@ -405,7 +406,7 @@ def test_processors_with_and_without_simd_give_the_same_frames(tmp_path: Path) -
 
 
 def settings_of(root: Path, **changes: Any) -> Any:
-    from unprocess_gen.config import SourceConfig
+    from unprocess_gen.config.schema import SourceConfig
 
     video = ["*.mp4", "*.mov", "*.mkv", "*.avi", "*.webm"]
     return SourceConfig(**{"root": str(root), "include": ["*.png"], "clips": True, "video": video} | changes)
@@ -792,7 +793,7 @@ def test_without_pyav_a_video_is_refused_with_the_way_out(
 
 
 def test_a_folder_of_videos_alone_needs_no_other_globs(films: Path, settings: Settings) -> None:
-    from unprocess_gen.config import check
+    from unprocess_gen.config.schema import check
 
     config = settings("source.clips=true", "source.include=[]")
     config.source.root = str(films)

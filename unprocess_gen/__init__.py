@@ -1,6 +1,6 @@
 """Clean and noisy raw pairs from ordinary sRGB photographs.
 
-``RawPairs(path)`` reads a finished dataset. The rest is reached through its room: ``unprocess_gen.pair.make_pair`` is
+``RawPairs(path)`` reads a finished dataset. The rest is reached through its room: ``unprocess_gen.simulation.pair.make_pair`` is
 the page to read first.
 """
 
@@ -12,13 +12,13 @@ __version__ = "0.1.0"
 __all__ = ["RawPairs", "__version__"]
 
 if TYPE_CHECKING:
-    from unprocess_gen.reader import RawPairs
+    from unprocess_gen.dataset.reader import RawPairs
 
 
 def __getattr__(name: str) -> Any:
     """Import the reader, and NumPy with it, only when it is asked for: the command line answers ``--help`` at once."""
     if name == "RawPairs":
-        from unprocess_gen.reader import RawPairs
+        from unprocess_gen.dataset.reader import RawPairs
 
         return RawPairs
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,6 +2,6 @@
 
 import sys
 
-from unprocess_gen.cli import main
+from unprocess_gen.cli.main import main
 
 sys.exit(main())

@@ -1,0 +1,1 @@
+"""Compose, validate and serialize the configuration."""

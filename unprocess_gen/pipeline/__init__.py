@@ -1,0 +1,1 @@
+"""Generate, verify, replay and repair datasets."""

@@ -1,0 +1,142 @@
+"""From a physical noise profile and a scene to the numbers of one frame, on the sensor in use.
+
+Profiles speak in electrons up to the system gain K and in DN of the sensor they were calibrated on after it; a number
+may depend on ISO, in one of the forms of `FORMS`. A profile holds for the ISOs that were measured and for no others: a
+sensor whose gain is dual has a branch on either side. What needs an exponential or a logarithm is computed in `decimal`
+and rounded once, since no libm gives the same last bit everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from decimal import Decimal, localcontext
+from typing import Any
+
+from unprocess_gen.config.distributions import draw
+from unprocess_gen.config.schema import SCENE_LAWS, BranchConfig, Config, NoiseConfig, branch_of, law
+from unprocess_gen.core.lookup_tables import DIGITS, normal_quantile, tukey_std
+from unprocess_gen.core.random_streams import body_key
+from unprocess_gen.core.types import Physics
+
+
+def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) -> Physics:
+    """Draw what the scene and the profile leave open, and convert it to the sensor's DN.
+
+    DN of the profile become DN of the sensor by s = (W - B) / (W_profile - B_profile): gains and offsets times s.
+    ``uniforms`` holds a uniform for each name of `plan.PARAMETERS`; ``config`` has passed `config.check`.
+    """
+    noise, scene, sensor = config.noise, config.scene, config.sensor
+    iso, seconds, celsius = (
+        draw(law(key, value, SCENE_LAWS), uniforms[key])
+        for key, value in (
+            ("iso", scene.iso if noise.iso is None else noise.iso),
+            ("exposure_s", scene.exposure_s),
+            ("temperature_c", scene.temperature_c),
+        )
+    )
+    branch = branch_of(noise, iso)
+    assert branch is not None and noise.white_level_dn is not None and noise.black_level_dn is not None
+    scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
+    gain = number(branch.dn_per_e, iso=iso)
+    shape = draw(law("read_shape", branch.read_shape, ("choice",)), uniforms["read_shape"])
+    warmth = _doublings(celsius, noise)
+    unit = f"{stream_key:016x}" if sensor.units == "image" else str(int(uniforms["sensor_unit"] * sensor.units))
+    errors = _black_error(branch, iso)
+    return Physics(
+        iso=iso,
+        exposure_s=seconds,
+        temperature_c=celsius,
+        dn_per_e=gain * scale,
+        prnu_std=noise.prnu_std or 0.0,
+        dark_e=(noise.dark_e_per_s or 0.0) * seconds * warmth,
+        dark_offset=sensor.dark_offset,
+        hot_pixel_share=noise.hot_pixel_share or 0.0,
+        hot_pixel_e=(noise.hot_pixel_e_per_s or 0.0) * seconds * warmth,
+        full_well_e=noise.full_well_e or 0.0,
+        read_law=branch.read_law,
+        read_shape=shape,
+        read_std_dn=number(branch.read_std_dn, iso=iso, gain=gain, uniform=uniforms["read_std"], shape=shape) * scale,
+        row_std_dn=number(branch.row_std_dn, iso=iso, gain=gain, uniform=uniforms["row_std"]) * scale,
+        column_std_dn=number(branch.column_std_dn, iso=iso, gain=gain, uniform=uniforms["column_std"]) * scale,
+        black_error_dn=(errors[0] * scale, errors[1] * scale, errors[2] * scale, errors[3] * scale),
+        dead_pixel_share=noise.dead_pixel_share or 0.0,
+        sensor_unit=unit,
+        body_key=body_key(config.seed, noise.name, unit),
+        fixed_pattern_in_clean=config.clean.includes_fixed_pattern,
+    )
+
+
+def _doublings(celsius: float, noise: NoiseConfig) -> float:
+    """Return by how much the dark current grows from the reference temperature: 2**((T - T_ref) / T_doubling)."""
+    with localcontext(prec=DIGITS):
+        exponent = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)
+        return float((exponent * Decimal(2).ln()).exp())
+
+
+def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:
+    """Return what a form of `FORMS` comes to; 0 for None.
+
+    ``gain`` is the profile's own K; ``uniform`` draws the scatter of a line; ``shape`` is that of Tukey's law.
+    """
+    if form is None:
+        return 0.0
+    if not isinstance(form, list):
+        return float(form)
+    with localcontext(prec=DIGITS):
+        return float(FORMS[form[0]](Decimal(iso), Decimal(gain), uniform, shape, *map(Decimal, form[1:])))
+
+
+def _per_iso(
+    iso: Decimal, gain: Decimal, u: float, shape: float, slope: Decimal, intercept: Decimal = Decimal(0)
+) -> Decimal:
+    return slope * iso + intercept
+
+
+def _root(iso: Decimal, gain: Decimal, u: float, shape: float, *coefficients: Decimal) -> Decimal:
+    """√(c0 + c1·ISO + c2·ISO² …): a deviation, from a variance that is a polynomial."""
+    total = Decimal(0)
+    for coefficient in reversed(coefficients):
+        total = total * iso + coefficient
+    return total.sqrt()
+
+
+def _line(
+    iso: Decimal, gain: Decimal, u: float, shape: float, slope: Decimal, intercept: Decimal, std: Decimal
+) -> Decimal:
+    """Ln σ = slope · ln K + intercept + std · n (ELD; natural logarithms)."""
+    scatter = std * normal_quantile(Decimal(u)) if std else Decimal(0)
+    return (slope * gain.ln() + intercept + scatter).exp()
+
+
+def _scale_line(iso: Decimal, gain: Decimal, u: float, shape: float, *line: Decimal) -> Decimal:
+    """As a line, of the scale of Tukey's law; times its deviation at scale 1."""
+    return _line(iso, gain, u, shape, *line) * tukey_std(shape)
+
+
+FORMS: dict[str, Callable[..., Decimal]] = {
+    "per_iso": _per_iso,
+    "root": _root,
+    "line": _line,
+    "scale_line": _scale_line,
+}
+"""What may stand in a branch in place of a number, ``[form, number, …]``."""
+
+
+def _black_error(branch: BranchConfig, iso: float) -> Sequence[float]:
+    """Return the offsets of the four sites: one for all, four, or a row of a table.
+
+    The rows share the branch's range of ln ISO among them, in equal parts.
+    """
+    value = branch.black_error_dn
+    if value is None:
+        return (0.0,) * 4
+    if not isinstance(value, list):
+        return (float(value),) * 4
+    if value[0] != "by_log_iso":
+        return [float(one) for one in value]
+    table, (low, high) = value[1:], branch.iso
+    if low == high:
+        return [float(one) for one in table[0]]
+    with localcontext(prec=DIGITS):
+        place = (Decimal(iso) / Decimal(low)).ln() / (Decimal(high) / Decimal(low)).ln()
+    return [float(one) for one in table[min(int(place * len(table)), len(table) - 1)]]

@@ -1,0 +1,226 @@
+"""The plan of an image: every parameter, drawn once. After this nothing is random; all is a function of (pixels, plan).
+
+Draws come from the image's own stream ``parameters`` (`streams`), a counter for each name in `PARAMETERS`, so a draw
+that is not needed moves no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from unprocess_gen.config.accuracy import choose, is_steep
+from unprocess_gen.config.distributions import draw
+from unprocess_gen.config.schema import (
+    SCENE_LAWS,
+    CameraConfig,
+    Config,
+    budget,
+    dequantizing,
+    effect_switch,
+    gain_laws,
+    is_normalised,
+    is_physical,
+    law,
+    noise_laws,
+    noise_levels,
+    uses_physics,
+)
+from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
+from unprocess_gen.core.types import Facts, Plan
+from unprocess_gen.planning.effect_selection import NOT_ROUNDED, Prediction, decide, light_of
+from unprocess_gen.planning.noise_profile import plan_physics
+from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.sensor import noise_in_dn
+
+PARAMETERS = (
+    *("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b"),
+    *("iso", "exposure_s", "temperature_c", "exposure_ratio", "read_shape", "read_std", "row_std", "column_std"),
+    "sensor_unit",
+)
+"""The number of each draw in the image's stream. Part of every dataset ever made: append, never reorder."""
+
+NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std")
+"""Those that every noise level draws for itself."""
+
+
+def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None) -> Plan:
+    """Draw every parameter of one image.
+
+    ``source_sha256`` is the hex digest of the source's bytes and ``occurrence`` the number of identical files before
+    it; together with ``config.seed`` they decide all draws. What the effects of a physical profile are judged by are
+    the ``facts`` of the pixels (`planner.facts_of`). ``config`` has passed `config.check`.
+    """
+    return plan_with_reasons(config, source_sha256, occurrence, facts)[0]
+
+
+def plan_pairs(
+    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, frame: int = 0
+) -> tuple[Plan, ...]:
+    """Return the plans of all pairs of one image, level by level and draw by draw: one clean frame, many noisy ones.
+
+    Of a frame of a clip, ``source_sha256`` and ``occurrence`` are the clip's, so that all of its frames share their
+    draws, and ``frame`` is its number, so that they do not share their noise.
+    """
+    levels = plan_levels(config, source_sha256, occurrence, facts)
+    return with_draws(config, [plan for plan, _ in levels], frame)
+
+
+def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
+    """Return a plan for every draw at each level."""
+    return tuple(replace(plan, draw=draw, frame=frame) for plan in levels for draw in range(config.noise.draws))
+
+
+Reasoned = tuple[Plan, tuple[Prediction, ...]]
+"""A plan, and what was predicted of every effect of a physical profile."""
+
+
+def plan_levels(
+    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None
+) -> tuple[Reasoned, ...]:
+    """Return the plan of every noise level, with its reasons."""
+    levels = range(len(noise_levels(config.noise)))
+    return tuple(plan_with_reasons(config, source_sha256, occurrence, facts, level) for level in levels)
+
+
+def plan_with_reasons(
+    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, level: int = 0
+) -> Reasoned:
+    """Return the plan of one noise level, with its reasons."""
+    key = stream_key(config.seed, source_sha256, occurrence)
+    uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
+    if level:
+        at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), level), strict=True))
+        uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
+    config = replace(config, noise=noise_levels(config.noise)[level])
+    plan = _plan(config, key, uniforms, level)
+    if not is_physical(config.noise):
+        return plan, ()
+    if facts is None:
+        raise ValueError("a physical profile needs the facts of the pixels")
+    physics = plan_physics(config, uniforms, key)
+    span_dn = float(plan.white_level_dn - plan.black_level_dn)
+    light = light_of(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    predictions = decide(config, physics, facts, light)
+    return (
+        replace(
+            plan,
+            physics=physics,
+            a_dn=physics.dn_per_e,
+            b_dn2=physics.read_std_dn * physics.read_std_dn,
+            effects=tuple(one.effect for one in predictions if one.simulated),
+            skipped=tuple(f"{one.effect}: {one.reason}" for one in predictions if not one.simulated),
+        ),
+        predictions,
+    )
+
+
+def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> Plan:
+    """Return the plan without what a physical profile adds."""
+    camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
+    red, blue, inverse_rgb = gain_laws(config.gains)
+    darkened = law("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_LAWS)
+    a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
+    span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
+    effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
+    plan = Plan(
+        seed=config.seed,
+        stream_key=key,
+        downscale=config.source.downscale,
+        dequantize=dequantizing(config.source),
+        scene=config.scene.name,
+        exposure_ratio=draw(darkened, uniforms["exposure_ratio"]),
+        camera=camera,
+        weights=weights,
+        rgb2cam=rgb2cam,
+        red_gain=draw(red, uniforms["red"]),
+        blue_gain=draw(blue, uniforms["blue"]),
+        inverse_rgb_gain=draw(inverse_rgb, uniforms["inverse_rgb"]),
+        tone=config.isp.tone,
+        gamma="srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma),
+        highlight=config.gains.highlight,
+        highlight_threshold=config.gains.threshold,
+        pattern=config.sensor.pattern,
+        bits=config.sensor.bits,
+        black_level_dn=config.sensor.black_level_dn,
+        white_level_dn=config.sensor.white_level_dn,
+        sensor_clip=config.sensor.clip,
+        saturated=config.sensor.saturated,
+        noise=config.noise.name,
+        noise_law=config.noise.law,
+        a_dn=a_dn,
+        b_dn2=b_dn2,
+        effects=effects,
+        skipped=skipped,
+        accuracy=config.accuracy.name,
+        methods=(),
+        law_distance=config.accuracy.law_distance,
+        level=level,
+        dtype=config.output.dtype,
+        layout=config.output.layout,
+    )
+    counts_electrons, normalised = uses_physics(config.noise), is_normalised(config)
+    return replace(plan, methods=choose(budget(config.accuracy), counts_electrons, normalised, is_steep(plan)))
+
+
+# ---------------------------------------------------------------------------------------------------------- camera
+
+Weights = tuple[float, float, float, float]
+
+
+def plan_camera(camera: CameraConfig, uniforms: dict[str, float]) -> tuple[str, Weights, colour.Matrix]:
+    """Return the camera's name, the weights of the four known cameras in it, and the matrix from RGB to camera."""
+    names = tuple(colour.CAMERAS)
+    if camera.law == "identity":
+        return camera.name, (0.0, 0.0, 0.0, 0.0), colour.IDENTITY
+    if camera.law == "custom":
+        return camera.name, (0.0, 0.0, 0.0, 0.0), colour.rgb2cam(colour.matrix(camera.xyz2cam or ()))
+    if camera.law == "convex":
+        weights = convex_weights(uniforms)
+        return camera.name, weights, colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
+    name = names[int(uniforms["choice"] * len(names))] if camera.law == "choice" else camera.name
+    w0, w1, w2, w3 = (float(name == other) for other in names)
+    return name, (w0, w1, w2, w3), colour.rgb2cam(colour.CAMERAS[name])
+
+
+def convex_weights(uniforms: dict[str, float]) -> Weights:
+    """Return four uniforms over their sum (Brooks et al. 2019, random_ccm())."""
+    u0, u1, u2, u3 = (uniforms[f"weight_{i}"] for i in range(4))
+    total = u0 + u1 + u2 + u3
+    return u0 / total, u1 / total, u2 / total, u3 / total
+
+
+# ----------------------------------------------------------------------------------------------------------- noise
+
+
+def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float]:
+    """Draw the noise level and convert it to the sensor's DN."""
+    noise, sensor = config.noise, config.sensor
+    a_law, b_law = noise_laws(noise)
+    a = draw(a_law, uniforms["a"])
+    b = draw(b_law, uniforms["b"], a)
+    return noise_in_dn(
+        a,
+        b,
+        units=noise.units or "",
+        black=noise.black or "",
+        profile_levels_dn=(noise.black_level_dn or 0, noise.white_level_dn or 0),
+        sensor_levels_dn=(sensor.black_level_dn, sensor.white_level_dn),
+    )
+
+
+def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the effects of a two-parameter profile that are simulated, in order, and those skipped, with the reason.
+
+    ``span_dn`` is white less black: where the variance is nowhere above 0 in it, there is no noise to simulate.
+    """
+    noise = config.noise.name
+    rounded = not is_normalised(config)
+    last = ("quantise",) if rounded else ()
+    skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)
+    if effect_switch(config.effects, "heteroscedastic") == "off":
+        return last, ("heteroscedastic: switched off", *skipped)
+    if a_dn * span_dn + b_dn2 <= 0:
+        none = f"heteroscedastic: noise={noise} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})"
+        return last, (none, *skipped)
+    return ("heteroscedastic", *last), skipped

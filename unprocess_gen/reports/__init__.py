@@ -1,0 +1,1 @@
+"""Describe datasets and runs for people: estimates, pictures, pages and measurements."""

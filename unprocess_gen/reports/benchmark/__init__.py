@@ -1,0 +1,1 @@
+"""Measure what accuracy costs in time."""

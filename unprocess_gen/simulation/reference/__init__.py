@@ -1,0 +1,1 @@
+"""Compute each step of the simulation in NumPy, as the article states it; the results define those of the kernels."""

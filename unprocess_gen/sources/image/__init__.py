@@ -1,0 +1,1 @@
+"""Read the headers and pixels of image files."""

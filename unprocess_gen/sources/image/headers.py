@@ -1,0 +1,580 @@
+"""What a file says of itself before a pixel is decoded: JPEG, PNG, TIFF, WebP and BMP, told by their first bytes.
+
+In few lines for each format, and OpenCV's shape is held against them later. Pillow was tried for it: its PNG plugin
+decodes all pixels to get at an ``eXIf`` chunk behind the image data, its WebP plugin starts a decoder, it refuses TIFFs
+before we can say why, and the walks that prove a file whole meet every header field on their way anyway. A header takes
+5 to 60 microseconds, whatever size it claims, plus the search through a JPEG for its last marker, at about 1 GB/s.
+
+OpenCV (4.12, 5.0) refuses every prefix of a file itself, but older ones, and ``imread`` of any version, hand out a
+half-gray JPEG. So a whole file is one that holds its end-of-image marker, IEND, or the last strip; bytes after the end
+(motion photos) are fine. What a file lost from its middle shows when it is decoded (`decode`).
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import NamedTuple, TypeVar
+
+from unprocess_gen.core.errors import SourceError
+
+ORIENTATIONS = range(1, 9)
+
+_MOST_PIECES = 2**18
+"""Segments or chunks of a file; 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. A file of nothing else takes 0.5 s."""
+
+_MAX_PROFILE_BYTES = 2**22
+# What reading a header field raises where the file ends before it; offsets of 64 bits overflow first.
+_PAST_THE_END = (struct.error, OverflowError)
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What a file says of itself.
+
+    ``width`` and ``height`` are as stored, before the orientation; ``bits`` (8 or 16) are those of the decoded array.
+    ``mode`` is ``gray``, ``white_is_zero``, ``rgb``, ``palette`` or ``cmyk``. ``frames`` counts the full pages of a
+    TIFF; an animation counts as 2. ``missing`` says what a cut took away, and is empty for a whole file.
+    """
+
+    format: str
+    width: int
+    height: int
+    mode: str = "rgb"
+    bits: int = 8
+    has_alpha: bool = False
+    orientation: int = 1
+    frames: int = 1
+    icc: bytes | None = None
+    missing: str = ""
+
+
+def probe(data: bytes) -> Header:
+    """Reads the header of a JPEG, PNG, TIFF, WebP or BMP file, told by its first bytes, and no pixel.
+
+    Raises
+    ------
+    SourceError
+        ``empty``, ``unsupported``, ``truncated`` (the cut went through the header itself) or ``corrupt``.
+    """
+    header = _header(data)
+    if header.width < 1 or header.height < 1:
+        raise SourceError("corrupt", f"the {header.format} header says {header.width} x {header.height} pixels")
+    return header
+
+
+def max_side(name: str) -> int:
+    """Return the longest side, in pixels, that the library behind OpenCV takes for a format."""
+    return _FORMATS[name].max_side
+
+
+_Piece = TypeVar("_Piece")
+
+
+def _bounded(pieces: Iterable[_Piece]) -> Iterator[_Piece]:
+    """Yields the pieces of a file, and refuses one that is made of so many that walking them takes long."""
+    for count, piece in enumerate(pieces):
+        if count == _MOST_PIECES:
+            raise SourceError("corrupt", f"the file has more than {_MOST_PIECES} segments or chunks")
+        yield piece
+
+
+# JPEG -----------------------------------------------------------------------------------------------------------------
+
+# Within a scan, FF is followed by 00, a restart marker or more FF: anything else begins the next segment.
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
+_JPEG_END, _JPEG_SCAN, _JPEG_EXIF, _JPEG_ICC = 0xD9, 0xDA, 0xE1, 0xE2
+_JPEG_HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)
+_JPEG_OTHER_FRAMES = (0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)
+_JPEG_MODES = {1: "gray", 3: "rgb", 4: "cmyk"}
+_JPEG_MOST_SCANS = 100
+"""Encoders write 1 to 20. An empty one takes 100 bytes, and 7 ms or more where the header claims 2^26 pixels."""
+_EXIF_PREFIX = b"Exif\0\0"
+_ICC_PREFIX = b"ICC_PROFILE\0"
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yields (marker, payload) up to the end-of-image marker, or to where the file ends before it."""
+    match = _JPEG_MARKER.search(data, 2)
+    while match is not None:
+        marker = data[match.start() + 1]
+        if marker == _JPEG_END:
+            yield marker, b""
+            return
+        (length,) = struct.unpack_from(">H", data, match.end())
+        end = match.end() + length
+        if length < 2 or end > len(data):
+            return
+        yield marker, data[match.end() + 2 : end]
+        match = _JPEG_MARKER.search(data, end)
+
+
+def _jpeg(data: bytes) -> Header:
+    header, orientation, profile, marker, scans = None, None, {}, 0, 0
+    for marker, payload in _bounded(_jpeg_segments(data)):
+        scans += marker == _JPEG_SCAN
+        if marker in _JPEG_HUFFMAN_FRAMES + _JPEG_OTHER_FRAMES and header is None:
+            header = _jpeg_frame(marker, payload)
+        elif marker == _JPEG_EXIF and payload.startswith(_EXIF_PREFIX) and orientation is None:
+            orientation = _exif_orientation(payload)
+        elif marker == _JPEG_ICC and payload.startswith(_ICC_PREFIX):
+            profile[payload[12:13]] = payload[14:]
+    if header is None:
+        raise SourceError("corrupt" if marker == _JPEG_END else "truncated", "the JPEG file has no frame header")
+    if scans > _JPEG_MOST_SCANS:
+        raise SourceError("corrupt", f"the JPEG file has {scans} scans, more than {_JPEG_MOST_SCANS}")
+    return replace(
+        header,
+        orientation=orientation or 1,
+        icc=b"".join(part for _, part in sorted(profile.items())) if profile else None,
+        missing="" if marker == _JPEG_END else "its end-of-image marker",
+    )
+
+
+def _jpeg_frame(marker: int, payload: bytes) -> Header:
+    depth, height, width, components = struct.unpack_from(">BHHB", payload)
+    if marker not in _JPEG_HUFFMAN_FRAMES or depth != 8 or components not in _JPEG_MODES:
+        raise _unsupported(f"a JPEG of kind SOF{marker - 0xC0} with {components} components of {depth} bits")
+    return Header("jpeg", width, height, _JPEG_MODES[components])
+
+
+# PNG ------------------------------------------------------------------------------------------------------------------
+
+_PNG_GRAY, _PNG_RGB, _PNG_PALETTE, _PNG_GRAY_ALPHA, _PNG_RGB_ALPHA = 0, 2, 3, 4, 6
+_PNG_MODES = {
+    _PNG_GRAY: "gray",
+    _PNG_RGB: "rgb",
+    _PNG_PALETTE: "palette",
+    _PNG_GRAY_ALPHA: "gray",
+    _PNG_RGB_ALPHA: "rgb",
+}
+_PNG_HEAD = 8
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yields (kind, start, end) of each whole chunk up to IEND."""
+    return _bounded(_png_walk(data))
+
+
+def _png_walk(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    at, kind = _PNG_HEAD, b""
+    while kind != b"IEND" and at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        start, at = at + 8, at + 12 + length
+        if at <= len(data):
+            yield kind, start, at - 4
+
+
+def _png_chunk(data: bytes, wanted: bytes) -> bytes | None:
+    return next((data[start:end] for kind, start, end in _png_chunks(data) if kind == wanted), None)
+
+
+def _png(data: bytes) -> Header:
+    kinds = {kind for kind, _, _ in _png_chunks(data)}
+    first, width, height, bits, colour = struct.unpack_from(">4sIIBB", data, _PNG_HEAD + 4)
+    if first != b"IHDR" or colour not in _PNG_MODES:
+        raise SourceError("corrupt", f"the PNG file begins with {first!r} and says colour type {colour}")
+    return Header(
+        "png",
+        width,
+        height,
+        _PNG_MODES[colour],
+        16 if bits == 16 else 8,
+        has_alpha=colour in (_PNG_GRAY_ALPHA, _PNG_RGB_ALPHA) or b"tRNS" in kinds,
+        orientation=_exif_orientation(_png_chunk(data, b"eXIf") or b""),
+        frames=2 if b"acTL" in kinds else 1,
+        icc=_png_profile(_png_chunk(data, b"iCCP")),
+        missing="" if b"IEND" in kinds else "its IEND chunk",
+    )
+
+
+def _png_profile(chunk: bytes | None) -> bytes | None:
+    """Unpacks iCCP: a name, a zero, the method, deflated bytes. A broken one is b"", which no policy takes for sRGB."""
+    if chunk is None:
+        return None
+    try:
+        return zlib.decompressobj().decompress(chunk.partition(b"\0")[2][1:], _MAX_PROFILE_BYTES)
+    except zlib.error:
+        return b""
+
+
+def png_transparent_gray(data: bytes) -> int:
+    """The gray that tRNS declares transparent, as the decoded array spells it."""
+    bits = data[_PNG_HEAD + 16]
+    key = int.from_bytes((_png_chunk(data, b"tRNS") or b"")[:2], "big")
+    return key if bits == 16 else (key & (2**bits - 1)) * (255 // (2**bits - 1))
+
+
+# TIFF, and the EXIF block, which is one -------------------------------------------------------------------------------
+
+_TIFF_VALUES = {1: "B", 3: "H", 4: "I", 7: "B", 13: "I", 16: "Q", 18: "Q"}
+_TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+_SUBFILE, _WIDTH, _HEIGHT, _BITS, _COMPRESSION, _PHOTOMETRIC = 254, 256, 257, 258, 259, 262
+_STRIP_OFFSETS, _ORIENTATION, _SAMPLES, _STRIP_ROWS, _STRIP_BYTES, _PLANES = 273, 274, 277, 278, 279, 284
+_TILE_WIDTH, _TILE_HEIGHT, _TILE_OFFSETS, _TILE_BYTES, _SAMPLE_FORMAT, _PROFILE = 322, 323, 324, 325, 339, 34675
+_REDUCED_PAGE = 1
+_CHUNKY, _SEPARATE = 1, 2
+_UNCOMPRESSED = 1
+_TIFF_COMPRESSIONS = {_UNCOMPRESSED: "none", 5: "LZW", 7: "JPEG", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
+_TIFF_CMYK, _TIFF_SUBSAMPLED = 5, 6
+# (photometric, bits, samples) -> mode; what is not here, OpenCV reads wrongly or not at all
+_TIFF_KINDS = {
+    (0, 1, 1): "white_is_zero",
+    (0, 8, 1): "white_is_zero",
+    (0, 16, 1): "white_is_zero",
+    (1, 1, 1): "gray",
+    (1, 8, 1): "gray",
+    (1, 16, 1): "gray",
+    (2, 8, 3): "rgb",
+    (2, 8, 4): "rgb",
+    (2, 16, 3): "rgb",
+    (2, 16, 4): "rgb",
+    (3, 1, 1): "palette",
+    (3, 4, 1): "palette",
+    (3, 8, 1): "palette",
+    (6, 8, 3): "rgb",
+}
+_MOST_ENTRIES = 4096
+"""Tags of a directory: libtiff takes no more. They are walked for up to `_MAX_PAGES` directories, which may overlap."""
+_MOST_PLACES, _MOST_VALUES = 2**22, 2**16
+"""Values of a tag that lists strips (of one row and one channel, in the longest picture there is) and of any other."""
+_MOST_READ = 16
+"""How many times its size a compressed file may list in strips: some share their bytes, and each is copied."""
+_SMALLEST_TILE = 32
+_LARGEST_TILE = 2**24
+_MAX_PAGES = 64
+"""Enough to know that there are too many; a chain of overlapping directories could take hours to count."""
+
+
+class _Entry(NamedTuple):
+    """One tag of a TIFF directory: ``at`` is the place of the entry, ``value_at`` that of its first value."""
+
+    at: int
+    kind: int
+    values: int
+    value_at: int
+
+
+class _Tiff(NamedTuple):
+    """How a TIFF file spells numbers, and where its first directory lies."""
+
+    order: str
+    big: bool
+    first: int
+
+
+_Page = dict[int, _Entry]
+
+
+def _tiff_start(data: bytes) -> _Tiff:
+    order = ">" if data[:2] == b"MM" else "<"
+    big = struct.unpack_from(order + "H", data, 2)[0] == 43
+    (first,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
+    return _Tiff(order, big, first)
+
+
+def _tiff_pages(data: bytes, tiff: _Tiff) -> Iterator[_Page]:
+    """Yields the directories of the chain; struct.error where one lies outside the file."""
+    at, seen = tiff.first, {0}
+    while at not in seen:
+        seen.add(at)
+        page, at = _tiff_page(data, at, tiff.order, tiff.big)
+        yield page
+
+
+def _tiff_page(data: bytes, at: int, order: str, big: bool) -> tuple[_Page, int]:
+    counter, entry, link = ("Q", "HHQ", "Q") if big else ("H", "HHI", "I")
+    step, inline = (20, 8) if big else (12, 4)
+    (count,) = struct.unpack_from(order + counter, data, at)
+    if count > _MOST_ENTRIES:
+        raise SourceError("corrupt", f"the TIFF directory has {count} entries, more than {_MOST_ENTRIES}")
+    first = at + struct.calcsize("<" + counter)
+    (following,) = struct.unpack_from(order + link, data, first + count * step)
+    page: _Page = {}
+    for place in range(first, first + count * step, step):
+        tag, kind, values = struct.unpack_from(order + entry, data, place)
+        value_at = place + step - inline
+        if values * _TIFF_SIZES.get(kind, 1) > inline:
+            (value_at,) = struct.unpack_from(order + link, data, value_at)
+        page.setdefault(tag, _Entry(place, kind, values, value_at))
+    return page, following
+
+
+def _values(data: bytes, order: str, entry: _Entry | None, most: int = _MOST_VALUES) -> tuple[int, ...]:
+    if entry is None or entry.kind not in _TIFF_VALUES:
+        return ()
+    if entry.values > most:
+        raise SourceError("corrupt", f"a TIFF tag has {entry.values} values, more than {most}")
+    return struct.unpack_from(f"{order}{entry.values}{_TIFF_VALUES[entry.kind]}", data, entry.value_at)
+
+
+def _tiff(data: bytes) -> Header:
+    tiff = _tiff_start(data)
+    pages = list(islice(_tiff_pages(data, tiff), _MAX_PAGES))
+    if not pages:
+        raise SourceError("corrupt", "the TIFF file has no page")
+    read = _reader(data, tiff.order, pages[0])
+    mode = _tiff_mode(read)
+    width, height, bits = read(_WIDTH, 0)[0], read(_HEIGHT, 0)[0], read(_BITS, 1)[0]
+    profile = pages[0].get(_PROFILE)
+    return Header(
+        "tiff",
+        width,
+        height,
+        mode,
+        16 if bits == 16 else 8,
+        has_alpha=mode == "rgb" and read(_SAMPLES, 1)[0] == 4,
+        orientation=_known_orientation(read(_ORIENTATION, 1)),
+        frames=sum(not _reader(data, tiff.order, each)(_SUBFILE, 0)[0] & _REDUCED_PAGE for each in pages),
+        icc=data[profile.value_at : profile.value_at + profile.values] if profile else None,
+        missing=_tiff_missing(read, len(data)),
+    )
+
+
+_Read = Callable[[int, int], tuple[int, ...]]
+
+
+def _reader(data: bytes, order: str, page: _Page) -> _Read:
+    """A look-up of tags: ``read(tag, default)`` is a tuple of at least one value."""
+
+    def read(tag: int, default: int) -> tuple[int, ...]:
+        most = _MOST_PLACES if tag in _STRIP_TAGS + _TILE_TAGS else _MOST_VALUES
+        return _values(data, order, page.get(tag), most) or (default,)
+
+    return read
+
+
+def _tiff_mode(read: _Read) -> str:
+    photometric, samples, depths = read(_PHOTOMETRIC, 1)[0], read(_SAMPLES, 1)[0], read(_BITS, 1)
+    if read(_SUBFILE, 0)[0] & _REDUCED_PAGE:
+        raise _unsupported("a TIFF whose first page is a thumbnail, as in camera raw files")
+    if photometric == _TIFF_CMYK:
+        return "cmyk"
+    kind = (photometric, depths[0], samples)
+    described = f"a TIFF of photometric {photometric} with {samples} samples of {depths} bits"
+    if photometric in (0, 1) and samples == 2:
+        raise SourceError("alpha", f"{described}: its alpha cannot be checked; save the picture without alpha")
+    if kind not in _TIFF_KINDS or len(set(depths)) > 1 or set(read(_SAMPLE_FORMAT, 1)) != {1}:
+        raise _unsupported(f"{described} and sample format {read(_SAMPLE_FORMAT, 1)[0]}")
+    _check_tiff_layout(read, depths[0], samples)
+    return _TIFF_KINDS[kind]
+
+
+def _check_tiff_layout(read: _Read, bits: int, samples: int) -> None:
+    """Refuses what OpenCV cannot read, or reads as something else."""
+    compression = read(_COMPRESSION, _UNCOMPRESSED)[0]
+    if compression not in _TIFF_COMPRESSIONS:
+        raise _unsupported(f"a TIFF of compression {compression}")
+    if bits == 16 and samples > 1 and read(_PLANES, _CHUNKY)[0] == _SEPARATE:
+        raise _unsupported("a 16-bit TIFF with separate colour planes")
+    if bits != 16 and min(*read(_TILE_WIDTH, _SMALLEST_TILE), *read(_TILE_HEIGHT, _SMALLEST_TILE)) < _SMALLEST_TILE:
+        raise _unsupported(f"an 8-bit TIFF with tiles narrower than {_SMALLEST_TILE} pixels")
+    if read(_TILE_WIDTH, 1)[0] * read(_TILE_HEIGHT, 1)[0] > _LARGEST_TILE:
+        raise _unsupported(f"a TIFF with tiles of more than {_LARGEST_TILE} pixels")
+
+
+_STRIP_TAGS = (_STRIP_OFFSETS, _STRIP_BYTES)
+_TILE_TAGS = (_TILE_OFFSETS, _TILE_BYTES)
+
+
+def _tiff_missing(read: _Read, size_bytes: int) -> str:
+    """What the file lacks of the strips or tiles that its first page lists."""
+    offsets, lengths = (read(tag, 0) for tag in (_TILE_TAGS if _is_tiled(read) else _STRIP_TAGS))
+    if 0 in offsets or 0 in lengths or len(offsets) != len(lengths):
+        raise SourceError("corrupt", "the TIFF page does not say where its pixels are")
+    if len(offsets) < _tiff_pieces(read):
+        raise SourceError("corrupt", f"the TIFF page lists {len(offsets)} pieces of {_tiff_pieces(read)}")
+    if sum(lengths) < _tiff_smallest(read):
+        raise SourceError("corrupt", f"the TIFF page lists {sum(lengths)} bytes, expected {_tiff_smallest(read)}")
+    end = max(offset + length for offset, length in zip(offsets, lengths, strict=True))
+    if end > size_bytes:
+        return f"{end - size_bytes} bytes of its strips"
+    if read(_COMPRESSION, _UNCOMPRESSED)[0] != _UNCOMPRESSED and sum(lengths) > _MOST_READ * size_bytes:
+        raise SourceError("corrupt", f"the TIFF page lists {sum(lengths)} bytes of strips, the file has {size_bytes}")
+    return ""
+
+
+def _is_tiled(read: _Read) -> bool:
+    return read(_TILE_OFFSETS, 0) != (0,)
+
+
+def _tiff_pieces(read: _Read) -> int:
+    """How many strips or tiles the first page needs."""
+    width, height = read(_WIDTH, 0)[0], read(_HEIGHT, 0)[0]
+    across = read(_TILE_WIDTH, 0)[0] if _is_tiled(read) else width
+    down = read(_TILE_HEIGHT, 0)[0] if _is_tiled(read) else read(_STRIP_ROWS, height)[0]
+    if not across or not down:
+        raise SourceError("corrupt", "the TIFF page has strips or tiles of no size")
+    planes = read(_SAMPLES, 1)[0] if read(_PLANES, _CHUNKY)[0] == _SEPARATE else 1
+    return -(-width // across) * -(-height // down) * planes
+
+
+def _tiff_smallest(read: _Read) -> int:
+    """How many bytes the pixels take at least: of compressed or subsampled ones we know nothing."""
+    if read(_COMPRESSION, _UNCOMPRESSED)[0] != _UNCOMPRESSED or read(_PHOTOMETRIC, 1)[0] == _TIFF_SUBSAMPLED:
+        return 1
+    return (read(_WIDTH, 0)[0] * read(_BITS, 1)[0] * read(_SAMPLES, 1)[0] + 7) // 8 * read(_HEIGHT, 0)[0]
+
+
+def tiff_without_orientation(data: bytes) -> bytes | bytearray:
+    """The TIFF file with tag 274 set to 1, so that no decoder turns the picture; untouched where it says so already."""
+    tiff = _tiff_start(data)
+    entry = next(_tiff_pages(data, tiff)).get(_ORIENTATION)
+    if entry is None or _values(data, tiff.order, entry) == (1,):
+        return data
+    edited = bytearray(data)
+    struct.pack_into(tiff.order + ("HHQH6x" if tiff.big else "HHIH2x"), edited, entry.at, _ORIENTATION, 3, 1, 1)
+    return edited
+
+
+def _exif_orientation(block: bytes) -> int:
+    """The orientation in an EXIF block; 1 where there is none or it is broken, which is no reason to refuse pixels."""
+    tiff = block.removeprefix(_EXIF_PREFIX)
+    if not _FORMATS["tiff"].magic.match(tiff):
+        return 1
+    try:
+        start = _tiff_start(tiff)
+        # Only the first directory: the second, of the thumbnail, is often broken by editors.
+        page = next(_tiff_pages(tiff, start), {})
+        return _known_orientation(_values(tiff, start.order, page.get(_ORIENTATION)))
+    except (*_PAST_THE_END, SourceError):
+        return 1
+
+
+def _known_orientation(values: tuple[int, ...]) -> int:
+    return values[0] if values and values[0] in ORIENTATIONS else 1
+
+
+# WebP -----------------------------------------------------------------------------------------------------------------
+
+_WEBP_HEAD = 12
+_WEBP_ALPHA, _WEBP_ANIMATION = 0x10, 0x02
+
+
+def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yields (kind, start, end) of each chunk; the last may reach past the end of the file."""
+    at = _WEBP_HEAD
+    while at + 8 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, at)
+        yield kind, at + 8, at + 8 + length
+        at += 8 + length + length % 2
+
+
+def _webp(data: bytes) -> Header:
+    chunks: dict[bytes, tuple[int, int]] = {}
+    for kind, *place in _bounded(_webp_chunks(data)):
+        chunks.setdefault(kind, (place[0], place[1]))
+    sizes = [read(data, chunks[kind][0]) for kind, read in _WEBP_SIZES.items() if kind in chunks]
+    lacking = 8 + struct.unpack_from("<I", data, 4)[0] - len(data)
+    if not sizes:
+        raise SourceError("truncated" if lacking > 0 else "corrupt", "the WebP file has no picture")
+    exif, icc = (data[slice(*chunks[kind])] if kind in chunks else None for kind in (b"EXIF", b"ICCP"))
+    flags = [flag for _, _, flag in sizes]
+    return Header(
+        "webp",
+        *sizes[0][:2],
+        has_alpha=b"ALPH" in chunks or any(flag & _WEBP_ALPHA for flag in flags),
+        orientation=_exif_orientation(exif or b""),
+        frames=2 if any(flag & _WEBP_ANIMATION for flag in flags) else 1,
+        icc=icc,
+        missing=f"{lacking} bytes of its RIFF block" if lacking > 0 else "",
+    )
+
+
+def _webp_canvas(data: bytes, at: int) -> tuple[int, int, int]:
+    """(width, height, flags) of an extended file: 24-bit sizes less one."""
+    flags, width, height = struct.unpack_from("<B3x3s3s", data, at)
+    return 1 + int.from_bytes(width, "little"), 1 + int.from_bytes(height, "little"), flags
+
+
+def _webp_lossy(data: bytes, at: int) -> tuple[int, int, int]:
+    """(width, height, flags) of a VP8 key frame: 14-bit sizes, the upper two bits ask for scaling."""
+    width, height = struct.unpack_from("<HH", data, at + 6)
+    return width & 0x3FFF, height & 0x3FFF, 0
+
+
+def _webp_lossless(data: bytes, at: int) -> tuple[int, int, int]:
+    """(width, height, flags) of a VP8L stream: two 14-bit sizes less one, then the alpha bit."""
+    (packed,) = struct.unpack_from("<I", data, at + 1)
+    return 1 + (packed & 0x3FFF), 1 + (packed >> 14 & 0x3FFF), _WEBP_ALPHA * (packed >> 28 & 1)
+
+
+# The extended header comes first: it speaks for the whole canvas.
+_WEBP_SIZES = {b"VP8X": _webp_canvas, b"VP8 ": _webp_lossy, b"VP8L": _webp_lossless}
+
+
+# BMP ------------------------------------------------------------------------------------------------------------------
+
+_BMP_KINDS = {1: "palette", 4: "palette", 8: "palette", 24: "rgb", 32: "rgb"}
+_BMP_PLAIN, _BMP_MASKED = 0, 3
+_BMP_OLD_HEADER, _BMP_ALPHA_HEADER = 12, 56
+_BMP_BYTE_MASKS = {0xFF, 0xFF00, 0xFF0000, 0xFF000000}
+_BMP_USUAL_MASKS = (0xFF0000, 0xFF00, 0xFF)
+
+
+def _bmp(data: bytes) -> Header:
+    offset, size = struct.unpack_from("<II", data, 10)
+    old = size == _BMP_OLD_HEADER
+    width, height, _, bits = struct.unpack_from("<HHHH" if old else "<iiHH", data, 18)
+    (compression,) = (_BMP_PLAIN,) if old else struct.unpack_from("<I", data, 30)
+    masked = compression == _BMP_MASKED and bits == 32
+    if bits not in _BMP_KINDS or not (compression == _BMP_PLAIN or masked):
+        raise _unsupported(f"a BMP of {bits} bits and compression {compression}")
+    end = offset + (width * bits + 31) // 32 * 4 * abs(height)
+    return Header(
+        "bmp",
+        width,
+        abs(height),
+        _BMP_KINDS[bits],
+        has_alpha=masked and _bmp_has_alpha(data, size),
+        missing=f"{end - len(data)} bytes of its pixels" if end > len(data) else "",
+    )
+
+
+def _bmp_has_alpha(data: bytes, header_size: int) -> bool:
+    red, green, blue = struct.unpack_from("<III", data, 54)
+    # Below a header of 56 bytes OpenCV takes the usual masks for granted.
+    unusual = header_size < _BMP_ALPHA_HEADER and (red, green, blue) != _BMP_USUAL_MASKS
+    if unusual or not {red, green, blue} < _BMP_BYTE_MASKS or len({red, green, blue}) < 3:
+        raise _unsupported(f"a BMP whose colours lie under the masks {red:#x}, {green:#x}, {blue:#x}")
+    return header_size >= _BMP_ALPHA_HEADER and struct.unpack_from("<I", data, 66)[0] != 0
+
+
+# The formats ----------------------------------------------------------------------------------------------------------
+
+
+class _Format(NamedTuple):
+    """``max_side`` is the longest side, in pixels, that the library behind OpenCV takes."""
+
+    magic: re.Pattern[bytes]
+    read: Callable[[bytes], Header]
+    max_side: int
+
+
+_FORMATS = {
+    "jpeg": _Format(re.compile(rb"\xff\xd8\xff"), _jpeg, 65_500),
+    "png": _Format(re.compile(rb"\x89PNG\r\n\x1a\n"), _png, 1_000_000),
+    "tiff": _Format(re.compile(rb"II[*+]\0|MM\0[*+]"), _tiff, 2**20),
+    "webp": _Format(re.compile(rb"RIFF....WEBP", re.DOTALL), _webp, 16_383),
+    "bmp": _Format(re.compile(rb"BM"), _bmp, 2**20),
+}
+
+
+def _header(data: bytes) -> Header:
+    if not data:
+        raise SourceError("empty", "the file has 0 bytes")
+    name = next((name for name, each in _FORMATS.items() if each.magic.match(data)), None)
+    if name is None:
+        raise _unsupported(f"a file that begins with {data[:8].hex(' ')}")
+    try:
+        return _FORMATS[name].read(data)
+    except _PAST_THE_END:
+        raise SourceError("truncated", f"the {name} header points past the end of the file") from None
+
+
+def _unsupported(what: str) -> SourceError:
+    return SourceError("unsupported", f"{what}; we read {', '.join(_FORMATS)} in 8 bits, PNG and TIFF also in 16")

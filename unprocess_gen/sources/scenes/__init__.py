@@ -1,0 +1,1 @@
+"""Generate the built-in synthetic scenes."""

@@ -1,0 +1,1 @@
+"""Read the frames of video files."""
