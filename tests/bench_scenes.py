@@ -27,7 +27,8 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from unprocess_gen.cli.hydra_app import conf_dir
-from unprocess_gen.config.schema import Config, check
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.planning import effect_selection as planner

@@ -23,7 +23,8 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from unprocess_gen.cli import main as door_room
-from unprocess_gen.config.schema import Config, check
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.pipeline import generate as runner
 
 COMMAND = Path(sys.executable).with_name("gen-dataset")

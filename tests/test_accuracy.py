@@ -17,8 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.cli.hydra_app import conf_dir
-from unprocess_gen.config.accuracy import METHODS, STAGES, choose, gaussian_distance
-from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig, budget, check, read_option
+from unprocess_gen.config.accuracy import METHODS, STAGES, choose
+from unprocess_gen.config.derived import budget
+from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig
+from unprocess_gen.config.serialization import read_option
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.reports.benchmark import measure as accuracy
 from unprocess_gen.reports.benchmark import report
@@ -35,6 +38,7 @@ from unprocess_gen.reports.benchmark.measure import (
 )
 from unprocess_gen.reports.estimate import forecast, text
 from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference.poisson import gaussian_distance
 
 Settings = Callable[..., Config]
 

@@ -21,7 +21,7 @@ from unprocess_gen.config.schema import (
     SensorConfig,
     SourceConfig,
 )
-from unprocess_gen.dataset.shards import array_xxh3
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.pipeline.generate import generate
 from unprocess_gen.sources.scenes import synthetic
 

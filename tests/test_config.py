@@ -16,19 +16,10 @@ from hypothesis import strategies as st
 
 from unprocess_gen.cli import hydra_app as compose
 from unprocess_gen.config import distributions as draws
-from unprocess_gen.config.schema import (
-    HIGHLIGHTS,
-    LAW_NUMBERS,
-    NOT_DATA,
-    RATES,
-    Config,
-    check,
-    dataset_yaml,
-    differences,
-    law,
-    read_dataset_yaml,
-    source_kind,
-)
+from unprocess_gen.config.distributions import LAW_NUMBERS, law
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import NOT_DATA, dataset_yaml, differences, read_dataset_yaml, source_kind
+from unprocess_gen.config.validation import HIGHLIGHTS, RATES, check
 from unprocess_gen.core import lookup_tables as tables
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Law

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from unprocess_gen.cli.main import HELP, VERBS
-from unprocess_gen.config.schema import RATES, BranchConfig, Config
+from unprocess_gen.config.schema import BranchConfig, Config
+from unprocess_gen.config.validation import RATES
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.dataset.manifest import COLUMNS
 from unprocess_gen.planning.noise_profile import FORMS

@@ -13,7 +13,8 @@ from conftest import Door, Settings, pixels
 from PIL import Image
 
 from unprocess_gen.cli import hydra_app as compose
-from unprocess_gen.config.schema import GainsConfig, NoiseConfig, read_option
+from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports import paper_figures as figures
 from unprocess_gen.reports.benchmark import report
 from unprocess_gen.reports.paper_figures import READINGS, Counted, Drawn, Recipes, Saturation

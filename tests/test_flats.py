@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 from moments import REACH, SAMPLER_ERROR, Moments, bernstein, moments, shares
 
-from unprocess_gen.config.schema import Config, check
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair

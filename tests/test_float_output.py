@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
 from unprocess_gen.config.accuracy import Budget, choose
-from unprocess_gen.config.schema import check
+from unprocess_gen.config.validation import check
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.lookup_tables import tukey_table
 from unprocess_gen.core.types import READABLE, Frame, Plan

@@ -15,7 +15,8 @@ from conftest import Door, Make, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.schema import Config, check
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import replay, verify

@@ -18,17 +18,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import STAGES, of_stage
-from unprocess_gen.config.schema import RATES
+from unprocess_gen.config.validation import RATES
 from unprocess_gen.core.errors import REASONS, DamageError
-from unprocess_gen.core.types import Counts, Facts, Pair, Patch, Physics, Plan, Source
+from unprocess_gen.core.types import Counts, Facts, Pair, Patch, Physics, Plan, Row, Source
+from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
     COLUMNS,
     JSON_BYTES,
     NAMES,
-    Row,
     failed_row,
     json_size,
-    key_text,
     ok_row,
     patch_of,
     plan_of,

@@ -11,22 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.accuracy import (
-    FORMS,
-    METHODS,
-    STAGES,
-    Budget,
-    choose,
-    gaussian_distance,
-    gaussian_from,
-    method,
-    of_stage,
-)
-from unprocess_gen.config.schema import Config, budget, check
+from unprocess_gen.config.accuracy import FORMS, METHODS, STAGES, Budget, choose, method, of_stage
+from unprocess_gen.config.derived import budget
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.reference.poisson import gaussian_distance, gaussian_from
 from unprocess_gen.sources.scenes import synthetic
 
 Settings = Callable[..., Config]

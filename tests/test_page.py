@@ -29,8 +29,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.dataset.manifest import Row, read_rows, write_rows
-from unprocess_gen.pipeline.verify import file_sha256, verify
+from unprocess_gen.core.files import file_sha256
+from unprocess_gen.core.types import Row
+from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
 from unprocess_gen.planning import plan
 from unprocess_gen.reports import dataset_report as page

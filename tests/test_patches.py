@@ -19,7 +19,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.schema import Config, check, dataset_yaml, read_dataset_yaml
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.types import Patch, PatchLaw
 from unprocess_gen.dataset.manifest import read_rows

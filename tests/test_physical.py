@@ -25,8 +25,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from moments import REACH, SAMPLER_ERROR, bernstein
 
-from unprocess_gen.config.accuracy import gaussian_from
-from unprocess_gen.config.schema import Config, branch_of, check
+from unprocess_gen.config.derived import branch_of
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Patch, Physics, Plan, Source, Srgb
@@ -39,6 +40,7 @@ from unprocess_gen.simulation.reference import noise as effects
 from unprocess_gen.simulation.reference.cfa import PATTERNS
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.poisson import gaussian_from
 from unprocess_gen.simulation.reference.sensor import noisy_limits, to_dn
 from unprocess_gen.simulation.reference.unprocess import unprocess
 from unprocess_gen.sources.scenes import synthetic

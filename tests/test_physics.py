@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.schema import BranchConfig, Config, check
+from unprocess_gen.config.schema import BranchConfig, Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Facts, Physics
 from unprocess_gen.planning.noise_profile import number, plan_physics

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from unprocess_gen.config.schema import check, read_dataset_yaml
+from unprocess_gen.config.serialization import read_dataset_yaml
+from unprocess_gen.config.validation import check
 from unprocess_gen.pipeline.generate import generate
 
 PINNED = Path(__file__).parents[1] / "manifests"

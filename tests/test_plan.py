@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moments import bernstein
 
-from unprocess_gen.config.schema import Config, check
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Law, Plan
 from unprocess_gen.planning.plan import PARAMETERS, draw, plan_camera, plan_image, plan_noise

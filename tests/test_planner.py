@@ -15,16 +15,17 @@ from conftest import Door, fill
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.schema import Config, check
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.lookup_tables import linear_table
 from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.planning.effect_selection import Light, Prediction, decide, facts_of, light_of
 from unprocess_gen.planning.plan import plan_image, plan_with_reasons
-from unprocess_gen.simulation.kernels.poisson import poisson
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.noise import EFFECTS, black_error, noise_variance, response
+from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
 from unprocess_gen.sources.scenes import synthetic

@@ -18,8 +18,9 @@ from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.simulation.kernels import poisson as poissons
 from unprocess_gen.simulation.kernels.normal import Quantiles, normal_quantiles, quick_normals
-from unprocess_gen.simulation.kernels.poisson import LIMIT, Counting, Tables, draw, poisson, poisson_tables, room_for
+from unprocess_gen.simulation.kernels.poisson import Counting, draw, room_for
 from unprocess_gen.simulation.reference.noise import normals
+from unprocess_gen.simulation.reference.poisson import LIMIT, Tables, poisson, poisson_tables
 
 WORDS = 2**32
 SIGN = 2**31

@@ -19,9 +19,9 @@ from conftest import fill
 import unprocess_gen
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.shards import array_xxh3
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources.loader import load

@@ -12,7 +12,8 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.hydra_app import RECIPE, conf_dir
-from unprocess_gen.config.schema import check, read_dataset_yaml
+from unprocess_gen.config.serialization import read_dataset_yaml
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.types import Srgb
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.scenes import synthetic

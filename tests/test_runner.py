@@ -19,11 +19,11 @@ from conftest import PHOTOS, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.schema import dataset_yaml
+from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.dataset.shards import array_xxh3
 from unprocess_gen.pipeline import generate as runner
 
 Make = Callable[..., runner.Summary]

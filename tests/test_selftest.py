@@ -15,7 +15,7 @@ from conftest import Door
 from unprocess_gen.core import lookup_tables as tables
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.dataset.shards import array_xxh3
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import gaussian as fused
 from unprocess_gen.simulation.kernels import normal as normals

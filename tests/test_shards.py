@@ -22,13 +22,13 @@ from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Counts, Pair
 from unprocess_gen.dataset import shards
 from unprocess_gen.dataset.shards import (
     Form,
     Member,
     ShardWriter,
-    array_xxh3,
     image_bytes,
     map_array,
     read_index,

@@ -15,9 +15,10 @@ from conftest import Door, Make, fill
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.dataset.keys import choose
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.shards import read_index
-from unprocess_gen.pipeline.verify import choose, replay, spread, verify
+from unprocess_gen.pipeline.verify import replay, spread, verify
 
 FILES = ("config.yaml", "manifest.csv", "dataset.json", "shards/shard-00000.tar", "shards/shard-00001.tar")
 

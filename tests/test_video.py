@@ -793,7 +793,7 @@ def test_without_pyav_a_video_is_refused_with_the_way_out(
 
 
 def test_a_folder_of_videos_alone_needs_no_other_globs(films: Path, settings: Settings) -> None:
-    from unprocess_gen.config.schema import check
+    from unprocess_gen.config.validation import check
 
     config = settings("source.clips=true", "source.include=[]")
     config.source.root = str(films)

@@ -1,7 +1,6 @@
 """Clean and noisy raw pairs from ordinary sRGB photographs.
 
-``RawPairs(path)`` reads a finished dataset. The rest is reached through its room: ``unprocess_gen.simulation.pair.make_pair`` is
-the page to read first.
+``RawPairs(path)`` reads a finished dataset.
 """
 
 from __future__ import annotations

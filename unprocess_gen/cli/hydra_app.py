@@ -101,7 +101,8 @@ def compose_one(flags: list[str], overrides: list[str], task: Task) -> int:
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
 
-    from unprocess_gen.config.schema import Config, check
+    from unprocess_gen.config.schema import Config
+    from unprocess_gen.config.validation import check
 
     ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
     outcomes: list[int | BaseException] = []
@@ -374,7 +375,7 @@ def _explain(error: BaseException, arguments: Sequence[str]) -> str:
     """Return one sentence with the key, the value and what is allowed."""
     from omegaconf.errors import OmegaConfBaseException
 
-    from unprocess_gen.config.schema import one_line
+    from unprocess_gen.config.serialization import one_line
 
     chain: list[BaseException] = []
     link: BaseException | None = error

@@ -226,7 +226,8 @@ def accuracy(arguments: list[str]) -> int:
 
 
 def _accuracy(config: Config, command: str) -> tuple[int, None]:
-    from unprocess_gen.config.schema import NoiseConfig, SensorConfig, read_option
+    from unprocess_gen.config.schema import NoiseConfig, SensorConfig
+    from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports.benchmark import measure as room
     from unprocess_gen.reports.benchmark import report
 
@@ -248,7 +249,8 @@ def _accuracy(config: Config, command: str) -> tuple[int, None]:
 
 def _tiers() -> dict[str, AccuracyConfig]:
     """Return every tier of ``conf/accuracy``, the reference first."""
-    from unprocess_gen.config.schema import AccuracyConfig, read_option
+    from unprocess_gen.config.schema import AccuracyConfig
+    from unprocess_gen.config.serialization import read_option
 
     files = sorted((conf_dir() / "accuracy").glob("*.yaml"), key=lambda path: (path.stem != "reference", path.stem))
     return {path.stem: read_option(path, AccuracyConfig) for path in files}
@@ -268,7 +270,8 @@ def figures(arguments: list[str]) -> int:
 
 
 def _figures(config: Config, command: str) -> tuple[int, None]:
-    from unprocess_gen.config.schema import GainsConfig, NoiseConfig, read_option
+    from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+    from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports import paper_figures as room
     from unprocess_gen.reports.benchmark import report
 
@@ -291,12 +294,13 @@ DNG_KEYS = {"--keys": str, "--to": str}
 
 def again(arguments: list[str]) -> int:
     """``gen-dataset again DIR source.root=… out=…``: make a dataset again from its ``config.yaml``."""
-    from unprocess_gen.config import schema as settings
+    from unprocess_gen.config.serialization import read_dataset_yaml
+    from unprocess_gen.config.validation import check
 
     if not arguments or "=" in arguments[0]:
         raise ConfigError("again: expected the folder of a dataset, then source.root=… and out=…")
     folder, chosen = Path(arguments[0]), _values("again", AGAIN_KEYS, arguments[1:])
-    config, kind = settings.read_dataset_yaml(folder / "config.yaml")
+    config, kind = read_dataset_yaml(folder / "config.yaml")
     if "out" not in chosen:
         raise ConfigError("again: out=… is missing: the folder to make it in")
     if (kind == "folder") != ("source.root" in chosen):
@@ -305,7 +309,7 @@ def again(arguments: list[str]) -> int:
     config.out, config.source.root = chosen["out"], chosen.get("source.root")
     config.n_jobs = chosen.get("n_jobs", config.n_jobs)
     config.source.max_failed = chosen.get("source.max_failed", config.source.max_failed)
-    settings.check(config)
+    check(config)
     code, _ = _generate(config)
     old, new = folder / "manifest.csv", Path(config.out) / "manifest.csv"
     if not old.exists():
@@ -397,13 +401,14 @@ def _told(folder: Path, damages: Iterable[object]) -> list[str]:
 
 def replay(arguments: list[str]) -> int:
     """``gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]``: make rows again."""
+    from unprocess_gen.dataset.keys import choose
     from unprocess_gen.pipeline import verify as room
 
     manifest = _first("replay", arguments, "a manifest.csv, or the folder of a dataset")
     chosen = _values("replay", REPLAY_KEYS, arguments[1:])
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(chosen["--to"]) if "--to" in chosen else None
-    rows = room.choose(manifest, chosen.get("--rows"), chosen.get("--keys"))
+    rows = choose(manifest, chosen.get("--rows"), chosen.get("--keys"))
     same = different = 0
     for one in room.replay(rows, room.source_root(manifest, chosen.get("source.root")), to):
         same, different = same + (not one.complaint), different + bool(one.complaint)

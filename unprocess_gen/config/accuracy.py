@@ -11,7 +11,6 @@ too (the quadratics of `tables.normal_table`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -200,43 +199,3 @@ def _best(stages: Sequence[str], budget: Budget) -> str:
 
 
 # ---------------------------------------------------------------------------------------------- Gauss for Poisson
-
-
-def gaussian_distance(rate_e: float, read_std_e: float) -> float:
-    """Return the distance between Poisson counts of a mean plus normal read noise, and a normal of their variance.
-
-    0.0665 · rate / (rate + read_std²)^1.5, the greatest difference of the two distribution functions by the first term
-    of the Edgeworth expansion: skewness / 6 times the greatest value of (z² - 1) φ(z), that at 0. That electrons come
-    in steps is not in it: read noise below half an electron shows them, and `electrons` keeps to counts there.
-    """
-    variance = rate_e + read_std_e * read_std_e
-    return 0.0665 * (rate_e / variance) / math.sqrt(variance) if variance else 0.0
-
-
-def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]:
-    """Return (r0, r1): at means up to r0 electrons and from r1 on, `gaussian_distance` is at most ``law_distance``.
-
-    It rises up to twice the read noise's variance and falls after it. (0, infinity) for a budget of 0; r0 = r1 where it
-    is within the budget everywhere.
-    """
-    if law_distance <= 0:
-        return 0.0, math.inf
-    peak = 2 * read_std_e * read_std_e
-    if gaussian_distance(peak, read_std_e) <= law_distance and peak:
-        return peak, peak
-    far = max(peak, 1.0)
-    while gaussian_distance(far, read_std_e) > law_distance:
-        far *= 2
-    below = _last_within(0.0, peak, read_std_e, law_distance) if peak else 0.0
-    return below, _last_within(far, peak, read_std_e, law_distance)
-
-
-def _last_within(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
-    """Return a mean within the distance, next to one that is not, between one that is and one that is not."""
-    for _ in range(60):
-        middle = (inside + outside) / 2
-        if gaussian_distance(middle, read_std_e) <= law_distance:
-            inside = middle
-        else:
-            outside = middle
-    return inside

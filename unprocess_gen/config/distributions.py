@@ -6,9 +6,13 @@ same last bit everywhere; that costs up to a millisecond a draw.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from decimal import Decimal, localcontext
+from typing import Any
 
+from unprocess_gen.config.values import is_number, value_text
+from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.lookup_tables import DIGITS, normal_cdf, normal_quantile
 from unprocess_gen.core.types import Law
 
@@ -71,3 +75,74 @@ LAWS: dict[str, Callable[..., float]] = {
     "log_linear_in_a": _log_linear_in_a,
 }
 """What each law does with a uniform in (0, 1)."""
+
+
+def _check_increasing(low: float, high: float) -> str | None:
+    return None if low < high else "the lowest value must lie below the highest"
+
+
+def _check_truncated(mean: float, std: float, low: float, high: float) -> str | None:
+    if std <= 0:
+        return "the standard deviation must be above 0"
+    if abs(low - mean) > 6 * std or abs(high - mean) > 6 * std:
+        return "the limits must lie within six standard deviations of the mean"
+    return _check_increasing(low, high)
+
+
+def _check_log_range(low: float, high: float) -> str | None:
+    return _check_increasing(low, high) if low > 0 else "the lowest value must be above 0"
+
+
+def _check_line(slope: float, intercept: float, std: float) -> str | None:
+    if not (abs(slope) <= 10 and abs(intercept) <= 50 and 0 <= std <= 10):
+        return "expected a slope of -10 to 10, an intercept of -50 to 50, a standard deviation of 0 to 10"
+    return None
+
+
+LAW_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
+    "constant": (("value",), lambda value: None),
+    "uniform": (("lowest", "highest"), _check_increasing),
+    "log_uniform": (("lowest", "highest"), _check_log_range),
+    "truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _check_truncated),
+    "inverse_truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _check_truncated),
+    "log_linear_in_a": (("slope", "intercept", "standard deviation"), _check_line),
+    "choice": (("value", "…"), lambda *values: None if values else "expected a value at least"),
+}
+"""The laws a parameter can be drawn from: their numbers, and what must hold between them (None: all is well)."""
+
+
+def law(key: str, value: Any, allowed: tuple[str, ...]) -> Law:
+    """Read a number or a law ``[kind, number, …]``; ConfigError names ``key``, the value and the ``allowed`` kinds."""
+    forms = "; ".join(f"[{kind}, {', '.join(LAW_NUMBERS[kind][0])}]" for kind in allowed)
+    if is_number(value):
+        return Law("constant", (float(value),))
+    if not isinstance(value, list) or not value or value[0] not in allowed:
+        raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a law: {forms}")
+    kind, numbers = str(value[0]), value[1:]
+    names, rule = LAW_NUMBERS[kind]
+    if (len(numbers) != len(names) and kind != "choice") or not all(is_number(number) for number in numbers):
+        raise ConfigError(f"{key}={value_text(value)}: expected finite numbers: [{kind}, {', '.join(names)}]")
+    complaint = rule(*numbers)
+    if complaint:
+        raise ConfigError(f"{key}={value_text(value)}: {complaint}")
+    return Law(kind, tuple(float(number) for number in numbers))
+
+
+def lowest(drawn: Law) -> float:
+    """Return a value that no draw of the law lies below."""
+    if drawn.kind in ("constant", "choice"):
+        return min(drawn.numbers)
+    if drawn.kind == "truncated_normal":
+        return drawn.numbers[2]
+    if drawn.kind == "inverse_truncated_normal":
+        return 1 / drawn.numbers[3] if drawn.numbers[2] > 0 else -math.inf
+    return drawn.numbers[0] if drawn.kind in ("uniform", "log_uniform") else 0.0
+
+
+def highest(drawn: Law) -> float:
+    """Return a value that no draw of the law lies above."""
+    if drawn.kind == "choice":
+        return max(drawn.numbers)
+    if drawn.kind == "inverse_truncated_normal":
+        return 1 / drawn.numbers[2] if drawn.numbers[2] > 0 else math.inf
+    return math.inf if drawn.kind == "log_linear_in_a" else drawn.numbers[-1]

@@ -28,7 +28,7 @@ from statistics import NormalDist
 import numpy as np
 
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.types import Float
+from unprocess_gen.core.types import Float, gamma_text
 
 DIGITS = 40
 OCTAVES, SEGMENTS = 32, 32
@@ -57,14 +57,6 @@ def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
     if tone not in TONES:
         raise ValueError(f"tone is {tone!r}, expected one of {', '.join(TONES)}")
     return _linear_table(tone, gamma_text(gamma), codes)
-
-
-def gamma_text(gamma: float | str) -> str:
-    """Return gamma as the manifest spells it: ``srgb``, or the shortest number (``1``, ``2.2``)."""
-    if gamma == "srgb":
-        return "srgb"
-    number = float(gamma)
-    return str(int(number)) if number.is_integer() else repr(number)
 
 
 def normal_table() -> Float:

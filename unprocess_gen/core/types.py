@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -312,3 +313,21 @@ class Law:
 
     kind: str
     numbers: tuple[float, ...]
+
+
+DESCRIPTIONS = {UINT16: "<u2", FLOAT32: "<f4"}
+"""The dtypes of frames as NumPy spells them in a file: little-endian."""
+
+
+def gamma_text(gamma: float | str) -> str:
+    """Return gamma as the manifest spells it: ``srgb``, or the shortest number (``1``, ``2.2``)."""
+    if gamma == "srgb":
+        return "srgb"
+    number = float(gamma)
+    return str(int(number)) if number.is_integer() else repr(number)
+
+
+Value = str | int | float | None
+
+
+Row = Mapping[str, Value]

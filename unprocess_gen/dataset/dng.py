@@ -44,12 +44,11 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.types import UINT16, Float, Frame, Plan
-from unprocess_gen.dataset.manifest import Row, plan_of, read_rows
+from unprocess_gen.core.files import array_xxh3, machine_error, place
+from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
+from unprocess_gen.dataset.keys import choose
+from unprocess_gen.dataset.manifest import plan_of, read_rows
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
-from unprocess_gen.dataset.shards import array_xxh3
-from unprocess_gen.pipeline.verify import choose
-from unprocess_gen.pipeline.workspace import machine_error, place
 from unprocess_gen.simulation.reference.cfa import CHANNELS
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 

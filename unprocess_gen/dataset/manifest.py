@@ -10,21 +10,16 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import itertools
 import json
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TextIO
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.lookup_tables import gamma_text
-from unprocess_gen.core.types import Pair, Patch, Physics, Plan, Source
+from unprocess_gen.core.types import Pair, Patch, Physics, Plan, Row, Source, Value, gamma_text
+from unprocess_gen.dataset.keys import KEY, key_text
 from unprocess_gen.simulation.reference.colour import matrix
-
-Value = str | int | float | None
-Row = Mapping[str, Value]
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,48 +139,6 @@ NAMES = tuple(column.name for column in COLUMNS)
 
 JSON_BYTES = 5632
 """Room for a row without its source's name: the longest numbers and reasons in every column take less."""
-
-
-KEY = re.compile(r"\d{8,}(-p\d{4,})?(-l\d\dd\d\d)?")
-"""A row's key: the source index, the patch where images are cut, level and draw where there are several of them."""
-
-
-def key_text(index: int) -> str:
-    """Return the key of a source: eight digits (more, should there be more than 10⁸ sources)."""
-    return f"{index:08d}"
-
-
-def patch_key(index: int, patch: Patch, several: bool) -> str:
-    """Return the key of a sample in its shard: that of its source, and the patch where images are cut in ``several``.
-
-    Four digits, more where there are more patches.
-    """
-    return f"{key_text(index)}-p{patch.number:04d}" if several else key_text(index)
-
-
-def pair_key(sample: str, plan: Plan, several: bool) -> str:
-    """Return the key of a row: that of its sample, and the level and draw where the sample has ``several`` pairs."""
-    return f"{sample}-l{plan.level:02d}d{plan.draw:02d}" if several else sample
-
-
-def image_key(row: Row) -> str:
-    """Return the key of a row's image."""
-    return str(row["key"]).partition("-")[0]
-
-
-def sample_key(row: Row) -> str:
-    """Return the key of a row's members in the shard: that of its image, or of its patch."""
-    return str(row["key"]).partition("-l")[0]
-
-
-def images(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield the rows of one image together, in order."""
-    return (list(some) for _, some in itertools.groupby(rows, key=image_key))
-
-
-def samples(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield the rows of one sample, a clean frame with its noisy ones, together, in order."""
-    return (list(some) for _, some in itertools.groupby(rows, key=sample_key))
 
 
 def ok_row(

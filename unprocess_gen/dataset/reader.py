@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.types import PACKED, UINT16, Float, Frame
-from unprocess_gen.dataset.manifest import Row, located_rows, read_row, sample_key
+from unprocess_gen.core.types import PACKED, UINT16, Float, Frame, Row
+from unprocess_gen.dataset.keys import sample_key
+from unprocess_gen.dataset.manifest import located_rows, read_row
 from unprocess_gen.dataset.shards import CLEAN, Form, Member, form_of, map_array, noisy_member, read_index, shard_name
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn

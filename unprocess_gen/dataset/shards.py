@@ -28,7 +28,8 @@ import numpy as np
 import xxhash
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Frame
+from unprocess_gen.core.files import little_endian
+from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame
 
 RECORD = 512
 END = b"\0" * (2 * RECORD)
@@ -43,10 +44,6 @@ def noisy_member(level: int, draw: int) -> str:
 def shard_name(number: int) -> str:
     """Return a shard's file name."""
     return f"shard-{number:05d}.tar"
-
-
-DESCRIPTIONS = {UINT16: "<u2", FLOAT32: "<f4"}
-"""The dtypes of frames as NumPy spells them in a file: little-endian."""
 
 
 class Form(NamedTuple):
@@ -82,15 +79,6 @@ def form_of(dtype: str, layout: str, height: int, width: int) -> Form:
     """Return the form of a frame of ``height`` x ``width`` sites."""
     shape = (4, height // 2, width // 2) if layout == PACKED else (height, width)
     return Form(dtype, shape)
-
-
-def array_xxh3(array: Frame) -> str:
-    """Return the XXH3-128 of an array's little-endian bytes, 32 hex digits."""
-    return xxhash.xxh3_128_hexdigest(_little_endian(array).data)
-
-
-def _little_endian(array: Frame) -> Frame:
-    return np.ascontiguousarray(array, dtype=DESCRIPTIONS[array.dtype.name])
 
 
 def _tar_header(name: str, size: int) -> bytes:
@@ -160,7 +148,7 @@ class ShardWriter:
     def add_frame(self, key: str, member: str, frame: Frame) -> None:
         """Append a frame of a sample."""
         header = Form(frame.dtype.name, frame.shape).header
-        self._member(f"{key}.{member}", len(header) + frame.nbytes, header, _little_endian(frame).data)
+        self._member(f"{key}.{member}", len(header) + frame.nbytes, header, little_endian(frame).data)
 
     def add_rows(self, key: str, row_json: bytes) -> None:
         """Append the rows of a sample, after its frames."""

@@ -31,12 +31,16 @@ from typing import Any
 
 from tqdm import tqdm
 
-from unprocess_gen.config.schema import Config, dataset_yaml, patch_law, source_kind
+from unprocess_gen.config.derived import patch_law
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.errors import MachineError, SourceError
-from unprocess_gen.core.types import Counts, Pair, Patch, Plan, Source, Srgb
-from unprocess_gen.dataset.manifest import Row, failed_row, images, ok_row, pair_key, patch_key, row_json
-from unprocess_gen.dataset.shards import CLEAN, ShardWriter, array_xxh3, noisy_member, shard_name
-from unprocess_gen.pipeline.workspace import Made, Workspace, machine_error
+from unprocess_gen.core.files import array_xxh3, machine_error
+from unprocess_gen.core.types import Counts, Pair, Patch, Plan, Row, Source, Srgb
+from unprocess_gen.dataset.keys import images, pair_key, patch_key
+from unprocess_gen.dataset.manifest import failed_row, ok_row, row_json
+from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
+from unprocess_gen.pipeline.workspace import Made, Workspace
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.simulation import self_test as selftest

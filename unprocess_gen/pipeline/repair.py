@@ -24,33 +24,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.config.schema import Config, dataset_yaml, read_dataset_yaml, source_kind
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml, source_kind
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceError, UnprocessGenError
-from unprocess_gen.core.types import Frame, Source
-from unprocess_gen.dataset.manifest import (
-    Row,
-    failed_row,
-    image_key,
-    images,
-    key_text,
-    readable_rows,
-    rows_of_json,
-    samples,
-    write_rows,
-)
+from unprocess_gen.core.files import file_sha256, machine_error, place
+from unprocess_gen.core.types import Frame, Row, Source
+from unprocess_gen.dataset.keys import image_key, images, key_text, samples
+from unprocess_gen.dataset.manifest import failed_row, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
 from unprocess_gen.pipeline.generate import Bench, Task, make_shard, shard_tasks, tally
-from unprocess_gen.pipeline.verify import Maker, expected, file_sha256, noisy_member_of, rows_by_shard
-from unprocess_gen.pipeline.workspace import (
-    Made,
-    Workspace,
-    dataset_facts,
-    dataset_text,
-    fingerprint,
-    machine_error,
-    place,
-    read_dataset,
-)
+from unprocess_gen.pipeline.verify import Maker, expected, noisy_member_of, rows_by_shard
+from unprocess_gen.pipeline.workspace import Made, Workspace, dataset_facts, dataset_text, fingerprint, read_dataset
 from unprocess_gen.sources.loader import list_photographs, load
 
 Facts = dict[str, Any]

@@ -10,10 +10,7 @@ A replay needs the row and the source, nothing else: no settings file, no other 
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import json
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,24 +20,16 @@ import numpy as np
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceError
-from unprocess_gen.core.types import Pair, Photograph, Source
-from unprocess_gen.dataset.manifest import (
-    Row,
-    image_key,
-    located_rows,
-    patch_of,
-    plan_of,
-    read_row,
-    read_rows,
-    row_json,
-    sample_key,
-    samples,
-)
-from unprocess_gen.dataset.shards import CLEAN, Expected, array_xxh3, check_members, form_of, noisy_member, shard_name
+from unprocess_gen.core.files import array_xxh3, file_sha256
+from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
+from unprocess_gen.dataset.keys import image_key, sample_key, samples
+from unprocess_gen.dataset.manifest import located_rows, patch_of, plan_of, read_row, read_rows, row_json
+from unprocess_gen.dataset.shards import CLEAN, Expected, check_members, form_of, noisy_member, shard_name
 from unprocess_gen.pipeline.workspace import read_dataset
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.sources.loader import load, source_of
+from unprocess_gen.sources import listing as sources
+from unprocess_gen.sources.loader import load
 from unprocess_gen.sources.patches import cut
 
 NO_LIMIT = 2**40
@@ -157,12 +146,6 @@ def noisy_member_of(row: Row) -> str:
     return noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
 
 
-def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 # ---------------------------------------------------------------------------------------------------------- replay
 
 
@@ -191,38 +174,6 @@ def spread(manifest: Path, count: int) -> Iterator[Row]:
     places = [at for at, row in located_rows(manifest) if row["status"] == "ok"]
     count = min(count, len(places))
     return (read_row(manifest, places[i * len(places) // count]) for i in range(count))
-
-
-def choose(manifest: Path, rows: str | None, keys: str | None) -> Iterator[Row]:
-    """Yield the rows numbered ``A:B`` (from 0, B not included) or those with the ``keys`` K,…; all without either.
-
-    Raises ConfigError for a range that is none, and for keys that the manifest does not have.
-    """
-    if keys is not None:
-        yield from _with_keys(manifest, keys.split(","))
-        return
-    first, last = _range(rows)
-    yield from itertools.islice(read_rows(manifest), first, last)
-
-
-def _range(rows: str | None) -> tuple[int, int | None]:
-    found = re.fullmatch(r"(\d*):(\d*)", rows if rows is not None else ":")
-    if found is None:
-        raise ConfigError(f"--rows {rows}: expected A:B, such as 0:10")
-    return int(found[1] or 0), int(found[2]) if found[2] else None
-
-
-def _with_keys(manifest: Path, keys: Sequence[str]) -> Iterator[Row]:
-    wanted = set(keys)
-    missing = set(keys)
-    for row in read_rows(manifest):
-        # the key of an image, or of a patch, stands for all of its pairs
-        named = {str(row["key"]), sample_key(row), image_key(row)} & wanted
-        if named:
-            missing -= named
-            yield row
-    if missing:
-        raise ConfigError(f"--keys {min(missing)}: {manifest} has no such key")
 
 
 def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[Replayed]:
@@ -325,3 +276,11 @@ def _keep(pair: Pair, to: Path, key: str) -> None:
     to.mkdir(parents=True, exist_ok=True)
     np.save(to / f"{key}.clean.npy", pair.clean)
     np.save(to / f"{key}.noisy.npy", pair.noisy)
+
+
+def source_of(row: Row) -> Source:
+    """Return the source that a row was made from."""
+    name, size = str(row["source"]), row["source_bytes"]
+    path = sources.decode_name(name)
+    clip, frame = str(row["clip"]) or NO_CLIP, int(row["frame"] or 0)
+    return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)

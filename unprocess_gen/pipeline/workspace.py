@@ -32,10 +32,11 @@ from typing import Any, TextIO
 
 from yaml import YAMLError
 
-from unprocess_gen.config.schema import differences, one_line
-from unprocess_gen.core.errors import ConfigError, DamageError, LockedError, MachineError
-from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.manifest import NAMES, Row, read_rows, write_rows
+from unprocess_gen.config.serialization import differences, one_line
+from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
+from unprocess_gen.core.files import machine_error, place
+from unprocess_gen.core.types import Row, Source
+from unprocess_gen.dataset.manifest import NAMES, read_rows, write_rows
 from unprocess_gen.dataset.shards import shard_name
 
 REPORT = "report.html"
@@ -352,32 +353,6 @@ def read_dataset(path: Path) -> dict[str, Any]:
 
 def _text(facts: dict[str, Any]) -> str:
     return json.dumps(facts, indent=1) + "\n"
-
-
-def machine_error(error: OSError, path: Path) -> MachineError:
-    """Return the one sentence for a failed write: what failed, where, and how many bytes are free there."""
-    try:
-        free = f"{shutil.disk_usage(path).free} bytes free"
-    except OSError:
-        free = "the folder is gone"
-    what = error.strerror or str(error)
-    return MachineError(f"{error.filename or path}: {what} ({free}); what is committed is kept, run again to go on")
-
-
-def place(aside: Path, path: Path) -> None:
-    """Put a finished file where it belongs, durably; another of its name is replaced."""
-    sync(aside)
-    os.replace(aside, path)
-    sync(path.parent)
-
-
-def sync(path: Path) -> None:
-    """Have what was written to a file, or renamed into a folder, survive a loss of power."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _same_size(out: Path, entry: dict[str, Any]) -> None:

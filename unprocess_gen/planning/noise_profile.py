@@ -12,8 +12,9 @@ from collections.abc import Callable, Sequence
 from decimal import Decimal, localcontext
 from typing import Any
 
-from unprocess_gen.config.distributions import draw
-from unprocess_gen.config.schema import SCENE_LAWS, BranchConfig, Config, NoiseConfig, branch_of, law
+from unprocess_gen.config.derived import SCENE_LAWS, branch_of
+from unprocess_gen.config.distributions import draw, law
+from unprocess_gen.config.schema import BranchConfig, Config, NoiseConfig
 from unprocess_gen.core.lookup_tables import DIGITS, normal_quantile, tukey_std
 from unprocess_gen.core.random_streams import body_key
 from unprocess_gen.core.types import Physics

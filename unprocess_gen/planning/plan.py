@@ -10,22 +10,20 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from unprocess_gen.config.accuracy import choose, is_steep
-from unprocess_gen.config.distributions import draw
-from unprocess_gen.config.schema import (
+from unprocess_gen.config.derived import (
     SCENE_LAWS,
-    CameraConfig,
-    Config,
     budget,
     dequantizing,
     effect_switch,
     gain_laws,
     is_normalised,
     is_physical,
-    law,
     noise_laws,
     noise_levels,
     uses_physics,
 )
+from unprocess_gen.config.distributions import draw, law
+from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.planning.effect_selection import NOT_ROUNDED, Prediction, decide, light_of

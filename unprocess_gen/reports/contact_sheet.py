@@ -22,16 +22,17 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.lookup_tables import linear_table
-from unprocess_gen.core.types import Float, Frame, Plan, Srgb
-from unprocess_gen.dataset.manifest import Row, image_key, patch_of, plan_of, read_rows, sample_key
+from unprocess_gen.core.types import Float, Frame, Plan, Row, Srgb
+from unprocess_gen.dataset.keys import image_key, sample_key
+from unprocess_gen.dataset.manifest import patch_of, plan_of, read_rows
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
-from unprocess_gen.pipeline.verify import NO_LIMIT, source_root
-from unprocess_gen.pipeline.workspace import machine_error
+from unprocess_gen.pipeline.verify import NO_LIMIT, source_of, source_root
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import mosaic, tile
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
-from unprocess_gen.sources.loader import load, source_of
+from unprocess_gen.sources.loader import load
 from unprocess_gen.sources.patches import cut
 
 Picture = NDArray[np.uint8]

@@ -24,12 +24,13 @@ import numpy as np
 import yaml
 
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.types import Float
-from unprocess_gen.dataset.manifest import COLUMNS, Row, image_key, read_rows, sample_key
+from unprocess_gen.core.files import file_sha256, machine_error, place
+from unprocess_gen.core.types import Float, Row
+from unprocess_gen.dataset.keys import image_key, sample_key
+from unprocess_gen.dataset.manifest import COLUMNS, read_rows
 from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
-from unprocess_gen.pipeline.verify import file_sha256
-from unprocess_gen.pipeline.workspace import REPORT, machine_error, place, read_dataset
+from unprocess_gen.pipeline.workspace import REPORT, read_dataset
 from unprocess_gen.reports import markup
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.benchmark.report import OF_A_DATASET, check_drawing, spelled

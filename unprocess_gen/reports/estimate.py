@@ -16,11 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.schema import AccuracyConfig, Config, is_physical, noise_levels, patch_law
+from unprocess_gen.config.derived import is_physical, noise_levels, patch_law
+from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Plan, Source
 from unprocess_gen.dataset.manifest import json_size
-from unprocess_gen.dataset.shards import array_xxh3, form_of, image_bytes, shard_bytes
+from unprocess_gen.dataset.shards import form_of, image_bytes, shard_bytes
 from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark import measure as accuracy

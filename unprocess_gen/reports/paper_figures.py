@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.types import Float, Frame, Plan, Source, Srgb
-from unprocess_gen.pipeline.workspace import machine_error
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports import markup
 from unprocess_gen.reports.markup import Html, element

@@ -21,8 +21,7 @@ from typing import BinaryIO
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import FLOAT32, Float, Frame
-from unprocess_gen.dataset.manifest import Row
+from unprocess_gen.core.types import FLOAT32, Float, Frame, Row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 

@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 
 from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.jit import is_kept, kernel
 from unprocess_gen.core.lookup_tables import linear_table, normal_table
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.types import FLOAT32, IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
-from unprocess_gen.dataset.shards import array_xxh3
 from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.kernels import gaussian as fused
 from unprocess_gen.simulation.kernels import gaussian_float32 as single

@@ -10,10 +10,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from unprocess_gen.config.schema import SourceConfig, patch_law
+from unprocess_gen.config.derived import patch_law
+from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
-from unprocess_gen.dataset.manifest import Row, image_key
 from unprocess_gen.sources import listing as sources
 from unprocess_gen.sources.image import decode
 from unprocess_gen.sources.scenes import synthetic
@@ -50,14 +50,6 @@ def spread(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
     if len(sources) <= count:
         return sources
     return tuple(sources[i * len(sources) // count] for i in range(count))
-
-
-def source_of(row: Row) -> Source:
-    """Return the source that a row was made from."""
-    name, size = str(row["source"]), row["source_bytes"]
-    path = sources.decode_name(name)
-    clip, frame = str(row["clip"]) or NO_CLIP, int(row["frame"] or 0)
-    return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)
 
 
 def load(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:

@@ -49,19 +49,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from unprocess_gen.config.accuracy import METHODS, STAGES, Budget, Method, choose, gaussian_from, of_stage
-from unprocess_gen.config.schema import (
-    AccuracyConfig,
-    CleanConfig,
-    Config,
-    EffectsConfig,
-    NoiseConfig,
-    SensorConfig,
-    budget,
-    check,
-    is_normalised,
-    is_physical,
-)
+from unprocess_gen.config.accuracy import METHODS, STAGES, Budget, Method, choose, of_stage
+from unprocess_gen.config.derived import budget, is_normalised, is_physical
+from unprocess_gen.config.schema import AccuracyConfig, CleanConfig, Config, EffectsConfig, NoiseConfig, SensorConfig
+from unprocess_gen.config.validation import check
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import linear_table, normal_table
@@ -89,13 +80,14 @@ from unprocess_gen.simulation.kernels.gaussian import (
 )
 from unprocess_gen.simulation.kernels.gaussian import scene_of as fused_scene
 from unprocess_gen.simulation.kernels.normal import Quantiles, fill_coarse_normals, fill_fine_normals, normal_quantiles
-from unprocess_gen.simulation.kernels.poisson import Counting, poisson_tables, room_for
-from unprocess_gen.simulation.kernels.poisson import Tables as PoissonTables
+from unprocess_gen.simulation.kernels.poisson import Counting, room_for
 from unprocess_gen.simulation.kernels.poisson import draw as draw_counts
 from unprocess_gen.simulation.kernels.simd import bare
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference.poisson import Tables as PoissonTables
+from unprocess_gen.simulation.reference.poisson import gaussian_from, poisson_tables
 from unprocess_gen.simulation.reference.sensor import quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
 from unprocess_gen.sources.loader import list_photographs, load, spread

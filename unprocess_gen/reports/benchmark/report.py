@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from unprocess_gen.config.accuracy import STAGES
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.pipeline.workspace import machine_error
+from unprocess_gen.core.files import machine_error
 from unprocess_gen.reports import markup
 from unprocess_gen.reports.benchmark.measure import REFERENCE, Report, Row
 from unprocess_gen.reports.markup import element

@@ -20,9 +20,10 @@ from unprocess_gen.core.random_streams import BLOCK, Words, purpose
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.gaussian import CHUNK, Key, fill_words, key_words
 from unprocess_gen.simulation.kernels.normal import Quantiles, exact_normal, normal_quantiles
-from unprocess_gen.simulation.kernels.poisson import Counting, Tables, poisson_tables, room_for
+from unprocess_gen.simulation.kernels.poisson import Counting, room_for
 from unprocess_gen.simulation.kernels.poisson import draw as draw_counts
 from unprocess_gen.simulation.reference.noise import Draws
+from unprocess_gen.simulation.reference.poisson import Tables, poisson_tables
 
 BAND, PIECE = 2**20, 2**16
 """Sites unprocessed at once: 8 MB of float64; and those that noise is added to: half a megabyte."""

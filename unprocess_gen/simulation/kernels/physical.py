@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.config.accuracy import gaussian_from
 from unprocess_gen.core.jit import inner, kernel
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.random_streams import BLOCK, LANES, ROUNDS, purpose
@@ -60,15 +59,15 @@ from unprocess_gen.simulation.kernels.poisson import (
     flag,
     list_open,
     normal_counts,
-    poisson_tables,
     room_for,
     settle,
     short_counts,
 )
-from unprocess_gen.simulation.kernels.poisson import Tables as PoissonTables
 from unprocess_gen.simulation.kernels.poisson import draw as draw_counts
 from unprocess_gen.simulation.kernels.simd import bare
 from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference.poisson import Tables as PoissonTables
+from unprocess_gen.simulation.reference.poisson import gaussian_from, poisson_tables
 
 PRNU, SHOT, DARK, HOT, DEAD = (
     np.uint64(purpose(stream)) for stream in ("prnu", "shot", "dark_current", "hot_pixels", "dead_pixels")

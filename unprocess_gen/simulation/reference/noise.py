@@ -19,7 +19,7 @@ import numpy as np
 from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, tukey_table
 from unprocess_gen.core.random_streams import Words, words
 from unprocess_gen.core.types import Float, Physics, Plan
-from unprocess_gen.simulation.kernels.poisson import poisson
+from unprocess_gen.simulation.reference.poisson import poisson
 
 EFFECTS = (
     *("prnu", "shot", "dark_current", "hot_pixels", "full_well"),  # in electrons

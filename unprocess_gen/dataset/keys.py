@@ -1,0 +1,85 @@
+"""Write, read and select the keys of manifest rows."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Patch, Plan, Row
+from unprocess_gen.dataset.manifest import read_rows
+
+KEY = re.compile(r"\d{8,}(-p\d{4,})?(-l\d\dd\d\d)?")
+"""A row's key: the source index, the patch where images are cut, level and draw where there are several of them."""
+
+
+def key_text(index: int) -> str:
+    """Return the key of a source: eight digits (more, should there be more than 10⁸ sources)."""
+    return f"{index:08d}"
+
+
+def patch_key(index: int, patch: Patch, several: bool) -> str:
+    """Return the key of a sample in its shard: that of its source, and the patch where images are cut in ``several``.
+
+    Four digits, more where there are more patches.
+    """
+    return f"{key_text(index)}-p{patch.number:04d}" if several else key_text(index)
+
+
+def pair_key(sample: str, plan: Plan, several: bool) -> str:
+    """Return the key of a row: that of its sample, and the level and draw where the sample has ``several`` pairs."""
+    return f"{sample}-l{plan.level:02d}d{plan.draw:02d}" if several else sample
+
+
+def image_key(row: Row) -> str:
+    """Return the key of a row's image."""
+    return str(row["key"]).partition("-")[0]
+
+
+def sample_key(row: Row) -> str:
+    """Return the key of a row's members in the shard: that of its image, or of its patch."""
+    return str(row["key"]).partition("-l")[0]
+
+
+def images(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    """Yield the rows of one image together, in order."""
+    return (list(some) for _, some in itertools.groupby(rows, key=image_key))
+
+
+def samples(rows: Iterable[Row]) -> Iterator[list[Row]]:
+    """Yield the rows of one sample, a clean frame with its noisy ones, together, in order."""
+    return (list(some) for _, some in itertools.groupby(rows, key=sample_key))
+
+
+def choose(manifest: Path, rows: str | None, keys: str | None) -> Iterator[Row]:
+    """Yield the rows numbered ``A:B`` (from 0, B not included) or those with the ``keys`` K,…; all without either.
+
+    Raises ConfigError for a range that is none, and for keys that the manifest does not have.
+    """
+    if keys is not None:
+        yield from _with_keys(manifest, keys.split(","))
+        return
+    first, last = _range(rows)
+    yield from itertools.islice(read_rows(manifest), first, last)
+
+
+def _range(rows: str | None) -> tuple[int, int | None]:
+    found = re.fullmatch(r"(\d*):(\d*)", rows if rows is not None else ":")
+    if found is None:
+        raise ConfigError(f"--rows {rows}: expected A:B, such as 0:10")
+    return int(found[1] or 0), int(found[2]) if found[2] else None
+
+
+def _with_keys(manifest: Path, keys: Sequence[str]) -> Iterator[Row]:
+    wanted = set(keys)
+    missing = set(keys)
+    for row in read_rows(manifest):
+        # the key of an image, or of a patch, stands for all of its pairs
+        named = {str(row["key"]), sample_key(row), image_key(row)} & wanted
+        if named:
+            missing -= named
+            yield row
+    if missing:
+        raise ConfigError(f"--keys {min(missing)}: {manifest} has no such key")

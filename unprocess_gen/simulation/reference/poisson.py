@@ -1,0 +1,307 @@
+"""Compute Poisson counts from 32-bit words, coupled to the normal deviates of the same words."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from decimal import Decimal, localcontext
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.lookup_tables import DIGITS, SEGMENTS, normal_cdf, normal_density, normal_table, sha256
+from unprocess_gen.core.random_streams import Words
+from unprocess_gen.core.types import Float
+
+LIMIT = 64.0
+"""Rates from here on go by the expansion."""
+
+
+TABLES_SHA256 = "25207712ad68964496f19a7d00d298dfbc6c164937338e04b57489c670bacbd6"
+"""Of all tables, one after the other."""
+
+
+# Coefficients of the expansion, lowest power of s first (the test derives them anew).
+A = (
+    *(1 / 6, -1 / 72, 1 / 270, -23 / 17280, 19 / 34020, -11237 / 43545600, 13 / 102060, -2482411 / 37623398400),
+    *(53741 / 1515591000, -272785979 / 13905608048640, 51173 / 4605822000),
+)
+
+
+B = (
+    *(1 / 3, -1 / 36, 7 / 810, -137 / 38880, 5 / 3024, -165779 / 195955200, 301 / 656100, -1219369 / 4702924800),
+    *(32976641 / 218245104000, -84622554329 / 938628543283200),
+)
+
+
+C = (
+    *(-8 / 405, 671 / 38880, -5189 / 408240, 2647909 / 293932800, -9683 / 1530900, 834145 / 188116992),
+    *(-678871967 / 218245104000, 14645993203 / 6704489594880, -19607719333 / 12767338584000),
+)
+
+
+D = (
+    *(-16 / 25515, 274867 / 146966400, -39281 / 13778100, 5006651 / 1511654400, -4372075159 / 1309470624000),
+    362985384281 / 117328567910400,
+)
+
+
+E = (5408 / 3444525, -18075959 / 4232632320, 27968607743 / 3928411872000, -9969287490329 / 1055957111193600)
+
+
+SHORT_LEAST, SHORT_REACH = 6.0, 3.5
+
+
+NORMAL_ERROR, SHORT_ERROR, LOW_ERROR = 6e-6, 0.05, 18.0
+"""For rates from SHORT_LEAST up and normals within SHORT_REACH the short form of x, of quick normals and in single
+precision, is off by less than NORMAL_ERROR·(8 + √rate) + SHORT_ERROR / rate + LOW_ERROR / rate³."""
+
+
+TAIL_CELLS = 8
+"""Cells of the normal's tail per standard deviation."""
+
+
+LAST_TAIL_CELL = 51
+
+
+ORDER = 7
+"""Degree of the polynomials in the tables of distribution functions."""
+
+
+RATE_CELLS = 10
+"""Cells per unit of √rate. A rate lies within a tenth of its standard deviation from the middle of its cell."""
+
+
+CELLS = int(8 * RATE_CELLS) + 1
+"""The last one is for √rate that rounds up to 8."""
+
+
+MOST = 128
+"""No count below `LIMIT` is as great."""
+
+
+NORMAL_CELLS, LEAST_NORMAL = 8, -6.5
+
+
+GUESS_UNIT = 0.125
+
+
+class Tables(NamedTuple):
+    """What the two forms look up, read-only.
+
+    ``tails`` ``[52, 8]``: the normal's upper tail at z is the polynomial of row floor(8 z) in z minus the cell's
+    middle. ``cdf`` ``[N, 8]``: row ``first[c] + k`` is P(K <= k) in the rate minus ``middle[c]``, for cell
+    c = floor(10 √rate) and k from ``least[c]`` to ``most[c]``; beyond those lies less than 2**-34. ``guess``
+    ``[81, 104]``: what x lies above rate + √rate·z in cell c and cell floor(8 (z + 6.5)) of the normal, in eighths.
+    """
+
+    tails: Float
+    cdf: Float
+    first: NDArray[np.int64]
+    least: NDArray[np.int64]
+    most: NDArray[np.int64]
+    middle: Float
+    guess: NDArray[np.int8]
+
+
+@functools.lru_cache(maxsize=1)
+def poisson_tables() -> Tables:
+    """Return the tables; MachineError where they do not come out as published."""
+    root = (2 * np.arange(CELLS) + 1) / (2 * RATE_CELLS)
+    middle = root * root
+    polynomials = _cdf_polynomials(middle)
+    least, most = _range(middle, polynomials)
+    counts = np.arange(MOST)
+    kept = (counts >= least[:, None]) & (counts <= most[:, None])
+    ends = np.cumsum(most - least + 1)
+    first = ends - most - 1
+    guess = np.array([_guesses(*cell) for cell in zip(middle, polynomials[..., 0], least, most, strict=True)])
+    tables = Tables(_tails(), polynomials[kept], first, least, most, middle, guess)
+    if (found := digest(tables)) != TABLES_SHA256:
+        raise MachineError(f"the Poisson tables came out as {found}, expected {TABLES_SHA256}")
+    for table in tables:
+        table.flags.writeable = False
+    return tables
+
+
+def digest(tables: Tables) -> str:
+    """Return the SHA-256 of all tables as little-endian doubles, one after the other."""
+    return sha256(np.concatenate([table.ravel().astype(np.float64) for table in tables]))
+
+
+def _tails() -> Float:
+    """Return `Tables.tails`, correctly rounded: the derivatives are Hermite polynomials times the density."""
+    rows = []
+    with localcontext() as context:
+        context.prec = DIGITS
+        for cell in range(LAST_TAIL_CELL + 1):
+            z = (Decimal(cell) + Decimal("0.5")) / TAIL_CELLS
+            term, before = -normal_density(z), Decimal(0)  # -phi·He_n / (n + 1)!, n = 0, but for the sign
+            row = [1 - normal_cdf(z), term]
+            for n in range(1, ORDER):  # He_n = z·He_(n-1) - (n - 1)·He_(n-2), and each derivative turns the sign
+                term, before = -(z * term + before * (n - 1) / n) / (n + 1), term
+                row.append(term)
+            rows.append([float(value) for value in row])
+    return np.array(rows)
+
+
+def _cdf_polynomials(middle: Float) -> Float:
+    """Return P(K <= k) and its derivatives in the rate over n! at each middle, ``[CELLS, MOST, 8]``.
+
+    The derivative of P(K <= k) is -P(K = k), and that of P(K = k) is P(K = k - 1) - P(K = k).
+    """
+    with localcontext() as context:
+        context.prec = DIGITS
+        none = np.array([float((-Decimal(float(rate))).exp()) for rate in middle])
+    share = np.zeros((CELLS, MOST))
+    share[:, 0] = none
+    for k in range(1, MOST):  # what is negligible is dropped, since it would underflow on the way
+        share[:, k] = np.where(share[:, k - 1] > 1e-60, share[:, k - 1], 0) * middle / k
+    terms = [np.cumsum(share, axis=1), -share]
+    for n in range(2, ORDER + 1):
+        before = np.pad(terms[-1][:, :-1], ((0, 0), (1, 0)))
+        terms.append((before - terms[-1]) / n)
+    return np.stack(terms, axis=-1)
+
+
+def _range(middle: Float, polynomials: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return per cell the least and the greatest k whose P(K <= k) is needed for any rate in the cell."""
+    root = np.arange(CELLS + 1) / RATE_CELLS
+    edge = root * root
+    at_lowest = _horner(polynomials, (edge[:-1] - middle)[:, None])
+    at_highest = _horner(polynomials, (edge[1:] - middle)[:, None])
+    least = np.maximum((at_lowest < 2.0**-34).sum(axis=1) - 1, 0)
+    most = (1 - at_highest > 2.0**-34).sum(axis=1)
+    return least, most
+
+
+def _guesses(rate: float, cdf: Float, least: int, most: int) -> NDArray[np.int8]:
+    """Return a row of `Tables.guess`: x from a line between the normals where the count changes."""
+    tail = np.minimum(cdf, 1 - cdf)
+    edges = np.flatnonzero(tail > 2.0**-33)
+    edges = edges[(edges >= least) & (edges <= most)]
+    z_edges = np.where(cdf[edges] < 0.5, -1, 1) * _quantile(np.minimum(tail[edges], 0.5 - 2.0**-33))
+    z = (np.arange(104) + 0.5) / NORMAL_CELLS + LEAST_NORMAL
+    at = np.clip(np.searchsorted(z_edges, z) - 1, 0, len(edges) - 2)
+    x = edges[at] + 1 + (z - z_edges[at]) / (z_edges[at + 1] - z_edges[at])
+    return np.asarray(np.rint((np.maximum(x, 1) - rate - np.sqrt(rate) * z) / GUESS_UNIT), dtype=np.int8)
+
+
+def poisson(words: Words, rate: Float) -> Float:
+    """Return Poisson counts as float64, the shape of ``words`` (uint32) and ``rate`` (float64, equal shapes).
+
+    ``rate`` is the mean, in counts, up to 1e9 (the caller sees to that); 0 and less, and NaN, give 0.
+    """
+    tail = _tail(words)
+    low = words >> np.uint32(31) == 1
+    high = rate >= LIMIT
+    counts = np.zeros(words.shape)
+    counts[high] = _by_expansion(tail[high], low[high], rate[high])
+    some = (rate > 0) & ~high
+    counts[some] = _by_cdf(np.where(low, tail, 1 - tail)[some], rate[some])
+    return counts
+
+
+def _tail(words: Words) -> Float:
+    """Return the tail probability of each word: (i + ½) / 2**32, i its lower 31 bits."""
+    return np.asarray(((words & np.uint32(0x7FFFFFFF)).astype(np.float64) + 0.5) * 2.0**-32)
+
+
+def _quantile(tail: Float) -> Float:
+    """Return the upper normal quantile of tail probabilities in [2**-33, ½), to 1.5e-7, as `effects.normals`."""
+    mantissa, exponent = np.frexp(tail * 2.0**33)
+    position = (2 * mantissa - 1) * SEGMENTS
+    segment = np.floor(position)
+    row = normal_table()[(exponent - 1) * SEGMENTS + segment.astype(np.int32)]
+    t = (position - segment) / SEGMENTS
+    return np.asarray(row[..., 0] + t * (row[..., 1] + t * row[..., 2]))
+
+
+def _by_expansion(tail: Float, low: NDArray[np.bool_], rate: Float) -> Float:
+    """Return floor(x) for rates from `LIMIT` up, from tail probabilities and their side."""
+    z = _quantile(tail)
+    cell = np.floor(z * TAIL_CELLS)
+    row = poisson_tables().tails[cell.astype(np.int64)]
+    offset = z - (cell + 0.5) / TAIL_CELLS
+    slope = _horner(row[..., 1:] * np.arange(1, ORDER + 1), offset)
+    z = z - (_horner(row, offset) - tail) / slope
+    return np.asarray(np.floor(expansion(rate, np.where(low, -z, z))))
+
+
+def expansion(rate: Float, w: Float) -> Float:
+    """Return x of the head of this room, for rates from `LIMIT` up and normals w up to 6.34 on either side."""
+    root = np.sqrt(rate)
+    s = w / root
+    c, d, e = _powers(C, s), _powers(D, s), _powers(E, s)
+    rest = w * w * _powers(A, s) + (_powers(B, s) + (c + (d + e / rate) / rate) / rate)
+    return np.asarray(rate + (root * w + rest))
+
+
+def _powers(coefficients: Sequence[float], s: Float) -> Float:
+    total = np.full_like(s, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = coefficient + s * total
+    return total
+
+
+def _horner(rows: Float, offset: Float) -> Float:
+    """Return the polynomials whose coefficients run along the last axis, the lowest power first."""
+    total = rows[..., -1]
+    for n in range(rows.shape[-1] - 2, -1, -1):
+        total = rows[..., n] + offset * total
+    return np.asarray(total)
+
+
+def _by_cdf(uniform: Float, rate: Float) -> Float:
+    """Return the least k with P(K <= k) >= ``uniform`` for rates in (0, `LIMIT`), by bisection."""
+    tables = poisson_tables()
+    cell = np.floor(np.sqrt(rate) * RATE_CELLS).astype(np.int64)
+    low, high = tables.least[cell], tables.most[cell] + 1
+    for _ in range(MOST.bit_length()):
+        k = np.minimum((low + high) // 2, tables.most[cell])
+        above = uniform > _horner(tables.cdf[tables.first[cell] + k], rate - tables.middle[cell])
+        low, high = np.where(above & (low < high), k + 1, low), np.where(above, high, np.minimum(high, k))
+    return np.asarray(low, dtype=np.float64)
+
+
+def gaussian_distance(rate_e: float, read_std_e: float) -> float:
+    """Return the distance between Poisson counts of a mean plus normal read noise, and a normal of their variance.
+
+    0.0665 · rate / (rate + read_std²)^1.5, the greatest difference of the two distribution functions by the first term
+    of the Edgeworth expansion: skewness / 6 times the greatest value of (z² - 1) φ(z), that at 0. That electrons come
+    in steps is not in it: read noise below half an electron shows them, and `electrons` keeps to counts there.
+    """
+    variance = rate_e + read_std_e * read_std_e
+    return 0.0665 * (rate_e / variance) / math.sqrt(variance) if variance else 0.0
+
+
+def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]:
+    """Return (r0, r1): at means up to r0 electrons and from r1 on, `gaussian_distance` is at most ``law_distance``.
+
+    It rises up to twice the read noise's variance and falls after it. (0, infinity) for a budget of 0; r0 = r1 where it
+    is within the budget everywhere.
+    """
+    if law_distance <= 0:
+        return 0.0, math.inf
+    peak = 2 * read_std_e * read_std_e
+    if gaussian_distance(peak, read_std_e) <= law_distance and peak:
+        return peak, peak
+    far = max(peak, 1.0)
+    while gaussian_distance(far, read_std_e) > law_distance:
+        far *= 2
+    below = _last_within(0.0, peak, read_std_e, law_distance) if peak else 0.0
+    return below, _last_within(far, peak, read_std_e, law_distance)
+
+
+def _last_within(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
+    """Return a mean within the distance, next to one that is not, between one that is and one that is not."""
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        if gaussian_distance(middle, read_std_e) <= law_distance:
+            inside = middle
+        else:
+            outside = middle
+    return inside
