@@ -26,7 +26,7 @@ import algorithm1
 
 from unprocess_gen.config.schema import AccuracyConfig, Config, GainsConfig, NoiseConfig
 from unprocess_gen.core.types import Patch, Plan, Source
-from unprocess_gen.dataset.manifest import ok_row
+from unprocess_gen.dataset.manifest import pair_row
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources.image.decode import decode
@@ -44,7 +44,7 @@ def fixed_plan(tier: str) -> Plan:
 
 def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
     tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
-    values = ok_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(0, 0, 0, 1, 1))
+    values = pair_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(0, 0, 0, 1, 1))
     row = {name: str(value) for name, value in values.items()}
     rng = np.random.default_rng(0)
 

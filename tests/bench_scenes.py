@@ -28,7 +28,7 @@ from omegaconf import OmegaConf
 
 from unprocess_gen.cli.hydra_app import conf_dir
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.planning import effect_selection as planner
@@ -60,7 +60,7 @@ def settings(*overrides: str) -> Config:
     loaded = OmegaConf.to_container(node, resolve=True)
     config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), loaded))
     assert isinstance(config, Config)
-    check(config)
+    validate_config(config)
     return config
 
 

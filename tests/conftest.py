@@ -24,7 +24,7 @@ from PIL import Image
 
 from unprocess_gen.cli import main as door_room
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline import generate as runner
 
 COMMAND = Path(sys.executable).with_name("gen-dataset")
@@ -137,7 +137,7 @@ def make(settings: Settings) -> Make:
     def made(root: Path | None, out: Path, *overrides: str, n_jobs: int = 1) -> runner.Summary:
         config = settings(*overrides)
         config.source.root, config.out, config.n_jobs = None if root is None else str(root), str(out), n_jobs
-        check(config)
+        validate_config(config)
         return runner.generate(config)
 
     return made

@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.cli.hydra_app import conf_dir
-from unprocess_gen.config.accuracy import METHODS, STAGES, choose
-from unprocess_gen.config.derived import budget
+from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
+from unprocess_gen.config.derived import accuracy_budget
 from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.reports.benchmark import measure as accuracy
 from unprocess_gen.reports.benchmark import report
@@ -92,14 +92,14 @@ def test_errors_and_times_are_there_where_they_can_be_measured(found: Report) ->
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
 def test_a_method_is_measured_under_a_budget_that_takes_it(method: Any) -> None:
-    assert method.spelled in accuracy.taken(budget(accuracy.alone(method, TIERS)))
+    assert method.spelled in accuracy.taken(accuracy_budget(accuracy.alone(method, TIERS)))
 
 
 def test_a_method_is_measured_with_no_other_form_than_its_own() -> None:
-    exact = set(choose(budget(TIERS[EXACT]), counts_electrons=True))
+    exact = set(choose_methods(accuracy_budget(TIERS[EXACT]), counts_electrons=True))
     for method in METHODS:
         if method.form == "float64":
-            chosen = set(choose(budget(accuracy.alone(method, TIERS)), counts_electrons=True))
+            chosen = set(choose_methods(accuracy_budget(accuracy.alone(method, TIERS)), counts_electrons=True))
             assert len(chosen - exact) <= 1
 
 
@@ -226,7 +226,7 @@ def test_any_settings_can_be_measured(
 ) -> None:
     config = settings(*overrides)
     config.source.root = str(fill(tmp_path / "photos", 2))
-    check(config)
+    validate_config(config)
     found = accuracy.measure(config, beside, Effort(2, 1, (16, 16), (8, 8), (8, 8), 4, 2))
 
     assert all(row.error_max == 0 for row in found.rows if row.stage in TIER_STAGES and row.method == EXACT)

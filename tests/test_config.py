@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 from unprocess_gen.cli import hydra_app as compose
 from unprocess_gen.config import distributions as draws
-from unprocess_gen.config.distributions import LAW_NUMBERS, law
+from unprocess_gen.config.distributions import DISTRIBUTION_NUMBERS, parse_distribution
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import NOT_DATA, dataset_yaml, differences, read_dataset_yaml, source_kind
-from unprocess_gen.config.validation import HIGHLIGHTS, RATES, check
+from unprocess_gen.config.validation import HIGHLIGHTS, RATES, validate_config
 from unprocess_gen.core import lookup_tables as tables
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Law
+from unprocess_gen.core.types import Distribution
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.reference import unprocess
 
@@ -51,7 +51,7 @@ SHA256 = "0" * 64
 
 @pytest.mark.parametrize("file", FILES, ids=str)
 def test_every_option_composes_and_passes_the_checks(file: Path, settings: Settings) -> None:
-    check(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
+    validate_config(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
@@ -338,7 +338,7 @@ def test_a_bad_value_is_refused_with_its_key_its_value_and_what_is_allowed(
 ) -> None:
     config = settings(*overrides.split(";"))
     with pytest.raises(ConfigError, match="^" + sentence) as error:
-        check(config)
+        validate_config(config)
     assert "\n" not in str(error.value)
 
 
@@ -353,27 +353,29 @@ ACCEPTED = [
 
 @pytest.mark.parametrize("override", ACCEPTED)
 def test_values_on_the_edge_of_what_is_allowed_are_accepted(override: str, settings: Settings) -> None:
-    check(settings(override))
+    validate_config(settings(override))
 
 
 def test_a_negative_b_is_accepted_where_the_profile_says_clip(settings: Settings) -> None:
-    check(settings("noise.b=-1", "noise.negative_variance=clip"))
+    validate_config(settings("noise.b=-1", "noise.negative_variance=clip"))
 
 
 def test_a_source_root_that_is_a_file_is_refused(settings: Settings, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"source.root=.*/file: no such folder"):
-        check(settings(f"source.root={tmp_path}/file"))
+        validate_config(settings(f"source.root={tmp_path}/file"))
 
 
 @given(low=st.floats(0.01, 5), width=st.floats(0.01, 5))
 def test_a_law_reads_as_its_kind_and_numbers(low: float, width: float) -> None:
-    assert law("gains.red", ["uniform", low, low + width], ("uniform",)) == Law("uniform", (low, low + width))
+    assert parse_distribution("gains.red", ["uniform", low, low + width], ("uniform",)) == Distribution(
+        "uniform", (low, low + width)
+    )
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53))
 def test_a_number_reads_as_a_constant(value: float) -> None:
-    assert law("noise.a", value, ("uniform",)) == Law("constant", (float(value),))
+    assert parse_distribution("noise.a", value, ("uniform",)) == Distribution("constant", (float(value),))
 
 
 # config.yaml ----------------------------------------------------------------------------------------------------------
@@ -498,7 +500,7 @@ def test_what_is_not_a_datasets_config_yaml_is_refused_in_one_line(content: byte
 def test_choices_are_those_of_the_rooms_that_serve_them() -> None:
     assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
     assert set(unprocess.TONES) == set(tables.TONES) == {"smoothstep", "none"}
-    assert set(LAW_NUMBERS) == set(draws.LAWS)
+    assert set(DISTRIBUTION_NUMBERS) == set(draws.DISTRIBUTIONS)
 
 
 @pytest.mark.parametrize("gain", [0, ["per_iso", 0.0], 1e-12])
@@ -506,7 +508,7 @@ def test_a_gain_without_electrons_is_refused(gain: Any, settings: Settings) -> N
     config = settings("noise=sony_a7s2")
     config.noise.branches[0].dn_per_e = gain
     with pytest.raises(ConfigError, match=r"noise.branches\[0\].dn_per_e=.*: expected a gain above 0"):
-        check(config)
+        validate_config(config)
 
 
 @pytest.mark.parametrize("shape", [-0.5, -0.7, 10, "x"])
@@ -514,7 +516,7 @@ def test_a_shape_without_a_variance_is_refused(shape: Any, settings: Settings) -
     config = settings("noise=sony_a7s2")
     config.noise.branches[0].read_shape = shape
     with pytest.raises(ConfigError, match=r"noise.branches\[0\].read_shape="):
-        check(config)
+        validate_config(config)
 
 
 @pytest.mark.parametrize("error", ["x", [1.0, 2.0], ["by_log_iso"], ["by_log_iso", 1.0], ["by_log_iso", None], []])
@@ -522,4 +524,4 @@ def test_a_black_error_of_another_form_is_refused(error: Any, settings: Settings
     config = settings("noise=sony_a7s2")
     config.noise.branches[0].black_error_dn = error
     with pytest.raises(ConfigError, match=r"noise.branches\[0\].black_error_dn=.*: expected a number, four"):
-        check(config)
+        validate_config(config)

@@ -28,7 +28,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.types import Plan
 from unprocess_gen.dataset import dng
-from unprocess_gen.dataset.manifest import plan_of
+from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation.reference.colour import CAMERAS
 from unprocess_gen.simulation.reference.isp import apply_gains
@@ -85,7 +85,7 @@ def xmp_of(tags: Tags) -> tuple[str, dict[str, Any]]:
 
 def pair(ds: Path, number: int = 0) -> tuple[np.ndarray, np.ndarray, dict[str, Any], Plan]:
     clean, noisy, row = RawPairs(ds)[number]
-    return clean, noisy, row, plan_of(row)
+    return clean, noisy, row, plan_from_row(row)
 
 
 def tags_of(row: dict[str, Any], name: str = "noisy") -> Tags:

@@ -21,7 +21,7 @@ import pytest
 from moments import REACH, SAMPLER_ERROR, Moments, bernstein, moments, shares
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
@@ -48,7 +48,7 @@ LINEAR = ("camera=identity", "gains=unity", "isp=linear")
 
 def plan_of(settings: Settings, noise: str, *overrides: str, image: int = 0) -> Plan:
     config = settings(*LINEAR, f"noise={noise}", *OPTIONS[noise], *overrides)
-    check(config)
+    validate_config(config)
     return plan_image(config, hashlib.sha256(b"flat %d" % image).hexdigest())
 
 

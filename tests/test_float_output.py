@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.accuracy import Budget, choose
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.accuracy import Budget, choose_methods
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.lookup_tables import tukey_table
 from unprocess_gen.core.types import READABLE, Frame, Plan
@@ -253,8 +253,8 @@ def test_packed_frames_are_mosaics_in_another_order(name: str) -> None:
 @pytest.mark.parametrize("counts", [False, True])
 def test_every_budget_but_the_readable_one_takes_the_same_methods(counts: bool) -> None:
     exact, fast = Budget("e", False, 0, 0, 1e-6, 0), Budget("f", False, 1, 1e-3, 1e-3, 5e-3)
-    assert choose(exact, counts, normalised=True) == choose(fast, counts, normalised=True)
-    assert not any(one.startswith("quantise:") for one in choose(exact, counts, normalised=True))
+    assert choose_methods(exact, counts, normalised=True) == choose_methods(fast, counts, normalised=True)
+    assert not any(one.startswith("quantise:") for one in choose_methods(exact, counts, normalised=True))
 
 
 @pytest.mark.parametrize("noise", ["brooks2019", "none", "oppo_reno10x"])
@@ -262,7 +262,7 @@ def test_floats_say_that_they_are_not_rounded(noise: str, settings: Settings) ->
     picture = selftest.golden_picture()
     for overrides, rounded in ((FLOATS, False), ((), True)):
         config = settings(f"noise={noise}", *overrides)
-        check(config)
+        validate_config(config)
         plan = plan_image(config, "0" * 64, facts=facts_for(config, picture))
         assert ("quantise" in plan.effects) == rounded
         assert ("quantise: float output is not rounded" in plan.skipped) != rounded

@@ -17,7 +17,7 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Source
 from unprocess_gen.reports.estimate import SAMPLE, forecast, text
 from unprocess_gen.simulation.reference.noise import EFFECTS
-from unprocess_gen.sources.loader import spread
+from unprocess_gen.sources.loader import evenly_spaced
 
 Settings = Callable[..., Any]
 
@@ -28,14 +28,14 @@ def listing(count: int) -> tuple[Source, ...]:
 
 @given(total=st.integers(1, 500), count=st.integers(1, 50))
 def test_a_spread_is_as_many_different_sources_in_order(total: int, count: int) -> None:
-    indices = [source.index for source in spread(listing(total), count)]
+    indices = [source.index for source in evenly_spaced(listing(total), count)]
     assert len(indices) == min(total, count)
     assert indices == sorted(set(indices))
 
 
 @given(total=st.integers(1, 500), count=st.integers(1, 50))
 def test_a_spread_is_even(total: int, count: int) -> None:
-    indices = [source.index for source in spread(listing(total), count)]
+    indices = [source.index for source in evenly_spaced(listing(total), count)]
     gaps = [after - before for before, after in zip(indices, [*indices[1:], total], strict=True)]
     assert max(gaps) - min(gaps) <= 1
     assert indices[0] == 0

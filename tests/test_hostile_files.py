@@ -38,7 +38,7 @@ from PIL import Image
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import REASONS, SourceError
 from unprocess_gen.core.types import Source
-from unprocess_gen.pipeline.generate import Bench, Task, make_shard
+from unprocess_gen.pipeline.generate import RunContext, ShardTask, make_shard
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources.image.decode import decode
@@ -342,12 +342,12 @@ def weigh_all(door: Connection, config: Config, tmp: str) -> None:
     """Make a shard of each source that comes in, and send out what it took. Runs in a process of its own."""
     for dtype in (np.uint8, np.uint16):  # what is compiled or read once is nobody's weight
         make_pair(np.zeros((4, 4, 3), dtype), plan_image(config, "0" * 64, 0))
-    bench = Bench(config, tmp, os.getpid())
+    bench = RunContext(config, tmp, os.getpid())
     while True:
         source: Source = door.recv()
         Path("/proc/self/clear_refs").write_text("5")  # sets the high-water mark back
         start = time.process_time()
-        made = make_shard(bench, Task(0, (source,)))
+        made = make_shard(bench, ShardTask(0, (source,)))
         seconds = time.process_time() - start
         if made.path is not None:
             Path(made.path).unlink()

@@ -28,7 +28,7 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.keys import choose
+from unprocess_gen.dataset.keys import select_rows
 from unprocess_gen.pipeline.verify import replay
 from unprocess_gen.sources.listing import decode_name, encode_name, list_folder, read_bytes
 
@@ -261,7 +261,7 @@ def test_the_json_in_a_shard_spells_the_name_as_the_manifest_does(made: Made) ->
 
 def test_replay_finds_each_source_again_by_its_key(made: Made) -> None:
     for row in table(made.out):
-        (one,) = replay(choose(made.out / "manifest.csv", None, row["key"]), str(made.root))
+        (one,) = replay(select_rows(made.out / "manifest.csv", None, row["key"]), str(made.root))
         assert (one.key, one.source, one.complaint) == (row["key"], row["source"], "")
 
 

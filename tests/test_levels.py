@@ -16,7 +16,7 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import replay, verify
@@ -178,7 +178,7 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
 )
 def test_what_cannot_be_meant_is_refused(settings: Settings, overrides: tuple[str, ...], complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
-        check(settings(*overrides))
+        validate_config(settings(*overrides))
 
 
 # Clips ----------------------------------------------------------------------------------------------------------------

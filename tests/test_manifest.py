@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.accuracy import STAGES, of_stage
+from unprocess_gen.config.accuracy import STAGES, methods_of_stage
 from unprocess_gen.config.validation import RATES
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import Counts, Facts, Pair, Patch, Physics, Plan, Row, Source
@@ -28,9 +28,9 @@ from unprocess_gen.dataset.manifest import (
     NAMES,
     failed_row,
     json_size,
-    ok_row,
-    patch_of,
-    plan_of,
+    pair_row,
+    patch_from_row,
+    plan_from_row,
     read_rows,
     row_json,
     write_rows,
@@ -123,7 +123,7 @@ def csv_text(rows: Iterable[Row]) -> str:
 
 
 def row_of(plan: Plan = PLAN, source: Source = SOURCE) -> Row:
-    return ok_row(key_text(source.index), source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32), PATCH)
+    return pair_row(key_text(source.index), source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32), PATCH)
 
 
 def through_csv(rows: list[Row], folder: Path) -> list[Row]:
@@ -257,7 +257,7 @@ def test_keys_are_eight_digits_and_more_where_needed(index: int, key: str) -> No
 
 @given(plans)
 def test_a_row_holds_its_plan(plan: Plan) -> None:
-    assert plan_of(row_of(plan)) == plan
+    assert plan_from_row(row_of(plan)) == plan
 
 
 @given(plan=plans, name=names)
@@ -265,13 +265,13 @@ def test_a_row_read_back_from_csv_holds_the_same_plan_to_the_last_bit(
     plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     (row,) = through_csv([row_of(plan, dataclasses.replace(SOURCE, name=name))], tmp_path_factory.mktemp("csv"))
-    assert repr(plan_of(row)) == repr(plan)
+    assert repr(plan_from_row(row)) == repr(plan)
     assert row["source"] == name
 
 
 @given(plans)
 def test_a_row_read_back_from_json_holds_the_same_plan(plan: Plan) -> None:
-    assert repr(plan_of(json.loads(row_json([row_of(plan)])))) == repr(plan)
+    assert repr(plan_from_row(json.loads(row_json([row_of(plan)])))) == repr(plan)
 
 
 @given(plan=plans)
@@ -290,7 +290,7 @@ def test_real_plans_come_back(settings: Callable[..., Any], tmp_path: Path) -> N
     for noise in ("brooks2019", "imx385_iso3200_rvdd", "none"):
         for camera in ("convex", "choice", "identity"):
             plan = plan_image(settings(f"noise={noise}", f"camera={camera}", "isp=srgb"), SHA256)
-            assert plan_of(through_csv([row_of(plan)], tmp_path)[0]) == plan
+            assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
 @pytest.mark.parametrize("noise", ["sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x"])
@@ -298,13 +298,13 @@ def test_real_physical_plans_come_back(settings: Callable[..., Any], noise: str,
     for scene in ("daylight", "night"):
         plan = plan_image(settings(f"noise={noise}", f"scene={scene}"), SHA256, facts=FACTS)
         assert plan.physics is not None
-        assert plan_of(through_csv([row_of(plan)], tmp_path)[0]) == plan
+        assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}])
 def test_a_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
-        plan_of({**row_of(), name: None})
+        plan_from_row({**row_of(), name: None})
 
 
 PHYSICAL_NAMES = NAMES[NAMES.index("iso") : NAMES.index("level")]
@@ -316,7 +316,7 @@ NUMBERED = ("level", "draw", "frame", "downscale", "dequantize")
 )
 def test_a_physical_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
-        plan_of({**row_of(PHYSICAL), name: None})
+        plan_from_row({**row_of(PHYSICAL), name: None})
 
 
 @pytest.mark.parametrize(
@@ -324,13 +324,13 @@ def test_a_physical_row_without_a_value_its_plan_needs_is_damage(name: str) -> N
 )
 def test_a_row_with_a_value_of_another_type_is_damage(name: str, value: str) -> None:
     with pytest.raises(DamageError, match="row 00000003: not a plan"):
-        plan_of({**row_of(), name: value})
+        plan_from_row({**row_of(), name: value})
 
 
 @pytest.mark.parametrize("name", ["patch", "patch_y", "patch_x", "height", "width"])
 def test_a_row_without_its_place_in_the_full_frame_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a patch \\({name} is empty"):
-        patch_of({**row_of(), name: None})
+        patch_from_row({**row_of(), name: None})
 
 
 # CSV ------------------------------------------------------------------------------------------------------------------
@@ -463,7 +463,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
         saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, law_distance=LONGEST,
         dtype="float32", layout="mosaic",
-        methods=tuple(max((one.spelled for one in of_stage(stage)), key=len) for stage in STAGES),
+        methods=tuple(max((one.spelled for one in methods_of_stage(stage)), key=len) for stage in STAGES),
         effects=("heteroscedastic", "quantise"),
         skipped=(f"heteroscedastic: noise={LONGEST_NAME} has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),
     )  # fmt: skip
@@ -478,7 +478,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     for one in (plan, physical):
         source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)
         key = f"1000000000-p{patch.number}-l99d99"
-        row = ok_row(key, source, SHA256, 8, 10**9, one, pair, ("1" * 32, "2" * 32), patch)
+        row = pair_row(key, source, SHA256, 8, 10**9, one, pair, ("1" * 32, "2" * 32), patch)
         yield {**row, "width": 2**40, "height": 2**40}
 
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.accuracy import FORMS, METHODS, STAGES, Budget, choose, method, of_stage
-from unprocess_gen.config.derived import budget
+from unprocess_gen.config.accuracy import FORMS, METHODS, STAGES, Budget, choose_methods, method, methods_of_stage
+from unprocess_gen.config.derived import accuracy_budget
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
@@ -38,20 +38,20 @@ def scene() -> np.ndarray:
 
 @pytest.mark.parametrize("tier", ["reference", "exact", "fast"])
 def test_each_tier_has_a_method_for_every_stage(settings: Settings, tier: str) -> None:
-    chosen = choose(budget(settings(f"accuracy={tier}").accuracy), counts_electrons=True)
+    chosen = choose_methods(accuracy_budget(settings(f"accuracy={tier}").accuracy), counts_electrons=True)
 
     assert [one.partition(":")[0] for one in chosen] == list(STAGES)
 
 
 def test_a_budget_for_everything_takes_the_cheapest_of_every_stage() -> None:
-    assert choose(ALL, counts_electrons=False) == tuple(
-        of_stage(stage)[0].spelled for stage in STAGES if stage not in ("shot", "effects")
+    assert choose_methods(ALL, counts_electrons=False) == tuple(
+        methods_of_stage(stage)[0].spelled for stage in STAGES if stage not in ("shot", "effects")
     )
 
 
 def test_counts_are_taken_for_normals_where_the_budget_allows() -> None:
-    assert "shot:gaussian_where_near" in choose(ALL, counts_electrons=True)
-    assert "shot:inversion" in choose(replace(ALL, law_distance=0.0), counts_electrons=True)
+    assert "shot:gaussian_where_near" in choose_methods(ALL, counts_electrons=True)
+    assert "shot:inversion" in choose_methods(replace(ALL, law_distance=0.0), counts_electrons=True)
 
 
 @given(
@@ -62,7 +62,7 @@ def test_counts_are_taken_for_normals_where_the_budget_allows() -> None:
 )
 def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
     some = Budget("some", False, dn, share, normal, distance)
-    chosen = [method(*spelled.split(":")) for spelled in choose(some, counts_electrons=False)]
+    chosen = [method(*spelled.split(":")) for spelled in choose_methods(some, counts_electrons=False)]
     cheaper = FORMS[: FORMS.index(chosen[0].form)]
 
     assert len({one.form for one in chosen}) == 1
@@ -72,28 +72,28 @@ def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, n
 
 
 def test_the_exact_tier_gives_no_dn_away() -> None:
-    chosen = set(choose(EXACT, counts_electrons=True))
+    chosen = set(choose_methods(EXACT, counts_electrons=True))
 
     assert all(one.clean_dn == 0 and not one.approximates_law for one in METHODS if one.spelled in chosen)
 
 
 def test_noise_that_counts_nothing_has_no_method_for_it() -> None:
-    assert not any(one.startswith("shot:") for one in choose(EXACT, counts_electrons=False))
+    assert not any(one.startswith("shot:") for one in choose_methods(EXACT, counts_electrons=False))
 
 
 def test_the_reference_reads_like_the_method(settings: Settings) -> None:
-    chosen = choose(budget(settings("accuracy=reference").accuracy), counts_electrons=True)
+    chosen = choose_methods(accuracy_budget(settings("accuracy=reference").accuracy), counts_electrons=True)
 
     assert all(one.readable for one in METHODS if one.spelled in set(chosen))
 
 
 def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
     said = ("accuracy.name=mine", "accuracy.normal_error=6e-4", "accuracy.clean_dn=1")
-    own = budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
-    stricter = budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
+    own = accuracy_budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
+    stricter = accuracy_budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
 
-    assert "normal:polynomial_float32" in choose(own, counts_electrons=False)
-    assert "normal:quadratic_float64" in choose(stricter, counts_electrons=False)
+    assert "normal:polynomial_float32" in choose_methods(own, counts_electrons=False)
+    assert "normal:quadratic_float64" in choose_methods(stricter, counts_electrons=False)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_an_impossible_budget_is_refused_with_the_best_that_can_be_had(
     settings: Settings, override: str, message: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        check(settings(override))
+        validate_config(settings(override))
 
     assert str(refused.value).startswith(message)
 
@@ -120,7 +120,7 @@ def test_the_plan_names_the_methods_of_its_tier(settings: Settings, noise: str, 
     plan = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
 
     assert (plan.accuracy, plan.law_distance) == ("fast", 5e-3)
-    assert plan.methods == choose(budget(config.accuracy), noise == "noise=nikon_d850")
+    assert plan.methods == choose_methods(accuracy_budget(config.accuracy), noise == "noise=nikon_d850")
 
 
 @pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=sony_a7s2"])
@@ -197,7 +197,7 @@ def test_the_distance_is_the_greatest_difference_of_the_two_distribution_functio
 def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
     """Cheapest first; the readable form last, and there is one."""
     for stage in STAGES:
-        forms = [FORMS.index(one.form) for one in of_stage(stage)]
+        forms = [FORMS.index(one.form) for one in methods_of_stage(stage)]
         assert forms == sorted(forms)
         assert forms[-1] == FORMS.index("numpy")
 

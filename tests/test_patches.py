@@ -21,18 +21,18 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
-from unprocess_gen.core.types import Patch, PatchLaw
+from unprocess_gen.core.types import Patch, PatchRule
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import replay, verify
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.estimate import forecast, text
+from unprocess_gen.sources import list_patches as room
 from unprocess_gen.sources import loader as photographs
-from unprocess_gen.sources import patches as room
-from unprocess_gen.sources.patches import patches, pixels_in_none
+from unprocess_gen.sources.patches import list_patches, pixels_in_none
 
 Settings = Callable[..., Config]
 Hash = Callable[[Path], str]
@@ -180,7 +180,7 @@ sizes = st.integers(0, 300)
 @given(lengths, lengths, sizes, sizes)
 def test_a_grid_holds_every_place_at_its_stride_and_no_other(side: int, stride: int, down: int, right: int) -> None:
     height, width = side + down, side + right
-    found = patches(PatchLaw("grid", side, stride=stride), 0, height, width)
+    found = list_patches(PatchRule("grid", side, stride=stride), 0, height, width)
     wanted = [(y, x) for y in range(0, down + 1, stride) for x in range(0, right + 1, stride)]
     assert [patch.origin for patch in found] == wanted
     assert [patch.number for patch in found] == list(range(len(wanted)))
@@ -188,7 +188,7 @@ def test_a_grid_holds_every_place_at_its_stride_and_no_other(side: int, stride: 
 
 @given(lengths, sizes, sizes, st.integers(0, 2**64 - 1))
 def test_random_places_are_even_and_inside(side: int, down: int, right: int, key: int) -> None:
-    for patch in patches(PatchLaw("random", side, count=20), key, side + down, side + right):
+    for patch in list_patches(PatchRule("random", side, count=20), key, side + down, side + right):
         assert (patch.y % 2, patch.x % 2, patch.height, patch.width) == (0, 0, side, side)
         assert 0 <= patch.y <= down
         assert 0 <= patch.x <= right
@@ -196,18 +196,18 @@ def test_random_places_are_even_and_inside(side: int, down: int, right: int, key
 
 def test_random_places_reach_the_first_and_the_last_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "patch_words", lambda key, count: [(0, 2**32 - 1), (2**32 - 1, 0)])
-    found = patches(PatchLaw("random", 10, count=2), 0, 31, 40)
+    found = list_patches(PatchRule("random", 10, count=2), 0, 31, 40)
     assert [patch.origin for patch in found] == [(0, 30), (20, 0)]
 
 
 def test_more_random_patches_leave_the_first_ones_where_they_are() -> None:
-    few, many = (patches(PatchLaw("random", 8, count=count), 5, 200, 300) for count in (10, 100))
+    few, many = (list_patches(PatchRule("random", 8, count=count), 5, 200, 300) for count in (10, 100))
     assert many[:10] == few
 
 
 def test_random_places_are_uniform() -> None:
     """64 x 64 places, 16 cells a side, 10,000 patches: no count is six standard deviations from the mean of 625."""
-    found = np.array([patch.origin for patch in patches(PatchLaw("random", 2, count=10_000), 3, 128, 128)])
+    found = np.array([patch.origin for patch in list_patches(PatchRule("random", 2, count=10_000), 3, 128, 128)])
     for axis in found.T:
         counts = np.bincount(axis // 8, minlength=16)
         assert np.abs(counts - 625).max() < 6 * np.sqrt(625)
@@ -216,25 +216,25 @@ def test_random_places_are_uniform() -> None:
 
 def test_random_places_are_the_same_on_every_machine() -> None:
     """The words are Philox's (`test_streams`); all that follows is whole numbers."""
-    found = patches(PatchLaw("random", 128, count=3), 0x0123456789ABCDEF, 2160, 2880)
+    found = list_patches(PatchRule("random", 128, count=3), 0x0123456789ABCDEF, 2160, 2880)
     assert [patch.origin for patch in found] == [(1662, 92), (166, 2310), (1910, 72)]
 
 
 def test_an_image_that_is_not_cut_is_its_only_patch() -> None:
-    assert patches(None, 7, 5, 9) == (Patch(0, 0, 0, 5, 9),)
+    assert list_patches(None, 7, 5, 9) == (Patch(0, 0, 0, 5, 9),)
 
 
 @pytest.mark.parametrize(
     ("law", "left_out"),
     [
         (None, 0),
-        (PatchLaw("grid", 10, stride=10), 25 * 32 - 20 * 30),
-        (PatchLaw("grid", 10, stride=8), 25 * 32 - 18 * 26),
-        (PatchLaw("grid", 4, stride=20), 25 * 32 - 4 * 16),
+        (PatchRule("grid", 10, stride=10), 25 * 32 - 20 * 30),
+        (PatchRule("grid", 10, stride=8), 25 * 32 - 18 * 26),
+        (PatchRule("grid", 4, stride=20), 25 * 32 - 4 * 16),
     ],
 )
-def test_pixels_in_no_patch_are_counted(law: PatchLaw | None, left_out: int) -> None:
-    assert pixels_in_none(patches(law, 0, 25, 32), 25, 32) == left_out
+def test_pixels_in_no_patch_are_counted(law: PatchRule | None, left_out: int) -> None:
+    assert pixels_in_none(list_patches(law, 0, 25, 32), 25, 32) == left_out
 
 
 # The setting ----------------------------------------------------------------------------------------------------------
@@ -270,13 +270,13 @@ def test_all_spellings_of_a_setting_give_one_config_yaml(
 )
 def test_what_cannot_be_meant_is_refused(value: str, settings: Settings) -> None:
     with pytest.raises(ConfigError, match=r"^source\.patch=.*: expected null, a side, \[grid, side\], ") as caught:
-        check(settings(f"source.patch={value}"))
+        validate_config(settings(f"source.patch={value}"))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("value", ["2", "32768", "[grid,2,32768]", "[random,2,1]", "[random,32768,10000]"])
 def test_the_ends_of_what_is_allowed_are_allowed(value: str, settings: Settings) -> None:
-    check(settings(f"source.patch={value}"))
+    validate_config(settings(f"source.patch={value}"))
 
 
 def test_a_refusal_costs_one_line_and_writes_nothing(door: Door, tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_why_an_image_is_too_small_is_said(settings: Settings, tmp_path: Path) -
     (source,) = photographs.list_photographs(config.source).sources
     why = r"unsupported: 16 x 12 pixels hold no patch of 14 x 14 \(source.patch\)$"
     with pytest.raises(SourceError, match=f"^{why}"):
-        photographs.load(config.source, source)
+        photographs.load_source(config.source, source)
     assert "fails     000.png: unsupported\n          16 x 12 pixels hold no patch" in text(
         config, forecast(config, 1, True)
     )

@@ -20,7 +20,7 @@ from unprocess_gen.pipeline.verify import replay
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.unprocess import dequantise
-from unprocess_gen.sources.loader import downscaled, list_photographs, load
+from unprocess_gen.sources.loader import downscaled, list_photographs, load_source
 
 
 @given(side=st.integers(1, 9), seed=st.integers(0, 99), deep=st.booleans())
@@ -44,7 +44,7 @@ def test_a_photograph_too_small_to_be_downscaled_is_unsupported(tmp_path: Path) 
     Image.fromarray(pixels(1, 3, 9)).save(tmp_path / "small.png")
     config = SourceConfig(root=str(tmp_path), include=["*"], downscale=4)
     with pytest.raises(SourceError, match=r"^unsupported: 9 x 3 pixels are fewer"):
-        load(config, list_photographs(config).sources[0])
+        load_source(config, list_photographs(config).sources[0])
 
 
 @pytest.mark.parametrize("override", ["source.downscale=2", "source.dequantize=dither"])

@@ -27,11 +27,11 @@ from moments import REACH, SAMPLER_ERROR, bernstein
 
 from unprocess_gen.config.derived import branch_of
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Patch, Physics, Plan, Source, Srgb
-from unprocess_gen.dataset.manifest import ok_row, plan_of, read_rows, write_rows
+from unprocess_gen.dataset.manifest import pair_row, plan_from_row, read_rows, write_rows
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.kernels import physical as electrons
@@ -80,7 +80,7 @@ def planned(settings: Settings, srgb: Srgb, *overrides: str, forced: bool = Fals
         branch.row_std_dn = branch.row_std_dn or 1.5
         branch.column_std_dn = branch.column_std_dn or 1.25
         branch.black_error_dn = branch.black_error_dn or [0.5, -1.5, 2.5, -3.75]
-    check(config)
+    validate_config(config)
     return plan_image(config, SHA256, facts=facts_of(srgb))
 
 
@@ -388,14 +388,14 @@ def test_a_row_alone_gives_the_same_pair_again(settings: Settings, noise: str, f
     overrides = (f"noise={noise}", "scene=low_light", f"noise.iso={ISOS[noise]}", "sensor.units=7")
     plan = planned(settings, picture(), *overrides, forced=forced)
     pair = make_pair(picture(), plan)
-    row = ok_row("00000000", Source(0, "a.png", "a.png", 1), SHA256, 1, 0, plan, pair, ("0" * 32, "0" * 32), WHOLE)
+    row = pair_row("00000000", Source(0, "a.png", "a.png", 1), SHA256, 1, 0, plan, pair, ("0" * 32, "0" * 32), WHOLE)
     stream = io.StringIO(newline="")
     write_rows(stream, [row])
     (tmp_path / "m.csv").write_text(stream.getvalue(), encoding="utf-8", newline="")
     (read,) = read_rows(tmp_path / "m.csv")
 
-    assert plan_of(read) == plan
-    again = make_pair(picture(), plan_of(read))
+    assert plan_from_row(read) == plan
+    again = make_pair(picture(), plan_from_row(read))
     np.testing.assert_array_equal(again.clean, pair.clean)
     np.testing.assert_array_equal(again.noisy, pair.noisy)
     assert again.counts == pair.counts
@@ -624,7 +624,7 @@ def test_a_scale_of_tukeys_law_is_multiplied_by_the_deviation_of_its_shape(setti
 def test_the_scatter_about_a_line_is_a_normal_in_the_logarithm(settings: Settings) -> None:
     config = settings("noise=oppo_reno10x", "noise.iso=800")
     config.noise.branches[0].read_std_dn = ["line", 0.5, 1.25, 0.25]
-    check(config)
+    validate_config(config)
     facts = facts_of(picture())
     plans = [plan_image(config, f"{n:064x}", facts=facts) for n in range(150)]
     scale = (4095 - 240) / (1023 - 64)
@@ -832,7 +832,7 @@ def test_a_table_of_black_errors_divides_its_range_of_iso_evenly_in_the_logarith
     config = settings("noise=nikon_d850", f"noise.iso={iso}")
     config.noise.branches[0].iso = [100, 400]
     config.noise.branches[0].black_error_dn = ["by_log_iso", *([n, 10 * n, -n, 0.5] for n in range(4))]
-    check(config)
+    validate_config(config)
     physics = plan_image(config, SHA256, facts=facts_of(picture())).physics
     scale = (4095 - 240) / (16383 - 400)
     assert physics is not None
@@ -842,7 +842,7 @@ def test_a_table_of_black_errors_divides_its_range_of_iso_evenly_in_the_logarith
 def test_a_table_of_black_errors_may_stand_at_one_iso(settings: Settings) -> None:
     config = settings("noise=nikon_d850", "noise.iso=100")
     config.noise.branches[0].iso = [100, 100]
-    check(config)
+    validate_config(config)
     physics = plan_image(config, SHA256, facts=facts_of(picture())).physics
     assert physics is not None
     assert physics.black_error_dn[0] < 0
@@ -1077,6 +1077,6 @@ def test_so_many_bodies_are_shared_by_all_images(settings: Settings) -> None:
 def test_fields_of_a_physics_are_all_in_the_row() -> None:
     """A number that the row does not hold could not be replayed."""
     pair = make_pair(flat(0, 2, 2), made())
-    row = ok_row("00000000", Source(0, "a", "a", 1), SHA256, 1, 0, made(), pair, ("0" * 32, "0" * 32), WHOLE)
+    row = pair_row("00000000", Source(0, "a", "a", 1), SHA256, 1, 0, made(), pair, ("0" * 32, "0" * 32), WHOLE)
     for field in dataclasses.fields(Physics):
         assert field.name in row or f"{field.name}_00" in row

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import BranchConfig, Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Facts, Physics
 from unprocess_gen.planning.noise_profile import number, plan_physics
@@ -42,7 +42,7 @@ def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: st
     config = settings(f"noise={noise}", f"noise.iso={iso}", *overrides)
     sensor = replace(config.sensor, bits=bits, black_level_dn=black, white_level_dn=white)
     config = replace(config, sensor=sensor)
-    check(config)
+    validate_config(config)
     return config
 
 
@@ -288,13 +288,13 @@ def test_a_shape_is_each_of_the_choices_as_often(settings: Settings) -> None:
 )
 def test_iso_is_drawn_from_its_law(settings: Settings, law: str, uniform: float, iso: float) -> None:
     config = settings("noise=sony_a7s2", f"noise.iso={law}")
-    check(config)
+    validate_config(config)
     assert math.isclose(physics(config, iso=uniform).iso, iso, rel_tol=1e-15)
 
 
 def test_the_isos_of_a_dataset_are_those_of_its_law(settings: Settings) -> None:
     config = settings("noise=oppo_reno10x", "noise.iso=[log_uniform,100,6400]")
-    check(config)
+    validate_config(config)
     isos = sorted(
         plan.physics.iso
         for n in range(200)
@@ -383,7 +383,7 @@ def test_settings_that_cannot_be_meant_are_refused(
     settings: Settings, overrides: tuple[str, ...], message: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        check(settings(*overrides))
+        validate_config(settings(*overrides))
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -423,7 +423,7 @@ def test_a_branch_that_cannot_be_meant_is_refused(settings: Settings, change: di
     branch = replace(config.noise.branches[0], **change)
     config = replace(config, noise=replace(config.noise, branches=[branch, *config.noise.branches[1:]]))
     with pytest.raises(ConfigError) as refused:
-        check(config)
+        validate_config(config)
     assert message in str(refused.value)
 
 
@@ -431,7 +431,7 @@ def test_a_branch_without_optional_numbers_has_none_of_their_effects(settings: S
     config = settings("noise=nikon_d850", "noise.iso=100")
     branch = BranchConfig(iso=[100, 100], dn_per_e=1.0, read_std_dn=2.0)
     config = replace(config, noise=replace(config.noise, branches=[branch], prnu_std=None, dark_e_per_s=None))
-    check(config)
+    validate_config(config)
     made = physics(config)
     assert (made.row_std_dn, made.column_std_dn, made.black_error_dn) == (0.0, 0.0, (0.0,) * 4)
     assert (made.prnu_std, made.dark_e, made.full_well_e, made.read_shape) == (0.0, 0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from unprocess_gen.config.serialization import read_dataset_yaml
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline.generate import generate
 
 PINNED = Path(__file__).parents[1] / "manifests"
@@ -24,7 +24,7 @@ def test_a_pinned_build_comes_out_the_same(name: str, tmp_path: Path) -> None:
     config, kind = read_dataset_yaml(PINNED / f"{name}.yaml")
     assert kind == "synthetic"
     config.out, config.n_jobs = str(tmp_path / "ds"), 1
-    check(config)
+    validate_config(config)
 
     generate(config)
 

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from moments import bernstein
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
-from unprocess_gen.core.types import Law, Plan
+from unprocess_gen.core.types import Distribution, Plan
 from unprocess_gen.planning.plan import PARAMETERS, draw, plan_camera, plan_image, plan_noise
 from unprocess_gen.simulation.reference import colour
 
@@ -35,7 +35,7 @@ uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) / 2**52)
 
 def plan_of(settings: Settings, *overrides: str, sha: str = SHA, occurrence: int = 0) -> Plan:
     config = settings(*overrides)
-    check(config)
+    validate_config(config)
     return plan_image(config, sha, occurrence)
 
 
@@ -53,10 +53,10 @@ def images(count: int) -> list[dict[str, float]]:
 
 # Laws -----------------------------------------------------------------------------------------------------------------
 
-GAIN = Law("truncated_normal", (0.8, 0.1, 0.5, 1.1))
-LITERAL = Law("inverse_truncated_normal", (0.8, 0.1, 0.5, 1.1))
-SHOT = Law("log_uniform", (0.0001, 0.012))
-READ = Law("log_linear_in_a", (2.18, 1.2, 0.26))
+GAIN = Distribution("truncated_normal", (0.8, 0.1, 0.5, 1.1))
+LITERAL = Distribution("inverse_truncated_normal", (0.8, 0.1, 0.5, 1.1))
+SHOT = Distribution("log_uniform", (0.0001, 0.012))
+READ = Distribution("log_linear_in_a", (2.18, 1.2, 0.26))
 
 
 def normal_cdf(z: mpmath.mpf) -> mpmath.mpf:
@@ -67,7 +67,7 @@ def normal_quantile(p: mpmath.mpf) -> mpmath.mpf:
     return mpmath.sqrt(2) * mpmath.erfinv(2 * p - 1)
 
 
-def by_mpmath(law: Law, uniform: float, a: float) -> mpmath.mpf:
+def by_mpmath(law: Distribution, uniform: float, a: float) -> mpmath.mpf:
     """The law by another library, in 40 digits."""
     u = mpmath.mpf(uniform)
     numbers = [mpmath.mpf(number) for number in law.numbers]
@@ -90,15 +90,15 @@ def by_mpmath(law: Law, uniform: float, a: float) -> mpmath.mpf:
         LITERAL,
         SHOT,
         READ,
-        Law("truncated_normal", (1.0, 0.25, 0.9, 2.5)),
-        Law("truncated_normal", (2.0, 0.1, 1.4, 2.6)),
-        Law("log_uniform", (1e-12, 3.0)),
-        Law("log_linear_in_a", (-1.5, 0.0, 2.0)),
-        Law("log_linear_in_a", (2.18, 1.2, 0.0)),
+        Distribution("truncated_normal", (1.0, 0.25, 0.9, 2.5)),
+        Distribution("truncated_normal", (2.0, 0.1, 1.4, 2.6)),
+        Distribution("log_uniform", (1e-12, 3.0)),
+        Distribution("log_linear_in_a", (-1.5, 0.0, 2.0)),
+        Distribution("log_linear_in_a", (2.18, 1.2, 0.0)),
     ],
     ids=lambda law: f"{law.kind} {law.numbers}",
 )
-def test_a_draw_is_its_laws_quantile_correctly_rounded(law: Law) -> None:
+def test_a_draw_is_its_laws_quantile_correctly_rounded(law: Distribution) -> None:
     """Half a unit in the last place; both sides hold 24 digits or more, so only a tie to 1e-8 of it could go astray."""
     with mpmath.workdps(40):
         for uniform in UNIFORMS:
@@ -112,30 +112,34 @@ def test_a_uniform_draw_is_on_the_line_to_its_three_roundings(uniform: float, lo
     high = low + width
     exact = Fraction(low) + Fraction(uniform) * (Fraction(high) - Fraction(low))
     slack = (2 * (Fraction(high) - Fraction(low)) + exact) / 2**53
-    assert abs(Fraction(draw(Law("uniform", (low, high)), uniform)) - exact) <= slack * (1 + Fraction(1, 10**6))
+    assert abs(Fraction(draw(Distribution("uniform", (low, high)), uniform)) - exact) <= slack * (
+        1 + Fraction(1, 10**6)
+    )
 
 
 @given(uniforms)
 def test_a_constant_is_no_draw(uniform: float) -> None:
-    assert draw(Law("constant", (2.15,)), uniform) == 2.15
+    assert draw(Distribution("constant", (2.15,)), uniform) == 2.15
 
 
 @pytest.mark.parametrize("uniform", [FIRST, 0.5, LAST])
 @pytest.mark.parametrize(
     ("law", "low", "high"),
     [
-        (Law("uniform", (1.9, 2.4)), 1.9, 2.4),
-        (Law("uniform", (1.5, 1.9)), 1.5, 1.9),
+        (Distribution("uniform", (1.9, 2.4)), 1.9, 2.4),
+        (Distribution("uniform", (1.5, 1.9)), 1.5, 1.9),
         (GAIN, 0.5, 1.1),
         (LITERAL, 1 / 1.1, 2.0),
         (SHOT, 0.0001, 0.012),
-        (Law("log_uniform", (1e-300, 1e300)), 1e-300, 1e300),
-        (Law("truncated_normal", (1.0, 0.1, 1.5, 1.6)), 1.5, 1.6),
-        (Law("truncated_normal", (1.0, 0.1, 0.4, 0.5)), 0.4, 0.5),
+        (Distribution("log_uniform", (1e-300, 1e300)), 1e-300, 1e300),
+        (Distribution("truncated_normal", (1.0, 0.1, 1.5, 1.6)), 1.5, 1.6),
+        (Distribution("truncated_normal", (1.0, 0.1, 0.4, 0.5)), 0.4, 0.5),
     ],
-    ids=lambda value: f"{value.kind} {value.numbers}" if isinstance(value, Law) else "",
+    ids=lambda value: f"{value.kind} {value.numbers}" if isinstance(value, Distribution) else "",
 )
-def test_a_draw_lies_within_its_limits_whatever_the_uniform(law: Law, low: float, high: float, uniform: float) -> None:
+def test_a_draw_lies_within_its_limits_whatever_the_uniform(
+    law: Distribution, low: float, high: float, uniform: float
+) -> None:
     assert low <= draw(law, uniform) <= high
 
 
@@ -146,8 +150,8 @@ def test_the_articles_literal_gain_is_the_inverse_of_brooks(uniform: float) -> N
     assert abs(product - 1) <= Fraction(2, 2**53) * (1 + Fraction(1, 10**6))
 
 
-@pytest.mark.parametrize("law", [Law("uniform", (1.9, 2.4)), GAIN, SHOT, READ], ids=lambda law: law.kind)
-def test_a_greater_uniform_never_gives_a_smaller_draw(law: Law) -> None:
+@pytest.mark.parametrize("law", [Distribution("uniform", (1.9, 2.4)), GAIN, SHOT, READ], ids=lambda law: law.kind)
+def test_a_greater_uniform_never_gives_a_smaller_draw(law: Distribution) -> None:
     drawn = [draw(law, uniform, 0.01) for uniform in sorted(UNIFORMS)]
     assert all(a <= b for a, b in itertools.pairwise(drawn))
 
@@ -250,8 +254,8 @@ def test_the_numbers_of_the_draws_are_those_of_every_dataset_ever_made() -> None
 def test_each_draw_takes_the_uniform_of_its_name(settings: Settings) -> None:
     plan = plan_of(settings, "noise=brooks2019")
     u = dict(zip(PARAMETERS, parameter_uniforms(plan.stream_key, len(PARAMETERS)), strict=True))
-    assert plan.red_gain == draw(Law("uniform", (1.9, 2.4)), u["red"])
-    assert plan.blue_gain == draw(Law("uniform", (1.5, 1.9)), u["blue"])
+    assert plan.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u["red"])
+    assert plan.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u["blue"])
     assert plan.inverse_rgb_gain == draw(GAIN, u["inverse_rgb"])
     a = draw(SHOT, u["a"])
     assert plan.a_dn == a * 3855.0

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.lookup_tables import linear_table
 from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
@@ -79,7 +79,7 @@ def configured(settings: Settings, *overrides: str) -> Config:
     for iso in (None, 1600, 3200):
         config.noise.iso = config.noise.iso if iso is None else iso
         try:
-            check(config)
+            validate_config(config)
             return config
         except ConfigError:
             continue
@@ -372,7 +372,7 @@ def test_a_strong_effect_is_on_in_the_plan_of_every_camera(settings: Settings, p
             for holder in (config.noise, *config.noise.branches):
                 if hasattr(holder, key):
                     setattr(holder, key, value)
-        check(config)
+        validate_config(config)
         for srgb in (cut("highlights-0", 40, 56), flat(200, 200, 200)):
             plan = switched(config, "auto", srgb, 0)
             if not (effect == "full_well" and scene == "night"):  # 50 electrons are more than there are
@@ -629,7 +629,7 @@ def test_all_on_simulates_what_has_a_number_and_says_what_has_none(settings: Set
 @pytest.mark.parametrize("effect", ["full_well", "column", "black_error"])
 def test_an_effect_without_a_number_cannot_be_switched_on_by_name(settings: Settings, effect: str) -> None:
     with pytest.raises(ConfigError, match=rf"effects.{effect}=on: noise=sony_a7s2 gives no {effect}_"):
-        check(settings("noise=sony_a7s2", "scene=indoor", f"effects.{effect}=on"))
+        validate_config(settings("noise=sony_a7s2", "scene=indoor", f"effects.{effect}=on"))
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)

@@ -17,7 +17,7 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.lookup_tables import linear_table
-from unprocess_gen.dataset.manifest import plan_of
+from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.reports import contact_sheet as preview
 from unprocess_gen.simulation.reference import isp as process
 from unprocess_gen.simulation.reference import unprocess
@@ -71,7 +71,7 @@ def places(sheet: np.ndarray, picture: np.ndarray) -> list[tuple[int, int]]:
 def test_a_sheet_holds_every_panel_one_to_one(few: Path, gray_world: Path, tmp_path: Path) -> None:
     """In the order: source, clean in three forms; residual, noisy in three forms, below."""
     clean, noisy, row = RawPairs(few)[0]
-    plan = plan_of(row)
+    plan = plan_from_row(row)
     low, high = {}, {}
     for name, raw in (("clean", clean), ("noisy", noisy)):
         low[name], high[name] = float(raw.min()), float(raw.max())
@@ -114,7 +114,7 @@ def test_the_part_of_a_large_frame_is_that_of_its_whole_development(few: Path, t
 
     [drawn] = preview.preview(few, tmp_path, ["00000001"])
 
-    part = codes(process.develop(clean, plan_of(row))[at.rows, at.columns])
+    part = codes(process.develop(clean, plan_from_row(row))[at.rows, at.columns])
     assert part.shape == (*preview.PANEL_PX, 3)
     assert len(places(png(drawn.files[0]), part)) == 1
 
@@ -133,7 +133,7 @@ def test_a_dark_scene_is_developed_as_bright_as_its_photograph(gray_world: Path,
     clean, _, row = RawPairs(tmp_path / "ds")[0]
     assert row["exposure_ratio"] > 10
 
-    developed = process.to_codes(process.develop(clean, plan_of(row)))
+    developed = process.to_codes(process.develop(clean, plan_from_row(row)))
 
     assert abs(float(developed.mean()) - float(pixels(3, HEIGHT, WIDTH).mean())) < 1
 
@@ -142,7 +142,7 @@ def test_a_dark_scene_is_developed_as_bright_as_its_photograph(gray_world: Path,
 
 
 def test_the_steps_together_are_the_pipeline(few: Path) -> None:
-    plan = plan_of(RawPairs(few)[0].row)
+    plan = plan_from_row(RawPairs(few)[0].row)
     source = pixels(3, HEIGHT, WIDTH)
     values = source / 255
 
@@ -155,7 +155,7 @@ def test_the_steps_together_are_the_pipeline(few: Path) -> None:
 
 def test_stages_show_each_step_and_end_with_the_frames_of_the_dataset(few: Path, tmp_path: Path) -> None:
     clean, noisy, row = RawPairs(few)[0]
-    plan = plan_of(row)
+    plan = plan_from_row(row)
     source = pixels(3, HEIGHT, WIDTH)
     light = unprocess.linear_light(source, plan.tone, plan.gamma)
     camera = unprocess.apply_ccm(light, plan.rgb2cam)
@@ -176,7 +176,7 @@ def test_stages_show_each_step_and_end_with_the_frames_of_the_dataset(few: Path,
 
 def test_dithered_codes_have_a_stage_of_their_own(gray_world: Path, make: Make, tmp_path: Path) -> None:
     make(gray_world, tmp_path / "ds", "source.limit=1", "source.dequantize=dither")
-    plan = plan_of(RawPairs(tmp_path / "ds")[0].row)
+    plan = plan_from_row(RawPairs(tmp_path / "ds")[0].row)
     source = pixels(3, HEIGHT, WIDTH)
     dithered = unprocess.dequantise(source, plan, linear_table(plan.tone, plan.gamma, 256))
 
@@ -501,4 +501,4 @@ def test_stages_need_the_source(few: Path) -> None:
     clean, noisy, row = RawPairs(few)[0]
 
     with pytest.raises(ValueError, match=r"00000000: there is no source .*it is gone"):
-        preview.stages(preview.Shown(clean, noisy, row, plan_of(row), None, "it is gone"))
+        preview.stages(preview.Shown(clean, noisy, row, plan_from_row(row), None, "it is gone"))

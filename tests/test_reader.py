@@ -24,7 +24,7 @@ from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.sources.loader import load
+from unprocess_gen.sources.loader import load_source
 
 
 def test_raw_pairs_is_the_name_of_the_package() -> None:
@@ -50,7 +50,7 @@ def test_pairs_are_those_that_their_photographs_and_plans_give(
     config = settings(f"source.root={photos}")
     for sample in RawPairs(dataset):
         name = str(sample.row["source"]).replace("%25", "%").replace("%3D", "=")
-        sha256, photograph = load(config.source, Source(0, name, name, sample.row["source_bytes"]))
+        sha256, photograph = load_source(config.source, Source(0, name, name, sample.row["source_bytes"]))
         expected = make_pair(photograph.srgb, plan_image(config, sha256))
         assert np.array_equal(sample.clean, expected.clean)
         assert np.array_equal(sample.noisy, expected.noisy)

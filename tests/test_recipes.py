@@ -13,7 +13,7 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.hydra_app import RECIPE, conf_dir
 from unprocess_gen.config.serialization import read_dataset_yaml
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.types import Srgb
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.scenes import synthetic
@@ -36,7 +36,7 @@ def test_a_recipe_passes_the_checks_whatever_options_are_chosen(
     recipe: str, overrides: tuple[str, ...], settings: Settings
 ) -> None:
     config = settings(f"+{RECIPE}={recipe}", *overrides, *NO_CLIPS.get(recipe, ()))
-    check(config)
+    validate_config(config)
     if "noise=none" in overrides:
         assert config.noise.name == "none"
     if "camera=sony_a7r" in overrides:
@@ -228,4 +228,4 @@ def test_eld_low_light_has_the_isos_and_light_factors_of_its_dataset(make: Make,
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", ["nikon_d850", "sony_a7s2", "canon_5d4", "canon_70d", "canon_700d"])
 def test_eld_low_light_holds_for_each_of_its_cameras(camera: str, settings: Settings) -> None:
-    check(settings(f"+{RECIPE}=eld_low_light", f"noise={camera}"))
+    validate_config(settings(f"+{RECIPE}=eld_low_light", f"noise={camera}"))

@@ -15,7 +15,7 @@ from conftest import Door, Make, fill
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.dataset.keys import choose
+from unprocess_gen.dataset.keys import select_rows
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.shards import read_index
 from unprocess_gen.pipeline.verify import replay, spread, verify
@@ -261,16 +261,16 @@ def test_verify_names_a_source_that_changed(whole: Path, door: Door, tmp_path: P
 
 def test_rows_are_chosen_by_number_or_key(whole: Path) -> None:
     manifest = whole / "manifest.csv"
-    assert [row["key"] for row in choose(manifest, "1:", None)] == ["00000001", "00000002"]
-    assert [row["key"] for row in choose(manifest, "0:1", None)] == ["00000000"]
-    assert [row["key"] for row in choose(manifest, None, "00000002,00000000")] == ["00000000", "00000002"]
-    assert len(list(choose(manifest, None, None))) == 3
+    assert [row["key"] for row in select_rows(manifest, "1:", None)] == ["00000001", "00000002"]
+    assert [row["key"] for row in select_rows(manifest, "0:1", None)] == ["00000000"]
+    assert [row["key"] for row in select_rows(manifest, None, "00000002,00000000")] == ["00000000", "00000002"]
+    assert len(list(select_rows(manifest, None, None))) == 3
 
 
 @pytest.mark.parametrize(("rows", "keys"), [("1", None), ("a:b", None), ("-1:2", None), (None, "7"), (None, "")])
 def test_a_choice_of_nothing_that_is_there_is_refused(rows: str | None, keys: str | None, whole: Path) -> None:
     with pytest.raises(ConfigError, match=r"--rows|--keys"):
-        list(choose(whole / "manifest.csv", rows, keys))
+        list(select_rows(whole / "manifest.csv", rows, keys))
 
 
 def test_a_sample_is_spread_over_the_manifest(whole: Path) -> None:

@@ -25,7 +25,7 @@ from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import replay, verify
 from unprocess_gen.sources import loader as photographs
-from unprocess_gen.sources.loader import list_photographs, load
+from unprocess_gen.sources.loader import list_photographs, load_source
 
 av = pytest.importorskip("av")
 from unprocess_gen.sources.video.decode import CODECS, FORMATS, Video  # noqa: E402
@@ -276,7 +276,7 @@ def test_rotation_is_applied_like_exif_orientation(orientation: int, tmp_path: P
     stored = rgb(opened(path), 0)
     turned(path, TURNS[orientation])
     (source,) = list_photographs(settings_of(tmp_path)).sources
-    _, photograph = load(settings_of(tmp_path), source)
+    _, photograph = load_source(settings_of(tmp_path), source)
 
     a, b, c, d = TURNS[orientation]
     q, p = np.mgrid[0:18, 0:34]
@@ -498,7 +498,7 @@ def test_a_video_with_too_many_pixels_is_one_failed_row(tmp_path: Path) -> None:
     config = settings_of(tmp_path, max_pixels=64 * 48 - 1)
     (source,) = list_photographs(config).sources
     with pytest.raises(SourceError, match=r"^too_large: 64 x 48 pixels are 3072"):
-        load(config, source)
+        load_source(config, source)
 
 
 def test_other_primaries_are_refused_where_profiles_are(tmp_path: Path) -> None:
@@ -507,7 +507,7 @@ def test_other_primaries_are_refused_where_profiles_are(tmp_path: Path) -> None:
     config = settings_of(tmp_path, icc="refuse")
     (source,) = list_photographs(config).sources
     with pytest.raises(SourceError, match=r"^icc: the primaries have code 9"):
-        load(config, source)
+        load_source(config, source)
 
 
 def damaged(folder: Path) -> tuple[Path, Path]:
@@ -734,19 +734,19 @@ def test_a_video_that_changes_under_the_run_stops_it(films: Path, tmp_path: Path
     copy = Path(shutil.copy(films / "h264.mp4", tmp_path / "a.mp4"))
     config = settings_of(tmp_path)
     first, second, *_ = list_photographs(config).sources
-    load(config, first)
+    load_source(config, first)
     content = bytearray(copy.read_bytes())
     content[-1] ^= 1
     copy.write_bytes(content)
     with pytest.raises((MachineError, SourceError), match="changed"):
-        load(config, second)
+        load_source(config, second)
 
 
 def test_the_file_is_opened_and_hashed_once(films: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     photographs._opened_film.cache_clear()
     config = settings_of(films, include=["none"], video=["*.mp4"])
     for source in list_photographs(config).sources:
-        load(config, source)
+        load_source(config, source)
     assert photographs._opened_film.cache_info().misses == 1
 
 
@@ -793,11 +793,11 @@ def test_without_pyav_a_video_is_refused_with_the_way_out(
 
 
 def test_a_folder_of_videos_alone_needs_no_other_globs(films: Path, settings: Settings) -> None:
-    from unprocess_gen.config.validation import check
+    from unprocess_gen.config.validation import validate_config
 
     config = settings("source.clips=true", "source.include=[]")
     config.source.root = str(films)
-    check(config)
+    validate_config(config)
     assert len(list_photographs(config.source).sources) == 34
 
 

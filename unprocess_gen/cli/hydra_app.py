@@ -102,7 +102,7 @@ def compose_one(flags: list[str], overrides: list[str], task: Task) -> int:
     from yaml import YAMLError
 
     from unprocess_gen.config.schema import Config
-    from unprocess_gen.config.validation import check
+    from unprocess_gen.config.validation import validate_config
 
     ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
     outcomes: list[int | BaseException] = []
@@ -113,7 +113,7 @@ def compose_one(flags: list[str], overrides: list[str], task: Task) -> int:
                 raise ConfigError(f"{_assignment(key, overrides)}: no such key; {_allowed(key)}")
             config = OmegaConf.to_object(node)
             assert isinstance(config, Config)
-            check(config)
+            validate_config(config)
             outcomes.append(task(config)[0])
         except BaseException as error:
             outcomes.append(error)
@@ -375,14 +375,14 @@ def _explain(error: BaseException, arguments: Sequence[str]) -> str:
     """Return one sentence with the key, the value and what is allowed."""
     from omegaconf.errors import OmegaConfBaseException
 
-    from unprocess_gen.config.serialization import one_line
+    from unprocess_gen.config.serialization import error_in_one_line
 
     chain: list[BaseException] = []
     link: BaseException | None = error
     while link is not None and link not in chain:
         chain.append(link)
         link = link.__cause__ or link.__context__
-    text = " ".join(one_line(link) for link in chain)
+    text = " ".join(error_in_one_line(link) for link in chain)
     option = re.search(r"Could not find '([^']+)/([^'/]*)'\s+Available options in '[^']+':((?:\n\t\S+)+)", str(error))
     if option:
         return f"{option[1]}={option[2]}: no such option; expected one of {', '.join(option[3].split())}"
@@ -393,7 +393,7 @@ def _explain(error: BaseException, arguments: Sequence[str]) -> str:
         key = getattr(link, "full_key", None)
         if isinstance(link, OmegaConfBaseException) and key:
             return f"{_assignment(key, arguments)}: {_reason(link, key)}"
-    return one_line(error)
+    return error_in_one_line(error)
 
 
 def _reason(error: Any, key: str) -> str:

@@ -295,7 +295,7 @@ DNG_KEYS = {"--keys": str, "--to": str}
 def again(arguments: list[str]) -> int:
     """``gen-dataset again DIR source.root=… out=…``: make a dataset again from its ``config.yaml``."""
     from unprocess_gen.config.serialization import read_dataset_yaml
-    from unprocess_gen.config.validation import check
+    from unprocess_gen.config.validation import validate_config
 
     if not arguments or "=" in arguments[0]:
         raise ConfigError("again: expected the folder of a dataset, then source.root=… and out=…")
@@ -309,7 +309,7 @@ def again(arguments: list[str]) -> int:
     config.out, config.source.root = chosen["out"], chosen.get("source.root")
     config.n_jobs = chosen.get("n_jobs", config.n_jobs)
     config.source.max_failed = chosen.get("source.max_failed", config.source.max_failed)
-    check(config)
+    validate_config(config)
     code, _ = _generate(config)
     old, new = folder / "manifest.csv", Path(config.out) / "manifest.csv"
     if not old.exists():
@@ -401,14 +401,14 @@ def _told(folder: Path, damages: Iterable[object]) -> list[str]:
 
 def replay(arguments: list[str]) -> int:
     """``gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]``: make rows again."""
-    from unprocess_gen.dataset.keys import choose
+    from unprocess_gen.dataset.keys import select_rows
     from unprocess_gen.pipeline import verify as room
 
     manifest = _first("replay", arguments, "a manifest.csv, or the folder of a dataset")
     chosen = _values("replay", REPLAY_KEYS, arguments[1:])
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(chosen["--to"]) if "--to" in chosen else None
-    rows = choose(manifest, chosen.get("--rows"), chosen.get("--keys"))
+    rows = select_rows(manifest, chosen.get("--rows"), chosen.get("--keys"))
     same = different = 0
     for one in room.replay(rows, room.source_root(manifest, chosen.get("source.root")), to):
         same, different = same + (not one.complaint), different + bool(one.complaint)

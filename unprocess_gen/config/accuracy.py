@@ -148,7 +148,9 @@ def is_steep(plan: Plan) -> bool:
     )
 
 
-def choose(budget: Budget, counts_electrons: bool, normalised: bool = False, steep: bool = False) -> tuple[str, ...]:
+def choose_methods(
+    budget: Budget, counts_electrons: bool, normalised: bool = False, steep: bool = False
+) -> tuple[str, ...]:
     """Return the methods of the first form that fits, as a row names them; ConfigError where none does.
 
     Noise made of counts has no form in float32, nor has what is ``steep`` (`is_steep`). Frames that are ``normalised``,
@@ -167,21 +169,21 @@ def choose(budget: Budget, counts_electrons: bool, normalised: bool = False, ste
     raise ConfigError(_best(stages, budget))
 
 
-def of_stage(stage: str) -> tuple[Method, ...]:
+def methods_of_stage(stage: str) -> tuple[Method, ...]:
     """Return the methods of a stage, cheapest first."""
     return tuple(method for method in METHODS if method.stage == stage)
 
 
 def method(stage: str, name: str) -> Method:
     """Return a method by stage and name; KeyError where there is none."""
-    for one in of_stage(stage):
+    for one in methods_of_stage(stage):
         if one.name == name:
             return one
     raise KeyError(f"{stage} has no method {name}")
 
 
 def _first(stage: str, form: str, budget: Budget) -> Method | None:
-    fitting = (one for one in of_stage(stage) if one.form == form and one.fits(budget))
+    fitting = (one for one in methods_of_stage(stage) if one.form == form and one.fits(budget))
     return next(fitting, None)
 
 
@@ -189,7 +191,7 @@ def _best(stages: Sequence[str], budget: Budget) -> str:
     """Say what is the best that can be had, of the first number that is asked too much of."""
     for key in ("clean_dn", "clean_changed_share", "normal_error"):
         for stage in stages:
-            best = min(of_stage(stage), key=lambda one: float(getattr(one, key)))
+            best = min(methods_of_stage(stage), key=lambda one: float(getattr(one, key)))
             if getattr(best, key) > getattr(budget, key):
                 return (
                     f"accuracy.{key}={getattr(budget, key):g}: the best that can be had is {getattr(best, key):g} "

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from unprocess_gen.config.accuracy import Budget
-from unprocess_gen.config.distributions import highest, law, lowest
+from unprocess_gen.config.distributions import highest, lowest, parse_distribution
 from unprocess_gen.config.schema import (
     AccuracyConfig,
     BranchConfig,
@@ -18,7 +18,7 @@ from unprocess_gen.config.schema import (
 )
 from unprocess_gen.config.values import is_number, is_whole, value_text
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import FLOAT32, Law, PatchLaw
+from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
 
 MIN_GAIN, MAX_GAIN = 1e-3, 1e3
 """Chosen: no camera comes near either, and no product or quotient of them overflows."""
@@ -28,24 +28,24 @@ MAX_VARIANCE = 1e15
 """Chosen: far above any sensor, and nothing overflows on the way to DN."""
 
 
-GAIN_LAWS = ("uniform", "truncated_normal")
+GAIN_DISTRIBUTIONS = ("uniform", "truncated_normal")
 
 
-INVERSE_GAIN_LAWS = (*GAIN_LAWS, "inverse_truncated_normal")
+INVERSE_GAIN_DISTRIBUTIONS = (*GAIN_DISTRIBUTIONS, "inverse_truncated_normal")
 
 
-A_LAWS = ("uniform", "log_uniform")
+A_DISTRIBUTIONS = ("uniform", "log_uniform")
 
 
-B_LAWS = (*A_LAWS, "log_linear_in_a")
+B_DISTRIBUTIONS = (*A_DISTRIBUTIONS, "log_linear_in_a")
 
 
-def gain_laws(gains: GainsConfig) -> tuple[Law, Law, Law]:
+def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, Distribution]:
     """Return the laws of the red, blue and inverse brightening gain; ConfigError unless every draw is above 0."""
     laws = (
-        law("gains.red", gains.red, GAIN_LAWS),
-        law("gains.blue", gains.blue, GAIN_LAWS),
-        law("gains.inverse_rgb", gains.inverse_rgb, INVERSE_GAIN_LAWS),
+        parse_distribution("gains.red", gains.red, GAIN_DISTRIBUTIONS),
+        parse_distribution("gains.blue", gains.blue, GAIN_DISTRIBUTIONS),
+        parse_distribution("gains.inverse_rgb", gains.inverse_rgb, INVERSE_GAIN_DISTRIBUTIONS),
     )
     for name, drawn in zip(("red", "blue", "inverse_rgb"), laws, strict=True):
         if not (lowest(drawn) >= MIN_GAIN and highest(drawn) <= MAX_GAIN):
@@ -54,9 +54,12 @@ def gain_laws(gains: GainsConfig) -> tuple[Law, Law, Law]:
     return laws
 
 
-def noise_laws(noise: NoiseConfig) -> tuple[Law, Law]:
+def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]:
     """Return the laws of a and b; ConfigError where a can be negative."""
-    a, b = law("noise.a", noise.a, A_LAWS), law("noise.b", noise.b, B_LAWS)
+    a, b = (
+        parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS),
+        parse_distribution("noise.b", noise.b, B_DISTRIBUTIONS),
+    )
     if lowest(a) < 0:
         raise ConfigError(f"noise.a={value_text(noise.a)}: the variance's slope must be 0 or more")
     for name, drawn in (("a", a), ("b", b)):
@@ -67,22 +70,22 @@ def noise_laws(noise: NoiseConfig) -> tuple[Law, Law]:
     return a, b
 
 
-def dequantizing(source: SourceConfig) -> str:
+def dequantize_method(source: SourceConfig) -> str:
     """Return ``off`` or ``dither``."""
     return YAML_SWITCHES.get(source.dequantize, source.dequantize)
 
 
-def patch_law(source: SourceConfig) -> PatchLaw | None:
+def patch_rule(source: SourceConfig) -> PatchRule | None:
     """Return how images are cut into patches, None where they stay whole; ConfigError where it cannot be meant."""
     match ["grid", source.patch] if is_whole(source.patch) else source.patch:
         case None:
             return None
         case ["grid", side] if _is_patch_length(side):
-            return PatchLaw("grid", side, stride=side)
+            return PatchRule("grid", side, stride=side)
         case ["grid", side, stride] if _is_patch_length(side) and _is_patch_length(stride):
-            return PatchLaw("grid", side, stride=stride)
+            return PatchRule("grid", side, stride=stride)
         case ["random", side, count] if _is_patch_length(side) and _is_patch_count(count):
-            return PatchLaw("random", side, count=count)
+            return PatchRule("random", side, count=count)
     raise ConfigError(
         f"source.patch={value_text(source.patch)}: expected null, a side, [grid, side], [grid, side, stride] or "
         f"[random, side, count]; side and stride are even, {MIN_PATCH} to {MAX_PATCH} pixels, "
@@ -98,9 +101,9 @@ def _is_patch_count(value: Any) -> bool:
     return is_whole(value) and 1 <= value <= MOST_RANDOM_PATCHES
 
 
-def _patch_setting(source: SourceConfig) -> list[Any] | None:
+def patch_setting(source: SourceConfig) -> list[Any] | None:
     """Return ``source.patch`` in the one spelling of ``config.yaml``."""
-    law = patch_law(source)
+    law = patch_rule(source)
     return None if law is None else [law.kind, law.side, law.stride or law.count]
 
 
@@ -135,7 +138,7 @@ def is_physical(noise: NoiseConfig) -> bool:
     return bool(noise.branches)
 
 
-SCENE_LAWS = ("uniform", "log_uniform", "choice")
+SCENE_DISTRIBUTIONS = ("uniform", "log_uniform", "choice")
 """What ISO and the numbers of a scene can be drawn from."""
 
 
@@ -158,7 +161,7 @@ BRANCH_NUMBERS = {"row": "row_std_dn", "column": "column_std_dn", "black_error":
 """The same, of those that depend on ISO."""
 
 
-def lacks(noise: NoiseConfig, effect: str) -> str | None:
+def missing_number(noise: NoiseConfig, effect: str) -> str | None:
     """Return a number that a physical profile would have to give for an effect and does not; None if all is there."""
     missing = (key for key in EFFECT_NUMBERS.get(effect, ()) if getattr(noise, key) is None)
     if effect in BRANCH_NUMBERS and any(getattr(branch, BRANCH_NUMBERS[effect]) is None for branch in noise.branches):
@@ -172,7 +175,7 @@ def effect_switch(effects: EffectsConfig, effect: str) -> str:
     return YAML_SWITCHES.get(said, said)
 
 
-def budget(accuracy: AccuracyConfig) -> Budget:
+def accuracy_budget(accuracy: AccuracyConfig) -> Budget:
     """Return the budget that the settings give."""
     return Budget(**dataclasses.asdict(accuracy))
 

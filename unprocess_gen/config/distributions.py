@@ -14,12 +14,12 @@ from typing import Any
 from unprocess_gen.config.values import is_number, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.lookup_tables import DIGITS, normal_cdf, normal_quantile
-from unprocess_gen.core.types import Law
+from unprocess_gen.core.types import Distribution
 
 
-def draw(law: Law, uniform: float, a: float = 0.0) -> float:
+def draw_parameter(law: Distribution, uniform: float, a: float = 0.0) -> float:
     """Return the value of a law at a uniform in (0, 1); ``a`` is what ``log_linear_in_a`` depends on."""
-    return LAWS[law.kind](uniform, a, *law.numbers)
+    return DISTRIBUTIONS[law.kind](uniform, a, *law.numbers)
 
 
 def _constant(u: float, a: float, value: float) -> float:
@@ -65,7 +65,7 @@ def _choice(u: float, a: float, *values: float) -> float:
     return values[int(u * len(values))]
 
 
-LAWS: dict[str, Callable[..., float]] = {
+DISTRIBUTIONS: dict[str, Callable[..., float]] = {
     "constant": _constant,
     "choice": _choice,
     "uniform": _uniform,
@@ -99,7 +99,7 @@ def _check_line(slope: float, intercept: float, std: float) -> str | None:
     return None
 
 
-LAW_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
+DISTRIBUTION_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
     "constant": (("value",), lambda value: None),
     "uniform": (("lowest", "highest"), _check_increasing),
     "log_uniform": (("lowest", "highest"), _check_log_range),
@@ -111,24 +111,24 @@ LAW_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
 """The laws a parameter can be drawn from: their numbers, and what must hold between them (None: all is well)."""
 
 
-def law(key: str, value: Any, allowed: tuple[str, ...]) -> Law:
+def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distribution:
     """Read a number or a law ``[kind, number, …]``; ConfigError names ``key``, the value and the ``allowed`` kinds."""
-    forms = "; ".join(f"[{kind}, {', '.join(LAW_NUMBERS[kind][0])}]" for kind in allowed)
+    forms = "; ".join(f"[{kind}, {', '.join(DISTRIBUTION_NUMBERS[kind][0])}]" for kind in allowed)
     if is_number(value):
-        return Law("constant", (float(value),))
+        return Distribution("constant", (float(value),))
     if not isinstance(value, list) or not value or value[0] not in allowed:
         raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a law: {forms}")
     kind, numbers = str(value[0]), value[1:]
-    names, rule = LAW_NUMBERS[kind]
+    names, rule = DISTRIBUTION_NUMBERS[kind]
     if (len(numbers) != len(names) and kind != "choice") or not all(is_number(number) for number in numbers):
         raise ConfigError(f"{key}={value_text(value)}: expected finite numbers: [{kind}, {', '.join(names)}]")
     complaint = rule(*numbers)
     if complaint:
         raise ConfigError(f"{key}={value_text(value)}: {complaint}")
-    return Law(kind, tuple(float(number) for number in numbers))
+    return Distribution(kind, tuple(float(number) for number in numbers))
 
 
-def lowest(drawn: Law) -> float:
+def lowest(drawn: Distribution) -> float:
     """Return a value that no draw of the law lies below."""
     if drawn.kind in ("constant", "choice"):
         return min(drawn.numbers)
@@ -139,7 +139,7 @@ def lowest(drawn: Law) -> float:
     return drawn.numbers[0] if drawn.kind in ("uniform", "log_uniform") else 0.0
 
 
-def highest(drawn: Law) -> float:
+def highest(drawn: Distribution) -> float:
     """Return a value that no draw of the law lies above."""
     if drawn.kind == "choice":
         return max(drawn.numbers)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from unprocess_gen.config.derived import _patch_setting
+from unprocess_gen.config.derived import patch_setting
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import is_number, value_text
 from unprocess_gen.core.errors import ConfigError
@@ -41,7 +41,7 @@ def dataset_yaml(config: Config) -> str:
     settings["source"] = {"kind": source_kind(config)} | {
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
-    settings["source"]["patch"] = _patch_setting(config.source)
+    settings["source"]["patch"] = patch_setting(config.source)
     for group, keys in NUMBERS_OR_LAWS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
@@ -65,7 +65,7 @@ def read_dataset_yaml(path: Path) -> tuple[Config, str]:
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; expected the config.yaml of a dataset") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError, OmegaConfBaseException) as error:
-        raise ConfigError(f"{path}: not the config.yaml of a dataset ({one_line(error)})") from error
+        raise ConfigError(f"{path}: not the config.yaml of a dataset ({error_in_one_line(error)})") from error
     assert isinstance(config, Config)
     return config, kind
 
@@ -98,6 +98,6 @@ def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def one_line(error: BaseException) -> str:
+def error_in_one_line(error: BaseException) -> str:
     """Return an exception's message on one line."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -9,28 +9,28 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.config.accuracy import choose
+from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.derived import (
-    A_LAWS,
+    A_DISTRIBUTIONS,
     MOST_LEVELS,
     NO_CLIP,
-    SCENE_LAWS,
+    SCENE_DISTRIBUTIONS,
     SWITCHES,
     YAML_SWITCHES,
+    accuracy_budget,
     branch_of,
-    budget,
-    dequantizing,
+    dequantize_method,
     effect_switch,
-    gain_laws,
+    gain_distributions,
     is_normalised,
     is_physical,
-    lacks,
-    noise_laws,
+    missing_number,
+    noise_distributions,
     noise_levels,
-    patch_law,
+    patch_rule,
     uses_physics,
 )
-from unprocess_gen.config.distributions import highest, law, lowest
+from unprocess_gen.config.distributions import highest, lowest, parse_distribution
 from unprocess_gen.config.schema import (
     BranchConfig,
     CameraConfig,
@@ -59,7 +59,7 @@ SELF_TESTS = ("stop", "go_on")
 MAX_PAIRS_PER_SHARD = 10**6
 
 
-def check(config: Config) -> None:
+def validate_config(config: Config) -> None:
     """Refuse settings that cannot be meant: ConfigError with the key, the value and what is allowed."""
     in_range("seed", config.seed, 0, 2**63 - 1)
     if config.n_jobs != -1:
@@ -69,7 +69,7 @@ def check(config: Config) -> None:
         raise ConfigError("out='': expected the name of a folder")
     _check_source(config.source)
     _check_camera(config.camera)
-    gain_laws(config.gains)
+    gain_distributions(config.gains)
     one_of("gains.highlight", config.gains.highlight, HIGHLIGHTS)
     if not 0 <= config.gains.threshold < 1:
         raise ConfigError(f"gains.threshold={config.gains.threshold}: expected 0 up to, but not including, 1")
@@ -101,8 +101,8 @@ def _check_source(source: SourceConfig) -> None:
     in_range("source.max_pixels", source.max_pixels, 1, 2**40)
     in_range("source.max_failed", source.max_failed, 0, 10**9)
     in_range("source.downscale", source.downscale, 1, 64)
-    one_of("source.dequantize", dequantizing(source), ("off", "dither"))
-    patch_law(source)
+    one_of("source.dequantize", dequantize_method(source), ("off", "dither"))
+    patch_rule(source)
     one_of("source.icc", source.icc, ("ignore", "refuse"))
     if source.icc == "refuse" and find_spec("PIL") is None:
         raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
@@ -181,7 +181,7 @@ def _check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
         raise ConfigError(
             f"noise.iso={value_text(noise.iso)}: noise={noise.name} holds for one ISO; choose a physical profile"
         )
-    _, b = noise_laws(noise)
+    _, b = noise_distributions(noise)
     if noise.law == "poisson" and (noise.black == "included" or lowest(b) < 0):
         raise ConfigError("noise.law=poisson: needs the black level subtracted and b of 0 or more")
     if noise.units == "normalized":
@@ -248,7 +248,7 @@ def _check_branch(key: str, branch: BranchConfig) -> None:
     for name in ("row_std_dn", "column_std_dn"):
         if getattr(branch, name) is not None:
             _check_form(f"{key}.{name}", getattr(branch, name), ("root", "line"))
-    shape = law(f"{key}.read_shape", branch.read_shape, ("choice",))
+    shape = parse_distribution(f"{key}.read_shape", branch.read_shape, ("choice",))
     if not (lowest(shape) > -0.5 and highest(shape) < 10):
         raise ConfigError(
             f"{key}.read_shape={value_text(branch.read_shape)}: Tukey's law has a variance for shapes above -0.5 only"
@@ -263,7 +263,7 @@ MAX_ELECTRONS = 1e9
 def _check_countable(noise: NoiseConfig) -> None:
     """Refuse a gain so small that white is more electrons than can be counted; without shot noise nothing is."""
     span = 1 if noise.units == "normalized" else (noise.white_level_dn or 0) - (noise.black_level_dn or 0)
-    a = law("noise.a", noise.a, A_LAWS)
+    a = parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS)
     if a.numbers != (0.0,) and lowest(a) * MAX_ELECTRONS < span:
         raise ConfigError(
             f"noise.a={value_text(noise.a)}: noise.law=poisson counts up to {MAX_ELECTRONS:g} electrons, so a must be "
@@ -273,8 +273,8 @@ def _check_countable(noise: NoiseConfig) -> None:
 
 def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
     """Refuse heat that sets free more electrons than can be counted."""
-    seconds = highest(law("scene.exposure_s", scene.exposure_s, SCENE_LAWS))
-    celsius = highest(law("scene.temperature_c", scene.temperature_c, SCENE_LAWS))
+    seconds = highest(parse_distribution("scene.exposure_s", scene.exposure_s, SCENE_DISTRIBUTIONS))
+    celsius = highest(parse_distribution("scene.temperature_c", scene.temperature_c, SCENE_DISTRIBUTIONS))
     for key in ("dark_e_per_s", "hot_pixel_e_per_s"):
         rate = Decimal((getattr(noise, key) or 0.0) * seconds)
         doublings = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)
@@ -323,7 +323,7 @@ def _check_black_error(key: str, value: Any) -> None:
 def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
     """Refuse an ISO at which nothing was calibrated, whether it is named, drawn or comes with the scene."""
     key, value = ("scene.iso", scene.iso) if noise.iso is None else ("noise.iso", noise.iso)
-    drawn = law(key, value, SCENE_LAWS)
+    drawn = parse_distribution(key, value, SCENE_DISTRIBUTIONS)
     ends = drawn.numbers
     inside = all(branch_of(noise, iso) is not None for iso in ends)
     if inside and drawn.kind not in ("constant", "choice"):
@@ -339,7 +339,7 @@ def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
 def _check_scene(scene: SceneConfig) -> None:
     check_name("scene.name", scene.name)
     for key, low, high in (("exposure_s", 1e-7, 1e5), ("temperature_c", -100.0, 150.0), ("exposure_ratio", 1e-3, 1e6)):
-        drawn = law(f"scene.{key}", getattr(scene, key), SCENE_LAWS)
+        drawn = parse_distribution(f"scene.{key}", getattr(scene, key), SCENE_DISTRIBUTIONS)
         if not low <= lowest(drawn) <= highest(drawn) <= high:
             raise ConfigError(f"scene.{key}={value_text(getattr(scene, key))}: expected {low:g} to {high:g}")
 
@@ -364,7 +364,7 @@ def _check_accuracy(config: Config) -> None:
         value = getattr(config.accuracy, key)
         if not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"accuracy.{key}={value}: expected a number of 0 or more")
-    choose(budget(config.accuracy), uses_physics(config.noise), is_normalised(config))
+    choose_methods(accuracy_budget(config.accuracy), uses_physics(config.noise), is_normalised(config))
 
 
 def _check_output(config: Config) -> None:
@@ -391,7 +391,7 @@ def _check_switched_on(config: Config, effect: str) -> None:
     if (effect == "heteroscedastic") == is_physical(noise):
         offers = "the physical effects" if is_physical(noise) else "heteroscedastic only"
         raise ConfigError(f"effects.{effect}=on: noise={noise.name} offers {offers}")
-    number = lacks(noise, effect)
+    number = missing_number(noise, effect)
     if number is not None:
         raise ConfigError(
             f"effects.{effect}=on: noise={noise.name} gives no {number}; set noise.{number}, or leave it off"
@@ -415,4 +415,4 @@ def _black_share(noise: NoiseConfig) -> float:
     """What the variance at black gains by an included black level, at the least, in the profile's own DN²."""
     if noise.black != "included" or noise.black_level_dn is None:
         return 0.0
-    return lowest(law("noise.a", noise.a, A_LAWS)) * noise.black_level_dn
+    return lowest(parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS)) * noise.black_level_dn

@@ -40,7 +40,7 @@ def machine_error(error: OSError, path: Path) -> MachineError:
     return MachineError(f"{error.filename or path}: {what} ({free}); what is committed is kept, run again to go on")
 
 
-def place(aside: Path, path: Path) -> None:
+def commit_file(aside: Path, path: Path) -> None:
     """Put a finished file where it belongs, durably; another of its name is replaced."""
     sync(aside)
     os.replace(aside, path)

@@ -68,7 +68,7 @@ class Photograph:
 
 
 @dataclass(frozen=True, slots=True)
-class PatchLaw:
+class PatchRule:
     """Which patches are cut out of each image, squares of ``side`` pixels.
 
     ``kind`` is ``grid``, whose corners are ``stride`` pixels apart, or ``random``, ``count`` of them; the number that
@@ -165,7 +165,7 @@ MOSAIC, PACKED = "mosaic", "packed"
 class Plan:
     """Everything that decides a pair besides its pixels: what a manifest row holds, as numbers.
 
-    Drawn once (`plan.plan_image`) or read back from a row (`manifest.plan_of`). ``downscale`` is the side of the
+    Drawn once (`plan.plan_image`) or read back from a row (`manifest.plan_from_row`). ``downscale`` is the side of the
     squares of source pixels that were averaged, ``dequantize`` says whether 8-bit codes are dithered,
     ``exposure_ratio`` what the scene is darkened by. ``weights`` are those of the mixed cameras in the order of
     `colour.CAMERAS`; ``rgb2cam`` is row-major and its rows sum to 1; ``red_gain`` and ``blue_gain`` are forward gains,
@@ -308,7 +308,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class Distribution:
     """How a parameter is drawn: a kind (`draws.LAWS` says what each does) and its numbers; ``constant`` has one."""
 
     kind: str

@@ -44,10 +44,10 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.files import array_xxh3, machine_error, place
+from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
-from unprocess_gen.dataset.keys import choose
-from unprocess_gen.dataset.manifest import plan_of, read_rows
+from unprocess_gen.dataset.keys import select_rows
+from unprocess_gen.dataset.manifest import plan_from_row, read_rows
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.simulation.reference.cfa import CHANNELS
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
@@ -107,13 +107,15 @@ def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> Exported
     written = [file for file in files if file not in present]
     for file in written:
         _write(to / file.name, _content(pairs, file))
-    without = sum(file.frame == "noisy" and noise_profile(plan_of(pairs[file.number].row)) is None for file in files)
+    without = sum(
+        file.frame == "noisy" and noise_profile(plan_from_row(pairs[file.number].row)) is None for file in files
+    )
     return Exported(len(written), len(present), without)
 
 
 def _numbers(manifest: Path, keys: str) -> dict[str, int]:
     """Return the key and the number of every pair that ``keys`` names; ConfigError for one that cannot be written."""
-    named = {str(row["key"]) for row in map(_writable, choose(manifest, None, keys))}
+    named = {str(row["key"]) for row in map(_writable, select_rows(manifest, None, keys))}
     pairs = (str(row["key"]) for row in read_rows(manifest) if row["status"] == "ok")
     return {key: number for number, key in enumerate(pairs) if key in named}
 
@@ -158,7 +160,7 @@ def _write(path: Path, content: bytes) -> None:
     aside = path.with_name(f".{path.name}.part")
     try:
         aside.write_bytes(content)
-        place(aside, path)
+        commit_file(aside, path)
     except PermissionError as error:
         raise ConfigError(f"--to {path.parent}: cannot be written ({error.strerror})") from error
     except OSError as error:
@@ -213,7 +215,7 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
 
 def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
     """Return what a file says of its frame besides TIFF's own tags, by rising code; ``shape`` is height, width."""
-    plan, packet, (height, width) = plan_of(row), xmp(row, name), shape
+    plan, packet, (height, width) = plan_from_row(row), xmp(row, name), shape
     profile = noise_profile(plan) if name == "noisy" else None
     return [
         Tag(271, ASCII, 0, MAKE),  # Make

@@ -43,17 +43,17 @@ def sample_key(row: Row) -> str:
     return str(row["key"]).partition("-l")[0]
 
 
-def images(rows: Iterable[Row]) -> Iterator[list[Row]]:
+def group_by_image(rows: Iterable[Row]) -> Iterator[list[Row]]:
     """Yield the rows of one image together, in order."""
     return (list(some) for _, some in itertools.groupby(rows, key=image_key))
 
 
-def samples(rows: Iterable[Row]) -> Iterator[list[Row]]:
+def group_by_sample(rows: Iterable[Row]) -> Iterator[list[Row]]:
     """Yield the rows of one sample, a clean frame with its noisy ones, together, in order."""
     return (list(some) for _, some in itertools.groupby(rows, key=sample_key))
 
 
-def choose(manifest: Path, rows: str | None, keys: str | None) -> Iterator[Row]:
+def select_rows(manifest: Path, rows: str | None, keys: str | None) -> Iterator[Row]:
     """Yield the rows numbered ``A:B`` (from 0, B not included) or those with the ``keys`` K,…; all without either.
 
     Raises ConfigError for a range that is none, and for keys that the manifest does not have.

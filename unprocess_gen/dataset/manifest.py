@@ -1,6 +1,6 @@
 """The manifest: one row a pair, and a row is a plan. Its columns stand in one tuple.
 
-A row is built once, by `ok_row` or `failed_row`, as a mapping from column to typed value; where a column does not
+A row is built once, by `pair_row` or `failed_row`, as a mapping from column to typed value; where a column does not
 apply, text is empty and a number None. In CSV, floats are Python's shortest round-trip spelling, so that a row read
 back is the same plan bit for bit. In the shards each row also stands as JSON, padded with blanks to a size that depends
 on the source's name alone: the size of a shard can then be told before it is made.
@@ -141,7 +141,7 @@ JSON_BYTES = 5632
 """Room for a row without its source's name: the longest numbers and reasons in every column take less."""
 
 
-def ok_row(
+def pair_row(
     key: str,
     source: Source,
     sha256: str,
@@ -257,7 +257,7 @@ def _row(source: Source, sha256: str | None, shard: int, seed: int, values: dict
     return {column.name: known.get(column.name, column.empty) for column in COLUMNS}
 
 
-def plan_of(row: Row) -> Plan:
+def plan_from_row(row: Row) -> Plan:
     """Return the plan that a row holds: replay needs the row and the source, nothing else.
 
     Raises DamageError where a value is missing or of another type.
@@ -307,8 +307,8 @@ def plan_of(row: Row) -> Plan:
         raise DamageError(f"row {row.get('key')}: not a plan ({error})") from error
 
 
-def patch_of(row: Row) -> Patch:
-    """Return what of the full frame a row's pair is; DamageError as `plan_of`."""
+def patch_from_row(row: Row) -> Patch:
+    """Return what of the full frame a row's pair is; DamageError as `plan_from_row`."""
     try:
         number, y, x, height, width = (_int(row, name) for name in ("patch", "patch_y", "patch_x", "height", "width"))
     except ValueError as error:
@@ -373,10 +373,10 @@ def read_rows(path: Path) -> Iterator[Row]:
 
     Raises DamageError where the file is not a manifest or a value does not fit its column.
     """
-    return (row for _, row in located_rows(path))
+    return (row for _, row in rows_with_offsets(path))
 
 
-def located_rows(path: Path) -> Iterator[tuple[int, Row]]:
+def rows_with_offsets(path: Path) -> Iterator[tuple[int, Row]]:
     """Yield each row with the byte that it begins at; a row is one line, since names have no line ends in them.
 
     Raises DamageError as `read_rows` does.
@@ -406,7 +406,7 @@ def readable_rows(path: Path) -> Iterator[Row]:
 
 
 def read_row(path: Path, at: int) -> Row:
-    """Return the row that begins at a byte told by `located_rows`; DamageError where none does."""
+    """Return the row that begins at a byte told by `rows_with_offsets`; DamageError where none does."""
     try:
         with path.open("rb") as stream:
             header = _header(stream.readline(), path)

@@ -11,7 +11,7 @@ import numpy as np
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.types import PACKED, UINT16, Float, Frame, Row
 from unprocess_gen.dataset.keys import sample_key
-from unprocess_gen.dataset.manifest import located_rows, read_row
+from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
 from unprocess_gen.dataset.shards import CLEAN, Form, Member, form_of, map_array, noisy_member, read_index, shard_name
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
@@ -54,7 +54,7 @@ class RawPairs:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._manifest = self.path / "manifest.csv"
-        places = (at for at, row in located_rows(self._manifest) if row["status"] == "ok")
+        places = (at for at, row in rows_with_offsets(self._manifest) if row["status"] == "ok")
         self._places = np.fromiter(places, dtype=np.int64)
         self._indexes: dict[int, dict[str, Member]] = {}
 

@@ -31,22 +31,22 @@ from typing import Any
 
 from tqdm import tqdm
 
-from unprocess_gen.config.derived import patch_law
+from unprocess_gen.config.derived import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error
 from unprocess_gen.core.types import Counts, Pair, Patch, Plan, Row, Source, Srgb
-from unprocess_gen.dataset.keys import images, pair_key, patch_key
-from unprocess_gen.dataset.manifest import failed_row, ok_row, row_json
+from unprocess_gen.dataset.keys import group_by_image, pair_key, patch_key
+from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
 from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
-from unprocess_gen.pipeline.workspace import Made, Workspace
+from unprocess_gen.pipeline.workspace import ShardResult, Workspace
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pairs
-from unprocess_gen.sources.loader import list_photographs, load
-from unprocess_gen.sources.patches import cut, patches
+from unprocess_gen.sources.loader import list_photographs, load_source
+from unprocess_gen.sources.patches import crop_patch, list_patches
 from unprocess_gen.sources.video.decode import is_installed
 
 PACKAGES = (
@@ -86,7 +86,7 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class ShardTask:
     """One shard's worth of work, as it travels to a worker."""
 
     shard: int
@@ -94,7 +94,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class RunContext:
     """What every task of a run shares: the settings, where to write aside, and whose run it is.
 
     ``core_to_spare``: there are more cores than workers, so that each can have a thread that writes.
@@ -123,8 +123,8 @@ def generate(config: Config) -> Summary:
         done = set(workspace.committed(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
         n_jobs = effective_jobs(config.n_jobs, len(todo))
-        bench = Bench(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < _own_cores())
-        given_up: dict[int, Made] = {}
+        bench = RunContext(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < _own_cores())
+        given_up: dict[int, ShardResult] = {}
         warned, rows_made = False, 0
         with Progress(len(listing.sources), sum(len(task.sources) for task in tasks if task.shard in done)) as progress:
             progress.say_compiling_once(_compiling_path(bench))
@@ -161,10 +161,10 @@ def generate(config: Config) -> Summary:
     return _summary(Path(config.out), facts, made=rows_made, started=started)
 
 
-def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[Task]:
+def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[ShardTask]:
     """Split the listing: shard s holds source indices [s·N, (s+1)·N)."""
     starts = range(0, len(sources), pairs_per_shard)
-    return [Task(shard, tuple(sources[at : at + pairs_per_shard])) for shard, at in enumerate(starts)]
+    return [ShardTask(shard, tuple(sources[at : at + pairs_per_shard])) for shard, at in enumerate(starts)]
 
 
 def effective_jobs(n_jobs: int, tasks: int) -> int:
@@ -181,7 +181,7 @@ def _own_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
+def run_tasks(bench: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardResult]:
     """Yield the shards as they are made: in order, but for those that are tried again after a worker died.
 
     One job needs no joblib, whose import takes 0.1 s and 8 MB.
@@ -207,7 +207,7 @@ def run_tasks(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made
             waiting.remove(task)
 
 
-def _run_alone(bench: Bench, task: Task) -> Iterator[Made]:
+def _run_alone(bench: RunContext, task: ShardTask) -> Iterator[ShardResult]:
     """Yield a shard that is made by a worker with nobody beside it; given up where that worker dies too."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -216,10 +216,10 @@ def _run_alone(bench: Bench, task: Task) -> Iterator[Made]:
     except TerminatedWorkerError:
         killer = next((one for one in task.sources if str(one.index) == _read_busy(bench, task)), task.sources[0])
         rows = (failed_row(one, None, task.shard, bench.config.seed, "worker_died") for one in task.sources)
-        yield Made(task.shard, None, 0, None, tuple(rows), killer=killer.name)
+        yield ShardResult(task.shard, None, 0, None, tuple(rows), killer=killer.name)
 
 
-def _run_pool(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made]:
+def _run_pool(bench: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardResult]:
     """Yield the shards in order as they are made; TerminatedWorkerError where a worker dies."""
     from joblib import Parallel, delayed
 
@@ -232,12 +232,12 @@ def _run_pool(bench: Bench, tasks: Sequence[Task], n_jobs: int) -> Iterator[Made
             yield from results
 
 
-def _busy_path(bench: Bench, task: Task) -> Path:
+def _busy_path(bench: RunContext, task: ShardTask) -> Path:
     """Return the file that names the source which a worker is at, while it makes a shard."""
     return Path(bench.tmp) / f"{task.shard}.busy"
 
 
-def _read_busy(bench: Bench, task: Task) -> str:
+def _read_busy(bench: RunContext, task: ShardTask) -> str:
     try:
         return _busy_path(bench, task).read_text()
     except FileNotFoundError:
@@ -263,7 +263,7 @@ def _interrupts_ignored() -> Iterator[None]:
 # --------------------------------------------------------------------------------------------------- in the workers
 
 
-def make_shard(bench: Bench, task: Task) -> Made:
+def make_shard(bench: RunContext, task: ShardTask) -> ShardResult:
     """Make one shard aside and return its rows; MachineError if the disk or the self-test fails."""
     _settle(bench.coordinator_pid)
     failed: dict[str, None] = {}
@@ -273,9 +273,11 @@ def make_shard(bench: Bench, task: Task) -> Made:
             rows = tuple(_make_rows(bench, task, writer, failed))
         _busy_path(bench, task).unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
-            return Made(task.shard, str(path), writer.bytes, writer.sha256, rows, self_test="; ".join(failed) or None)
+            return ShardResult(
+                task.shard, str(path), writer.bytes, writer.sha256, rows, self_test="; ".join(failed) or None
+            )
         path.unlink()
-        return Made(task.shard, None, 0, None, rows)
+        return ShardResult(task.shard, None, 0, None, rows)
     except MemoryError as error:
         if os.getpid() != bench.coordinator_pid:
             os._exit(1)  # as if the kernel had ended us: the shard is tried again with nobody beside it
@@ -288,38 +290,40 @@ def make_shard(bench: Bench, task: Task) -> Made:
         raise machine_error(error, Path(bench.tmp)) from error
 
 
-def _make_rows(bench: Bench, task: Task, writer: ShardWriter, failed: dict[str, None]) -> Iterator[Row]:
+def _make_rows(bench: RunContext, task: ShardTask, writer: ShardWriter, failed: dict[str, None]) -> Iterator[Row]:
     for source in task.sources:
         _busy_path(bench, task).write_text(str(source.index))
         yield from make_image(bench, task.shard, source, writer, failed)
 
 
-def make_image(bench: Bench, shard: int, source: Source, writer: ShardWriter, failed: dict[str, None]) -> list[Row]:
+def make_image(
+    bench: RunContext, shard: int, source: Source, writer: ShardWriter, failed: dict[str, None]
+) -> list[Row]:
     """Append one image to a shard, whole or patch by patch, and return its rows.
 
     Puts what is wrong with this process, where it was told to go on with that, into ``failed``, each once.
     """
     config = bench.config
     try:
-        sha256, photograph = load(config.source, source, config.output.layout)
+        sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
         if error.reason == "unreadable" and source.reason is None and not _is_there(config, source):
             raise MachineError(
                 f"source {source.name} is gone since it was listed; what is committed is kept, run again with it back"
             ) from error
         return [failed_row(source, error.sha256, shard, config.seed, error.reason)]
-    law = patch_law(config.source)
+    law = patch_rule(config.source)
     facts = facts_for(config, photograph.srgb, source.frames)
     plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
     failed |= dict.fromkeys(_self_test(bench, plans))
     rows: list[Row] = []
     height, width = photograph.srgb.shape[:2]
-    for patch in patches(law, plans[0].stream_key, height, width, config.output.layout):
+    for patch in list_patches(law, plans[0].stream_key, height, width, config.output.layout):
         key = patch_key(source.index, patch, several=law is not None)
         some: list[Row] = []
-        for plan, pair, digests in _add_frames(writer, key, cut(photograph.srgb, patch), patch, plans):
+        for plan, pair, digests in _add_frames(writer, key, crop_patch(photograph.srgb, patch), patch, plans):
             row_key = pair_key(key, plan, several=len(plans) > 1)
-            some.append(ok_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch))
+            some.append(pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch))
         writer.add_rows(key, row_json(some))
         rows += some
     return rows
@@ -365,7 +369,7 @@ def _keep_memory() -> None:
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
 
 
-def _self_test(bench: Bench, plans: Sequence[Plan]) -> list[str]:
+def _self_test(bench: RunContext, plans: Sequence[Plan]) -> list[str]:
     """Prove the kernels that an image's plans need, and no other, for each takes seconds to compile.
 
     Returns what is wrong with this process; MachineError unless told to go on with it.
@@ -380,7 +384,7 @@ def _self_test(bench: Bench, plans: Sequence[Plan]) -> list[str]:
     return failed
 
 
-def _compiling_path(bench: Bench) -> Path:
+def _compiling_path(bench: RunContext) -> Path:
     """Return the file that is there as soon as a worker compiles kernels."""
     return Path(bench.tmp) / "compiling"
 
@@ -435,7 +439,7 @@ class Progress:
 
     def advance(self, rows: Iterable[Row]) -> None:
         """Count the images of a committed shard."""
-        statuses = [some[0]["status"] for some in images(rows)]
+        statuses = [some[0]["status"] for some in group_by_image(rows)]
         self._failed += statuses.count("failed")
         self._done += len(statuses)
         self._bar.set_postfix(failed=self._failed, refresh=False)

@@ -27,15 +27,22 @@ from typing import Any
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml, source_kind
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceError, UnprocessGenError
-from unprocess_gen.core.files import file_sha256, machine_error, place
+from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Frame, Row, Source
-from unprocess_gen.dataset.keys import image_key, images, key_text, samples
+from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import failed_row, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
-from unprocess_gen.pipeline.generate import Bench, Task, make_shard, shard_tasks, tally
+from unprocess_gen.pipeline.generate import RunContext, ShardTask, make_shard, shard_tasks, tally
 from unprocess_gen.pipeline.verify import Maker, expected, noisy_member_of, rows_by_shard
-from unprocess_gen.pipeline.workspace import Made, Workspace, dataset_facts, dataset_text, fingerprint, read_dataset
-from unprocess_gen.sources.loader import list_photographs, load
+from unprocess_gen.pipeline.workspace import (
+    ShardResult,
+    Workspace,
+    dataset_facts,
+    dataset_text,
+    fingerprint,
+    read_dataset,
+)
+from unprocess_gen.sources.loader import list_photographs, load_source
 
 Facts = dict[str, Any]
 
@@ -108,7 +115,7 @@ def _sound_facts(folder: Path) -> Facts:
 def _place(aside: Path, path: Path) -> None:
     """Put a finished file where it belongs, in a folder that may be gone too."""
     path.parent.mkdir(exist_ok=True)
-    place(aside, path)
+    commit_file(aside, path)
 
 
 def _write(aside: Path, path: Path, text: str) -> None:
@@ -246,12 +253,12 @@ def _rows_inside(shard: Path) -> list[Row]:
 def _remade_rows(folder: Path, facts: Facts, config: Config, aside: Path) -> Iterator[Row]:
     """Yield every row: those in sound shards as they are, all others made again, and their shards mended with them."""
     sources = list_photographs(_with_sources(config).source).sources
-    bench = Bench(config, str(aside), os.getpid())
+    bench = RunContext(config, str(aside), os.getpid())
     for task, entry in zip(shard_tasks(sources, config.output.pairs_per_shard), facts["shards"], strict=False):
         if entry.get("provisional"):
             yield from (failed_row(one, None, task.shard, config.seed, "worker_died") for one in task.sources)
         elif _is_sound(folder, entry):
-            found = images(_rows_inside(folder / entry["file"]) if entry["file"] else ())
+            found = group_by_image(_rows_inside(folder / entry["file"]) if entry["file"] else ())
             inside = {image_key(some[0]): some for some in found}
             for source in task.sources:
                 yield from inside.get(key_text(source.index)) or [_failure(config, task, source)]
@@ -268,9 +275,9 @@ def _with_sources(config: Config) -> Config:
     return config
 
 
-def _failure(config: Config, task: Task, source: Source) -> Row:
+def _failure(config: Config, task: ShardTask, source: Source) -> Row:
     try:
-        load(config.source, source, config.output.layout)
+        load_source(config.source, source, config.output.layout)
     except SourceError as error:
         return failed_row(source, error.sha256, task.shard, config.seed, error.reason)
     raise DamageError(f"source {source.name}: failed when the dataset was made, and can be used now; {AGAIN}")
@@ -289,7 +296,7 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, asi
     kept, maker = 0, Maker(root)
     try:
         with ShardWriter(part) as writer:
-            for sample, some, frames in zip(wanted, samples(rows), salvage(path, wanted), strict=True):
+            for sample, some, frames in zip(wanted, group_by_sample(rows), salvage(path, wanted), strict=True):
                 kept += _mend_sample(writer, sample, some, frames, maker)
     except UnprocessGenError as error:
         part.unlink()
@@ -374,5 +381,7 @@ def _entry(folder: Path, number: int, rows: Sequence[Row], old: Facts) -> Facts:
     except (KeyError, IndexError, TypeError, AttributeError):
         self_test = None
     if not path.is_file():
-        return Made(number, None, 0, None, tuple(rows), killer, self_test).entry()
-    return Made(number, str(path), path.stat().st_size, file_sha256(path), tuple(rows), killer, self_test).entry()
+        return ShardResult(number, None, 0, None, tuple(rows), killer, self_test).entry()
+    return ShardResult(
+        number, str(path), path.stat().st_size, file_sha256(path), tuple(rows), killer, self_test
+    ).entry()

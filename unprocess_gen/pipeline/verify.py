@@ -22,15 +22,22 @@ from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, file_sha256
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
-from unprocess_gen.dataset.keys import image_key, sample_key, samples
-from unprocess_gen.dataset.manifest import located_rows, patch_of, plan_of, read_row, read_rows, row_json
+from unprocess_gen.dataset.keys import group_by_sample, image_key, sample_key
+from unprocess_gen.dataset.manifest import (
+    patch_from_row,
+    plan_from_row,
+    read_row,
+    read_rows,
+    row_json,
+    rows_with_offsets,
+)
 from unprocess_gen.dataset.shards import CLEAN, Expected, check_members, form_of, noisy_member, shard_name
 from unprocess_gen.pipeline.workspace import read_dataset
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources import listing as sources
-from unprocess_gen.sources.loader import load
-from unprocess_gen.sources.patches import cut
+from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.patches import crop_patch
 
 NO_LIMIT = 2**40
 """Pixels a replay accepts: the run that wrote the row had a limit of its own."""
@@ -129,7 +136,7 @@ def _check_sha256(path: Path, entry: dict[str, Any] | None) -> Iterator[Damage]:
 
 def expected(rows: Iterable[Row]) -> list[Expected]:
     """Return what rows say of the members of each of their samples; DamageError where a value is missing."""
-    return [_expected(some) for some in samples(row for row in rows if row["status"] == "ok")]
+    return [_expected(some) for some in group_by_sample(row for row in rows if row["status"] == "ok")]
 
 
 def _expected(rows: Sequence[Row]) -> Expected:
@@ -171,7 +178,7 @@ def source_root(manifest: Path, root: str | None) -> str | None:
 
 def spread(manifest: Path, count: int) -> Iterator[Row]:
     """Yield ``count`` rows of pairs (or all there are), evenly spread over a manifest."""
-    places = [at for at, row in located_rows(manifest) if row["status"] == "ok"]
+    places = [at for at, row in rows_with_offsets(manifest) if row["status"] == "ok"]
     count = min(count, len(places))
     return (read_row(manifest, places[i * len(places) // count]) for i in range(count))
 
@@ -221,7 +228,7 @@ class Maker:
         """
         if self._root is None and not _is_scene(row):
             raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
-        plan = plan_of(row)
+        plan = plan_from_row(row)
         selftest.check(selftest.kernels(plan))
         try:
             sha256, photograph = self._load(row)
@@ -232,8 +239,8 @@ class Maker:
             raise DamageError(str(error)) from error
         if complaint := _changed(sha256, row):
             raise DamageError(complaint)
-        patch = patch_of(row)
-        pixels = cut(photograph.srgb, patch)
+        patch = patch_from_row(row)
+        pixels = crop_patch(photograph.srgb, patch)
         if pixels.shape[:2] != (patch.height, patch.width):
             raise DamageError(
                 f"its {patch.width} x {patch.height} pixels from row {patch.y}, column {patch.x} on "
@@ -254,7 +261,7 @@ class Maker:
         source = source_of(row)
         if self._kept is None or self._kept[:2] != (config, source):
             self._kept = None  # two photographs at a time would take twice the memory
-            self._kept = config, source, *load(config, source)
+            self._kept = config, source, *load_source(config, source)
         return self._kept[2:]
 
 

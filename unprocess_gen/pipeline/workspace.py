@@ -32,9 +32,9 @@ from typing import Any, TextIO
 
 from yaml import YAMLError
 
-from unprocess_gen.config.serialization import differences, one_line
+from unprocess_gen.config.serialization import differences, error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
-from unprocess_gen.core.files import machine_error, place
+from unprocess_gen.core.files import commit_file, machine_error
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.manifest import NAMES, read_rows, write_rows
 from unprocess_gen.dataset.shards import shard_name
@@ -47,7 +47,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class ShardResult:
     """A shard that a worker finished: where it lies (None: no pair in it, no file), and its rows.
 
     ``killer`` names the photograph at which workers died twice; then the rows are provisional and there is no file.
@@ -195,7 +195,7 @@ class Workspace:
         try:
             differing = differences(self.config_yaml, path.read_text(encoding="utf-8"))
         except (ValueError, YAMLError) as error:
-            raise DamageError(f"{path}: cannot be read ({one_line(error)}); choose another out") from error
+            raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)}); choose another out") from error
         if differing:
             raise ConfigError(
                 f"out={self.out}: was begun with other settings: {_some(differing)}; choose another out, or remove it"
@@ -254,17 +254,17 @@ class Workspace:
     def _rows_path(self, shard: int) -> Path:
         return self.rows / f"{shard:05d}.json"
 
-    def commit(self, made: Made) -> None:
+    def commit(self, made: ShardResult) -> None:
         """Put a finished shard into place, durably: its rows first, then the shard. MachineError if that fails."""
         record = {"entry": made.entry(), "rows": [[row[name] for name in NAMES] for row in made.rows]}
         try:
             self._write(self._rows_path(made.shard), json.dumps(record, separators=(",", ":")))
             if made.path is not None:
-                place(Path(made.path), self.shards / shard_name(made.shard))
+                commit_file(Path(made.path), self.shards / shard_name(made.shard))
         except OSError as error:
             raise machine_error(error, self.out) from error
 
-    def finish(self, shards: int, given_up: dict[int, Made], facts: dict[str, Any]) -> dict[str, Any]:
+    def finish(self, shards: int, given_up: dict[int, ShardResult], facts: dict[str, Any]) -> dict[str, Any]:
         """Write ``manifest.csv`` and, last, ``dataset.json``; return what the latter says. MachineError on failure.
 
         Shards that are ``given_up`` for now have provisional rows; then ``.work`` stays, for the next run to go on.
@@ -279,7 +279,7 @@ class Workspace:
             raise machine_error(error, self.out) from error
         return dataset
 
-    def all_rows(self, shards: int, given_up: dict[int, Made]) -> Iterator[Row]:
+    def all_rows(self, shards: int, given_up: dict[int, ShardResult]) -> Iterator[Row]:
         """Yield every row of the dataset, in source order."""
         for shard in range(shards):
             yield from given_up[shard].rows if shard in given_up else self.committed_rows([shard])
@@ -301,14 +301,16 @@ class Workspace:
         aside = self.work / (path.name + ".part")
         with aside.open("w", encoding="utf-8", newline="") as stream:
             yield stream
-        place(aside, path)
+        commit_file(aside, path)
 
 
 def _read_listing(path: Path) -> dict[str, Any]:
     try:
         return {name: (size, sha256) for name, size, sha256 in json.loads(path.read_text(encoding="utf-8"))}
     except (ValueError, TypeError) as error:
-        raise DamageError(f"{path}: cannot be read ({one_line(error)}); remove the folder and start again") from error
+        raise DamageError(
+            f"{path}: cannot be read ({error_in_one_line(error)}); remove the folder and start again"
+        ) from error
 
 
 def dataset_facts(
@@ -345,7 +347,7 @@ def read_dataset(path: Path) -> dict[str, Any]:
         facts.pop("dataset_sha256")
         whole = dataset_text(facts) == text
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        raise DamageError(f"{path}: cannot be read ({one_line(error)})") from error
+        raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
     if not whole:
         raise DamageError(f"{path}: is not as it was written: its own SHA-256 does not fit")
     return dict(facts)

@@ -22,7 +22,7 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-from unprocess_gen.config.derived import EFFECT_NUMBERS, effect_switch, is_normalised, is_physical, lacks
+from unprocess_gen.config.derived import EFFECT_NUMBERS, effect_switch, is_normalised, is_physical, missing_number
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.lookup_tables import linear_table
 from unprocess_gen.core.types import Facts, Physics, Srgb
@@ -165,7 +165,7 @@ def _said(config: Config, effect: str) -> Said | None:
         )
     if switch == "off":
         return Said(False, "switched off")
-    number = lacks(config.noise, effect)
+    number = missing_number(config.noise, effect)
     if number is not None:
         return Said(False, f"noise={config.noise.name} gives no {number}")
     if switch == "on":

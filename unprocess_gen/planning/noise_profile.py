@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 from decimal import Decimal, localcontext
 from typing import Any
 
-from unprocess_gen.config.derived import SCENE_LAWS, branch_of
-from unprocess_gen.config.distributions import draw, law
+from unprocess_gen.config.derived import SCENE_DISTRIBUTIONS, branch_of
+from unprocess_gen.config.distributions import draw_parameter, parse_distribution
 from unprocess_gen.config.schema import BranchConfig, Config, NoiseConfig
 from unprocess_gen.core.lookup_tables import DIGITS, normal_quantile, tukey_std
 from unprocess_gen.core.random_streams import body_key
@@ -28,7 +28,7 @@ def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) ->
     """
     noise, scene, sensor = config.noise, config.scene, config.sensor
     iso, seconds, celsius = (
-        draw(law(key, value, SCENE_LAWS), uniforms[key])
+        draw_parameter(parse_distribution(key, value, SCENE_DISTRIBUTIONS), uniforms[key])
         for key, value in (
             ("iso", scene.iso if noise.iso is None else noise.iso),
             ("exposure_s", scene.exposure_s),
@@ -39,7 +39,7 @@ def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) ->
     assert branch is not None and noise.white_level_dn is not None and noise.black_level_dn is not None
     scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
     gain = number(branch.dn_per_e, iso=iso)
-    shape = draw(law("read_shape", branch.read_shape, ("choice",)), uniforms["read_shape"])
+    shape = draw_parameter(parse_distribution("read_shape", branch.read_shape, ("choice",)), uniforms["read_shape"])
     warmth = _doublings(celsius, noise)
     unit = f"{stream_key:016x}" if sensor.units == "image" else str(int(uniforms["sensor_unit"] * sensor.units))
     errors = _black_error(branch, iso)

@@ -9,20 +9,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from unprocess_gen.config.accuracy import choose, is_steep
+from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.derived import (
-    SCENE_LAWS,
-    budget,
-    dequantizing,
+    SCENE_DISTRIBUTIONS,
+    accuracy_budget,
+    dequantize_method,
     effect_switch,
-    gain_laws,
+    gain_distributions,
     is_normalised,
     is_physical,
-    noise_laws,
+    noise_distributions,
     noise_levels,
     uses_physics,
 )
-from unprocess_gen.config.distributions import draw, law
+from unprocess_gen.config.distributions import draw_parameter, parse_distribution
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Facts, Plan
@@ -116,8 +116,8 @@ def plan_with_reasons(
 def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> Plan:
     """Return the plan without what a physical profile adds."""
     camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
-    red, blue, inverse_rgb = gain_laws(config.gains)
-    darkened = law("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_LAWS)
+    red, blue, inverse_rgb = gain_distributions(config.gains)
+    darkened = parse_distribution("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_DISTRIBUTIONS)
     a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
     span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
     effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
@@ -125,15 +125,15 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         seed=config.seed,
         stream_key=key,
         downscale=config.source.downscale,
-        dequantize=dequantizing(config.source),
+        dequantize=dequantize_method(config.source),
         scene=config.scene.name,
-        exposure_ratio=draw(darkened, uniforms["exposure_ratio"]),
+        exposure_ratio=draw_parameter(darkened, uniforms["exposure_ratio"]),
         camera=camera,
         weights=weights,
         rgb2cam=rgb2cam,
-        red_gain=draw(red, uniforms["red"]),
-        blue_gain=draw(blue, uniforms["blue"]),
-        inverse_rgb_gain=draw(inverse_rgb, uniforms["inverse_rgb"]),
+        red_gain=draw_parameter(red, uniforms["red"]),
+        blue_gain=draw_parameter(blue, uniforms["blue"]),
+        inverse_rgb_gain=draw_parameter(inverse_rgb, uniforms["inverse_rgb"]),
         tone=config.isp.tone,
         gamma="srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma),
         highlight=config.gains.highlight,
@@ -158,7 +158,9 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         layout=config.output.layout,
     )
     counts_electrons, normalised = uses_physics(config.noise), is_normalised(config)
-    return replace(plan, methods=choose(budget(config.accuracy), counts_electrons, normalised, is_steep(plan)))
+    return replace(
+        plan, methods=choose_methods(accuracy_budget(config.accuracy), counts_electrons, normalised, is_steep(plan))
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------- camera
@@ -194,9 +196,9 @@ def convex_weights(uniforms: dict[str, float]) -> Weights:
 def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float]:
     """Draw the noise level and convert it to the sensor's DN."""
     noise, sensor = config.noise, config.sensor
-    a_law, b_law = noise_laws(noise)
-    a = draw(a_law, uniforms["a"])
-    b = draw(b_law, uniforms["b"], a)
+    a_law, b_law = noise_distributions(noise)
+    a = draw_parameter(a_law, uniforms["a"])
+    b = draw_parameter(b_law, uniforms["b"], a)
     return noise_in_dn(
         a,
         b,

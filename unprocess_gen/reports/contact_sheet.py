@@ -26,14 +26,14 @@ from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.lookup_tables import linear_table
 from unprocess_gen.core.types import Float, Frame, Plan, Row, Srgb
 from unprocess_gen.dataset.keys import image_key, sample_key
-from unprocess_gen.dataset.manifest import patch_of, plan_of, read_rows
+from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.pipeline.verify import NO_LIMIT, source_of, source_root
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import mosaic, tile
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
-from unprocess_gen.sources.loader import load
-from unprocess_gen.sources.patches import cut
+from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.patches import crop_patch
 
 Picture = NDArray[np.uint8]
 
@@ -136,15 +136,15 @@ def _shown(folder: Path, keys: Sequence[str], source_folder: Path | None) -> Ite
         if of_image != image_key(row):
             of_image, (photograph, lacks) = image_key(row), _photograph(row, root)
         source_part, lacks_part = _part_of(photograph, lacks, row)
-        yield Shown(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_of(row), source_part, lacks_part)
+        yield Shown(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), source_part, lacks_part)
 
 
 def _part_of(photograph: Srgb | None, lacks: str, row: Row) -> tuple[Srgb | None, str]:
     """Return what of a photograph a row's frames show, or None and the reason."""
     if photograph is None:
         return None, lacks
-    patch = patch_of(row)
-    part = cut(photograph, patch)
+    patch = patch_from_row(row)
+    part = crop_patch(photograph, patch)
     if part.shape[:2] != (patch.height, patch.width):
         return None, f"its {photograph.shape[1]} x {photograph.shape[0]} pixels are not those of the row"
     return part, ""
@@ -182,7 +182,7 @@ def _photograph(row: Row, root: str | None) -> tuple[Srgb | None, str]:
         return None, "the dataset does not say where its photographs are; give --source ROOT"
     config = SourceConfig(root=None if is_scene else root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
     try:
-        sha256, photograph = load(config, source_of(row))
+        sha256, photograph = load_source(config, source_of(row))
     except (SourceError, MachineError, ConfigError) as error:  # of one photograph: the sheet is made without it
         return None, str(error)
     if sha256 != row["source_sha256"]:
@@ -447,7 +447,7 @@ def _reduced(srgb: Srgb, side: int) -> Float:
 
 def _dithered(shown: Shown, at: Window) -> Float:
     assert shown.source is not None
-    plan, patch = shown.plan, patch_of(shown.row)
+    plan, patch = shown.plan, patch_from_row(shown.row)
     origin = patch.y + at.rows.start, patch.x + at.columns.start
     curve = linear_table(plan.tone, plan.gamma, 256)
     return unprocess.dequantise(shown.source[at.rows, at.columns], plan, curve, origin) / 65535

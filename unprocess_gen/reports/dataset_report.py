@@ -24,7 +24,7 @@ import numpy as np
 import yaml
 
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.files import file_sha256, machine_error, place
+from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Float, Row
 from unprocess_gen.dataset.keys import image_key, sample_key
 from unprocess_gen.dataset.manifest import COLUMNS, read_rows
@@ -62,7 +62,7 @@ def write(folder: Path, to: Path | None = None, source: Path | None = None) -> P
     aside = to.with_name(to.name + ".part")
     try:
         aside.write_bytes(content)
-        place(aside, to)
+        commit_file(aside, to)
     except OSError as error:
         aside.unlink(missing_ok=True)
         raise machine_error(error, to) from error

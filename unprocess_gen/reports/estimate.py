@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.derived import is_physical, noise_levels, patch_law
+from unprocess_gen.config.derived import is_physical, noise_levels, patch_rule
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
@@ -27,8 +27,8 @@ from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_f
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark import measure as accuracy
 from unprocess_gen.simulation.pair import make_pairs
-from unprocess_gen.sources.loader import list_photographs, load, spread
-from unprocess_gen.sources.patches import cut, patches, pixels_in_none
+from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_source
+from unprocess_gen.sources.patches import crop_patch, list_patches, pixels_in_none
 
 SAMPLE = 16
 
@@ -83,7 +83,7 @@ def forecast(
     Raises ConfigError as `photographs.list_photographs` does.
     """
     sources = list_photographs(config.source).sources
-    chosen = sources if read_all else spread(sources, SAMPLE)
+    chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
     _warm_up(config)
     looks = tuple(look(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
@@ -104,7 +104,7 @@ def look(config: Config, source: Source) -> Look:
     """Make the pairs of one photograph, with the digests that its shard takes, and throw them away."""
     started = time.perf_counter()
     try:
-        sha256, photograph = load(config.source, source, config.output.layout)
+        sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
         return Look(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
@@ -113,9 +113,9 @@ def look(config: Config, source: Source) -> Look:
     plans = with_draws(config, levels, source.frame)
     height, width = photograph.srgb.shape[:2]
     output = config.output
-    cuts = patches(patch_law(config.source), plans[0].stream_key, height, width, output.layout)
+    cuts = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, output.layout)
     for patch in cuts:
-        for number, pair in enumerate(make_pairs(cut(photograph.srgb, patch), plans, patch.origin)):
+        for number, pair in enumerate(make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin)):
             for frame in (pair.clean, pair.noisy) if number == 0 else (pair.noisy,):
                 array_xxh3(frame)
                 hashlib.sha256(frame.data)
@@ -132,7 +132,7 @@ def _prices(config: Config, looks: tuple[Look, ...], tiers: Mapping[str, Accurac
     """Measure what accuracy costs on the first photograph that can be read."""
     for one in looks:
         if one.levels:
-            return accuracy.prices(config, dict(tiers), load(config.source, one.source)[1].srgb)
+            return accuracy.prices(config, dict(tiers), load_source(config.source, one.source)[1].srgb)
     return {}
 
 
@@ -182,7 +182,7 @@ def _pairs(told: Forecast) -> str:
 
 def _patches(config: Config, looks: tuple[Look, ...]) -> list[str]:
     """Return what is cut out of an image and how much of it is in no patch; nothing where images stay whole."""
-    law, cut_up = patch_law(config.source), [one for one in looks if one.patches]
+    law, cut_up = patch_rule(config.source), [one for one in looks if one.patches]
     odd = [one for one in cut_up if one.left_out]
     if law is None and odd:
         share = sum(one.left_out for one in odd) / sum(one.pixels for one in cut_up)

@@ -37,7 +37,7 @@ from unprocess_gen.simulation.reference.unprocess import (
     invert_gains_per_channel,
     linear_light,
 )
-from unprocess_gen.sources.loader import list_photographs, load, spread
+from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_source
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -138,7 +138,7 @@ def draw(config: Config, recipes: Recipes) -> list[Drawn]:
         raise ConfigError(f"source.patch={config.source.patch}: the figures show whole photographs; leave it out")
     listed = list_photographs(config.source).sources
     subject = _subject(config, recipes, listed)
-    counted = _count(config, recipes, spread(listed, MOST_COUNTED))
+    counted = _count(config, recipes, evenly_spaced(listed, MOST_COUNTED))
     return [
         _tone(subject),
         _gamma(subject),
@@ -186,7 +186,7 @@ def _on_page(one: Drawn) -> Html:
 def _subject(config: Config, recipes: Recipes, listed: Sequence[Source]) -> Subject:
     for source in listed:
         with suppress(SourceError):
-            sha256, photograph = load(config.source, source)
+            sha256, photograph = load_source(config.source, source)
             plans = {name: _plan(config, source, sha256, recipes.gains[name]) for name in GAINS}
             by_author = replace(config, noise=recipes.authors_noise)
             authors = _plan(by_author, source, sha256, recipes.gains[DEFAULT_GAINS])
@@ -204,7 +204,7 @@ def _count(config: Config, recipes: Recipes, listed: Iterable[Source]) -> Counte
     failed = []
     for source in listed:
         try:
-            sha256, photograph = load(config.source, source)
+            sha256, photograph = load_source(config.source, source)
         except SourceError as error:
             failed.append(f"{source.name} ({error.reason})")
             continue

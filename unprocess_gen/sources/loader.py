@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from unprocess_gen.config.derived import patch_law
+from unprocess_gen.config.derived import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
@@ -45,14 +45,14 @@ def list_photographs(config: SourceConfig) -> sources.Listing:
     return sources.Listing(numbered, listing.not_matched, listing.skipped_links)
 
 
-def spread(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
+def evenly_spaced(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
     """Return at most ``count`` sources, evenly spread over the listing."""
     if len(sources) <= count:
         return sources
     return tuple(sources[i * len(sources) // count] for i in range(count))
 
 
-def load(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:
+def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:
     """Return the SHA-256 of a source's bytes (of a scene's pixels) and its pixels, decoded and downscaled.
 
     Raises SourceError, with the digest as ``sha256`` where the bytes could be read, also where no patch fits into the
@@ -61,7 +61,7 @@ def load(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[st
     """
     digest, photograph = _full_frame(config, source)
     height, width = photograph.srgb.shape[:2]
-    law = patch_law(config)
+    law = patch_rule(config)
     if law is not None and min(height, width) < law.side:
         text = f"{width} x {height} pixels hold no patch of {law.side} x {law.side} (source.patch)"
         raise SourceError("unsupported", text, digest)

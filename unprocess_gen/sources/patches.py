@@ -16,10 +16,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from unprocess_gen.core.random_streams import patch_words
-from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchLaw, Srgb
+from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
 
 
-def patches(law: PatchLaw | None, stream_key: int, height: int, width: int, layout: str = MOSAIC) -> tuple[Patch, ...]:
+def list_patches(
+    law: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC
+) -> tuple[Patch, ...]:
     """Return the patches of an image, in order; without a law the whole image is one.
 
     Of an odd side packed planes leave out the last row or column, which has no whole 2x2 tiles. Grids go row by row
@@ -33,18 +35,18 @@ def patches(law: PatchLaw | None, stream_key: int, height: int, width: int, layo
     return tuple(Patch(number, y, x, law.side, law.side) for number, (y, x) in enumerate(corners))
 
 
-def _grid(law: PatchLaw, height: int, width: int) -> Iterator[tuple[int, int]]:
+def _grid(law: PatchRule, height: int, width: int) -> Iterator[tuple[int, int]]:
     rows, columns = (range(0, length - law.side + 1, law.stride) for length in (height, width))
     return itertools.product(rows, columns)
 
 
-def _random(law: PatchLaw, stream_key: int, height: int, width: int) -> Iterator[tuple[int, int]]:
+def _random(law: PatchRule, stream_key: int, height: int, width: int) -> Iterator[tuple[int, int]]:
     rows, columns = ((length - law.side) // 2 + 1 for length in (height, width))
     for first, second in patch_words(stream_key, law.count):
         yield 2 * (first * rows >> 32), 2 * (second * columns >> 32)
 
 
-def cut(srgb: Srgb, patch: Patch) -> Srgb:
+def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
     """Return the pixels of a patch."""
     return srgb[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width]
 

@@ -49,10 +49,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from unprocess_gen.config.accuracy import METHODS, STAGES, Budget, Method, choose, of_stage
-from unprocess_gen.config.derived import budget, is_normalised, is_physical
+from unprocess_gen.config.accuracy import METHODS, STAGES, Budget, Method, choose_methods, methods_of_stage
+from unprocess_gen.config.derived import accuracy_budget, is_normalised, is_physical
 from unprocess_gen.config.schema import AccuracyConfig, CleanConfig, Config, EffectsConfig, NoiseConfig, SensorConfig
-from unprocess_gen.config.validation import check
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import linear_table, normal_table
@@ -90,7 +90,7 @@ from unprocess_gen.simulation.reference.poisson import Tables as PoissonTables
 from unprocess_gen.simulation.reference.poisson import gaussian_from, poisson_tables
 from unprocess_gen.simulation.reference.sensor import quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
-from unprocess_gen.sources.loader import list_photographs, load, spread
+from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,7 +276,7 @@ def _settings(config: Config, beside: Beside) -> dict[str, Config]:
         two_numbers = replace(at_14_bits, noise=replace(config.noise, law="gaussian"))
         physical = _at_some_iso(replace(other, noise=beside.electrons))
     for one in (two_numbers, physical):
-        check(one)
+        validate_config(one)
     return {"two_numbers": two_numbers, "electrons": physical, "own": config}
 
 
@@ -286,7 +286,7 @@ FALLBACK_ISO = 1600
 
 def _at_some_iso(config: Config) -> Config:
     try:
-        check(config)
+        validate_config(config)
     except ConfigError:
         return replace(config, noise=replace(config.noise, iso=FALLBACK_ISO))
     return config
@@ -302,11 +302,11 @@ def _tiers(config: Config, beside: Beside) -> dict[str, AccuracyConfig]:
 
 def _subjects(config: Config, effort: Effort) -> tuple[Subject, ...]:
     """Read photographs, spread over the listing; those that fail are passed over."""
-    sources = spread(list_photographs(config.source).sources, effort.photographs)
+    sources = evenly_spaced(list_photographs(config.source).sources, effort.photographs)
     subjects = []
     for source in sources:
         with suppress(SourceError):
-            sha256, photograph = load(config.source, source)
+            sha256, photograph = load_source(config.source, source)
             identity = source.stream_identity(sha256)
             subjects.append(Subject(source.name, identity, *_cuts(photograph.srgb, effort)))
     if not subjects:
@@ -399,13 +399,13 @@ def flat_rates(read_std_e: float, law_distance: float) -> list[float]:
 
 def taken(asked: Budget) -> frozenset[str]:
     """Return the methods that a budget takes, for noise of two numbers or of counts."""
-    return frozenset(spelled for counts in (False, True) for spelled in choose(asked, counts))
+    return frozenset(spelled for counts in (False, True) for spelled in choose_methods(asked, counts))
 
 
 def alone(method: Method, tiers: dict[str, AccuracyConfig]) -> AccuracyConfig:
     """Return the budget that takes a method and is exact otherwise; of those that go together, all of them."""
     exact = tiers[EXACT]
-    if method.spelled in taken(budget(exact)):
+    if method.spelled in taken(accuracy_budget(exact)):
         return exact
     if method.readable:
         return tiers[REFERENCE]
@@ -878,10 +878,10 @@ def _one_round(lab: Lab, subject: Subject, steps: Steps) -> Times:
 
 
 def _method_rows(lab: Lab, errors: dict[tuple[str, str], Error | None], rounds: Sequence[Times]) -> Iterator[Row]:
-    chosen = {name: taken(budget(tier)) for name, tier in lab.tiers.items()}
+    chosen = {name: taken(accuracy_budget(tier)) for name, tier in lab.tiers.items()}
     for stage in STAGES:
-        reference = of_stage(stage)[-1].name
-        for method in of_stage(stage):
+        reference = methods_of_stage(stage)[-1].name
+        for method in methods_of_stage(stage):
             tiers = " ".join(name for name, spelled in chosen.items() if method.spelled in spelled)
             key = (stage, method.name)
             yield _row(stage, method.name, tiers, errors[key], rounds, key, (stage, reference))
