@@ -15,8 +15,8 @@ from conftest import Door, Make, fill
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.dataset.keys import select_rows
 from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
 from unprocess_gen.pipeline.verify import replay, spread, verify
 

@@ -401,7 +401,7 @@ def _told(folder: Path, damages: Iterable[object]) -> list[str]:
 
 def replay(arguments: list[str]) -> int:
     """``gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]``: make rows again."""
-    from unprocess_gen.dataset.keys import select_rows
+    from unprocess_gen.dataset.selection import select_rows
     from unprocess_gen.pipeline import verify as room
 
     manifest = _first("replay", arguments, "a manifest.csv, or the folder of a dataset")

@@ -46,9 +46,9 @@ import numpy as np
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
-from unprocess_gen.dataset.keys import select_rows
 from unprocess_gen.dataset.manifest import plan_from_row, read_rows
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
+from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.simulation.reference.cfa import CHANNELS
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 
