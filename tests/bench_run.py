@@ -90,7 +90,7 @@ def has_pair(out: Path) -> bool:
 
 def start(cores: Sequence[int], out: Path, *arguments: str) -> float:
     """Time a process of the tool from its start to its first pair; it then goes on to its end."""
-    pin = f"import os; os.sched_setaffinity(0, {list(cores)}); from unprocess_gen import cli; cli.main()"
+    pin = f"import os; os.sched_setaffinity(0, {list(cores)}); from unprocess_gen.cli import main; main.main()"
     started = time.perf_counter()
     command = [sys.executable, "-c", pin, *arguments, f"out={out}"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -56,6 +56,7 @@ from unprocess_gen.simulation.kernels import poisson
 from unprocess_gen.simulation.kernels.normal import fill_coarse_normals, fill_fine_normals, normal_quantiles
 from unprocess_gen.simulation.kernels.simd import bare, load
 from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.simulation.reference.poisson import poisson_tables
 
 KERNELS = {
     f"{room}.{name}": value
@@ -205,7 +206,7 @@ def doubles() -> str:
     key = fused.key_words(2**33 + 1, 5, 6, 7)
     _draws(key, words)
     normals = floats.by_inverse_cdf(words[None], normal_table())[0]
-    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson.poisson_tables(), of_counts, counts)
+    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson_tables(), of_counts, counts)
     body = electrons._body(plan, (1, count), (0, 0))
     _digitise(counts, words, body, of_counts, digitised)
     _round(n % 9 + 0.5, noisy, tally)
@@ -268,7 +269,7 @@ def compile_kernels() -> None:
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)
-    given = words, doubles, normal_quantiles(), poisson.poisson_tables(), poisson.room_for(8), doubles
+    given = words, doubles, normal_quantiles(), poisson_tables(), poisson.room_for(8), doubles
     _draw.compile(tuple(map(numba.typeof, given)))
 
 

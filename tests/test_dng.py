@@ -542,7 +542,7 @@ def test_a_full_disk_leaves_no_half_file(ds: Path, door: Door, monkeypatch: pyte
     def full(aside: Path, path: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(aside))
 
-    monkeypatch.setattr(dng, "place", full)
+    monkeypatch.setattr(dng, "commit_file", full)
     done = door("dng", ds, "--keys", "00000000", "--to", "to")
     assert (done.code, done.err.count("\n")) == (5, 1)
     assert "No space left on device" in done.err

@@ -80,9 +80,3 @@ def test_every_file_the_readme_names_is_there(path: str) -> None:
 
 def test_the_readme_names_no_tool_that_does_not_exist() -> None:
     assert set(re.findall(r"gen-dataset ([a-z]+) ", README)) <= set(VERBS)
-
-
-def test_the_readme_puts_every_room_on_its_floor() -> None:
-    rooms = {path.stem for path in (ROOT / "unprocess_gen").glob("[a-z]*.py")}
-    table = README.partition("| floor | rooms |")[2].partition("\n\n")[0]
-    assert set(re.findall(r"`(\w+)`", table)) == rooms

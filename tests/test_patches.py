@@ -30,8 +30,8 @@ from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import replay, verify
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.estimate import forecast, text
-from unprocess_gen.sources import list_patches as room
 from unprocess_gen.sources import loader as photographs
+from unprocess_gen.sources import patches as room
 from unprocess_gen.sources.patches import list_patches, pixels_in_none
 
 Settings = Callable[..., Config]

@@ -16,11 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from moments import bernstein
 
+from unprocess_gen.config.distributions import draw_parameter as draw
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Distribution, Plan
-from unprocess_gen.planning.plan import PARAMETERS, draw, plan_camera, plan_image, plan_noise
+from unprocess_gen.planning.plan import PARAMETERS, plan_camera, plan_image, plan_noise
 from unprocess_gen.simulation.reference import colour
 
 Settings = Callable[..., Config]

@@ -14,7 +14,7 @@ import pytest
 
 from unprocess_gen.cli import hydra_app as room
 from unprocess_gen.cli.hydra_app import compose, compose_beside
-from unprocess_gen.config import schema as settings_room
+from unprocess_gen.config import validation as settings_room
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 
@@ -168,7 +168,7 @@ def test_a_bug_is_told_here_where_a_child_met_it(children: ForkedChildren, monke
     def broken(config: Config) -> NoReturn:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(settings_room, "check", broken)
+    monkeypatch.setattr(settings_room, "validate_config", broken)
 
     assert compose_beside([], [lambda: None]) is None
     with pytest.raises(RuntimeError, match="a bug"):
