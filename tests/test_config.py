@@ -420,8 +420,8 @@ def test_source_kind_follows_from_the_root(settings: Settings) -> None:
 
 def test_keys_that_do_not_decide_the_data_are_left_out(settings: Settings) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings()))
-    assert NOT_DATA == {"": ("out", "n_jobs", "self_test"), "source": ("root", "max_failed")}
-    assert {"out", "n_jobs", "self_test"}.isdisjoint(loaded)
+    assert NOT_DATA == {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
+    assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)
     assert {"root", "max_failed"}.isdisjoint(loaded["source"])
 
 
@@ -435,7 +435,9 @@ def test_every_other_key_is_there(settings: Settings) -> None:
             assert field.name in loaded or field.name in NOT_DATA[""]
 
 
-@pytest.mark.parametrize("keys", ["out=elsewhere", "n_jobs=3", "self_test=go_on", "source.max_failed=7"])
+@pytest.mark.parametrize(
+    "keys", ["out=elsewhere", "n_jobs=3", "self_test=go_on", "check_disk=false", "source.max_failed=7"]
+)
 def test_what_does_not_decide_the_data_does_not_change_the_text(keys: str, settings: Settings) -> None:
     assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
 

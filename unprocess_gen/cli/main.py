@@ -71,7 +71,8 @@ Settings are key=value, in any order. Groups (group=option; their keys are group
   output   webdataset   dtype (uint16, float32), layout (mosaic, packed), pairs_per_shard
   experiment ipol_demo brooks2019_training crvd_like eld_low_light
            recipes, whose settings others change; added with a plus: +experiment=ipol_demo
-and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on).
+and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on),
+check_disk (true).
 
   --cfg job           print the settings and stop
   --config-dir DIR    add a folder of your own options

@@ -12,7 +12,7 @@ from pathlib import Path
 SEVERITY = (0, 3, 11, 4, 2, 5, 1)
 """Exit codes from good to bad: a sweep ends with the worst of its jobs."""
 
-NOT_IN_NAMES = ("out", "n_jobs", "self_test", "source.root")
+NOT_IN_NAMES = ("out", "n_jobs", "self_test", "check_disk", "source.root")
 """Settings that do not tell one job's data from another's."""
 
 LONGEST_NAME = 200

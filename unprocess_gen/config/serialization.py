@@ -16,7 +16,7 @@ from unprocess_gen.core.errors import ConfigError
 Option = TypeVar("Option")
 
 
-NOT_DATA = {"": ("out", "n_jobs", "self_test"), "source": ("root", "max_failed")}
+NOT_DATA = {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
 """Keys that do not decide a dataset's bytes, by group; its ``config.yaml`` leaves them out."""
 
 
