@@ -14,8 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from unprocess_gen.reports.benchmark.measure import Row
-from unprocess_gen.reports.benchmark.report import markdown
+from unprocess_gen.reports.benchmark.measure import Measurement
+from unprocess_gen.reports.benchmark.report import markdown_table
 
 HERE = Path(__file__).parent
 README = HERE.parent / "README.md"
@@ -23,9 +23,11 @@ TABLE = re.compile(r"(<!-- accuracy: [^>]*-->\n).*?(<!-- end of accuracy -->)", 
 TEXTS = ("stage", "method", "tier", "error_unit")
 
 
-def row(line: dict[str, str]) -> Row:
+def row(line: dict[str, str]) -> Measurement:
     """Read a line of accuracy.csv back."""
-    return Row(**{name: text if name in TEXTS else float(text) if text else None for name, text in line.items()})
+    return Measurement(
+        **{name: text if name in TEXTS else float(text) if text else None for name, text in line.items()}
+    )
 
 
 def main() -> None:
@@ -36,7 +38,7 @@ def main() -> None:
         report = Path(folder) / "report"
         shutil.copy(report / "accuracy.png", HERE / "accuracy.png")
         with (report / "accuracy.csv").open(newline="", encoding="utf-8") as lines:
-            table = markdown([row(line) for line in csv.DictReader(lines)])
+            table = markdown_table([row(line) for line in csv.DictReader(lines)])
     text = README.read_text(encoding="utf-8")
     README.write_text(TABLE.sub(lambda found: found[1] + table + "\n" + found[2], text), encoding="utf-8")
 

@@ -23,26 +23,29 @@ from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, Sen
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.reports import formatting, report_files
 from unprocess_gen.reports.benchmark import measure as accuracy
 from unprocess_gen.reports.benchmark import report
 from unprocess_gen.reports.benchmark.measure import (
-    BY_NAME,
+    BENCHMARKS_BY_NAME,
     EXACT,
-    MEASUREMENTS,
+    METHOD_BENCHMARKS,
     REFERENCE,
     TIER_STAGES,
-    Beside,
-    Effort,
-    Report,
-    Row,
+    BenchmarkProfiles,
+    BenchmarkReport,
+    Measurement,
+    SampleSizes,
 )
-from unprocess_gen.reports.estimate import forecast, text
+from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.simulation.reference import noise as effects
 from unprocess_gen.simulation.reference.poisson import gaussian_distance
 
 Settings = Callable[..., Config]
 
-LITTLE = Effort(photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32), compiled=(48, 64), flat=128, positions=16)
+LITTLE = SampleSizes(
+    photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32), compiled=(48, 64), flat=128, positions=16
+)
 TIERS = {
     name: read_option(conf_dir() / "accuracy" / f"{name}.yaml", AccuracyConfig) for name in (REFERENCE, EXACT, "fast")
 }
@@ -53,17 +56,17 @@ def option(group: str, name: str, schema: type) -> Any:
 
 
 @pytest.fixture(scope="session")
-def beside() -> Beside:
+def beside() -> BenchmarkProfiles:
     two_numbers, electrons = (option("noise", name, NoiseConfig) for name in ("imx385_iso3200", "sony_a7s2"))
-    return Beside(TIERS, two_numbers, electrons, option("sensor", "generic_14bit", SensorConfig))
+    return BenchmarkProfiles(TIERS, two_numbers, electrons, option("sensor", "generic_14bit", SensorConfig))
 
 
 @pytest.fixture(scope="session")
-def found(settings: Settings, beside: Beside) -> Report:
-    return accuracy.measure(settings("scene=low_light"), beside, LITTLE, "gen-dataset accuracy")
+def found(settings: Settings, beside: BenchmarkProfiles) -> BenchmarkReport:
+    return accuracy.measure_accuracy(settings("scene=low_light"), beside, LITTLE, "gen-dataset accuracy")
 
 
-def rows_of(found: Report, *stages: str) -> dict[str, Row]:
+def rows_of(found: BenchmarkReport, *stages: str) -> dict[str, Measurement]:
     return {f"{row.stage}:{row.method}": row for row in found.rows if row.stage in stages}
 
 
@@ -71,19 +74,19 @@ def rows_of(found: Report, *stages: str) -> dict[str, Row]:
 
 
 def test_every_method_has_its_measurement() -> None:
-    assert [one.spelled for one in MEASUREMENTS] == [method.spelled for method in METHODS]
+    assert [one.spelled for one in METHOD_BENCHMARKS] == [method.spelled for method in METHODS]
 
 
-def test_every_method_and_tier_has_one_row(found: Report) -> None:
+def test_every_method_and_tier_has_one_row(found: BenchmarkReport) -> None:
     expected = [(method.stage, method.name) for method in METHODS]
     expected += [(stage, tier) for stage in TIER_STAGES for tier in TIERS]
 
     assert [(row.stage, row.method) for row in found.rows] == expected
 
 
-def test_errors_and_times_are_there_where_they_can_be_measured(found: Report) -> None:
+def test_errors_and_times_are_there_where_they_can_be_measured(found: BenchmarkReport) -> None:
     for row in found.rows:
-        measured = BY_NAME.get(f"{row.stage}:{row.method}")
+        measured = BENCHMARKS_BY_NAME.get(f"{row.stage}:{row.method}")
         assert (row.error_max is None) == (measured is not None and measured.error is None)
         assert (row.ns_per_pixel is None) == (measured is not None and measured.ns is None)
         assert (row.ns_per_pixel is None) == (row.ratio_to_reference is None)
@@ -103,14 +106,14 @@ def test_a_method_is_measured_with_no_other_form_than_its_own() -> None:
             assert len(chosen - exact) <= 1
 
 
-def test_the_tiers_of_a_method_are_those_that_take_it(found: Report) -> None:
+def test_the_tiers_of_a_method_are_those_that_take_it(found: BenchmarkReport) -> None:
     assert rows_of(found, "curve")["curve:exact_table"].tier.split() == [EXACT, "fast"]  # fast: where electrons count
     assert rows_of(found, "curve")["curve:float32_table"].tier.split() == ["fast"]
     assert rows_of(found, "curve")["curve:numpy_table"].tier.split() == [REFERENCE]
     assert rows_of(found, "tier")["tier:fast"].tier == "fast"
 
 
-def test_the_reference_is_its_own_measure(found: Report) -> None:
+def test_the_reference_is_its_own_measure(found: BenchmarkReport) -> None:
     for row in found.rows:
         if row.method == REFERENCE or (row.stage not in TIER_STAGES and row.tier == REFERENCE):
             assert row.ratio_to_reference == 1
@@ -121,7 +124,7 @@ def test_the_reference_is_its_own_measure(found: Report) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
-def test_measured_errors_are_within_what_the_method_states(found: Report, method: Any) -> None:
+def test_measured_errors_are_within_what_the_method_states(found: BenchmarkReport, method: Any) -> None:
     row = rows_of(found, method.stage)[method.spelled]
     if row.error_max is None:
         pytest.skip("cannot be called by itself yet")
@@ -137,7 +140,7 @@ def test_measured_errors_are_within_what_the_method_states(found: Report, method
 
 
 @pytest.mark.parametrize("stage", TIER_STAGES)
-def test_the_exact_tier_differs_in_no_dn(found: Report, stage: str) -> None:
+def test_the_exact_tier_differs_in_no_dn(found: BenchmarkReport, stage: str) -> None:
     row = rows_of(found, stage)[f"{stage}:exact"]
 
     assert (row.error_max, row.error_rms, row.changed_share) == (0, 0, 0)
@@ -161,10 +164,12 @@ def test_the_distance_of_laws_is_the_largest_difference_of_their_distribution_fu
 
 
 def test_normals_in_place_of_counts_are_as_far_from_the_law_as_the_formula_says(
-    settings: Settings, beside: Beside, monkeypatch: pytest.MonkeyPatch
+    settings: Settings, beside: BenchmarkProfiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = settings("noise=sony_a7s2", "scene=night", "source.limit=1")
-    lab = accuracy.Lab(accuracy._settings(config, beside), TIERS, accuracy._subjects(config, LITTLE), LITTLE)
+    lab = accuracy.BenchmarkSession(
+        accuracy._settings(config, beside), TIERS, accuracy._subjects(config, LITTLE), LITTLE
+    )
     plans = [plan for _, plan in accuracy._flat_plans(lab, TIERS[REFERENCE])]
     counted = lab.flats(TIERS[REFERENCE])
     near = effects.READABLE_DRAWS._replace(poisson=lambda words, rate: rate + np.sqrt(rate) * effects.normals(words))
@@ -190,7 +195,7 @@ def test_the_words_of_normals_reach_every_segment_and_both_ends_of_each() -> Non
     assert 0.4 < (words >> 31).mean() < 0.6
 
 
-def test_the_true_normals_are_the_quantiles(found: Report) -> None:
+def test_the_true_normals_are_the_quantiles(found: BenchmarkReport) -> None:
     words = np.array([0, 2**31 - 1, 2**31, 2**32 - 1], dtype=np.uint32)
 
     assert accuracy.true_normals(words) == pytest.approx([6.337957, 2.918e-10, -6.337957, -2.918e-10], rel=1e-4)
@@ -222,40 +227,46 @@ def test_flat_fields_have_means_on_both_sides_of_where_a_normal_is_near_enough(
     ids=lambda overrides: overrides[0],
 )
 def test_any_settings_can_be_measured(
-    overrides: tuple[str, ...], settings: Settings, beside: Beside, tmp_path: Path
+    overrides: tuple[str, ...], settings: Settings, beside: BenchmarkProfiles, tmp_path: Path
 ) -> None:
     config = settings(*overrides)
     config.source.root = str(fill(tmp_path / "photos", 2))
     validate_config(config)
-    found = accuracy.measure(config, beside, Effort(2, 1, (16, 16), (8, 8), (8, 8), 4, 2))
+    found = accuracy.measure_accuracy(config, beside, SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2))
 
     assert all(row.error_max == 0 for row in found.rows if row.stage in TIER_STAGES and row.method == EXACT)
     assert ("mine" in {row.method for row in found.rows}) == ("accuracy.name=mine" in overrides)
 
 
-def test_a_budget_that_is_no_tier_has_a_name_of_its_own(settings: Settings, beside: Beside) -> None:
+def test_a_budget_that_is_no_tier_has_a_name_of_its_own(settings: Settings, beside: BenchmarkProfiles) -> None:
     config = settings("accuracy.law_distance=1e-3")
 
     assert list(accuracy._tiers(config, beside)) == [*TIERS, "exact_changed"]
 
 
-def test_photographs_that_cannot_be_read_are_passed_over(settings: Settings, beside: Beside, tmp_path: Path) -> None:
+def test_photographs_that_cannot_be_read_are_passed_over(
+    settings: Settings, beside: BenchmarkProfiles, tmp_path: Path
+) -> None:
     (fill(tmp_path, 2) / "000.png").write_bytes(b"")
-    found = accuracy.measure(settings(f"source.root={tmp_path}"), beside, Effort(2, 1, (8, 8), (8, 8), (8, 8), 4, 2))
+    found = accuracy.measure_accuracy(
+        settings(f"source.root={tmp_path}"), beside, SampleSizes(2, 1, (8, 8), (8, 8), (8, 8), 4, 2)
+    )
 
     assert found.facts["measured on"].startswith("1 photographs")
 
 
-def test_where_no_photograph_can_be_read_that_is_said(settings: Settings, beside: Beside, tmp_path: Path) -> None:
+def test_where_no_photograph_can_be_read_that_is_said(
+    settings: Settings, beside: BenchmarkProfiles, tmp_path: Path
+) -> None:
     (tmp_path / "a.png").write_bytes(b"")
     with pytest.raises(ConfigError, match=r"none of 1 photographs tried can be read"):
-        accuracy.measure(settings(f"source.root={tmp_path}"), beside, LITTLE)
+        accuracy.measure_accuracy(settings(f"source.root={tmp_path}"), beside, LITTLE)
 
 
 # The report -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_table_of_numbers_has_the_columns_that_are_promised(found: Report) -> None:
+def test_the_table_of_numbers_has_the_columns_that_are_promised(found: BenchmarkReport) -> None:
     lines = list(csv.DictReader(report.csv_text(found.rows).splitlines()))
 
     assert list(lines[0]) == [
@@ -278,11 +289,11 @@ def test_the_table_of_numbers_has_the_columns_that_are_promised(found: Report) -
     ],
 )
 def test_the_front_is_what_nothing_beats_in_both(points: list[tuple[float, float]], front: list[int]) -> None:
-    assert report.pareto(points) == front
+    assert report.pareto_front(points) == front
 
 
-def test_the_figure_is_a_picture_fit_for_a_page(found: Report) -> None:
-    content = report.png(found.rows)
+def test_the_figure_is_a_picture_fit_for_a_page(found: BenchmarkReport) -> None:
+    content = report.benchmark_figure(found.rows)
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
 
     assert 700 <= picture.shape[0] <= 1200
@@ -293,17 +304,19 @@ def test_the_figure_is_a_picture_fit_for_a_page(found: Report) -> None:
 
 def test_the_figure_can_be_drawn_of_any_errors_and_times() -> None:
     rows = [
-        Row(stage, name, tier, error, error, "DN", 0.0, ns, 1.0)
+        Measurement(stage, name, tier, error, error, "DN", 0.0, ns, 1.0)
         for stage in (*STAGES, *TIER_STAGES)
         for name, tier, error, ns in (("a", "fast", 1e-3, 0.01), ("b", "mine", 2.0, 4000.0), ("c", "", None, None))
     ]
 
-    assert report.png(rows)[:4] == b"\x89PNG"
+    assert report.benchmark_figure(rows)[:4] == b"\x89PNG"
 
 
 def test_the_page_is_one_file_without_a_script_and_escapes_names() -> None:
     name = "<script>alert('&\")</script>"
-    page = report.page(Report((Row(name, name, name, 1.0, 1.0, name, 0.5, 1.0, 1.0),), {name: name}), b"png")
+    page = report.benchmark_page(
+        BenchmarkReport((Measurement(name, name, name, 1.0, 1.0, name, 0.5, 1.0, 1.0),), {name: name}), b"png"
+    )
 
     assert "<script" not in page
     assert "&lt;script&gt;alert(&#x27;&amp;&quot;)" in page
@@ -311,16 +324,16 @@ def test_the_page_is_one_file_without_a_script_and_escapes_names() -> None:
     assert not re.search(r"(href|src)=\"(?!data:)", page)
 
 
-def test_the_page_says_how_it_was_measured(found: Report) -> None:
-    page = report.page(found, b"")
+def test_the_page_says_how_it_was_measured(found: BenchmarkReport) -> None:
+    page = report.benchmark_page(found, b"")
 
     for fact in ("gen-dataset accuracy", "numpy ", "dead_leaves-0", "imx385_iso3200", "sony_a7s2", "low_light"):
         assert fact in page
     assert all(row.method in page for row in found.rows)
 
 
-def test_the_terminals_lines_are_aligned(found: Report) -> None:
-    lines = report.table(found.rows).splitlines()
+def test_the_terminals_lines_are_aligned(found: BenchmarkReport) -> None:
+    lines = report.text_table(found.rows).splitlines()
 
     assert len(lines) == len(found.rows) + 1
     assert len({line.index(name) for line in lines for name in ("method", "exact_table") if name in line}) == 1
@@ -330,7 +343,7 @@ def test_the_terminals_lines_are_aligned(found: Report) -> None:
     ("value", "said"), [(None, "–"), (0.0, "0"), (1.234e-7, "1.2e-07"), (293.4, "290"), (5.33, "5.3")]
 )
 def test_numbers_are_spelled_for_people(value: float | None, said: str) -> None:
-    assert report.spelled(value) == said
+    assert formatting.short_number(value) == said
 
 
 # The command ----------------------------------------------------------------------------------------------------------
@@ -339,9 +352,11 @@ def test_numbers_are_spelled_for_people(value: float | None, said: str) -> None:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the command measure little."""
-    little = Effort(2, 1, (16, 16), (8, 8), (8, 8), 4, 2)
-    true = accuracy.measure
-    monkeypatch.setattr(accuracy, "measure", lambda config, beside, command: true(config, beside, little, command))
+    little = SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2)
+    true = accuracy.measure_accuracy
+    monkeypatch.setattr(
+        accuracy, "measure_accuracy", lambda config, beside, command: true(config, beside, little, command)
+    )
 
 
 @pytest.mark.usefixtures("quick")
@@ -356,7 +371,7 @@ def test_the_command_writes_three_files_and_says_so(door: Door, tmp_path: Path) 
     assert "gen-dataset accuracy source.root=" in (tmp_path / "new/report/accuracy.html").read_text()
 
 
-@pytest.mark.parametrize("name", report.OF_A_DATASET)
+@pytest.mark.parametrize("name", report_files.DATASET_ENTRIES)
 def test_a_dataset_is_no_place_for_a_report(door: Door, tmp_path: Path, name: str) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds" / name).mkdir()
@@ -364,7 +379,7 @@ def test_a_dataset_is_no_place_for_a_report(door: Door, tmp_path: Path, name: st
 
     assert done.code == 2
     assert done.err == (
-        f"gen-dataset: out=ds: holds a dataset ({name}), where a report would be damage; choose another out\n"
+        f"gen-dataset: out=ds: contains a dataset ({name}); expected a folder without one; choose another out\n"
     )
 
 
@@ -372,13 +387,16 @@ def test_a_file_in_the_way_is_refused(door: Door, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = door("accuracy", "out=file")
 
-    assert (done.code, done.err) == (2, "gen-dataset: out=file: cannot be written (file is no folder)\n")
+    assert (done.code, done.err) == (
+        2,
+        "gen-dataset: out=file: cannot be written (file is not a folder); choose another out\n",
+    )
 
 
 def test_without_matplotlib_the_extra_is_named_before_anything_is_measured(
     door: Door, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(report, "find_spec", lambda name: None)
+    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
     done = door("accuracy", "out=new")
 
     assert done.code == 2
@@ -391,7 +409,11 @@ def test_without_matplotlib_the_extra_is_named_before_anything_is_measured(
 
 def test_a_plan_tells_the_price_of_what_is_chosen_beside_the_tiers(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 2)}")
-    line = next(line for line in text(config, forecast(config, 1, True, TIERS)).splitlines() if "accuracy" in line)
+    line = next(
+        line
+        for line in format_estimate(config, estimate_run(config, 1, True, TIERS)).splitlines()
+        if "accuracy" in line
+    )
 
     assert re.fullmatch(
         r"accuracy  exact: clean 0 DN, normals 1e-06 σ, exact laws; [\d.e+]+ ns a pixel here "
@@ -403,8 +425,9 @@ def test_a_plan_tells_the_price_of_what_is_chosen_beside_the_tiers(settings: Set
 def test_a_plan_says_what_a_loose_budget_gives_away(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "accuracy=fast")
 
-    assert "accuracy  fast: clean within 1 DN at a share of 0.001, normals 0.001 σ, laws within 0.005; " in text(
-        config, forecast(config, 1, True)
+    assert (
+        "accuracy  fast: clean within 1 DN at a share of 0.001, normals 0.001 σ, laws within 0.005; "
+        in format_estimate(config, estimate_run(config, 1, True))
     )
 
 
@@ -412,4 +435,4 @@ def test_a_plan_of_nothing_readable_has_no_price(settings: Settings, tmp_path: P
     (tmp_path / "a.png").write_bytes(b"")
     config = settings(f"source.root={tmp_path}")
 
-    assert "exact laws;" not in text(config, forecast(config, 1, True, TIERS))
+    assert "exact laws;" not in format_estimate(config, estimate_run(config, 1, True, TIERS))

@@ -16,8 +16,14 @@ from unprocess_gen.cli import hydra_app as compose
 from unprocess_gen.config.schema import GainsConfig, NoiseConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports import paper_figures as figures
-from unprocess_gen.reports.benchmark import report
-from unprocess_gen.reports.paper_figures import READINGS, Counted, Drawn, Recipes, Saturation
+from unprocess_gen.reports import report_files
+from unprocess_gen.reports.paper_figures import (
+    INTERPRETATIONS,
+    ImageSaturation,
+    PaperFigure,
+    PaperOptions,
+    SaturationCounts,
+)
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.simulation.reference.cfa import PATTERNS
 from unprocess_gen.sources.scenes import synthetic
@@ -26,15 +32,15 @@ FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
 
 
 @pytest.fixture(scope="module")
-def recipes() -> Recipes:
+def recipes() -> PaperOptions:
     gains = {name: read_option(compose.conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in figures.GAINS}
-    return Recipes(gains, read_option(compose.conf_dir() / "noise" / f"{figures.AUTHORS_NOISE}.yaml", NoiseConfig))
+    return PaperOptions(gains, read_option(compose.conf_dir() / "noise" / f"{figures.AUTHORS_NOISE}.yaml", NoiseConfig))
 
 
 @pytest.fixture(scope="module")
-def drawn(settings: Settings, recipes: Recipes) -> list[Drawn]:
+def drawn(settings: Settings, recipes: PaperOptions) -> list[PaperFigure]:
     """The figures of two built-in scenes."""
-    return figures.draw(settings("source.limit=2"), recipes)
+    return figures.draw_figures(settings("source.limit=2"), recipes)
 
 
 def colours(png: bytes) -> int:
@@ -43,19 +49,21 @@ def colours(png: bytes) -> int:
     return len(np.unique(rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]))
 
 
-def test_every_figure_is_a_picture_of_something(drawn: list[Drawn]) -> None:
+def test_every_figure_is_a_picture_of_something(drawn: list[PaperFigure]) -> None:
     assert [one.file for one in drawn] == FILES[:-1]
     least = {"fig4.png": 200, "fig6.png": 200, "fig7.png": 200}
     found = {one.file: colours(one.png) for one in drawn}
     assert {file: count for file, count in found.items() if count < least.get(file, 2000)} == {}
 
 
-def test_every_caption_says_what_to_see_and_where_the_article_differs(drawn: list[Drawn]) -> None:
+def test_every_caption_says_what_to_see_and_where_the_article_differs(drawn: list[PaperFigure]) -> None:
     assert [one.file for one in drawn if "Against the article: " not in " ".join(one.caption)] == []
     assert [one.file for one in drawn if re.search(r"nan|inf\b|\{", " ".join(one.caption))] == []
 
 
-def test_counts_of_figure_6_are_those_of_algorithm_1(settings: Settings, recipes: Recipes, drawn: list[Drawn]) -> None:
+def test_counts_of_figure_6_are_those_of_algorithm_1(
+    settings: Settings, recipes: PaperOptions, drawn: list[PaperFigure]
+) -> None:
     (figure,) = (one for one in drawn if one.file == "fig6.png")
     srgb = synthetic.scene("dead_leaves-0")
     planes = srgb[0::2, 0::2, 0], srgb[0::2, 1::2, 1], srgb[1::2, 0::2, 1], srgb[1::2, 1::2, 2]
@@ -68,7 +76,7 @@ def test_counts_of_figure_6_are_those_of_algorithm_1(settings: Settings, recipes
     assert len(set(after.values())) > 2
 
 
-def test_gains_above_one_saturate_and_those_below_do_not(drawn: list[Drawn]) -> None:
+def test_gains_above_one_saturate_and_those_below_do_not(drawn: list[PaperFigure]) -> None:
     (figure,) = (one for one in drawn if one.file == "fig6.png")
     before = {float(line[4].rstrip("%")) for line in figure.table[1:]}
     after = {line[0]: float(line[5].rstrip("%")) for line in figure.table[1:]}
@@ -80,15 +88,17 @@ def test_gains_above_one_saturate_and_those_below_do_not(drawn: list[Drawn]) -> 
     ("top", "bottom", "fits"), [(5, 9, True), (4, 6, True), (6, 9, False), (5, 5, False), (9, 5, False)]
 )
 def test_the_caption_of_figure_6_means_no_more_on_top_and_more_at_the_bottom(top: int, bottom: int, fits: bool) -> None:
-    reading = READINGS[0]
-    counted = {reading.top: [Saturation(100, 5, top)], reading.bottom: [Saturation(100, 5, bottom)]}
-    assert Counted(counted).fitting(reading) == fits
+    reading = INTERPRETATIONS[0]
+    counted = {reading.top: [ImageSaturation(100, 5, top)], reading.bottom: [ImageSaturation(100, 5, bottom)]}
+    assert SaturationCounts(counted).fitting(reading) == fits
 
 
-def test_the_pictures_reading_fits_the_caption_and_the_formulas_does_not(settings: Settings, recipes: Recipes) -> None:
+def test_the_pictures_reading_fits_the_caption_and_the_formulas_does_not(
+    settings: Settings, recipes: PaperOptions
+) -> None:
     config = settings("source.limit=5")
     counted = figures._count(config, recipes, figures.list_photographs(config.source).sources)
-    by_formula, by_pictures = (counted.fitting(reading) for reading in READINGS)
+    by_formula, by_pictures = (counted.fitting(reading) for reading in INTERPRETATIONS)
     assert by_formula == 0
     assert by_pictures >= 3
 
@@ -115,21 +125,21 @@ def test_a_small_picture_keeps_the_mean_and_a_mosaic_its_four_sites() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1), (2, 2), (3, 40), (17, 131), (131, 17)])
 def test_any_shape_of_photograph_is_drawn(
-    shape: tuple[int, int], settings: Settings, recipes: Recipes, tmp_path: Path
+    shape: tuple[int, int], settings: Settings, recipes: PaperOptions, tmp_path: Path
 ) -> None:
     Image.fromarray(pixels(3, *shape)).save(tmp_path / "one.png")
     config = settings()
     config.source.root = str(tmp_path)
-    assert len(figures.draw(config, recipes)) == len(FILES) - 1
+    assert len(figures.draw_figures(config, recipes)) == len(FILES) - 1
 
 
 # The command ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch, drawn: list[Drawn]) -> None:
+def quick(monkeypatch: pytest.MonkeyPatch, drawn: list[PaperFigure]) -> None:
     """Have the command draw nothing new."""
-    monkeypatch.setattr(figures, "draw", lambda config, recipes: drawn)
+    monkeypatch.setattr(figures, "draw_figures", lambda config, recipes: drawn)
 
 
 @pytest.mark.usefixtures("quick")
@@ -167,7 +177,7 @@ def test_patches_are_refused(door: Door, tmp_path: Path) -> None:
 def test_without_matplotlib_one_line_names_the_extra(
     door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(report, "find_spec", lambda name: None)
+    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
     done = door("figures", "out=figs")
     assert done.code == 2
     assert done.err == "gen-dataset: figures: drawing needs matplotlib; pip install 'unprocess_gen[figures]'\n"
@@ -175,13 +185,13 @@ def test_without_matplotlib_one_line_names_the_extra(
 
 
 def test_a_photograph_that_cannot_be_read_is_named_and_the_next_one_shown(
-    settings: Settings, recipes: Recipes, tmp_path: Path
+    settings: Settings, recipes: PaperOptions, tmp_path: Path
 ) -> None:
     (tmp_path / "<a>.png").write_bytes(b"no picture")
     Image.fromarray(pixels(3, 1, 1)).save(tmp_path / "<b>.png")
     config = settings()
     config.source.root = str(tmp_path)
-    page = figures.page(figures.draw(config, recipes), "command")
+    page = figures.figures_page(figures.draw_figures(config, recipes), "command")
     assert "Photographs that cannot be read: &lt;a&gt;.png (unsupported)." in page
     assert html.unescape(page).count("On <b>.png") == 5
     assert "<a>" not in page and "<b>" not in page

@@ -27,7 +27,7 @@ from unprocess_gen.pipeline.verify import replay, verify
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.reports import photon_transfer as transfer
-from unprocess_gen.reports.estimate import forecast
+from unprocess_gen.reports.estimate import estimate_run
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.pair import make_pair, make_pairs
@@ -362,7 +362,7 @@ def test_the_bytes_are_told_exactly(
     config = settings(*overrides, "noise.draws=2")
     config.source.root = str(photos)
     summary = make(photos, tmp_path / "ds", *overrides, "noise.draws=2")
-    told = forecast(config, 1, read_all=True)
+    told = estimate_run(config, 1, read_all=True)
     assert told.bytes == summary.bytes == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
 
 
@@ -429,11 +429,11 @@ def test_bytes_are_little_endian_and_digests_are_theirs(packed: Path) -> None:
 )
 def test_the_noise_in_the_arrays_is_the_rows(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1", *overrides)
-    found = list(transfer.fits(tmp_path / "ds"))
+    found = list(transfer.iterate_fits(tmp_path / "ds"))
     assert len(found) == 1
     assert found[0].deviation < 5
     clean, noisy, row = RawPairs(tmp_path / "ds")[0]
-    lying = transfer.fit(clean, noisy, row | {"a_dn": row["a_dn"] * 1.1})
+    lying = transfer.fit_pair(clean, noisy, row | {"a_dn": row["a_dn"] * 1.1})
     assert lying is not None
     assert lying.deviation > transfer.ALARM
 

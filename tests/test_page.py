@@ -36,10 +36,10 @@ from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
 from unprocess_gen.planning import plan
 from unprocess_gen.reports import dataset_report as page
-from unprocess_gen.reports import markup
+from unprocess_gen.reports import markup, report_files
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.benchmark import report
-from unprocess_gen.reports.dataset_report import PARAMETERS, WORDS, Histogram, Tally, Words
+from unprocess_gen.reports.dataset_report import PARAMETERS, WORDS, Histogram, ManifestStatistics, ValueCounts
 
 TreeHash = Callable[[Path], str]
 
@@ -64,7 +64,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
 
 @pytest.fixture(scope="module")
 def text(made: Path) -> str:
-    return page.page(made)
+    return page.dataset_page(made)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def scenes(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scenes_page(scenes: Path) -> str:
-    return page.page(scenes)
+    return page.dataset_page(scenes)
 
 
 def cells(folder: Path, column: str) -> list[str]:
@@ -120,8 +120,8 @@ def test_a_histogram_of_uniform_values_is_flat() -> None:
 
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_a_tally_does_not_depend_on_how_rows_come(made: Path, size: int) -> None:
-    def tallied(count: int) -> Tally:
-        tally, rows = Tally(), list(read_rows(made / "manifest.csv"))
+    def tallied(count: int) -> ManifestStatistics:
+        tally, rows = ManifestStatistics(), list(read_rows(made / "manifest.csv"))
         for start in range(0, len(rows), count):
             tally.add(rows[start : start + count])
         return tally
@@ -133,7 +133,7 @@ def test_a_tally_does_not_depend_on_how_rows_come(made: Path, size: int) -> None
 
 
 def test_words_are_counted_and_too_many_are_summed_up() -> None:
-    few, many, different = Words(), Words(), Words()
+    few, many, different = ValueCounts(), ValueCounts(), ValueCounts()
     for number in range(1000):
         few.add("ab"[number % 3 == 0])
         many.add(str(number % 70))
@@ -252,7 +252,7 @@ def test_clipping_is_the_manifests(made: Path, text: str) -> None:
 @pytest.mark.slow
 def test_effects_that_were_left_out_have_their_reason(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=2", "noise=sony_a7s2", "effects.prnu=off", "source.patch=[random,64,3]")
-    text = page.page(tmp_path / "ds")
+    text = page.dataset_page(tmp_path / "ds")
     assert '<tr><td>prnu</td><td class="n">6</td><td>switched off</td></tr>' in text
     assert '<tr><td>column</td><td class="n">6</td><td>noise=sony_a7s2 gives no column_std_dn</td></tr>' in text
     assert "<b>read_std_dn</b>" in text
@@ -275,16 +275,16 @@ def test_noise_that_is_not_the_manifests_is_called_wrong(
     scenes: Path, scenes_page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "of 2 pairs, evenly spread (a: slope, b: intercept, with 95 % intervals). All are what" in scenes_page
-    true = transfer.fit
-    monkeypatch.setattr(transfer, "fit", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
-    assert "2 of them are not what the manifest says" in page.page(scenes)
+    true = transfer.fit_pair
+    monkeypatch.setattr(transfer, "fit_pair", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
+    assert "2 of them are not what the manifest says" in page.dataset_page(scenes)
 
 
 def test_where_every_photograph_failed_there_is_a_page_all_the_same(make: Make, tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/a.png").touch()
     make(tmp_path / "photos", tmp_path / "ds", "source.max_failed=1")
-    text = page.page(tmp_path / "ds")
+    text = page.dataset_page(tmp_path / "ds")
     assert "0 pairs" in text and "1 failed" in text
     assert '<tr><td>empty</td><td class="n">1</td></tr>' in text
 
@@ -410,7 +410,7 @@ def test_a_mistake_costs_one_line(arguments: tuple[str, ...], sentence: str, cop
 
 
 def test_without_matplotlib_one_line_names_the_extra(copy: Path, door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "find_spec", lambda name: None)
+    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
     done = door("report", copy)
     assert done.code == 2
     assert done.err == "gen-dataset: report: drawing needs matplotlib; pip install 'unprocess_gen[figures]'\n"
@@ -461,7 +461,7 @@ def test_the_page_of_a_hundred_thousand_rows_is_small_and_needs_no_more_memory(
         signed["manifest_sha256"] = file_sha256(out / "manifest.csv")
         (out / "dataset.json").write_text(dataset_text(signed), encoding="ascii")
         tracemalloc.start()
-        sizes.append(len(page.page(out).encode()))
+        sizes.append(len(page.dataset_page(out).encode()))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert max(sizes) < 200_000

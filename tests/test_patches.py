@@ -29,7 +29,7 @@ from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import replay, verify
 from unprocess_gen.reports import photon_transfer as transfer
-from unprocess_gen.reports.estimate import forecast, text
+from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.sources import loader as photographs
 from unprocess_gen.sources import patches as room
 from unprocess_gen.sources.patches import list_patches, pixels_in_none
@@ -306,8 +306,8 @@ def test_why_an_image_is_too_small_is_said(settings: Settings, tmp_path: Path) -
     why = r"unsupported: 16 x 12 pixels hold no patch of 14 x 14 \(source.patch\)$"
     with pytest.raises(SourceError, match=f"^{why}"):
         photographs.load_source(config.source, source)
-    assert "fails     000.png: unsupported\n          16 x 12 pixels hold no patch" in text(
-        config, forecast(config, 1, True)
+    assert "fails     000.png: unsupported\n          16 x 12 pixels hold no patch" in format_estimate(
+        config, estimate_run(config, 1, True)
     )
 
 
@@ -520,7 +520,7 @@ def test_a_dataset_of_patches_is_made_again_from_its_config(cut_up: Path, source
 def test_the_noise_of_small_patches_is_found_to_be_that_of_their_rows(side: int, make: Make, tmp_path: Path) -> None:
     """Few sites tell little: the errors have to say so. Of 800 normal deviations the largest lies below 5."""
     make(None, tmp_path / "ds", "source.limit=2", f"source.patch=[random,{side},400]")
-    found = list(transfer.fits(tmp_path / "ds"))
+    found = list(transfer.iterate_fits(tmp_path / "ds"))
     assert len(found) > 300
     assert max(one.deviation for one in found) < 5
 
@@ -533,9 +533,9 @@ def test_bytes_and_pairs_are_foretold_exactly(patch: str, sources: Path, make: M
     made = make(sources, tmp_path / "ds", patch, *LEVELS, "output.pairs_per_shard=2")
     config, _ = read_dataset_yaml(tmp_path / "ds" / "config.yaml")
     config.source.root = str(sources)
-    told = forecast(config, 1, read_all=True)
+    told = estimate_run(config, 1, read_all=True)
     assert (told.bytes, sum(look.pairs for look in told.looks)) == (made.bytes, made.pairs)
-    assert f"pairs     {made.pairs}, in 2 shards of 2" in text(config, told)
+    assert f"pairs     {made.pairs}, in 2 shards of 2" in format_estimate(config, told)
 
 
 @pytest.mark.parametrize(
@@ -547,9 +547,9 @@ def test_bytes_and_pairs_are_foretold_exactly(patch: str, sources: Path, make: M
 )
 def test_what_is_cut_and_what_is_left_out_is_told(patch: str, line: str, sources: Path, settings: Settings) -> None:
     config = settings(f"source.root={sources}", patch)
-    assert line in text(config, forecast(config, 1, True))
+    assert line in format_estimate(config, estimate_run(config, 1, True))
 
 
 def test_of_whole_images_no_patches_are_told(sources: Path, settings: Settings) -> None:
     config = settings(f"source.root={sources}")
-    assert "\npatches " not in text(config, forecast(config, 1, True))
+    assert "\npatches " not in format_estimate(config, estimate_run(config, 1, True))

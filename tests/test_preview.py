@@ -97,7 +97,7 @@ def test_a_sheet_holds_every_panel_one_to_one(few: Path, gray_world: Path, tmp_p
         ),
     ]
 
-    [drawn] = preview.preview(few, tmp_path, ["00000000"])
+    [drawn] = preview.write_sheets(few, tmp_path, ["00000000"])
     sheet = png(drawn.files[0])
 
     found = [places(sheet, picture) for picture in expected]
@@ -110,9 +110,9 @@ def test_a_sheet_holds_every_panel_one_to_one(few: Path, gray_world: Path, tmp_p
 
 def test_the_part_of_a_large_frame_is_that_of_its_whole_development(few: Path, tmp_path: Path) -> None:
     clean, _, row = RawPairs(few)[1]
-    at = preview.window(*clean.shape)
+    at = preview.detail_window(*clean.shape)
 
-    [drawn] = preview.preview(few, tmp_path, ["00000001"])
+    [drawn] = preview.write_sheets(few, tmp_path, ["00000001"])
 
     part = codes(process.develop(clean, plan_from_row(row))[at.rows, at.columns])
     assert part.shape == (*preview.PANEL_PX, 3)
@@ -120,10 +120,10 @@ def test_the_part_of_a_large_frame_is_that_of_its_whole_development(few: Path, t
 
 
 def test_a_source_of_16_bits_is_shown(few: Path, tmp_path: Path) -> None:
-    [drawn] = preview.preview(few, tmp_path, ["00000003"])
+    [drawn] = preview.write_sheets(few, tmp_path, ["00000003"])
 
     source = cv2.cvtColor(pixels(5, 41, 57, np.uint16), cv2.COLOR_BGR2RGB)
-    assert drawn.lacks == ""
+    assert drawn.missing_source == ""
     assert len(places(png(drawn.files[0]), codes(source / 65535))) == 1
 
 
@@ -146,7 +146,7 @@ def test_the_steps_together_are_the_pipeline(few: Path) -> None:
     source = pixels(3, HEIGHT, WIDTH)
     values = source / 255
 
-    for step in preview.STEPS:
+    for step in preview.PROCESSING_STEPS:
         values = step.apply(values, plan)
 
     # what 1 - v rounds, the steep end of the tone curve takes the root of
@@ -167,7 +167,7 @@ def test_stages_show_each_step_and_end_with_the_frames_of_the_dataset(few: Path,
             sites[y::2, x::2, channel] = level[y::2, x::2]
         expected.append(codes(sites))
 
-    [drawn] = preview.preview(few, tmp_path, ["00000000"], with_stages=True)
+    [drawn] = preview.write_sheets(few, tmp_path, ["00000000"], with_stages=True)
 
     assert [path.name for path in drawn.files] == ["00000000.png", "00000000.stages.png"]
     picture = png(drawn.files[1])
@@ -180,7 +180,7 @@ def test_dithered_codes_have_a_stage_of_their_own(gray_world: Path, make: Make, 
     source = pixels(3, HEIGHT, WIDTH)
     dithered = unprocess.dequantise(source, plan, linear_table(plan.tone, plan.gamma, 256))
 
-    [drawn] = preview.preview(tmp_path / "ds", tmp_path / "to", with_stages=True)
+    [drawn] = preview.write_sheets(tmp_path / "ds", tmp_path / "to", with_stages=True)
 
     picture = png(drawn.files[1])
     assert len(places(picture, source)) == 2  # 8 bits do not tell half a code
@@ -224,7 +224,7 @@ def test_channels_of_tiles_are_their_means(pattern: str) -> None:
 def test_the_part_begins_at_a_whole_tile_inside_the_frame_and_the_average_is_fine_enough(
     height: int, width: int
 ) -> None:
-    at = preview.window(height, width)
+    at = preview.detail_window(height, width)
 
     for part, length, most in ((at.rows, height, preview.PANEL_PX[0]), (at.columns, width, preview.PANEL_PX[1])):
         assert part.start % 2 == 0
@@ -279,7 +279,7 @@ def test_an_overview_without_photographs_says_so_and_shows_the_rest(few: Path, t
 
 
 def test_at_most_eight_pairs_are_shown_unasked_spread_over_the_manifest(dataset: Path, tmp_path: Path) -> None:
-    shown = [drawn.key for drawn in preview.preview(dataset, tmp_path)]
+    shown = [drawn.key for drawn in preview.write_sheets(dataset, tmp_path)]
 
     assert shown == [f"{i * len(PHOTOS) // 8:08d}" for i in range(8)]
 
@@ -288,17 +288,17 @@ def test_frames_of_any_size_are_shown(dataset: Path, tmp_path: Path) -> None:
     """One pixel by one, three by forty, and eleven others."""
     keys = [str(pair.row["key"]) for pair in RawPairs(dataset)]
 
-    drawn = list(preview.preview(dataset, tmp_path, keys, with_stages=True))
+    drawn = list(preview.write_sheets(dataset, tmp_path, keys, with_stages=True))
 
     assert [one.key for one in drawn] == keys
-    assert all(one.lacks == "" and len(one.files) == 2 for one in drawn)
+    assert all(one.missing_source == "" and len(one.files) == 2 for one in drawn)
 
 
 def test_packed_planes_are_shown_as_the_mosaic_that_they_are(gray_world: Path, make: Make, tmp_path: Path) -> None:
     sheets = []
     for layout in ("mosaic", "packed"):
         make(gray_world, tmp_path / layout, "source.include=[large.png]", f"output.layout={layout}")
-        [drawn] = preview.preview(tmp_path / layout, tmp_path / "sheets" / layout, with_stages=True)
+        [drawn] = preview.write_sheets(tmp_path / layout, tmp_path / "sheets" / layout, with_stages=True)
         sheets.append([file.read_bytes() for file in drawn.files])
 
     assert len(sheets[0]) == 2
@@ -313,7 +313,7 @@ def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Pa
 
     assert np.abs(floats.clean - wholes.clean.astype(np.float64)).max() <= 0.5 + 1e-3  # rounded, or not; float32
     assert np.abs(floats.noisy - wholes.noisy.astype(np.float64)).max() <= 0.5 + 1e-3
-    sheets = [preview.sheet(shown).astype(int) for shown in (wholes, floats)]
+    sheets = [preview.pair_sheet(shown).astype(int) for shown in (wholes, floats)]
     assert sheets[0].shape == sheets[1].shape
     assert np.abs(sheets[0] - sheets[1]).mean() < 1
 
@@ -321,9 +321,9 @@ def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Pa
 def test_built_in_scenes_are_their_own_source(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1")
 
-    [drawn] = preview.preview(tmp_path / "ds", tmp_path / "to")
+    [drawn] = preview.write_sheets(tmp_path / "ds", tmp_path / "to")
 
-    assert drawn.lacks == ""
+    assert drawn.missing_source == ""
 
 
 @pytest.mark.parametrize(
@@ -334,10 +334,10 @@ def test_a_key_of_an_image_or_a_patch_stands_for_all_of_its_pairs(
 ) -> None:
     make(gray_world, tmp_path / "ds", "source.patch=[random,32,4]", "noise.levels=2")
 
-    drawn = list(preview.preview(tmp_path / "ds", tmp_path / "to", keys))
+    drawn = list(preview.write_sheets(tmp_path / "ds", tmp_path / "to", keys))
 
     assert len(drawn) == len({one.files[0].name for one in drawn}) == count
-    assert not any(one.lacks for one in drawn)
+    assert not any(one.missing_source for one in drawn)
 
 
 def test_a_patch_is_shown_beside_its_own_part_of_the_source(gray_world: Path, make: Make, tmp_path: Path) -> None:
@@ -345,7 +345,7 @@ def test_a_patch_is_shown_beside_its_own_part_of_the_source(gray_world: Path, ma
     row = RawPairs(tmp_path / "ds")[1].row
     y, x = row["patch_y"], row["patch_x"]
 
-    drawn = list(preview.preview(tmp_path / "ds", tmp_path / "to"))
+    drawn = list(preview.write_sheets(tmp_path / "ds", tmp_path / "to"))
 
     part = pixels(3, HEIGHT, WIDTH)[y : y + 32, x : x + 32]
     assert len(places(png(drawn[1].files[0]), part)) == 1
@@ -354,9 +354,9 @@ def test_a_patch_is_shown_beside_its_own_part_of_the_source(gray_world: Path, ma
 def test_a_downscaled_source_is_shown_as_the_frames_saw_it(gray_world: Path, make: Make, tmp_path: Path) -> None:
     make(gray_world, tmp_path / "ds", "source.downscale=2", "source.limit=1")
 
-    [drawn] = preview.preview(tmp_path / "ds", tmp_path / "to")
+    [drawn] = preview.write_sheets(tmp_path / "ds", tmp_path / "to")
 
-    assert drawn.lacks == ""
+    assert drawn.missing_source == ""
     assert len(places(png(drawn.files[0]), codes(downscaled(pixels(3, HEIGHT, WIDTH), 2) / 65535))) == 1
 
 
@@ -446,7 +446,7 @@ def test_a_wrong_argument_costs_one_line_and_writes_nothing(
 
 def test_an_unknown_key_is_told_how_keys_look(few: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"has keys from 00000000 to 00000003; .* 00000003-p0007 .* 00000003-l01d02"):
-        list(preview.preview(few, tmp_path, ["12"]))
+        list(preview.write_sheets(few, tmp_path, ["12"]))
 
 
 @pytest.mark.parametrize("arguments", [(), ("--to", "x"), ("source.root=x", "--to", "x")])
@@ -474,7 +474,7 @@ def test_a_dataset_without_a_pair_is_refused(make: Make, tmp_path: Path) -> None
     make(tmp_path / "photos", tmp_path / "ds")
 
     with pytest.raises(ConfigError, match="every photograph failed"):
-        list(preview.preview(tmp_path / "ds", tmp_path / "to"))
+        list(preview.write_sheets(tmp_path / "ds", tmp_path / "to"))
 
 
 def test_a_folder_that_is_no_dataset_is_damage(tmp_path: Path) -> None:
@@ -494,11 +494,11 @@ def test_a_folder_that_cannot_be_made_is_the_machines_fault(few: Path, tmp_path:
     (tmp_path / "file").write_text("")
 
     with pytest.raises(MachineError, match="Not a directory"):
-        list(preview.preview(few, tmp_path / "file" / "sheets"))
+        list(preview.write_sheets(few, tmp_path / "file" / "sheets"))
 
 
 def test_stages_need_the_source(few: Path) -> None:
     clean, noisy, row = RawPairs(few)[0]
 
     with pytest.raises(ValueError, match=r"00000000: there is no source .*it is gone"):
-        preview.stages(preview.Shown(clean, noisy, row, plan_from_row(row), None, "it is gone"))
+        preview.stages_sheet(preview.SheetPair(clean, noisy, row, plan_from_row(row), None, "it is gone"))

@@ -21,7 +21,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
 
 
 def test_every_pair_fits_its_row(scenes: Path) -> None:
-    found = list(transfer.fits(scenes))
+    found = list(transfer.iterate_fits(scenes))
     assert len(found) == 3
     assert max(one.deviation for one in found) < 5
 
@@ -38,7 +38,7 @@ def test_every_pair_fits_its_row(scenes: Path) -> None:
 )
 def test_every_kind_of_noise_fits_its_row(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=2", *overrides)
-    found = list(transfer.fits(tmp_path / "ds"))
+    found = list(transfer.iterate_fits(tmp_path / "ds"))
     assert len(found) == 2
     assert max(one.deviation for one in found) < 5
 
@@ -46,7 +46,7 @@ def test_every_kind_of_noise_fits_its_row(overrides: tuple[str, ...], make: Make
 @pytest.mark.parametrize(("column", "factor"), [("a_dn", 1.05), ("a_dn", 0.95), ("b_dn2", 1.8), ("b_dn2", 0.2)])
 def test_a_row_whose_numbers_are_not_those_of_its_arrays_is_found(scenes: Path, column: str, factor: float) -> None:
     clean, noisy, row = RawPairs(scenes)[0]
-    found = transfer.fit(clean, noisy, row | {column: row[column] * factor})
+    found = transfer.fit_pair(clean, noisy, row | {column: row[column] * factor})
     assert found is not None
     assert found.deviation > transfer.ALARM
 
@@ -54,7 +54,7 @@ def test_a_row_whose_numbers_are_not_those_of_its_arrays_is_found(scenes: Path, 
 def test_errors_are_those_of_repeated_draws(make: Make, tmp_path: Path) -> None:
     """Sixteen draws of one image: their spread in units of the stated error, chi squared with 15 degrees of freedom."""
     make(None, tmp_path / "ds", "source.limit=1", "noise.draws=16")
-    found = list(transfer.fits(tmp_path / "ds"))
+    found = list(transfer.iterate_fits(tmp_path / "ds"))
     for value, error in (("slope", "slope_error"), ("intercept", "intercept_error")):
         spread = np.var([getattr(one, value) for one in found], ddof=1) / found[0].__getattribute__(error) ** 2
         assert 0.2 < spread < 2.7
@@ -66,7 +66,7 @@ def test_a_pair_with_no_range_of_signal_is_passed_over() -> None:
     row |= {"white_level_dn": 4095, "sensor_clip": "sensor", "key": "00000000"}
     row |= {"dtype": "uint16", "layout": "mosaic"}
     row |= dict.fromkeys(("dn_per_e", "row_std_dn", "column_std_dn", "dark_e", "prnu_std", "width", "height"), 0.0)
-    assert transfer.fit(flat, flat, row) is None
+    assert transfer.fit_pair(flat, flat, row) is None
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,8 @@ def test_the_command_says_how_far_the_worst_pair_lies(scenes: Path, door: Door, 
 def test_the_command_ends_with_4_where_the_noise_is_not_the_rows(
     scenes: Path, door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    true = transfer.fit
-    monkeypatch.setattr(transfer, "fit", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
+    true = transfer.fit_pair
+    monkeypatch.setattr(transfer, "fit_pair", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
     done = door("verify", scenes, "--noise")
     assert done.code == 4
     assert "noise of 00000000: a 6.9" in done.err

@@ -211,9 +211,9 @@ def _plan(config: Config, read_all: bool) -> tuple[int, None]:
     from unprocess_gen.pipeline import generate as runner
     from unprocess_gen.reports import estimate as forecast
 
-    told = forecast.forecast(config, runner.effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
+    told = forecast.estimate_run(config, runner.effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
     print(f"out       {config.out}")
-    print(forecast.text(config, told))
+    print(forecast.format_estimate(config, told))
     return 0, None
 
 
@@ -229,21 +229,22 @@ def accuracy(arguments: list[str]) -> int:
 def _accuracy(config: Config, command: str) -> tuple[int, None]:
     from unprocess_gen.config.schema import NoiseConfig, SensorConfig
     from unprocess_gen.config.serialization import read_option
+    from unprocess_gen.reports import report_files
     from unprocess_gen.reports.benchmark import measure as room
     from unprocess_gen.reports.benchmark import report
 
     out = Path(config.out)
-    report.check_out(out, "accuracy")
+    report_files.check_report_folder(out, "accuracy")
     noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
-    beside = room.Beside(
+    beside = room.BenchmarkProfiles(
         _tiers(),
         read_option(noise / "imx385_iso3200.yaml", NoiseConfig),
         read_option(noise / "sony_a7s2.yaml", NoiseConfig),
         read_option(sensor / "generic_14bit.yaml", SensorConfig),
     )
-    found = room.measure(config, beside, command=command)
-    report.write(found, out)
-    print(report.table(found.rows))
+    found = room.measure_accuracy(config, beside, command=command)
+    report.write_benchmark(found, out)
+    print(report.text_table(found.rows))
     print(f"{out}: {', '.join(report.FILES)}")
     return 0, None
 
@@ -274,14 +275,14 @@ def _figures(config: Config, command: str) -> tuple[int, None]:
     from unprocess_gen.config.schema import GainsConfig, NoiseConfig
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports import paper_figures as room
-    from unprocess_gen.reports.benchmark import report
+    from unprocess_gen.reports import report_files
 
     out = Path(config.out)
-    report.check_out(out, "figures")
+    report_files.check_report_folder(out, "figures")
     gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in room.GAINS}
     authors = read_option(conf_dir() / "noise" / f"{room.AUTHORS_NOISE}.yaml", NoiseConfig)
-    drawn = room.draw(config, room.Recipes(gains, authors))
-    print(f"{out}: {', '.join(room.write(drawn, out, command))}")
+    drawn = room.draw_figures(config, room.PaperOptions(gains, authors))
+    print(f"{out}: {', '.join(room.write_figures(drawn, out, command))}")
     return 0, None
 
 
@@ -382,13 +383,13 @@ def _check_noise(folder: Path, to: str | None) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen.reports import photon_transfer as transfer
 
-    looked = transfer.look(folder)
+    looked = transfer.fit_dataset(folder)
     if looked.worst is None:
         print(f"{folder}: no pair has sites enough to fit its noise")
         return []
     print(f"noise of {looked.count} pairs fitted (a, b with 95 % intervals); the farthest from its row: {looked.worst}")
     if to is not None:
-        transfer.draw(looked.first, Path(to))
+        transfer.draw_fits(looked.first, Path(to))
         print(f"drawn in {to}")
     return _told(folder, (f"noise of {one}" for one in looked.wrong))
 
@@ -424,7 +425,7 @@ def report(arguments: list[str]) -> int:
     from unprocess_gen.reports import dataset_report as page
 
     folder, chosen = _first("report", arguments), _values("report", REPORT_KEYS, arguments[1:])
-    print(page.write(folder, chosen.get("--to"), chosen.get("--source")))
+    print(page.write_dataset_report(folder, chosen.get("--to"), chosen.get("--source")))
     return 0
 
 
@@ -440,11 +441,14 @@ def preview(arguments: list[str]) -> int:
     to, source = Path(chosen["--to"]), Path(chosen["--source"]) if "--source" in chosen else None
     keys = chosen["--keys"].split(",") if "--keys" in chosen else []
     files = 0
-    for drawn in room.preview(folder, to, keys, source, with_stages):
+    for drawn in room.write_sheets(folder, to, keys, source, with_stages):
         files += len(drawn.files)
-        if drawn.lacks:
+        if drawn.missing_source:
             left_out = "the source's panel and the stages are" if with_stages else "the source's panel is"
-            print(f"gen-dataset: {drawn.key} ({drawn.source}): {left_out} left out: {drawn.lacks}", file=sys.stderr)
+            print(
+                f"gen-dataset: {drawn.key} ({drawn.source}): {left_out} left out: {drawn.missing_source}",
+                file=sys.stderr,
+            )
     print(f"{files} pictures in {to}")
     return 0
 

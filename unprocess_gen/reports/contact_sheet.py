@@ -51,7 +51,7 @@ Mosaic = Frame | Float
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class SheetPair:
     """A pair that is to be shown: its frames and row, its plan, and its source's pixels, or what became of them."""
 
     clean: Mosaic
@@ -59,7 +59,7 @@ class Shown:
     row: Row
     plan: Plan
     source: Srgb | None
-    lacks: str
+    missing_source: str
 
     @property
     def key(self) -> str:
@@ -67,29 +67,29 @@ class Shown:
         return str(self.row["key"])
 
 
-class Sheet(NamedTuple):
+class SheetFiles(NamedTuple):
     """What was written for a pair: its key, the name of its source, the files, and why the source is not among them."""
 
     key: str
     source: str
     files: tuple[Path, ...]
-    lacks: str
+    missing_source: str
 
 
-def preview(
+def write_sheets(
     folder: Path, to: Path, keys: Sequence[str] = (), source: Path | None = None, with_stages: bool = False
-) -> Iterator[Sheet]:
+) -> Iterator[SheetFiles]:
     """Write ``KEY.png`` for each pair into the folder ``to``, and ``KEY.stages.png`` if asked; yield what was written.
 
     ``keys`` and ``source`` as for `contact_sheet`. Raises as it does, and MachineError where a file cannot be written.
     """
     _check_to(folder, to)
     for shown in _shown(folder, keys, source):
-        pictures = {f"{shown.key}.png": sheet(shown)}
+        pictures = {f"{shown.key}.png": pair_sheet(shown)}
         if with_stages and shown.source is not None:
-            pictures[f"{shown.key}.stages.png"] = stages(shown)
+            pictures[f"{shown.key}.stages.png"] = stages_sheet(shown)
         files = tuple(_write(picture, to / name) for name, picture in pictures.items())
-        yield Sheet(shown.key, str(shown.row["source"]), files, shown.lacks)
+        yield SheetFiles(shown.key, str(shown.row["source"]), files, shown.missing_source)
 
 
 def contact_sheet(folder: Path, keys: Sequence[str] = (), source: Path | None = None) -> Picture:
@@ -123,26 +123,26 @@ def _write(picture: Picture, path: Path) -> Path:
 # ------------------------------------------------------------------------------------------ the pairs and their sources
 
 
-def _shown(folder: Path, keys: Sequence[str], source_folder: Path | None) -> Iterator[Shown]:
+def _shown(folder: Path, keys: Sequence[str], source_folder: Path | None) -> Iterator[SheetPair]:
     """Yield pairs in the order of the manifest; the photograph of several is decoded once."""
     if source_folder is not None and not source_folder.is_dir():
         raise ConfigError(f"--source {source_folder}: is no folder")
     pairs = RawPairs(folder)
     numbers = _numbers(folder / "manifest.csv", keys) if keys else _spread(folder, len(pairs))
     root = source_root(folder / "manifest.csv", None if source_folder is None else str(source_folder))
-    of_image, photograph, lacks = "", None, ""
+    of_image, photograph, missing_source = "", None, ""
     for number in numbers:
         clean, noisy, row = pairs[number]
         if of_image != image_key(row):
-            of_image, (photograph, lacks) = image_key(row), _photograph(row, root)
-        source_part, lacks_part = _part_of(photograph, lacks, row)
-        yield Shown(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), source_part, lacks_part)
+            of_image, (photograph, missing_source) = image_key(row), _photograph(row, root)
+        source_part, lacks_part = _part_of(photograph, missing_source, row)
+        yield SheetPair(mosaic_dn(clean, row), mosaic_dn(noisy, row), row, plan_from_row(row), source_part, lacks_part)
 
 
-def _part_of(photograph: Srgb | None, lacks: str, row: Row) -> tuple[Srgb | None, str]:
+def _part_of(photograph: Srgb | None, missing_source: str, row: Row) -> tuple[Srgb | None, str]:
     """Return what of a photograph a row's frames show, or None and the reason."""
     if photograph is None:
-        return None, lacks
+        return None, missing_source
     patch = patch_from_row(row)
     part = crop_patch(photograph, patch)
     if part.shape[:2] != (patch.height, patch.width):
@@ -199,7 +199,7 @@ STRIP_PX = (120, 180)
 COLUMNS = 4
 
 
-class Panel(NamedTuple):
+class SheetPanel(NamedTuple):
     """Two pictures of one thing, the whole and a part of it one to one, with a title and what is to be known of them.
 
     A picture that there is none of is None, and ``note`` says why.
@@ -211,7 +211,7 @@ class Panel(NamedTuple):
     part: Picture | None = None
 
 
-class Window(NamedTuple):
+class DetailWindow(NamedTuple):
     """The part that is shown one to one, and the side of the squares that the whole is averaged over beforehand."""
 
     rows: slice
@@ -219,18 +219,18 @@ class Window(NamedTuple):
     side: int
 
 
-def window(height: int, width: int, panel_px: tuple[int, int] = PANEL_PX) -> Window:
+def detail_window(height: int, width: int, panel_px: tuple[int, int] = PANEL_PX) -> DetailWindow:
     """Return what is shown of a frame: its middle, which begins at an even row and column as the Bayer tile does.
 
     Averaged, the whole is still twice as large as its panel, or more: a mosaic of that size holds the panel's detail.
     """
     rows, columns = _middle(height, panel_px[0]), _middle(width, panel_px[1])
     reduction = max(height / panel_px[0], width / panel_px[1])
-    return Window(rows, columns, max(1, min(int(reduction / 2), height // 2, width // 2)))
+    return DetailWindow(rows, columns, max(1, min(int(reduction / 2), height // 2, width // 2)))
 
 
-def _window(shown: Shown, panel_px: tuple[int, int] = PANEL_PX) -> Window:
-    return window(shown.clean.shape[0], shown.clean.shape[1], panel_px)
+def _window(shown: SheetPair, panel_px: tuple[int, int] = PANEL_PX) -> DetailWindow:
+    return detail_window(shown.clean.shape[0], shown.clean.shape[1], panel_px)
 
 
 def _middle(length: int, most: int) -> slice:
@@ -263,7 +263,7 @@ def channels(binned_dn: Float, pattern: str) -> Float:
     return np.stack([np.mean([f for f, c in zip(found, filters, strict=True) if c == k], axis=0) for k in range(3)], -1)
 
 
-def sheet(shown: Shown) -> Picture:
+def pair_sheet(shown: SheetPair) -> Picture:
     """Return a pair's contact sheet: source, clean frame, noise residual, noisy frame, and both developed."""
     at = _window(shown)
     clean, noisy = binned(shown.clean, at.side), binned(shown.noisy, at.side)
@@ -276,7 +276,7 @@ def sheet(shown: Shown) -> Picture:
     return _page(_heading(shown, at), panels)
 
 
-def _strip(shown: Shown) -> Picture:
+def _strip(shown: SheetPair) -> Picture:
     """Return the strip of a pair in an overview: whole frames only."""
     at = _window(shown, STRIP_PX)
     clean, noisy = binned(shown.clean, at.side), binned(shown.noisy, at.side)
@@ -286,11 +286,11 @@ def _strip(shown: Shown) -> Picture:
         *_frame_panels("noisy", shown.noisy, noisy, shown.plan, at, STRIP_PX)[1:],
         _residual_panel(shown, noisy - clean, at, STRIP_PX),
     )
-    bare = [Panel(panel.title, panel.note if panel.whole is None else "", panel.whole) for panel in panels]
+    bare = [SheetPanel(panel.title, panel.note if panel.whole is None else "", panel.whole) for panel in panels]
     return _page([f"{shown.key}   {shown.row['source']}"], bare, STRIP_PX, len(bare))
 
 
-def _heading(shown: Shown, at: Window) -> list[str]:
+def _heading(shown: SheetPair, at: DetailWindow) -> list[str]:
     row, plan = shown.row, shown.plan
     height, width = shown.clean.shape
     darker = f", exposure 1 / {plan.exposure_ratio:g}" if plan.exposure_ratio != 1 else ""
@@ -306,17 +306,17 @@ def _heading(shown: Shown, at: Window) -> list[str]:
     ]
 
 
-def _source_panel(shown: Shown, at: Window, panel_px: tuple[int, int] = PANEL_PX) -> Panel:
+def _source_panel(shown: SheetPair, at: DetailWindow, panel_px: tuple[int, int] = PANEL_PX) -> SheetPanel:
     if shown.source is None:
-        return Panel("source", f"left out: {shown.lacks}", None)
+        return SheetPanel("source", f"left out: {shown.missing_source}", None)
     white = _white(shown.source)
     whole, part = fitted(shown.source, panel_px), shown.source[at.rows, at.columns]
-    return Panel("source", f"{8 * shown.source.itemsize} bits", _codes(whole / white), _codes(part / white))
+    return SheetPanel("source", f"{8 * shown.source.itemsize} bits", _codes(whole / white), _codes(part / white))
 
 
 def _frame_panels(
-    name: str, raw: Mosaic, whole: Float, plan: Plan, at: Window, panel_px: tuple[int, int] = PANEL_PX
-) -> tuple[Panel, Panel, Panel]:
+    name: str, raw: Mosaic, whole: Float, plan: Plan, at: DetailWindow, panel_px: tuple[int, int] = PANEL_PX
+) -> tuple[SheetPanel, SheetPanel, SheetPanel]:
     """Return a raw frame with its own stretch and with the common one, and developed; ``whole`` is it averaged."""
     low, high = float(raw.min()), float(raw.max())
     gray, part = _shrunk(whole, panel_px), raw[at.rows, at.columns]
@@ -329,8 +329,10 @@ def _frame_panels(
 
     white_dn = plan.black_level_dn + (plan.white_level_dn - plan.black_level_dn) * plan.exposure
     return (
-        Panel(f"{name} raw, own stretch", f"{low:.6g} to {high:.6g} DN, its least and greatest", own(gray), own(part)),
-        Panel(
+        SheetPanel(
+            f"{name} raw, own stretch", f"{low:.6g} to {high:.6g} DN, its least and greatest", own(gray), own(part)
+        ),
+        SheetPanel(
             f"{name} raw, common stretch",
             f"{plan.black_level_dn} to {white_dn:.5g} DN, square root",
             common(gray),
@@ -340,20 +342,22 @@ def _frame_panels(
     )
 
 
-def _developed_panel(name: str, raw: Mosaic, whole: Float, plan: Plan, at: Window, panel_px: tuple[int, int]) -> Panel:
+def _developed_panel(
+    name: str, raw: Mosaic, whole: Float, plan: Plan, at: DetailWindow, panel_px: tuple[int, int]
+) -> SheetPanel:
     title = f"{name} raw, developed"
     if min(raw.shape) < 2:
-        return Panel(title, "left out: less than 2 x 2 sites do not show all three colours", None)
+        return SheetPanel(title, "left out: less than 2 x 2 sites do not show all three colours", None)
     rgb = develop(whole, plan) if at.side == 1 else process(to_light(channels(whole, plan.pattern), plan), plan)
     part = _developed_part(raw, plan, at)
-    return Panel(title, "with the row's own parameters", _codes(fitted(rgb, panel_px)), _codes(part))
+    return SheetPanel(title, "with the row's own parameters", _codes(fitted(rgb, panel_px)), _codes(part))
 
 
 REACH_PX = 2
 """How far a demosaicked pixel looks (`process.KERNELS`)."""
 
 
-def _developed_part(raw: Mosaic, plan: Plan, at: Window) -> Float:
+def _developed_part(raw: Mosaic, plan: Plan, at: DetailWindow) -> Float:
     """Develop the part and the little around it that the demosaic sees, so that the part is that of the whole."""
     y, x = (max(0, part.start - REACH_PX) for part in (at.rows, at.columns))
     around = develop(raw[y : at.rows.stop + REACH_PX, x : at.columns.stop + REACH_PX], plan)  # y and x are even
@@ -364,20 +368,22 @@ def _developed_part(raw: Mosaic, plan: Plan, at: Window) -> Float:
 RMS_SHOWN = 4.0
 
 
-def _residual_panel(shown: Shown, whole: Float, at: Window, panel_px: tuple[int, int] = PANEL_PX) -> Panel:
+def _residual_panel(
+    shown: SheetPair, whole: Float, at: DetailWindow, panel_px: tuple[int, int] = PANEL_PX
+) -> SheetPanel:
     """Show noisy less clean about a middle gray, which is 0; black and white are four times its RMS, or 1 DN."""
     gray = _shrunk(whole, panel_px)
     part = shown.noisy[at.rows, at.columns].astype(np.float64) - shown.clean[at.rows, at.columns]
     reach = [max(RMS_SHOWN * float(np.sqrt(np.mean(one * one))), 1.0) for one in (gray, part)]
     note = f"black to white: +-{reach[0]:.3g} DN (averaged), +-{reach[1]:.3g} DN (one to one)"
     pictures = [_codes((one / dn + 1) / 2) for one, dn in zip((gray, part), reach, strict=True)]
-    return Panel("noisy - clean", note, *pictures)
+    return SheetPanel("noisy - clean", note, *pictures)
 
 
 # ----------------------------------------------------------------------------------------------------------- the stages
 
 
-class Step(NamedTuple):
+class ProcessingStep(NamedTuple):
     """A step of the pipeline: what it did, with which numbers, and the function itself, ``[H, W, 3]`` to the same."""
 
     title: str
@@ -389,15 +395,17 @@ def _gains_text(plan: Plan) -> str:
     return f"times {', '.join(f'{gain:.3g}' for gain in plan.inverse_gains)}; highlights {plan.highlight}"
 
 
-STEPS = (
-    Step("tone curve undone", lambda plan: plan.tone, lambda v, plan: unprocess.TONES[plan.tone](v, 1 - v)),
-    Step("gamma undone", lambda plan: f"gamma {plan.gamma}", lambda v, plan: unprocess.expand_gamma(v, plan.gamma)),
-    Step(
+PROCESSING_STEPS = (
+    ProcessingStep("tone curve undone", lambda plan: plan.tone, lambda v, plan: unprocess.TONES[plan.tone](v, 1 - v)),
+    ProcessingStep(
+        "gamma undone", lambda plan: f"gamma {plan.gamma}", lambda v, plan: unprocess.expand_gamma(v, plan.gamma)
+    ),
+    ProcessingStep(
         "colour matrix undone",
         lambda plan: f"camera {plan.camera}",
         lambda u, plan: unprocess.apply_ccm(u, plan.rgb2cam),
     ),
-    Step(
+    ProcessingStep(
         "gains undone",
         _gains_text,
         lambda i, plan: unprocess.invert_gains(i, plan.inverse_gains, plan.highlight, plan.highlight_threshold),
@@ -406,7 +414,7 @@ STEPS = (
 """The steps of the article's Figure 1 up to the mosaic."""
 
 
-def stages(shown: Shown) -> Picture:
+def stages_sheet(shown: SheetPair) -> Picture:
     """Return a picture of the photograph after each step, 0 black and 1 white (the article, Figure 1).
 
     The steps are done by the readable formulas, on the whole, averaged, and on the part one to one; the last two are
@@ -414,14 +422,14 @@ def stages(shown: Shown) -> Picture:
     is not at hand.
     """
     if shown.source is None:
-        raise ValueError(f"{shown.key}: there is no source to go through the steps ({shown.lacks})")
+        raise ValueError(f"{shown.key}: there is no source to go through the steps ({shown.missing_source})")
     plan, at = shown.plan, _window(shown)
     whole, part = _reduced(shown.source, at.side), shown.source[at.rows, at.columns] / _white(shown.source)
     panels = [_stage_panel("source", "", whole, part)]
     if plan.dequantize == "dither" and shown.source.dtype == np.uint8:
         part = _dithered(shown, at)
         panels.append(_stage_panel("codes dithered", "by up to half a code", whole, part))
-    for step in STEPS:
+    for step in PROCESSING_STEPS:
         whole, part = step.apply(whole, plan), step.apply(part, plan)
         panels.append(_stage_panel(step.title, step.note(plan), whole, part))
     panels.append(_mosaic_panel("mosaic", plan, mosaic(whole, plan.pattern), mosaic(part, plan.pattern)))
@@ -445,7 +453,7 @@ def _reduced(srgb: Srgb, side: int) -> Float:
     return np.asarray(cv2.resize(srgb, size, interpolation=cv2.INTER_AREA), dtype=np.float64) / _white(srgb)
 
 
-def _dithered(shown: Shown, at: Window) -> Float:
+def _dithered(shown: SheetPair, at: DetailWindow) -> Float:
     assert shown.source is not None
     plan, patch = shown.plan, patch_from_row(shown.row)
     origin = patch.y + at.rows.start, patch.x + at.columns.start
@@ -453,13 +461,13 @@ def _dithered(shown: Shown, at: Window) -> Float:
     return unprocess.dequantise(shown.source[at.rows, at.columns], plan, curve, origin) / 65535
 
 
-def _stage_panel(title: str, note: str, whole: Float, part: Float) -> Panel:
-    return Panel(title, note + _outside(whole), _codes(fitted(whole, PANEL_PX)), _codes(part))
+def _stage_panel(title: str, note: str, whole: Float, part: Float) -> SheetPanel:
+    return SheetPanel(title, note + _outside(whole), _codes(fitted(whole, PANEL_PX)), _codes(part))
 
 
-def _mosaic_panel(title: str, plan: Plan, whole: Float, part: Float) -> Panel:
+def _mosaic_panel(title: str, plan: Plan, whole: Float, part: Float) -> SheetPanel:
     pictures = [sites(np.sqrt(np.clip(light, 0, 1)), plan.pattern) for light in (whole, part)]
-    return Panel(title, plan.pattern + _outside(whole), _codes(fitted(pictures[0], PANEL_PX)), _codes(pictures[1]))
+    return SheetPanel(title, plan.pattern + _outside(whole), _codes(fitted(pictures[0], PANEL_PX)), _codes(pictures[1]))
 
 
 def _outside(values: Float) -> str:
@@ -510,7 +518,7 @@ FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 
 
 def _page(
-    heading: Sequence[str], panels: Sequence[Panel], panel_px: tuple[int, int] = PANEL_PX, columns: int = COLUMNS
+    heading: Sequence[str], panels: Sequence[SheetPanel], panel_px: tuple[int, int] = PANEL_PX, columns: int = COLUMNS
 ) -> Picture:
     """Lay panels out in rows below a heading: title and note, the whole, and the part where there are parts."""
     width = columns * (panel_px[1] + MARGIN_PX) + MARGIN_PX
@@ -547,7 +555,7 @@ def _framed(picture: Picture | None, panel_px: tuple[int, int]) -> Picture:
 
 
 def _text(paragraphs: Sequence[str], width: int, left: int = 0) -> Picture:
-    """Write paragraphs, each from a line of its own; signs that the font lacks become question marks."""
+    """Write paragraphs, each from a line of its own; signs that the font missing_source become question marks."""
     lines = [
         line for text in paragraphs for line in wrapped(text.encode("ascii", "replace").decode(), width - 2 * left)
     ]

@@ -33,9 +33,10 @@ from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.workspace import REPORT, read_dataset
 from unprocess_gen.reports import markup
 from unprocess_gen.reports import photon_transfer as transfer
-from unprocess_gen.reports.benchmark.report import OF_A_DATASET, check_drawing, spelled
 from unprocess_gen.reports.contact_sheet import contact_sheet
+from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.markup import Html, element
+from unprocess_gen.reports.report_files import DATASET_ENTRIES, require_libraries
 from unprocess_gen.sources.listing import encode_name
 
 FITTED = 8
@@ -45,7 +46,7 @@ NAMED, SHARDS_NAMED, WORDS_NAMED = 50, 20, 16
 """Failures, shards and values of a word that are listed; what is more is counted."""
 
 
-def write(folder: Path, to: Path | None = None, source: Path | None = None) -> Path:
+def write_dataset_report(folder: Path, to: Path | None = None, source: Path | None = None) -> Path:
     """Write the page of a finished dataset, ``report.html`` in its folder unless told otherwise; return its path.
 
     ``source`` is the folder of the photographs, for the contact sheet (`preview.contact_sheet`).
@@ -54,11 +55,11 @@ def write(folder: Path, to: Path | None = None, source: Path | None = None) -> P
     DamageError where the dataset is not finished or its manifest or settings are not those it was finished with,
     MachineError where the page cannot be written.
     """
-    check_drawing("report")
+    require_libraries("report")
     _check_finished(folder)
     to = folder / REPORT if to is None else to
     _check_to(folder, to)
-    content = page(folder, source).encode()
+    content = dataset_page(folder, source).encode()
     aside = to.with_name(to.name + ".part")
     try:
         aside.write_bytes(content)
@@ -70,16 +71,16 @@ def write(folder: Path, to: Path | None = None, source: Path | None = None) -> P
 
 
 def _check_to(folder: Path, to: Path) -> None:
-    if any(to.resolve().is_relative_to((folder / name).resolve()) for name in OF_A_DATASET):
+    if any(to.resolve().is_relative_to((folder / name).resolve()) for name in DATASET_ENTRIES):
         raise ConfigError(f"--to {to}: belongs to the dataset; name another file")
     if to.is_dir() or not to.parent.is_dir():
         raise ConfigError(f"--to {to}: expected the name of a file in a folder that is there")
 
 
-def page(folder: Path, source: Path | None = None) -> str:
-    """Return the page of a finished dataset; raises DamageError as `write` does."""
+def dataset_page(folder: Path, source: Path | None = None) -> str:
+    """Return the page of a finished dataset; raises DamageError as `write_benchmark` does."""
     facts = _facts(folder)
-    tally = Tally()
+    tally = ManifestStatistics()
     for rows in _batches(read_rows(folder / "manifest.csv")):
         tally.add(rows)
     name = encode_name(folder.resolve().name)
@@ -187,7 +188,7 @@ def _halved(counts: Mapping[int, int]) -> dict[int, int]:
     return halved
 
 
-class Words:
+class ValueCounts:
     """How often each of a few words was met; of those that come after `MOST` different ones, how many there were."""
 
     MOST = 64
@@ -216,7 +217,7 @@ class Words:
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class ParameterColumn:
     """A column of numbers that is drawn, or follows from what is: which draws of `plan.PARAMETERS` decide it."""
 
     column: str
@@ -226,24 +227,24 @@ class Parameter:
 
 PARAMETERS = (
     *(
-        Parameter(f"w_{name}", (f"weight_{at}", "choice"))
+        ParameterColumn(f"w_{name}", (f"weight_{at}", "choice"))
         for at, name in enumerate(("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100"))
     ),
-    Parameter("red_gain", ("red",)),
-    Parameter("blue_gain", ("blue",)),
-    Parameter("inverse_rgb_gain", ("inverse_rgb",)),
-    Parameter("exposure_ratio", ("exposure_ratio",)),
-    Parameter("a_dn", ("a", "iso")),
-    Parameter("b_dn2", ("b", "read_std")),
-    Parameter("iso", ("iso",), physical=True),
-    Parameter("exposure_s", ("exposure_s",), physical=True),
-    Parameter("temperature_c", ("temperature_c",), physical=True),
-    Parameter("dn_per_e", physical=True),
-    Parameter("dark_e", physical=True),
-    Parameter("read_shape", ("read_shape",), physical=True),
-    Parameter("read_std_dn", ("read_std",), physical=True),
-    Parameter("row_std_dn", ("row_std",), physical=True),
-    Parameter("column_std_dn", ("column_std",), physical=True),
+    ParameterColumn("red_gain", ("red",)),
+    ParameterColumn("blue_gain", ("blue",)),
+    ParameterColumn("inverse_rgb_gain", ("inverse_rgb",)),
+    ParameterColumn("exposure_ratio", ("exposure_ratio",)),
+    ParameterColumn("a_dn", ("a", "iso")),
+    ParameterColumn("b_dn2", ("b", "read_std")),
+    ParameterColumn("iso", ("iso",), physical=True),
+    ParameterColumn("exposure_s", ("exposure_s",), physical=True),
+    ParameterColumn("temperature_c", ("temperature_c",), physical=True),
+    ParameterColumn("dn_per_e", physical=True),
+    ParameterColumn("dark_e", physical=True),
+    ParameterColumn("read_shape", ("read_shape",), physical=True),
+    ParameterColumn("read_std_dn", ("read_std",), physical=True),
+    ParameterColumn("row_std_dn", ("row_std",), physical=True),
+    ParameterColumn("column_std_dn", ("column_std",), physical=True),
 )
 WORDS = ("camera", "sensor_unit", "scene", "noise", "noise_law", "tone", "gamma", "highlight", "pattern", "accuracy")
 SHARES = (
@@ -255,7 +256,7 @@ SHARES = (
 MEANING = {column.name: column.meaning for column in COLUMNS}
 
 
-class Spread:
+class ColumnStatistics:
     """A column of numbers: its values in bins, and in bins of their logarithms while all lie above 0."""
 
     MAGNITUDES = 20.0
@@ -282,7 +283,7 @@ class Spread:
 
 
 @dataclass
-class Skipped:
+class OmittedEffect:
     """An effect that was left out: of how many pairs, why it was of the first, and whether of all for that reason."""
 
     pairs: int
@@ -291,18 +292,20 @@ class Skipped:
 
 
 @dataclass
-class Tally:
+class ManifestStatistics:
     """What the rows of a manifest come to; as large for ten rows as for a million."""
 
     rows: int = 0
     images: int = 0
     failed: list[tuple[str, str, str]] = field(default_factory=list)
-    spreads: dict[str, Spread] = field(default_factory=lambda: {one.column: Spread() for one in PARAMETERS})
-    shares: dict[str, Spread] = field(default_factory=lambda: {name: Spread() for name in SHARES})
-    words: dict[str, Words] = field(default_factory=lambda: {name: Words() for name in WORDS})
-    sizes: Words = field(default_factory=Words)
-    effects: Words = field(default_factory=Words)
-    skipped: dict[str, Skipped] = field(default_factory=dict)
+    spreads: dict[str, ColumnStatistics] = field(
+        default_factory=lambda: {one.column: ColumnStatistics() for one in PARAMETERS}
+    )
+    shares: dict[str, ColumnStatistics] = field(default_factory=lambda: {name: ColumnStatistics() for name in SHARES})
+    words: dict[str, ValueCounts] = field(default_factory=lambda: {name: ValueCounts() for name in WORDS})
+    sizes: ValueCounts = field(default_factory=ValueCounts)
+    effects: ValueCounts = field(default_factory=ValueCounts)
+    skipped: dict[str, OmittedEffect] = field(default_factory=dict)
     physical: bool = False
     first: tuple[str, int] | None = None
     _image: str = ""
@@ -340,7 +343,7 @@ class Tally:
             self._skip(*text.partition(": ")[::2])
 
     def _skip(self, effect: str, reason: str) -> None:
-        known = self.skipped.setdefault(effect, Skipped(0, reason))
+        known = self.skipped.setdefault(effect, OmittedEffect(0, reason))
         known.pairs += 1
         known.always &= reason == known.reason
 
@@ -411,7 +414,7 @@ def _setting(settings: Any, key: str) -> str:
     return yaml.safe_dump(settings, default_flow_style=True, width=10**6, allow_unicode=True).partition("\n")[0]
 
 
-def _made(facts: Mapping[str, Any], tally: Tally) -> list[Html]:
+def _made(facts: Mapping[str, Any], tally: ManifestStatistics) -> list[Html]:
     run = facts["run"]
     return [
         markup.facts(
@@ -429,7 +432,7 @@ def _made(facts: Mapping[str, Any], tally: Tally) -> list[Html]:
     ]
 
 
-def _failed(facts: Mapping[str, Any], tally: Tally) -> list[Html]:
+def _failed(facts: Mapping[str, Any], tally: ManifestStatistics) -> list[Html]:
     if not facts["failed"]:
         return [element("p", "Nothing failed.")]
     more = sum(facts["failed"].values()) - len(tally.failed)
@@ -438,7 +441,7 @@ def _failed(facts: Mapping[str, Any], tally: Tally) -> list[Html]:
     return [reasons, named, *([element("p", f"And {more:,} more; see manifest.csv.")] if more else [])]
 
 
-def _effects(tally: Tally) -> list[Html]:
+def _effects(tally: ManifestStatistics) -> list[Html]:
     if tally.first is None:
         return [element("p", "No pair, no effect.")]
     simulated = [(effect, f"{count:,}") for effect, count in tally.effects.counts.items()]
@@ -450,12 +453,12 @@ def _effects(tally: Tally) -> list[Html]:
     return [*tables, markup.table(("left out", "pairs", "why"), left_out, {1})] if left_out else tables
 
 
-def _drawn(tally: Tally) -> list[Html]:
+def _drawn(tally: ManifestStatistics) -> list[Html]:
     if tally.first is None:
         return [element("p", "No pair, nothing drawn.")]
     words = {name: tally.words[name].said() for name in WORDS if tally.physical or name != "sensor_unit"}
     shown = {one.column: tally.spreads[one.column] for one in PARAMETERS if tally.physical or not one.physical}
-    same = {name: spelled(spread.plain.least, 6) for name, spread in shown.items() if spread.is_constant}
+    same = {name: short_number(spread.plain.least, 6) for name, spread in shown.items() if spread.is_constant}
     charts = [_chart(name, spread) for name, spread in shown.items() if not spread.is_constant]
     lines = [(name, text, MEANING[name]) for name, text in (words | same).items()]
     return [
@@ -464,12 +467,12 @@ def _drawn(tally: Tally) -> list[Html]:
     ]
 
 
-def _chart(name: str, spread: Spread, percent: bool = False) -> Html:
+def _chart(name: str, spread: ColumnStatistics, percent: bool = False) -> Html:
     """Return a column's histogram, with its ends below and its mean above it."""
     histogram = spread.log2 if spread.by_magnitude else spread.plain
     bars = histogram.bars()
     least, mean, greatest = (
-        f"{spelled(value * 100, 3)} %" if percent else spelled(value, 4)
+        f"{short_number(value * 100, 3)} %" if percent else short_number(value, 4)
         for value in (spread.plain.least, spread.plain.mean, spread.plain.greatest)
     )
     scale = ", logarithmic" if spread.by_magnitude else ""
@@ -490,7 +493,7 @@ def _bars(counts: Sequence[int], label: str) -> Html:
     return Html(f'<svg {view} aria-label="{markup.escaped(label)}">{"".join(rects)}</svg>')
 
 
-def _clipped(facts: Mapping[str, Any], tally: Tally) -> list[Html]:
+def _clipped(facts: Mapping[str, Any], tally: ManifestStatistics) -> list[Html]:
     if tally.first is None:
         return [element("p", "No pair, no site.")]
     sites = facts["sites"]
@@ -507,12 +510,12 @@ def _noise(folder: Path) -> list[Html]:
     """Return the photon-transfer check of a few pairs."""
     pairs = RawPairs(folder)
     count = min(FITTED, len(pairs))
-    fits = [transfer.fit(*pairs[number * len(pairs) // count]) for number in range(count)]
+    fits = [transfer.fit_pair(*pairs[number * len(pairs) // count]) for number in range(count)]
     found = [one for one in fits if one is not None]
     if not found:
         return [element("p", f"None of {count} pairs looked at has sites enough to fit its noise.")]
     drawing = io.BytesIO()
-    transfer.draw(found, drawing)
+    transfer.draw_fits(found, drawing)
     wrong = sum(one.deviation > transfer.ALARM for one in found)
     verdict = (
         f"{wrong} of them are not what the manifest says: gen-dataset verify --noise looks at every pair."
@@ -543,7 +546,7 @@ def _noise(folder: Path) -> list[Html]:
     ]
 
 
-def _loading(folder: Path, facts: Mapping[str, Any], tally: Tally) -> list[Html]:
+def _loading(folder: Path, facts: Mapping[str, Any], tally: ManifestStatistics) -> list[Html]:
     if tally.first is None:
         return [element("p", "No pair, nothing to load.")]
     said = element("p", "From the folder that holds it:")

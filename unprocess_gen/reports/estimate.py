@@ -34,7 +34,7 @@ SAMPLE = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SourceEstimate:
     """What one photograph would give: the bytes of its pairs (0 where it fails), the time, the plans of its
     noise levels or the reason.
 
@@ -57,7 +57,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
+class RunEstimate:
     """What a run would make; ``exact`` where every photograph was read.
 
     ``prices``: what a pair costs under the chosen accuracy and every tier, nanoseconds a pixel, measured just now;
@@ -71,13 +71,13 @@ class Forecast:
     seconds: float
     n_jobs: int
     free_bytes: int
-    looks: tuple[Look, ...]
+    looks: tuple[SourceEstimate, ...]
     prices: dict[str, float]
 
 
-def forecast(
+def estimate_run(
     config: Config, n_jobs: int, read_all: bool, tiers: Mapping[str, AccuracyConfig] | None = None
-) -> Forecast:
+) -> RunEstimate:
     """Look at the photographs of a run; ``n_jobs`` is what the time is divided by, ``tiers`` what is priced beside it.
 
     Raises ConfigError as `photographs.list_photographs` does.
@@ -85,7 +85,7 @@ def forecast(
     sources = list_photographs(config.source).sources
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
     _warm_up(config)
-    looks = tuple(look(config, source) for source in chosen)
+    looks = tuple(estimate_source(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
     per_shard = config.output.pairs_per_shard
     shards = -(-len(sources) // per_shard)
@@ -97,16 +97,16 @@ def forecast(
     seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
     free = shutil.disk_usage(_existing(Path(config.out))).free
     prices = _prices(config, looks, tiers or {})
-    return Forecast(len(sources), shards, total, exact, seconds, n_jobs, free, looks, prices)
+    return RunEstimate(len(sources), shards, total, exact, seconds, n_jobs, free, looks, prices)
 
 
-def look(config: Config, source: Source) -> Look:
+def estimate_source(config: Config, source: Source) -> SourceEstimate:
     """Make the pairs of one photograph, with the digests that its shard takes, and throw them away."""
     started = time.perf_counter()
     try:
         sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
-        return Look(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
+        return SourceEstimate(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
     told = plan_levels(config, *identity, facts)
     levels, predictions = tuple(plan for plan, _ in told), tuple(of_level for _, of_level in told)
@@ -125,14 +125,14 @@ def look(config: Config, source: Source) -> Look:
     seconds = time.perf_counter() - started
     pixels, left_out = width * height, pixels_in_none(cuts, height, width)
     pairs = len(cuts) * len(plans)
-    return Look(source, size, seconds, levels, None, predictions, len(cuts), pairs, pixels, left_out)
+    return SourceEstimate(source, size, seconds, levels, None, predictions, len(cuts), pairs, pixels, left_out)
 
 
-def _prices(config: Config, looks: tuple[Look, ...], tiers: Mapping[str, AccuracyConfig]) -> dict[str, float]:
+def _prices(config: Config, looks: tuple[SourceEstimate, ...], tiers: Mapping[str, AccuracyConfig]) -> dict[str, float]:
     """Measure what accuracy costs on the first photograph that can be read."""
     for one in looks:
         if one.levels:
-            return accuracy.prices(config, dict(tiers), load_source(config.source, one.source)[1].srgb)
+            return accuracy.measure_tier_times(config, dict(tiers), load_source(config.source, one.source)[1].srgb)
     return {}
 
 
@@ -151,7 +151,7 @@ def _existing(path: Path) -> Path:
 # -------------------------------------------------------------------------------------------------------- for people
 
 
-def text(config: Config, told: Forecast) -> str:
+def format_estimate(config: Config, told: RunEstimate) -> str:
     """Return the forecast as lines for a terminal."""
     about = "" if told.exact else "about "
     lines = [
@@ -175,12 +175,12 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _pairs(told: Forecast) -> str:
+def _pairs(told: RunEstimate) -> str:
     pairs = sum(one.pairs for one in told.looks)
     return str(pairs) if told.exact else f"about {pairs * told.sources // len(told.looks)}"
 
 
-def _patches(config: Config, looks: tuple[Look, ...]) -> list[str]:
+def _patches(config: Config, looks: tuple[SourceEstimate, ...]) -> list[str]:
     """Return what is cut out of an image and how much of it is in no patch; nothing where images stay whole."""
     law, cut_up = patch_rule(config.source), [one for one in looks if one.patches]
     odd = [one for one in cut_up if one.left_out]
@@ -209,7 +209,7 @@ def _accuracy(chosen: AccuracyConfig, prices: dict[str, float]) -> list[str]:
     return [f"{line}; {prices[chosen.name]:.3g} ns a pixel here" + (f" ({others})" if others else "")]
 
 
-def _failures(config: Config, told: Forecast) -> list[str]:
+def _failures(config: Config, told: RunEstimate) -> list[str]:
     failed = [one for one in told.looks if one.reason is not None]
     lines = [f"fails     {one.source.name}: {one.reason}\n          {one.complaint}" for one in failed]
     if len(failed) > config.source.max_failed:
@@ -217,7 +217,7 @@ def _failures(config: Config, told: Forecast) -> list[str]:
     return lines
 
 
-def _noise(config: Config, looks: tuple[Look, ...]) -> list[str]:
+def _noise(config: Config, looks: tuple[SourceEstimate, ...]) -> list[str]:
     plans = [plan for one in looks for plan in one.levels]
     if not plans:
         return []

@@ -5,8 +5,8 @@ and so does where they differ from the article's text. Raw frames are shown as t
 from the lowest to the highest DN stretched to the full one. The article's photographs are not known, so counts are its
 claims tried on others: those of Figure 6 on up to `MOST_COUNTED` photographs, one at a time.
 
-The article's Figure 6 can be read in two ways (`READINGS`). Its formula divides by g_rgb, so the greatest g_rgb gives
-the darkest raw frame; its caption has the most saturation there, which is what multiplying by it gives.
+The article's Figure 6 can be read in two ways (`INTERPRETATIONS`). Its formula divides by g_rgb, so the greatest
+g_rgb gives the darkest raw frame; its caption has the most saturation there, which is what multiplying by it gives.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core.errors import ConfigError, SourceError
-from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.types import Float, Frame, Plan, Source, Srgb
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports import markup
 from unprocess_gen.reports.markup import Html, element
+from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.cfa import CHANNELS, tile
 from unprocess_gen.simulation.reference.isp import compress_gamma, smoothstep
@@ -57,7 +57,7 @@ CROP_PX = 64
 """Side of the crops of Figure 5."""
 
 
-class Reading(NamedTuple):
+class GainInterpretation(NamedTuple):
     """One way to read Figure 6: what is said of it, and the gains (options of ``conf/gains``) of its two rows."""
 
     said: str
@@ -65,19 +65,19 @@ class Reading(NamedTuple):
     bottom: str
 
 
-READINGS = (
-    Reading("by the formula, divided by g_rgb", "paper_min", "paper_max"),
-    Reading("by the pictures, multiplied by it", "fig6_top", "fig6_bottom"),
+INTERPRETATIONS = (
+    GainInterpretation("by the formula, divided by g_rgb", "paper_min", "paper_max"),
+    GainInterpretation("by the pictures, multiplied by it", "fig6_top", "fig6_bottom"),
 )
 DEFAULT_GAINS = "fixed"
-GAINS = (DEFAULT_GAINS, *(name for reading in READINGS for name in (reading.top, reading.bottom)))
+GAINS = (DEFAULT_GAINS, *(name for reading in INTERPRETATIONS for name in (reading.top, reading.bottom)))
 """The options of ``conf/gains`` that the figures are made with."""
 
 AUTHORS_NOISE = "imx385_iso3200_rvdd"
 
 
 @dataclass(frozen=True, slots=True)
-class Recipes:
+class PaperOptions:
     """What the article sets: the gains of `GAINS` by name, and its author's own noise profile beside the default."""
 
     gains: Mapping[str, GainsConfig]
@@ -85,7 +85,7 @@ class Recipes:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class PaperFigure:
     """A figure: its file, its title, the PNG, and what stands below it: paragraphs, and a table (headings first)."""
 
     file: str
@@ -96,7 +96,7 @@ class Drawn:
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class FigureSource:
     """The photograph that is shown, and its plan under the gains of each name."""
 
     name: str
@@ -105,7 +105,7 @@ class Subject:
     authors: Plan
 
 
-class Saturation(NamedTuple):
+class ImageSaturation(NamedTuple):
     """Sites of a photograph's clean frame: all, at the highest code in the photograph itself, at white in the frame."""
 
     sites: int
@@ -114,13 +114,13 @@ class Saturation(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Counted:
+class SaturationCounts:
     """The saturations of photographs under the gains of each name, and which could not be read, and why."""
 
-    by_gains: Mapping[str, Sequence[Saturation]]
+    by_gains: Mapping[str, Sequence[ImageSaturation]]
     failed: tuple[str, ...] = ()
 
-    def fitting(self, reading: Reading) -> int:
+    def fitting(self, reading: GainInterpretation) -> int:
         """Return how many photographs are as Figure 6's caption says: no more saturation on top, more at the bottom."""
         both = zip(self.by_gains[reading.top], self.by_gains[reading.bottom], strict=True)
         return sum(top.after <= top.before and bottom.after > bottom.before for top, bottom in both)
@@ -129,7 +129,7 @@ class Counted:
 Picture = NDArray[np.float64]
 
 
-def draw(config: Config, recipes: Recipes) -> list[Drawn]:
+def draw_figures(config: Config, recipes: PaperOptions) -> list[PaperFigure]:
     """Draw all figures on the first photograph of the source that can be read.
 
     Raises ConfigError where there is none, and where ``source.patch`` asks for patches: figures show photographs.
@@ -149,19 +149,14 @@ def draw(config: Config, recipes: Recipes) -> list[Drawn]:
     ]
 
 
-def write(drawn: Sequence[Drawn], out: Path, command: str) -> list[str]:
+def write_figures(drawn: Sequence[PaperFigure], out: Path, command: str) -> list[str]:
     """Write the figures and their page; return the names of the files. MachineError where that fails."""
-    contents = {**{one.file: one.png for one in drawn}, PAGE: page(drawn, command).encode()}
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            (out / name).write_bytes(content)
-    except OSError as error:
-        raise machine_error(error, out) from error
+    contents = {**{one.file: one.png for one in drawn}, PAGE: figures_page(drawn, command).encode()}
+    write_files(out, contents)
     return list(contents)
 
 
-def page(drawn: Sequence[Drawn], command: str) -> str:
+def figures_page(drawn: Sequence[PaperFigure], command: str) -> str:
     """Return the page: every figure with its caption; the pictures lie beside it."""
     return markup.page(
         "The article's figures",
@@ -172,7 +167,7 @@ def page(drawn: Sequence[Drawn], command: str) -> str:
     )
 
 
-def _on_page(one: Drawn) -> Html:
+def _on_page(one: PaperFigure) -> Html:
     said = [element("p", text) for text in one.caption]
     if one.table:
         said.append(markup.table(one.table[0], one.table[1:], right=range(1, len(one.table[0]))))
@@ -183,14 +178,14 @@ def _on_page(one: Drawn) -> Html:
 # --------------------------------------------------------------------------------------------------- the photographs
 
 
-def _subject(config: Config, recipes: Recipes, listed: Sequence[Source]) -> Subject:
+def _subject(config: Config, recipes: PaperOptions, listed: Sequence[Source]) -> FigureSource:
     for source in listed:
         with suppress(SourceError):
             sha256, photograph = load_source(config.source, source)
             plans = {name: _plan(config, source, sha256, recipes.gains[name]) for name in GAINS}
             by_author = replace(config, noise=recipes.authors_noise)
             authors = _plan(by_author, source, sha256, recipes.gains[DEFAULT_GAINS])
-            return Subject(source.name, photograph.srgb, plans, authors)
+            return FigureSource(source.name, photograph.srgb, plans, authors)
     raise ConfigError(f"source.root={config.source.root}: none of {len(listed)} photographs can be read")
 
 
@@ -198,9 +193,9 @@ def _plan(config: Config, source: Source, sha256: str, gains: GainsConfig) -> Pl
     return plan_image(replace(config, gains=gains), *source.stream_identity(sha256))
 
 
-def _count(config: Config, recipes: Recipes, listed: Iterable[Source]) -> Counted:
+def _count(config: Config, recipes: PaperOptions, listed: Iterable[Source]) -> SaturationCounts:
     """Count the saturated sites of photographs under the gains of every name."""
-    counted: dict[str, list[Saturation]] = {name: [] for name in GAINS}
+    counted: dict[str, list[ImageSaturation]] = {name: [] for name in GAINS}
     failed = []
     for source in listed:
         try:
@@ -212,8 +207,8 @@ def _count(config: Config, recipes: Recipes, listed: Iterable[Source]) -> Counte
         for name in GAINS:
             plan = _plan(config, source, sha256, recipes.gains[name])
             after = make_pair(photograph.srgb, plan).counts.saturated
-            counted[name].append(Saturation(before.size, int(before.sum()), after))
-    return Counted(counted, tuple(failed))
+            counted[name].append(ImageSaturation(before.size, int(before.sum()), after))
+    return SaturationCounts(counted, tuple(failed))
 
 
 def _saturated_before(srgb: Srgb, pattern: str) -> NDArray[np.bool_]:
@@ -317,7 +312,7 @@ def _inverse_tone(codes: Srgb) -> Float:
     return linear_light(codes, "smoothstep", 1.0)
 
 
-def _tone(subject: Subject) -> Drawn:
+def _tone(subject: FigureSource) -> PaperFigure:
     x = np.linspace(0, 1, 256)
     inverse = _inverse_tone(CODES)
     as_written = 0.5 - np.sin(np.arcsin(1 - 2 * (CODES / 255)) / 3)
@@ -337,7 +332,7 @@ def _tone(subject: Subject) -> Drawn:
         return figure
 
     seen = ", ".join(f"{code} to {inverse[code] * 255:.0f}" for code in (16, 64, 192, 240))
-    return Drawn(
+    return PaperFigure(
         "fig2.png",
         "Figure 2: the tone curve and its inverse",
         _png(drawn),
@@ -364,7 +359,7 @@ def _code_histogram(axes: Axes, srgb: Srgb, curves: Mapping[str, Float]) -> None
     axes.legend(frameon=False)
 
 
-def _gamma(subject: Subject) -> Drawn:
+def _gamma(subject: FigureSource) -> PaperFigure:
     u = np.arange(256) / 255
 
     def drawn() -> Figure:
@@ -392,7 +387,7 @@ def _gamma(subject: Subject) -> Drawn:
 
     linear = linear_light(CODES, "smoothstep", GAMMA)
     seen = ", ".join(f"{code}: {linear[code]:.2g}" for code in (16, 64, 128, 192, 240))
-    return Drawn(
+    return PaperFigure(
         "fig3.png",
         "Figure 3: gamma compression and its inverse",
         _png(drawn),
@@ -409,7 +404,7 @@ def _gamma(subject: Subject) -> Drawn:
 # -------------------------------------------------------------------------------------------- Figure 4: the function f
 
 
-def _highlight_function(subject: Subject) -> Drawn:
+def _highlight_function(subject: FigureSource) -> PaperFigure:
     i = np.linspace(0, 1, 1001)
     fixed = subject.plans[DEFAULT_GAINS]
     gains = {
@@ -434,7 +429,7 @@ def _highlight_function(subject: Subject) -> Drawn:
 
     weakest = min(fixed.inverse_gains)
     slope = weakest + (1 - weakest) * (1 + 2 / (1 - HIGHLIGHT))
-    return Drawn(
+    return PaperFigure(
         "fig4.png",
         "Figure 4: the function that keeps highlights",
         _png(drawn),
@@ -453,7 +448,7 @@ def _highlight_function(subject: Subject) -> Drawn:
 # ------------------------------------------------------------------------------------------- Figure 5: the default raw
 
 
-def _default_raw(subject: Subject, counted: Counted) -> Drawn:
+def _default_raw(subject: FigureSource, counted: SaturationCounts) -> PaperFigure:
     plan, authors = subject.plans[DEFAULT_GAINS], subject.authors
     pair, by_author = make_pair(subject.srgb, plan), make_pair(subject.srgb, authors)
 
@@ -471,7 +466,7 @@ def _default_raw(subject: Subject, counted: Counted) -> Drawn:
 
     silent_dn = -authors.b_dn2 / authors.a_dn
     before = _saturated_before(subject.srgb, plan.pattern)
-    return Drawn(
+    return PaperFigure(
         "fig5.png",
         "Figure 5: the default raw frame, clean and noisy",
         _png(drawn),
@@ -520,10 +515,10 @@ HEADINGS = (
 )
 
 
-def _saturations(subject: Subject, counted: Counted) -> Drawn:
+def _saturations(subject: FigureSource, counted: SaturationCounts) -> PaperFigure:
     def drawn() -> Figure:
         figure, axes = _figure(2, 4, 11.0, _aspect(subject.srgb))
-        for column, reading in enumerate(READINGS):
+        for column, reading in enumerate(INTERPRETATIONS):
             for row, name in enumerate((reading.top, reading.bottom)):
                 plan = subject.plans[name]
                 clean = make_pair(subject.srgb, plan).clean
@@ -535,10 +530,11 @@ def _saturations(subject: Subject, counted: Counted) -> Drawn:
         return figure
 
     verdicts = "; ".join(
-        f"{reading.said} ({reading.top}, {reading.bottom}), on {counted.fitting(reading)}" for reading in READINGS
+        f"{reading.said} ({reading.top}, {reading.bottom}), on {counted.fitting(reading)}"
+        for reading in INTERPRETATIONS
     )
     failed = (f"Photographs that cannot be read: {', '.join(counted.failed)}.",) if counted.failed else ()
-    return Drawn(
+    return PaperFigure(
         "fig6.png",
         "Figure 6: saturations at the minimum and maximum gains",
         _png(drawn),
@@ -556,7 +552,7 @@ def _saturations(subject: Subject, counted: Counted) -> Drawn:
     )
 
 
-def _saturation_line(name: str, plan: Plan, counted: Sequence[Saturation]) -> tuple[str, ...]:
+def _saturation_line(name: str, plan: Plan, counted: Sequence[ImageSaturation]) -> tuple[str, ...]:
     """Return a line of the table; of the photographs counted the first that can be read is the one shown."""
     first, sites = counted[0], sum(one.sites for one in counted)
     return (
@@ -576,7 +572,7 @@ SMALL_GAINS, LARGE_GAINS = "paper_max", "fig6_bottom"
 """The gains of Figure 7 with the smallest and the largest inverse gains among those of Figure 6."""
 
 
-def _highlights(subject: Subject) -> Drawn:
+def _highlights(subject: FigureSource) -> PaperFigure:
     small, large = subject.plans[SMALL_GAINS], subject.plans[LARGE_GAINS]
     kept = make_pair(subject.srgb, small).clean
     plain = make_pair(subject.srgb, replace(small, highlight="none")).clean
@@ -598,7 +594,7 @@ def _highlights(subject: Subject) -> Drawn:
         return figure
 
     rows = ((LARGE_GAINS, large, many), (SMALL_GAINS, small, kept), (f"{SMALL_GAINS}, no function", small, plain))
-    return Drawn(
+    return PaperFigure(
         "fig7.png",
         "Figure 7: the highlights that the function creates",
         _png(drawn),

@@ -44,7 +44,7 @@ low where the variance is, and an error taken from it would be too small just wh
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class NoiseFit:
     """What the arrays of one pair say: slope (DN) and intercept (DN²) of the variance, each with its standard error.
 
     ``expected`` are the two the row's numbers come to; ``signal_dn`` and ``variance_dn2`` the points that were fitted.
@@ -77,37 +77,37 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class FitSummary:
     """What is kept of a dataset's fits: how many, the farthest from its row, the wrong ones, and the first few."""
 
     count: int
-    worst: Fit | None
-    wrong: list[Fit]
-    first: list[Fit]
+    worst: NoiseFit | None
+    wrong: list[NoiseFit]
+    first: list[NoiseFit]
 
 
-def look(folder: Path) -> Look:
-    """Fit every pair of a dataset, one at a time; raises as `fits`."""
+def fit_dataset(folder: Path) -> FitSummary:
+    """Fit every pair of a dataset, one at a time; raises as `iterate_fits`."""
     count, worst = 0, None
-    wrong: list[Fit] = []
-    first: list[Fit] = []
-    for one in fits(folder):
+    wrong: list[NoiseFit] = []
+    first: list[NoiseFit] = []
+    for one in iterate_fits(folder):
         count += 1
         worst = one if worst is None or one.deviation > worst.deviation else worst
         wrong += [one] if one.deviation > ALARM else []
         first += [one] if len(first) < MOST_DRAWN else []
-    return Look(count, worst, wrong, first)
+    return FitSummary(count, worst, wrong, first)
 
 
-def fits(folder: Path) -> Iterator[Fit]:
+def iterate_fits(folder: Path) -> Iterator[NoiseFit]:
     """Yield a fit for every pair of a dataset that has sites enough; DamageError where it is not whole."""
     for clean, noisy, row in RawPairs(folder):
-        found = fit(clean, noisy, row)
+        found = fit_pair(clean, noisy, row)
         if found is not None:
             yield found
 
 
-def fit(clean: Frame, noisy: Frame, row: Row) -> Fit | None:
+def fit_pair(clean: Frame, noisy: Frame, row: Row) -> NoiseFit | None:
     """Fit the variance of one pair; None where fewer than three DN of the clean frame have sites enough."""
     black, slope, intercept, prnu = _law(row)
     clean_dn, noisy_dn = (mosaic_dn(frame, row).astype(np.float64) for frame in (clean, noisy))
@@ -146,7 +146,7 @@ def fit(clean: Frame, noisy: Frame, row: Row) -> Fit | None:
     shared = _shared_error(row)
     errors = math.sqrt(inverse[0, 0]), math.sqrt(inverse[1, 1] + shared * shared)
     expected = slope, intercept
-    return Fit(str(row["key"]), float(a), errors[0], float(b), errors[1], expected, signal, variance, rounding)
+    return NoiseFit(str(row["key"]), float(a), errors[0], float(b), errors[1], expected, signal, variance, rounding)
 
 
 def _number(row: Row, name: str) -> float:
@@ -185,7 +185,7 @@ def _shared_error(row: Row) -> float:
     )
 
 
-def draw(found: list[Fit], to: Path | BinaryIO) -> None:
+def draw_fits(found: list[NoiseFit], to: Path | BinaryIO) -> None:
     """Draw variance against signal of the pairs, and the lines expected, as PNG; ConfigError without matplotlib."""
     try:
         from matplotlib.figure import Figure

@@ -94,7 +94,7 @@ from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_s
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class BenchmarkProfiles:
     """What the settings are measured beside: every tier by its name, two noise profiles, and a sensor of 14 bits.
 
     ``two_numbers`` and ``electrons`` stand in where the settings' own profile is of the other kind.
@@ -107,7 +107,7 @@ class Beside:
 
 
 @dataclass(frozen=True, slots=True)
-class Effort:
+class SampleSizes:
     """How much is measured; pictures as height and width at most.
 
     ``photographs`` are read, ``sampled`` pixels of each serve for errors, cut-outs of ``readable`` and ``compiled`` for
@@ -124,7 +124,7 @@ class Effort:
     positions: int = 64
 
 
-class Error(NamedTuple):
+class MethodError(NamedTuple):
     """An error and its unit; ``changed_share``: of the DN, None where no DN are compared."""
 
     max: float
@@ -134,8 +134,8 @@ class Error(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """A line of the report; None where nothing was measured (`MEASUREMENTS`)."""
+class Measurement:
+    """A line of the report; None where nothing was measured (`METHOD_BENCHMARKS`)."""
 
     stage: str
     method: str
@@ -149,10 +149,10 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class BenchmarkReport:
     """The rows, and the circumstances they were measured under, in words for people."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[Measurement, ...]
     facts: dict[str, str]
 
 
@@ -165,7 +165,9 @@ LEAST_NS = 0.01
 """What a difference of times is at least: below it, nothing can be told from nothing."""
 
 
-def measure(config: Config, beside: Beside, effort: Effort | None = None, command: str = "") -> Report:
+def measure_accuracy(
+    config: Config, beside: BenchmarkProfiles, effort: SampleSizes | None = None, command: str = ""
+) -> BenchmarkReport:
     """Measure every method and every tier on the photographs of the settings; a progress bar goes to stderr.
 
     ``command`` is what the report says it was made by. Raises ConfigError where no photograph can be read, or the
@@ -176,25 +178,27 @@ def measure(config: Config, beside: Beside, effort: Effort | None = None, comman
             "output.dtype=float32: errors are measured in whole DN; say output.dtype=uint16 (frames in float32 are the "
             "same, and exact, in every tier)"
         )
-    effort, config = effort or Effort(), _as_mosaics(config)
-    lab = Lab(_settings(config, beside), _tiers(config, beside), _subjects(config, effort), effort)
-    calls = len(MEASUREMENTS) + len(lab.tiers) * 3
-    with Steps(len(MEASUREMENTS) + len(TIER_STAGES) * len(lab.tiers) + calls * (effort.rounds + 1)) as steps:
+    effort, config = effort or SampleSizes(), _as_mosaics(config)
+    lab = BenchmarkSession(_settings(config, beside), _tiers(config, beside), _subjects(config, effort), effort)
+    calls = len(METHOD_BENCHMARKS) + len(lab.tiers) * 3
+    with MeasurementProgress(
+        len(METHOD_BENCHMARKS) + len(TIER_STAGES) * len(lab.tiers) + calls * (effort.rounds + 1)
+    ) as steps:
         errors = dict(_errors(lab, steps))
         _one_round(lab, lab.tiny(), steps)  # compiles what was not
         rounds = [_one_round(lab, lab.subjects[turn % len(lab.subjects)], steps) for turn in range(effort.rounds)]
     rows = (*_method_rows(lab, errors, rounds), *_tier_rows(lab, errors, rounds))
-    return Report(rows, _facts(lab, command))
+    return BenchmarkReport(rows, _facts(lab, command))
 
 
-def prices(config: Config, tiers: dict[str, AccuracyConfig], srgb: Srgb) -> dict[str, float]:
+def measure_tier_times(config: Config, tiers: dict[str, AccuracyConfig], srgb: Srgb) -> dict[str, float]:
     """Return what a pair of the settings costs under their own budget and every tier, nanoseconds a pixel, by name.
 
     Quickly: medians of three turns on cut-outs of one picture, of the readable forms on a small one.
     """
-    effort = Effort(sampled=(16, 16), readable=(64, 96), compiled=(384, 512))
-    lab = Lab({"own": _as_mosaics(config)}, {**tiers, config.accuracy.name: config.accuracy}, (), effort)
-    subject = Subject("", ("0" * 64, 0), *_cuts(srgb, effort))
+    effort = SampleSizes(sampled=(16, 16), readable=(64, 96), compiled=(384, 512))
+    lab = BenchmarkSession({"own": _as_mosaics(config)}, {**tiers, config.accuracy.name: config.accuracy}, (), effort)
+    subject = BenchmarkImage("", ("0" * 64, 0), *_cuts(srgb, effort))
     for tier in lab.tiers:
         _pair_ns(lab, "own", lab.tiers[tier], lab.tiny(subject))
     turns = [{tier: _pair_ns(lab, "own", lab.tiers[tier], subject) for tier in lab.tiers} for _ in range(3)]
@@ -210,7 +214,7 @@ def _as_mosaics(config: Config) -> Config:
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
+class BenchmarkImage:
     """A photograph: every so manyth of its pixels, and two cut-outs of its middle."""
 
     name: str
@@ -221,18 +225,18 @@ class Subject:
 
 
 @dataclass
-class Lab:
+class BenchmarkSession:
     """What the measurements share: settings and tiers by name, the photographs, and the pairs that were made."""
 
     settings: dict[str, Config]
     tiers: dict[str, AccuracyConfig]
-    subjects: tuple[Subject, ...]
-    effort: Effort
+    subjects: tuple[BenchmarkImage, ...]
+    effort: SampleSizes
     _made: dict[object, list[tuple[Pair, Plan]]] = field(default_factory=dict)
     _flats: dict[object, list[Frame]] = field(default_factory=dict)
 
     def plan(
-        self, setting: str, accuracy: AccuracyConfig, subject: Subject, srgb: Srgb, edit: str = "as_it_is"
+        self, setting: str, accuracy: AccuracyConfig, subject: BenchmarkImage, srgb: Srgb, edit: str = "as_it_is"
     ) -> Plan:
         """Plan a picture of a subject under a budget."""
         config = replace(self.settings[setting], accuracy=accuracy)
@@ -254,7 +258,7 @@ class Lab:
             self._flats[key] = [make_pair(white, plan).noisy for white, plan in _flat_plans(self, accuracy)]
         return self._flats[key]
 
-    def tiny(self, subject: Subject | None = None) -> Subject:
+    def tiny(self, subject: BenchmarkImage | None = None) -> BenchmarkImage:
         """Return a corner of a subject, to have the machine code ready."""
         subject = subject or self.subjects[0]
         corner = _copy(subject.sampled[:16, :16])
@@ -265,7 +269,7 @@ def _numbers(accuracy: AccuracyConfig) -> object:
     return dataclasses.astuple(replace(accuracy, name=""))
 
 
-def _settings(config: Config, beside: Beside) -> dict[str, Config]:
+def _settings(config: Config, beside: BenchmarkProfiles) -> dict[str, Config]:
     """Return the settings as they are, and at 14 bits with noise of either kind: their own, where it is of that."""
     at_14_bits = replace(config, sensor=beside.sensor)
     # What was said of one kind's effects is no word about the other's.
@@ -292,7 +296,7 @@ def _at_some_iso(config: Config) -> Config:
     return config
 
 
-def _tiers(config: Config, beside: Beside) -> dict[str, AccuracyConfig]:
+def _tiers(config: Config, beside: BenchmarkProfiles) -> dict[str, AccuracyConfig]:
     """Return every tier, and the settings' own budget where it is none of them."""
     own = config.accuracy
     if any(_numbers(own) == _numbers(tier) for tier in beside.tiers.values()):
@@ -300,7 +304,7 @@ def _tiers(config: Config, beside: Beside) -> dict[str, AccuracyConfig]:
     return {**beside.tiers, f"{own.name}_changed" if own.name in beside.tiers else own.name: own}
 
 
-def _subjects(config: Config, effort: Effort) -> tuple[Subject, ...]:
+def _subjects(config: Config, effort: SampleSizes) -> tuple[BenchmarkImage, ...]:
     """Read photographs, spread over the listing; those that fail are passed over."""
     sources = evenly_spaced(list_photographs(config.source).sources, effort.photographs)
     subjects = []
@@ -308,13 +312,13 @@ def _subjects(config: Config, effort: Effort) -> tuple[Subject, ...]:
         with suppress(SourceError):
             sha256, photograph = load_source(config.source, source)
             identity = source.stream_identity(sha256)
-            subjects.append(Subject(source.name, identity, *_cuts(photograph.srgb, effort)))
+            subjects.append(BenchmarkImage(source.name, identity, *_cuts(photograph.srgb, effort)))
     if not subjects:
         raise ConfigError(f"source.root={config.source.root}: none of {len(sources)} photographs tried can be read")
     return tuple(subjects)
 
 
-def _cuts(srgb: Srgb, effort: Effort) -> tuple[Srgb, Srgb, Srgb]:
+def _cuts(srgb: Srgb, effort: SampleSizes) -> tuple[Srgb, Srgb, Srgb]:
     """Return every so manyth pixel of a picture, and its middle in two sizes."""
     step = max(1, math.ceil(math.sqrt(srgb.shape[0] * srgb.shape[1] / math.prod(effort.sampled))))
     return _copy(srgb[::step, ::step]), _middle(srgb, effort.readable), _middle(srgb, effort.compiled)
@@ -356,7 +360,7 @@ FLAT_DN_PER_E = 8.0
 """So fine that rounding to DN hides nothing of the law, where the range has room for it."""
 
 
-def _flat_plans(lab: Lab, accuracy: AccuracyConfig) -> Iterator[tuple[Srgb, Plan]]:
+def _flat_plans(lab: BenchmarkSession, accuracy: AccuracyConfig) -> Iterator[tuple[Srgb, Plan]]:
     """Yield white pictures and plans that darken them to a mean of so many electrons, with Gaussian read noise."""
     white = np.full((lab.effort.flat, lab.effort.flat, 3), 255, dtype=np.uint8)
     plan = lab.plan("electrons", accuracy, lab.subjects[0], white)
@@ -419,13 +423,15 @@ def alone(method: Method, tiers: dict[str, AccuracyConfig]) -> AccuracyConfig:
     )
 
 
-def clean_error(lab: Lab, setting: str, accuracy: AccuracyConfig) -> Error:
+def clean_error(lab: BenchmarkSession, setting: str, accuracy: AccuracyConfig) -> MethodError:
     """Return the error of the clean frames under a budget."""
     ours, reference = ([pair.clean for pair, _ in lab.pairs(setting, one)] for one in (accuracy, lab.tiers[REFERENCE]))
     return compare(ours, reference, "DN")
 
 
-def noisy_error(lab: Lab, setting: str, accuracy: AccuracyConfig, edit: str = "as_it_is", unit: str = "σ") -> Error:
+def noisy_error(
+    lab: BenchmarkSession, setting: str, accuracy: AccuracyConfig, edit: str = "as_it_is", unit: str = "σ"
+) -> MethodError:
     """Return the error of the noisy frames under a budget, in DN or in σ of shot, read and rounding noise."""
     ours, reference = (lab.pairs(setting, one, edit) for one in (accuracy, lab.tiers[REFERENCE]))
     stds_dn = [noise_std_dn(pair, plan) for pair, plan in reference] if unit == "σ" else None
@@ -439,21 +445,21 @@ def noise_std_dn(pair: Pair, plan: Plan) -> Float:
 
 def compare(
     ours: Sequence[Frame], reference: Sequence[Frame], unit: str, scales_dn: Sequence[Float] | None = None
-) -> Error:
+) -> MethodError:
     """Return the error of all frames together, in DN or in units of ``scales_dn``."""
     differences = [one.astype(np.float64) - other for one, other in zip(ours, reference, strict=True)]
     changed = sum(int(np.count_nonzero(one)) for one in differences) / sum(one.size for one in differences)
     if scales_dn is not None:
         differences = [one / scale for one, scale in zip(differences, scales_dn, strict=True)]
     every = np.concatenate([one.ravel() for one in differences])
-    return Error(float(np.abs(every).max()), math.sqrt(float(np.mean(every * every))), unit, changed)
+    return MethodError(float(np.abs(every).max()), math.sqrt(float(np.mean(every * every))), unit, changed)
 
 
-def shot_error(lab: Lab, accuracy: AccuracyConfig) -> Error:
+def shot_error(lab: BenchmarkSession, accuracy: AccuracyConfig) -> MethodError:
     """Return the distance of the laws on flat fields as max, the difference on photographs in σ as rms."""
     on_photographs = noisy_error(lab, "electrons", accuracy, "with_shot")
     distance = law_distance(lab.flats(accuracy), lab.flats(lab.tiers[REFERENCE]))
-    return Error(distance, on_photographs.rms, "distribution (max), σ (rms)", on_photographs.changed_share)
+    return MethodError(distance, on_photographs.rms, "distribution (max), σ (rms)", on_photographs.changed_share)
 
 
 def law_distance(ours: Sequence[Frame], reference: Sequence[Frame]) -> float:
@@ -470,12 +476,12 @@ def _distance(one: Frame, other: Frame) -> float:
     return float(np.abs(np.cumsum(shares)).max() / one.size)
 
 
-def normal_error(sampler: Callable[[Words], Float], positions: int) -> Error:
+def normal_error(sampler: Callable[[Words], Float], positions: int) -> MethodError:
     """Return the error of normals against the true quantiles, in σ."""
     words, weights = normal_words(positions)
     truth = true_normals(words)
     off = np.abs(sampler(words) - truth)
-    return Error(float(off.max()), math.sqrt(float(np.sum(weights * off * off) / np.sum(weights))), "σ")
+    return MethodError(float(off.max()), math.sqrt(float(np.sum(weights * off * off) / np.sum(weights))), "σ")
 
 
 def normal_words(positions: int) -> tuple[Words, Float]:
@@ -532,7 +538,9 @@ def clocked(call: Callable[[], object], pixels: int) -> float:
     return max(time.thread_time_ns() - started, 1) / pixels
 
 
-def _pair_ns(lab: Lab, setting: str, accuracy: AccuracyConfig, subject: Subject, edit: str = "as_it_is") -> float:
+def _pair_ns(
+    lab: BenchmarkSession, setting: str, accuracy: AccuracyConfig, subject: BenchmarkImage, edit: str = "as_it_is"
+) -> float:
     """Make a pair, of a camera body not seen before, and return what it took."""
     readable = accuracy.readable
     srgb = subject.readable if readable else subject.compiled
@@ -541,18 +549,18 @@ def _pair_ns(lab: Lab, setting: str, accuracy: AccuracyConfig, subject: Subject,
     return clocked(lambda: make_pair(srgb, plan), srgb.shape[0] * srgb.shape[1])
 
 
-def _difference_ns(lab: Lab, method: Method, subject: Subject, edits: tuple[str, str]) -> float:
+def _difference_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage, edits: tuple[str, str]) -> float:
     """Return by how much a pair with some effects takes longer than one without them."""
     accuracy = alone(method, lab.tiers)
     longer, shorter = (_pair_ns(lab, "electrons", accuracy, subject, edit) for edit in edits)
     return max(longer - shorter, LEAST_NS)
 
 
-def _numpy_shot_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_shot_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     return _difference_ns(lab, method, subject, ("with_shot", "without_shot"))
 
 
-def _counts_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _counts_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     plan, light = _light_of(lab, subject, subject.readable)
     physics = lab.plan("electrons", lab.tiers[EXACT], subject, subject.readable).physics
     assert physics is not None
@@ -564,7 +572,7 @@ def _counts_ns(lab: Lab, method: Method, subject: Subject) -> float:
     return clocked(lambda: _counts(rates, turns, words, *given), turns * rates.size)
 
 
-def _near_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _near_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     """Return what counts take, and by how much a pair takes longer without them: there is no loop of its own."""
     ours, exact = (
         _pair_ns(lab, "electrons", accuracy, subject, "with_shot")
@@ -573,58 +581,58 @@ def _near_ns(lab: Lab, method: Method, subject: Subject) -> float:
     return max(_counts_ns(lab, method, subject) + ours - exact, LEAST_NS)
 
 
-def _effects_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _effects_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     return _difference_ns(lab, method, subject, ("without_shot", "without_effects"))
 
 
-def _clean_plan(lab: Lab, srgb: Srgb, subject: Subject) -> tuple[Plan, Float]:
+def _clean_plan(lab: BenchmarkSession, srgb: Srgb, subject: BenchmarkImage) -> tuple[Plan, Float]:
     plan = lab.plan("two_numbers", lab.tiers[EXACT], subject, srgb)
     return plan, linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
 
 
-def _scene(lab: Lab, subject: Subject) -> tuple[Srgb, Scene]:
+def _scene(lab: BenchmarkSession, subject: BenchmarkImage) -> tuple[Srgb, Scene]:
     srgb = subject.compiled
     plan, curve = _clean_plan(lab, srgb, subject)
     return srgb, fused_scene(plan, curve, srgb.shape, (0, 0))
 
 
-def _look_up_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _look_up_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
     out = np.empty(CHUNK)
     return clocked(lambda: _signals(srgb, scene, out), srgb.shape[0] * srgb.shape[1])
 
 
-def _look_up32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _look_up32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
     products, out = scene.products.astype(np.float32), np.empty(CHUNK, dtype=np.float32)
     return clocked(lambda: _signals32(srgb, products, scene.sites, out), srgb.shape[0] * srgb.shape[1])
 
 
-def _clean_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _clean_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
     counts = np.zeros(6, dtype=np.int64)
     return clocked(lambda: _cleans(srgb, scene, make_room(), counts), srgb.shape[0] * srgb.shape[1])
 
 
-def _clean32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _clean32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
     of_scene = single.products32_of(scene), single.sites_of(scene), single.light_of(scene)
     return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room()), srgb.shape[0] * srgb.shape[1])
 
 
-def _numpy_curve_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_curve_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb = subject.readable
     _, curve = _clean_plan(lab, srgb, subject)
     return clocked(lambda: curve[srgb], srgb.shape[0] * srgb.shape[1])
 
 
-def _numpy_colour_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_colour_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb = subject.readable
     plan, curve = _clean_plan(lab, srgb, subject)
     return clocked(lambda: camera_light(srgb, plan, curve), srgb.shape[0] * srgb.shape[1])
 
 
-def _numpy_mosaic_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_mosaic_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb = subject.readable
     plan, curve = _clean_plan(lab, srgb, subject)
     return clocked(lambda: unprocess(srgb, plan, curve=curve), srgb.shape[0] * srgb.shape[1])
@@ -634,7 +642,7 @@ BUFFERS = 8
 """Chunks of light or words that take turns, so that no two calls in a row see the same: they fit the nearest caches."""
 
 
-def _light_of(lab: Lab, subject: Subject, srgb: Srgb) -> tuple[Plan, Float]:
+def _light_of(lab: BenchmarkSession, subject: BenchmarkImage, srgb: Srgb) -> tuple[Plan, Float]:
     plan, curve = _clean_plan(lab, srgb, subject)
     return plan, unprocess(srgb, plan, curve=curve)
 
@@ -642,13 +650,13 @@ def _light_of(lab: Lab, subject: Subject, srgb: Srgb) -> tuple[Plan, Float]:
 LIMITS_DN = (0.0, 16383.0)
 
 
-def _round_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _round_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     chunks, turns = _chunks_of_dn(lab, subject)
     buffers = np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
     return clocked(lambda: _digits(chunks, turns, LIMITS_DN, *buffers), turns * chunks.size)
 
 
-def _round32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _round32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     plan, _ = _clean_plan(lab, subject.compiled, subject)
     doubles, turns = _chunks_of_dn(lab, subject)
     chunks, law = doubles.astype(np.float32), single.law_of(plan, LIMITS_DN)
@@ -656,14 +664,14 @@ def _round32_ns(lab: Lab, method: Method, subject: Subject) -> float:
     return clocked(lambda: _digits32(chunks, turns, law, black, noisy), turns * chunks.size)
 
 
-def _chunks_of_dn(lab: Lab, subject: Subject) -> tuple[Float, int]:
+def _chunks_of_dn(lab: BenchmarkSession, subject: BenchmarkImage) -> tuple[Float, int]:
     """Return chunks of a photograph's DN before rounding, and how often they go round for as many as it has pixels."""
     plan, light = _light_of(lab, subject, subject.readable)
     chunks = np.resize(to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest), (BUFFERS, CHUNK))
     return chunks, -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
 
 
-def _numpy_round_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_round_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     plan, light = _light_of(lab, subject, subject.readable)
     black_dn, white_dn = plan.black_level_dn, plan.white_level_dn
     return clocked(lambda: quantise(to_dn(light, black_dn, white_dn, plan.brightest), black_dn, white_dn), light.size)
@@ -674,23 +682,23 @@ def _some_words(count: int) -> Words:
     return (np.arange(count, dtype=np.uint64) * np.uint64(2654435769)).astype(np.uint32)
 
 
-def _normals_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _normals_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     """Return the time of the quick normals, which stand in wherever the exact ones give the same DN."""
     return _clocked_normals(_normals, subject)
 
 
-def _normals32_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _normals32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     return _clocked_normals(_normals32, subject)
 
 
-def _clocked_normals(kernel: Callable[..., None], subject: Subject) -> float:
+def _clocked_normals(kernel: Callable[..., None], subject: BenchmarkImage) -> float:
     chunks = _some_words(BUFFERS * CHUNK).reshape(BUFFERS, CHUNK)
     turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
     depths, out = np.empty((2, CHUNK), dtype=np.float32)
     return clocked(lambda: kernel(chunks, turns, depths, out), turns * chunks.size)
 
 
-def _numpy_normals_ns(lab: Lab, method: Method, subject: Subject) -> float:
+def _numpy_normals_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     words = _some_words(subject.readable.shape[0] * subject.readable.shape[1])
     return clocked(lambda: effects.normals(words), words.size)
 
@@ -790,66 +798,66 @@ def _normals32(chunks: Words, turns: int, depths: Single, out: Single) -> None:
 
 # --------------------------------------------------------------------------------------------- the table of both
 
-MethodError = Callable[[Lab, Method], Error]
-MethodTime = Callable[[Lab, Method, Subject], float]
+ErrorFunction = Callable[[BenchmarkSession, Method], MethodError]
+TimeFunction = Callable[[BenchmarkSession, Method, BenchmarkImage], float]
 
 
-class Measurement(NamedTuple):
+class MethodBenchmark(NamedTuple):
     """How error and time of a method are measured; None where its kernel cannot be called by itself yet."""
 
     spelled: str
-    error: MethodError | None
-    ns: MethodTime | None
+    error: ErrorFunction | None
+    ns: TimeFunction | None
 
 
-def _of_clean(lab: Lab, method: Method) -> Error:
+def _of_clean(lab: BenchmarkSession, method: Method) -> MethodError:
     return clean_error(lab, "two_numbers", alone(method, lab.tiers))
 
 
-def _of_shot(lab: Lab, method: Method) -> Error:
+def _of_shot(lab: BenchmarkSession, method: Method) -> MethodError:
     return shot_error(lab, alone(method, lab.tiers))
 
 
-def _of_effects(lab: Lab, method: Method) -> Error:
+def _of_effects(lab: BenchmarkSession, method: Method) -> MethodError:
     return noisy_error(lab, "electrons", alone(method, lab.tiers), "without_shot", "DN")
 
 
-def _of_normals(sampler: Callable[[Words], Float]) -> MethodError:
+def _of_normals(sampler: Callable[[Words], Float]) -> ErrorFunction:
     return lambda lab, method: normal_error(sampler, lab.effort.positions)
 
 
-MEASUREMENTS = (
-    Measurement("curve:float32_table", _of_clean, _look_up32_ns),
-    Measurement("curve:exact_table", _of_clean, _look_up_ns),
-    Measurement("curve:numpy_table", _of_clean, _numpy_curve_ns),
-    Measurement("colour:fused_float32", _of_clean, _clean32_ns),
-    Measurement("colour:fused_float64", _of_clean, _clean_ns),
-    Measurement("colour:numpy_float64", _of_clean, _numpy_colour_ns),
-    Measurement("mosaic:at_site_float32", _of_clean, _clean32_ns),
-    Measurement("mosaic:at_site", _of_clean, _clean_ns),
-    Measurement("mosaic:after_colour", _of_clean, _numpy_mosaic_ns),
-    Measurement("normal:polynomial_float32", _of_normals(polynomial_normals), _normals32_ns),
-    Measurement("normal:quadratic_float64", _of_normals(quadratic_normals), _normals_ns),
-    Measurement("normal:numpy_float64", _of_normals(effects.normals), _numpy_normals_ns),
-    Measurement("shot:gaussian_where_near", _of_shot, _near_ns),
-    Measurement("shot:inversion", _of_shot, _counts_ns),
-    Measurement("shot:numpy_inversion", _of_shot, _numpy_shot_ns),
-    Measurement("effects:fused_float64", _of_effects, _effects_ns),
-    Measurement("effects:numpy_float64", _of_effects, _effects_ns),
-    Measurement("quantise:fused_float32", _of_clean, _round32_ns),
-    Measurement("quantise:fused_float64", _of_clean, _round_ns),
-    Measurement("quantise:numpy_float64", _of_clean, _numpy_round_ns),
+METHOD_BENCHMARKS = (
+    MethodBenchmark("curve:float32_table", _of_clean, _look_up32_ns),
+    MethodBenchmark("curve:exact_table", _of_clean, _look_up_ns),
+    MethodBenchmark("curve:numpy_table", _of_clean, _numpy_curve_ns),
+    MethodBenchmark("colour:fused_float32", _of_clean, _clean32_ns),
+    MethodBenchmark("colour:fused_float64", _of_clean, _clean_ns),
+    MethodBenchmark("colour:numpy_float64", _of_clean, _numpy_colour_ns),
+    MethodBenchmark("mosaic:at_site_float32", _of_clean, _clean32_ns),
+    MethodBenchmark("mosaic:at_site", _of_clean, _clean_ns),
+    MethodBenchmark("mosaic:after_colour", _of_clean, _numpy_mosaic_ns),
+    MethodBenchmark("normal:polynomial_float32", _of_normals(polynomial_normals), _normals32_ns),
+    MethodBenchmark("normal:quadratic_float64", _of_normals(quadratic_normals), _normals_ns),
+    MethodBenchmark("normal:numpy_float64", _of_normals(effects.normals), _numpy_normals_ns),
+    MethodBenchmark("shot:gaussian_where_near", _of_shot, _near_ns),
+    MethodBenchmark("shot:inversion", _of_shot, _counts_ns),
+    MethodBenchmark("shot:numpy_inversion", _of_shot, _numpy_shot_ns),
+    MethodBenchmark("effects:fused_float64", _of_effects, _effects_ns),
+    MethodBenchmark("effects:numpy_float64", _of_effects, _effects_ns),
+    MethodBenchmark("quantise:fused_float32", _of_clean, _round32_ns),
+    MethodBenchmark("quantise:fused_float64", _of_clean, _round_ns),
+    MethodBenchmark("quantise:numpy_float64", _of_clean, _numpy_round_ns),
 )
 """How every method of `METHODS` is measured, in its order."""
 
-BY_NAME = {one.spelled: one for one in MEASUREMENTS}
+BENCHMARKS_BY_NAME = {one.spelled: one for one in METHOD_BENCHMARKS}
 TIER_SETTING = {"tier": "two_numbers", "tier_noisy": "two_numbers", "tier_electrons": "electrons", "tier_own": "own"}
 
 
-def _errors(lab: Lab, steps: Steps) -> Iterator[tuple[tuple[str, str], Error | None]]:
+def _errors(lab: BenchmarkSession, steps: MeasurementProgress) -> Iterator[tuple[tuple[str, str], MethodError | None]]:
     """Yield the error of every method and tier, by stage and name."""
     for method in METHODS:
-        error = BY_NAME[method.spelled].error
+        error = BENCHMARKS_BY_NAME[method.spelled].error
         yield (method.stage, method.name), None if error is None else error(lab, method)
         steps.advance()
     for stage in TIER_STAGES:
@@ -862,11 +870,11 @@ def _errors(lab: Lab, steps: Steps) -> Iterator[tuple[tuple[str, str], Error | N
 Times = dict[tuple[str, str], float]
 
 
-def _one_round(lab: Lab, subject: Subject, steps: Steps) -> Times:
+def _one_round(lab: BenchmarkSession, subject: BenchmarkImage, steps: MeasurementProgress) -> Times:
     """Run everything once on one subject; nanoseconds a pixel by stage (of a tier: setting) and name."""
     times: Times = {}
     for method in METHODS:
-        ns = BY_NAME[method.spelled].ns
+        ns = BENCHMARKS_BY_NAME[method.spelled].ns
         if ns is not None:
             times[method.stage, method.name] = ns(lab, method, subject)
         steps.advance()
@@ -877,7 +885,9 @@ def _one_round(lab: Lab, subject: Subject, steps: Steps) -> Times:
     return times
 
 
-def _method_rows(lab: Lab, errors: dict[tuple[str, str], Error | None], rounds: Sequence[Times]) -> Iterator[Row]:
+def _method_rows(
+    lab: BenchmarkSession, errors: dict[tuple[str, str], MethodError | None], rounds: Sequence[Times]
+) -> Iterator[Measurement]:
     chosen = {name: taken(accuracy_budget(tier)) for name, tier in lab.tiers.items()}
     for stage in STAGES:
         reference = methods_of_stage(stage)[-1].name
@@ -887,7 +897,9 @@ def _method_rows(lab: Lab, errors: dict[tuple[str, str], Error | None], rounds: 
             yield _row(stage, method.name, tiers, errors[key], rounds, key, (stage, reference))
 
 
-def _tier_rows(lab: Lab, errors: dict[tuple[str, str], Error | None], rounds: Sequence[Times]) -> Iterator[Row]:
+def _tier_rows(
+    lab: BenchmarkSession, errors: dict[tuple[str, str], MethodError | None], rounds: Sequence[Times]
+) -> Iterator[Measurement]:
     for stage in TIER_STAGES:
         for name in lab.tiers:
             setting = TIER_SETTING[stage]
@@ -898,24 +910,24 @@ def _row(
     stage: str,
     name: str,
     tiers: str,
-    error: Error | None,
+    error: MethodError | None,
     rounds: Sequence[Times],
     key: tuple[str, str],
     reference: tuple[str, str],
-) -> Row:
+) -> Measurement:
     ns = ratio = None
     if key in rounds[0]:
         ns = statistics.median(times[key] for times in rounds)
         ratio = statistics.median(times[key] / times[reference] for times in rounds)
     if error is None:
-        return Row(stage, name, tiers, None, None, "", None, ns, ratio)
-    return Row(stage, name, tiers, error.max, error.rms, error.unit, error.changed_share, ns, ratio)
+        return Measurement(stage, name, tiers, None, None, "", None, ns, ratio)
+    return Measurement(stage, name, tiers, error.max, error.rms, error.unit, error.changed_share, ns, ratio)
 
 
 # ----------------------------------------------------------------------------------------------- circumstances
 
 
-def _facts(lab: Lab, command: str) -> dict[str, str]:
+def _facts(lab: BenchmarkSession, command: str) -> dict[str, str]:
     """Return what a reader must know of how the numbers came about."""
     effort, settings = lab.effort, lab.settings
     sites = sum(one.sampled.shape[0] * one.sampled.shape[1] for one in lab.subjects)
@@ -959,7 +971,7 @@ PLAIN_LINE_S = 5.0
 """Seconds between progress lines where there is no terminal."""
 
 
-class Steps:
+class MeasurementProgress:
     """A bar over measurements on a terminal, a plain line every few seconds elsewhere; both on stderr."""
 
     def __init__(self, total: int) -> None:
@@ -967,7 +979,7 @@ class Steps:
         self._plain = not sys.stderr.isatty()
         self._bar = tqdm(total=total, desc="measuring", unit="step", file=sys.stderr, disable=self._plain)
 
-    def __enter__(self) -> Steps:
+    def __enter__(self) -> MeasurementProgress:
         return self
 
     def __exit__(self, *_: object) -> None:

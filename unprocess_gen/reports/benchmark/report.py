@@ -10,67 +10,37 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import fields
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from unprocess_gen.config.accuracy import STAGES
-from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.files import machine_error
 from unprocess_gen.reports import markup
-from unprocess_gen.reports.benchmark.measure import REFERENCE, Report, Row
+from unprocess_gen.reports.benchmark.measure import REFERENCE, BenchmarkReport, Measurement
+from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.markup import element
+from unprocess_gen.reports.report_files import write_files
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLUMNS = tuple(one.name for one in fields(Row))
+COLUMNS = tuple(one.name for one in fields(Measurement))
 FILES = ("accuracy.csv", "accuracy.png", "accuracy.html")
-OF_A_DATASET = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work")
-"""What marks a folder as a dataset, finished or begun, where foreign files would be taken for damage."""
 
 
-def check_drawing(verb: str) -> None:
-    """Refuse a verb that draws where nothing can be drawn: ConfigError."""
-    if find_spec("matplotlib") is None:
-        raise ConfigError(f"{verb}: drawing needs matplotlib; pip install 'unprocess_gen[figures]'")
-
-
-def check_out(out: Path, verb: str) -> None:
-    """Refuse a folder that cannot be written or holds a dataset, and where nothing can be drawn: ConfigError."""
-    check_drawing(verb)
-    for name in OF_A_DATASET:
-        if (out / name).exists():
-            raise ConfigError(
-                f"out={out}: holds a dataset ({name}), where a report would be damage; choose another out"
-            )
-    there = next(path for path in (out, *out.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise ConfigError(f"out={out}: cannot be written ({there} is no folder)")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"out={out}: cannot be written (Permission denied)")
-
-
-def write(report: Report, out: Path) -> None:
+def write_benchmark(report: BenchmarkReport, out: Path) -> None:
     """Write the three files, over those of an earlier report; MachineError where that fails."""
-    picture = png(report.rows)
-    contents = (csv_text(report.rows).encode(), picture, page(report, picture).encode())
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, content in zip(FILES, contents, strict=True):
-            (out / name).write_bytes(content)
-    except OSError as error:
-        raise machine_error(error, out) from error
+    picture = benchmark_figure(report.rows)
+    contents = (csv_text(report.rows).encode(), picture, benchmark_page(report, picture).encode())
+    write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
 # -------------------------------------------------------------------------------------------------------- tables
 
 
-def csv_text(rows: Sequence[Row]) -> str:
+def csv_text(rows: Sequence[Measurement]) -> str:
     """Return ``accuracy.csv``; empty where nothing was measured."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -84,35 +54,30 @@ def csv_text(rows: Sequence[Row]) -> str:
 HEADINGS = ("stage", "method", "tiers", "max error", "RMS error", "unit", "changed", "ns a pixel", "of reference")
 
 
-def cells(row: Row) -> tuple[str, ...]:
+def cells(row: Measurement) -> tuple[str, ...]:
     """Return a row as people read it, in the order of `HEADINGS`."""
     return (
         row.stage,
         row.method,
         row.tier,
-        spelled(row.error_max),
-        spelled(row.error_rms),
+        short_number(row.error_max),
+        short_number(row.error_rms),
         row.error_unit,
         "–" if row.changed_share is None else _percent(row.changed_share),
-        spelled(row.ns_per_pixel, 3),
+        short_number(row.ns_per_pixel, 3),
         "–" if row.ratio_to_reference is None else _percent(row.ratio_to_reference),
     )
 
 
-def spelled(value: float | None, digits: int = 2) -> str:
-    """Return a number to some digits, without an exponent where it is short."""
-    return "–" if value is None else f"{float(f'{value:.{digits}g}'):g}"
-
-
 def _percent(share: float) -> str:
-    return f"{spelled(share * 100)} %"
+    return f"{short_number(share * 100)} %"
 
 
 RIGHT = frozenset({3, 4, 6, 7, 8})
 """Columns of numbers."""
 
 
-def table(rows: Sequence[Row]) -> str:
+def text_table(rows: Sequence[Measurement]) -> str:
     """Return the rows as lines for a terminal."""
     lines = [HEADINGS, *(cells(row) for row in rows)]
     widths = [max(len(line[at]) for line in lines) for at in range(len(HEADINGS))]
@@ -125,7 +90,7 @@ def table(rows: Sequence[Row]) -> str:
     )
 
 
-def markdown(rows: Sequence[Row]) -> str:
+def markdown_table(rows: Sequence[Measurement]) -> str:
     """Return the rows as a Markdown table."""
     rule = "|".join("--:" if at in RIGHT else "---" for at in range(len(HEADINGS)))
     lines = [f"| {' | '.join(HEADINGS)} |", f"|{rule}|"]
@@ -135,15 +100,15 @@ def markdown(rows: Sequence[Row]) -> str:
 # -------------------------------------------------------------------------------------------------------- figure
 
 
-def pareto(points: Sequence[tuple[float, float]]) -> list[int]:
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Return which points no other beats: none is as good in both numbers and better in one; smaller is better."""
     return [
         at for at, (x, y) in enumerate(points) if not any((a <= x and b <= y) and (a < x or b < y) for a, b in points)
     ]
 
 
-class Panel(NamedTuple):
-    """A panel: which stages it shows, each with its marker, which error (`Row` field), and what it is called."""
+class FigurePanel(NamedTuple):
+    """Hold what a panel shows: title, stages, the error field of `Measurement`, and the label of its axis."""
 
     title: str
     stages: tuple[str, ...]
@@ -152,17 +117,17 @@ class Panel(NamedTuple):
 
 
 PANELS = (
-    Panel(
+    FigurePanel(
         "whole tiers, clean and noisy frame",
         ("tier_noisy", "tier_electrons"),
         "error_rms",
         "noisy frame, RMS (σ of its noise)",
     ),
-    *(Panel(stage, (stage,), "error_rms", "clean frame, RMS (DN)") for stage in ("curve", "colour", "mosaic")),
-    Panel("normal", ("normal",), "error_max", "largest error (σ)"),
-    Panel("shot", ("shot",), "error_max", "distance of the laws"),
-    Panel("effects", ("effects",), "error_rms", "noisy frame, RMS (DN)"),
-    Panel("quantise", ("quantise",), "error_rms", "clean frame, RMS (DN)"),
+    *(FigurePanel(stage, (stage,), "error_rms", "clean frame, RMS (DN)") for stage in ("curve", "colour", "mosaic")),
+    FigurePanel("normal", ("normal",), "error_max", "largest error (σ)"),
+    FigurePanel("shot", ("shot",), "error_max", "distance of the laws"),
+    FigurePanel("effects", ("effects",), "error_rms", "noisy frame, RMS (DN)"),
+    FigurePanel("quantise", ("quantise",), "error_rms", "clean frame, RMS (DN)"),
 )
 assert {stage for panel in PANELS for stage in panel.stages} == {*STAGES, "tier_noisy", "tier_electrons"}
 
@@ -172,7 +137,7 @@ MARKERS = {"tier_noisy": ("o", "two numbers"), "tier_electrons": ("s", "electron
 FRONT = "#999999"
 
 
-def png(rows: Sequence[Row]) -> bytes:
+def benchmark_figure(rows: Sequence[Measurement]) -> bytes:
     """Draw the figure, as the bytes of a PNG."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -196,7 +161,7 @@ def _grid(figure: Figure) -> list[Axes]:
     return [figure.add_subplot(grid[0, :2]), *(figure.add_subplot(grid[row, column]) for row, column in others)]
 
 
-def _draw_panel(panel: Panel, axes: Axes, rows: Sequence[Row]) -> None:
+def _draw_panel(panel: FigurePanel, axes: Axes, rows: Sequence[Measurement]) -> None:
     shown = [row for row in rows if row.stage in panel.stages and None not in (row.ns_per_pixel, _error(panel, row))]
     axes.set_title(panel.title, loc="left")
     axes.set_ylabel(panel.axis)
@@ -208,7 +173,7 @@ def _draw_panel(panel: Panel, axes: Axes, rows: Sequence[Row]) -> None:
     at_front: set[int] = set()
     for stage in panel.stages:
         of_stage = [at for at, row in enumerate(shown) if row.stage == stage]
-        front = [of_stage[at] for at in pareto([points[at] for at in of_stage])]
+        front = [of_stage[at] for at in pareto_front([points[at] for at in of_stage])]
         axes.plot(*zip(*sorted(points[at] for at in front), strict=True), color=FRONT, linewidth=1.2, zorder=1)
         at_front |= set(front)
     below = labels_below(points)
@@ -230,7 +195,7 @@ def labels_below(points: Sequence[tuple[float, float]]) -> list[bool]:
     return below
 
 
-def _error(panel: Panel, row: Row) -> float | None:
+def _error(panel: FigurePanel, row: Measurement) -> float | None:
     value: float | None = getattr(row, panel.error)
     return value
 
@@ -264,14 +229,14 @@ def _decades(ns: Sequence[float]) -> tuple[float, float]:
     return middle / reach, middle * reach
 
 
-def _colour(row: Row) -> str:
+def _colour(row: Measurement) -> str:
     """Return the colour of the nearest tier that takes a method, the reference last."""
     tiers = row.tier.split()
     others = [tier for tier in tiers if tier not in COLOURS]
     return next((COLOURS[tier] for tier in ("exact", "fast") if tier in tiers), OTHER_COLOUR if others else "#000000")
 
 
-def _draw_point(axes: Axes, row: Row, point: tuple[float, float], filled: bool, below: bool) -> None:
+def _draw_point(axes: Axes, row: Measurement, point: tuple[float, float], filled: bool, below: bool) -> None:
     marker, kind = MARKERS.get(row.stage, ("o", ""))
     colour = _colour(row)
     axes.plot(*point, marker, color=colour, markersize=8, markerfacecolor=colour if filled else "white", zorder=3)
@@ -279,7 +244,7 @@ def _draw_point(axes: Axes, row: Row, point: tuple[float, float], filled: bool, 
     low, high = (math.log(limit) for limit in axes.get_xlim())
     at_right = (math.log(point[0]) - low) / (high - low) > 0.55
     axes.annotate(
-        f"{name}\n{spelled(row.ns_per_pixel, 2)} ns",
+        f"{name}\n{short_number(row.ns_per_pixel, 2)} ns",
         point,
         xytext=(5 if at_right else -3 if below else 5, -7 if below else 5),
         textcoords="offset points",
@@ -291,7 +256,7 @@ def _draw_point(axes: Axes, row: Row, point: tuple[float, float], filled: bool, 
     )
 
 
-def _legend(figure: Figure, rows: Sequence[Row]) -> None:
+def _legend(figure: Figure, rows: Sequence[Measurement]) -> None:
     """Say above all panels what colours and markers mean."""
     from matplotlib.lines import Line2D
 
@@ -321,7 +286,7 @@ NOTES = (
 )
 
 
-def page(report: Report, picture: bytes) -> str:
+def benchmark_page(report: BenchmarkReport, picture: bytes) -> str:
     """Return ``accuracy.html``: one file without a script, the figure in it."""
     stages = [None, *(row.stage for row in report.rows)]
     first = [at for at, row in enumerate(report.rows) if row.stage != stages[at]]

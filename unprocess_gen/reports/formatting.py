@@ -1,0 +1,28 @@
+"""Format numbers for tables, figures and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+NOT_MEASURED = "–"
+
+
+def short_number(value: float | None, digits: int = 2) -> str:
+    """Return a number with some significant digits, without an exponent if it is short; a dash for None."""
+    return NOT_MEASURED if value is None else f"{float(f'{value:.{digits}g}'):g}"
+
+
+def percentage(fraction: float | None, digits: int = 2) -> str:
+    """Return a fraction as a percentage; a dash for None."""
+    return NOT_MEASURED if fraction is None else f"{short_number(fraction * 100, digits)} %"
+
+
+def value_range(values: Sequence[float], digits: int = 6) -> str:
+    """Return the smallest and largest of some numbers, or the number itself if they are equal."""
+    low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def byte_size(count: int) -> str:
+    """Return a number of bytes in decimal megabytes or gigabytes."""
+    return f"{count / 1e9:,.2f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"

@@ -1,0 +1,78 @@
+"""Check that a report can be written where it was asked for, and write its files.
+
+Reports are no part of a dataset. This module imports no kernel, so that the dataset report starts without Numba.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import machine_error
+
+DATASET_ENTRIES = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work")
+"""Names that mark a folder as a dataset, finished or not. Other files in such a folder count as damage."""
+
+LIBRARIES = {"matplotlib": "drawing needs", "jinja2": "HTML pages need"}
+"""Optional libraries of the extra ``figures``, and the purpose that an error message names."""
+
+
+def require_libraries(verb: str, names: tuple[str, ...] = ("matplotlib", "jinja2")) -> None:
+    """Check that the optional libraries of a verb are installed.
+
+    Parameters
+    ----------
+    verb : str
+        Name of the verb, for the message.
+    names : tuple of str
+        Keys of `LIBRARIES`.
+
+    Raises
+    ------
+    ConfigError
+        If a library is missing; the message names the extra that installs it.
+    """
+    for name in names:
+        if find_spec(name) is None:
+            raise ConfigError(f"{verb}: {LIBRARIES[name]} {name}; pip install 'unprocess_gen[figures]'")
+
+
+def check_report_folder(out: Path, verb: str) -> None:
+    """Check, before any work, that a verb can draw and write its report to a folder.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the report; it need not exist.
+    verb : str
+        Name of the verb, for messages.
+
+    Raises
+    ------
+    ConfigError
+        If a library is missing, the folder cannot be written, or it contains a dataset.
+    """
+    require_libraries(verb)
+    for name in DATASET_ENTRIES:
+        if (out / name).exists():
+            raise ConfigError(
+                f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out"
+            )
+    nearest = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not nearest.is_dir():
+        raise ConfigError(f"out={out}: cannot be written ({nearest} is not a folder); choose another out")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ConfigError(f"out={out}: cannot be written (Permission denied); choose another out")
+
+
+def write_files(out: Path, contents: Mapping[str, bytes]) -> None:
+    """Write files into a folder, replacing those of an earlier report; MachineError if that fails."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            (out / name).write_bytes(content)
+    except OSError as error:
+        raise machine_error(error, out) from error
