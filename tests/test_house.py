@@ -12,8 +12,8 @@ import unprocess_gen
 PACKAGE = Path(unprocess_gen.__file__).parent
 
 ONLY_IN = {
-    "hydra": {"cli.hydra_app"},
-    "omegaconf": {"cli.hydra_app", "config.serialization"},
+    "hydra": {"cli.hydra_app", "config.composition", "config.composition_errors"},
+    "omegaconf": {"cli.hydra_app", "config.composition", "config.composition_errors", "config.serialization"},
     "joblib": {"pipeline.generate"},
     "llvmlite": {"simulation.kernels.simd", "core.shortcuts"},
     "numba": {"core.jit", "simulation.kernels.simd", "core.shortcuts"},

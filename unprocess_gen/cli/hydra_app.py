@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from unprocess_gen.cli.sweep import Job, folder_name, overrides_text, worst, write_table
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, UnprocessGenError
 
 if TYPE_CHECKING:
@@ -49,15 +50,6 @@ SWEEP_FLAGS = ("-m", "--multirun")
 
 Task = Callable[["Config"], tuple[int, "Summary | None"]]
 """What is run on the settings: returns the exit code, and what was made."""
-
-
-def conf_dir() -> Path:
-    """Return the folder of the options: inside the installed package, or beside it in a source tree."""
-    here = Path(__file__).resolve().parents[1]
-    for folder in (here / "conf", here.parent / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise ConfigError(f"no conf/config.yaml in or beside {here}: the installation is not whole")
 
 
 def compose(

@@ -22,7 +22,8 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen import __version__
-from unprocess_gen.cli.hydra_app import complain, compose, conf_dir
+from unprocess_gen.cli.hydra_app import complain, compose
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 
 if TYPE_CHECKING:

@@ -1,0 +1,136 @@
+"""`load_config`: overrides and option files to a validated config, inside other Hydra applications too."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.version import getbase
+
+from unprocess_gen.config.composition import load_config
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import ConfigError
+
+OWN_PROFILE = "name: own\nunits: normalized\nblack: subtracted\na: 1e-3\nb: 0\n"
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """Return a folder with one option of a user: ``noise=own``."""
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/own.yaml").write_text(OWN_PROFILE)
+    return tmp_path / "mine"
+
+
+def test_overrides_decide_the_config() -> None:
+    config = load_config(["camera=sony_a7r", "noise=imx385_iso1600", "seed=7"])
+
+    assert isinstance(config, Config)
+    assert (config.camera.name, config.noise.name, config.seed) == ("sony_a7r", "imx385_iso1600", 7)
+
+
+def test_composing_twice_gives_equal_configs() -> None:
+    assert load_config(["seed=3"]) == load_config(("seed=3",))
+
+
+def test_option_files_of_the_user_are_found(own: Path) -> None:
+    assert load_config(["noise=own", "noise.bits=null"], own).noise.a == 0.001
+    assert load_config(["noise=own", "noise.bits=null"], str(own)).noise.name == "own"
+    with pytest.raises(ConfigError, match="noise=own: no such option"):
+        load_config(["noise=own"])
+
+
+def test_a_relative_config_dir_starts_at_the_working_directory(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(own.parent)
+    assert load_config(["noise=own"], "mine").noise.name == "own"
+
+
+def test_hydra_composes_on_the_registered_schema() -> None:
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        assert hydra.compose("config", ["seed=5"]).seed == 5
+
+
+def test_a_running_hydra_application_keeps_its_state(tmp_path: Path) -> None:
+    (tmp_path / "app.yaml").write_text("a: 1\n")
+    with hydra.initialize_config_dir(str(tmp_path), version_base="1.2", job_name="app"):
+        before, state = GlobalHydra.instance(), GlobalHydra.instance().hydra
+
+        assert load_config(["seed=5"]).seed == 5
+
+        assert GlobalHydra.instance() is before
+        assert GlobalHydra.instance().hydra is state
+        assert str(getbase()) == "1.2"
+        node = hydra.compose("app", ["a=2"], return_hydra_config=True)
+        assert (node.a, node.hydra.job.name) == (2, "app")
+
+
+def test_state_is_restored_after_an_error() -> None:
+    assert not GlobalHydra.instance().is_initialized()
+    with pytest.raises(ConfigError):
+        load_config(["camera=nope"])
+    assert not GlobalHydra.instance().is_initialized()
+
+
+def test_threads_compose_at_the_same_time() -> None:
+    seeds: list[int] = []
+    threads = [threading.Thread(target=lambda i=i: seeds.append(load_config([f"seed={i}"]).seed)) for i in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(seeds) == list(range(6))
+
+
+REFUSED = [
+    ("camera=sony_a7", r"camera=sony_a7: no such option; expected one of choice, .*; did you mean sony_a7r\?"),
+    ("source.rot=p", r"source.rot=p: no such key; source has root, .*; did you mean root\?"),
+    ("sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
+    ("+sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
+    ("seed=abc", r"seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
+    ("seed=-1", r"seed=-1: expected 0 to "),
+    ("seed=[1", r"seed=\[1: not a valid override"),
+    ("seed", r"seed: expected a setting key=value"),
+    ("~seed", r"~seed: a setting cannot be taken away"),
+    ("out=${", r"out=\$\{: "),
+    ("out=${no.such}", r"out=\$\{no.such\}: Interpolation key 'no.such' not found"),
+    ("camera=null", r"camera=null: expected the name of an option: choice, "),
+    ("experiment=ipol_demo", r"experiment=ipol_demo: a recipe is added to the settings; say \+experiment=ipol_demo"),
+    ("hydra.mode=MULTIRUN", r"hydra.mode=MULTIRUN: settings of Hydra belong to the command line"),
+]
+
+
+@pytest.mark.parametrize(("override", "sentence"), REFUSED, ids=[override for override, _ in REFUSED])
+def test_mistakes_are_explained_in_one_sentence(override: str, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence) as caught:
+        load_config([override])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_config_dir_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--config-dir: folder '.*nowhere' not found"):
+        load_config(config_dir=tmp_path / "nowhere")
+
+
+def test_interpolations_resolve_in_every_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UG_FOLDER", "here")
+    config = load_config(["out=${oc.env:UG_FOLDER}/x", "seed=${output.pairs_per_shard}"])
+    assert (config.out, config.seed) == ("here/x", 8)
+
+
+@pytest.mark.parametrize("name", ["$HOME", "a$b", r"\${x}", "it's", "été", "a b", "[1]", "back\\slash", "=", "a,b"])
+def test_folder_names_are_taken_as_they_are(name: str) -> None:
+    assert load_config([f"out={name}"]).out == name.replace(r"\${", "${")
+
+
+def test_home_folder_is_expanded() -> None:
+    assert load_config(["out=~/x"]).out == os.path.expanduser("~/x")
+
+
+def test_options_of_a_group_are_listed() -> None:
+    assert group_options("accuracy") == ["exact", "fast", "reference"]
+    assert group_options("nope") == []

@@ -1,0 +1,304 @@
+"""Compose a validated `Config` from option files and overrides, with Hydra's Compose API.
+
+Importing this module registers the schema in Hydra's ConfigStore, so that Hydra's own ``compose`` works on ``conf/``
+too. Composing leaves the state of a running Hydra application unchanged.
+
+Design: ``docs/design/composition_and_sweeps.md``.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobRuntime
+from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.version import VersionBase
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from unprocess_gen.config.composition_errors import explain, unknown_key
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError
+
+SCHEMA_NAME = "gen_dataset_schema"
+"""Name of the schema in Hydra's ConfigStore; first entry of the defaults list in ``conf/config.yaml``."""
+
+ConfigStore.instance().store(name=SCHEMA_NAME, node=Config)
+
+VERSION_BASE = "1.3"
+"""Version of Hydra whose behaviour is requested."""
+
+ADDED_GROUPS = {"experiment": "a recipe", "sweep": "a sweep"}
+"""Groups without settings of their own, and what their options are: added with ``+``, in no defaults list."""
+
+PATH_KEYS = ("source.root", "out")
+"""Keys whose values are paths, which are quoted for Hydra's grammar."""
+
+
+@dataclass(frozen=True, slots=True)
+class OptionFolders:
+    """Name the folders and the primary config that a config is composed from.
+
+    Attributes
+    ----------
+    main : Path
+        Folder with the primary config; None for `conf_dir`.
+    name : str
+        Primary config, without ``.yaml``.
+    own : Path or None
+        The user's folder of option files, searched after ``main``.
+    """
+
+    main: Path | None = None
+    name: str = "config"
+    own: Path | None = None
+
+
+def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str] | None = None) -> Config:
+    """Compose and validate the config of one dataset.
+
+    Works inside a running Hydra application and without one; the application's own config is left unchanged.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Hydra overrides, as on the command line: ``["camera=sony_a7r", "noise.draws=2"]``. Values of ``source.root``
+        and ``out`` may contain any character; a literal ``${`` is written ``\\${``.
+    config_dir : path-like, optional
+        Folder of additional option files, as with ``--config-dir``.
+
+    Returns
+    -------
+    Config
+        The resolved config.
+
+    Raises
+    ------
+    ConfigError
+        If an override, an option file or a value is not allowed. The message names key, value and what is allowed.
+    """
+    for override in overrides:
+        check_override(override)
+        if re.match(r"\+*hydra\b", override) and not override.startswith("hydra.searchpath="):
+            raise ConfigError(f"{override}: settings of Hydra belong to the command line; expected keys of a dataset")
+    node = compose_node(overrides, OptionFolders(own=None if config_dir is None else Path(config_dir)))
+    return validated_config(node, overrides)
+
+
+def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None) -> DictConfig:
+    """Compose overrides without validating values.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Overrides as the user wrote them; paths need no quotes (`quoted_path`).
+    folders : OptionFolders, optional
+        What to compose from; the built-in options if omitted.
+
+    Returns
+    -------
+    DictConfig
+        The unresolved config, with Hydra's own settings in its key ``hydra``.
+
+    Raises
+    ------
+    ConfigError
+        If Hydra or OmegaConf refuses the overrides or an option file.
+    """
+    folders = folders or OptionFolders()
+    if folders.own is not None and not folders.own.is_dir():
+        raise ConfigError(f"--config-dir: folder '{folders.own}' not found; expected a folder of option files")
+    try:
+        with _hydra_for(folders):
+            return hydra.compose(folders.name, [quoted_path(one) for one in overrides], return_hydra_config=True)
+    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError, RecursionError) as error:
+        raise ConfigError(explain(error, overrides)) from error
+
+
+def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
+    """Resolve and validate a composed config.
+
+    Parameters
+    ----------
+    node : DictConfig
+        Result of `compose_node`; its key ``hydra`` is removed.
+    overrides : sequence of str
+        The overrides it was composed from, to quote in messages.
+
+    Returns
+    -------
+    Config
+        The resolved config.
+
+    Raises
+    ------
+    ConfigError
+        If a key is not in the schema, an interpolation fails or a value is out of range.
+    """
+    with open_dict(node):
+        node.pop("hydra", None)
+    for key in _unknown_keys(node, Config()):
+        raise ConfigError(unknown_key(key, overrides))
+    try:
+        config = OmegaConf.to_object(node)
+    except (OmegaConfBaseException, RecursionError) as error:
+        raise ConfigError(explain(error, overrides)) from error
+    assert isinstance(config, Config)
+    validate_config(config)
+    return config
+
+
+def check_override(override: str) -> None:
+    """Refuse an override that Hydra would take for something else, or answer with several lines.
+
+    Parameters
+    ----------
+    override : str
+        Override as the user wrote it.
+
+    Raises
+    ------
+    ConfigError
+        If it is not ``key=value``, removes a key, or gives a group something that is not the name of an option.
+    """
+    key, equals, value = override.lstrip("+").partition("=")
+    if override.startswith("~"):
+        raise ConfigError(f"{override}: a setting cannot be taken away; choose another value or option")
+    if not equals:
+        raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
+    if key in ADDED_GROUPS and not override.startswith("+"):
+        raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; say +{override}")
+    options = group_options(key) if key.isalpha() else []
+    word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
+    if options and not word:
+        raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}")
+
+
+def quoted_path(override: str) -> str:
+    """Quote the value of a path for Hydra's grammar, and expand ``~``.
+
+    An unquoted path with an umlaut, an apostrophe or a bracket is not a word of that grammar. Interpolations stay
+    active; ``\\${`` is a literal ``${``.
+
+    Parameters
+    ----------
+    override : str
+        Any override.
+
+    Returns
+    -------
+    str
+        The override with its value quoted if its key is in `PATH_KEYS`, else unchanged.
+    """
+    key, _, path = override.partition("=")
+    if key not in PATH_KEYS or path in ("", "null") or path[0] in "'\"":
+        return override
+    path = os.path.expanduser(path)
+    path = re.sub(r"(\\*)'", r"\1\1\\'", path)
+    path = re.sub(r"(\\+)$", r"\1\1", path)
+    return f"{key}='{path}'"
+
+
+def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> Iterator[str]:
+    """Yield the keys that a ``+`` override added to the config and the schema lacks."""
+    for key in map(str, node):
+        value = getattr(schema, key, None)
+        if not hasattr(schema, key):
+            yield prefix + key
+        elif is_dataclass(value):
+            yield from _unknown_keys(node[key], value, f"{prefix}{key}.")
+
+
+# --------------------------------------------------------------------------------------- Hydra's process-wide state
+
+_LOCK = threading.RLock()
+_own_folder: Path | None = None
+
+
+class OwnOptions(SearchPathPlugin):
+    """Append the user's folder of option files to Hydra's search path, at the place of ``--config-dir``."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append the folder of the composition in progress, if it has one."""
+        if _own_folder is not None:
+            search_path.append("command-line", f"{CheckedFiles.scheme()}://{_own_folder.absolute()}")
+
+
+class CheckedFiles(ConfigSource):
+    """Read the user's option files, after checking that they can be read safely."""
+
+    @staticmethod
+    def scheme() -> str:
+        """Return the prefix of search paths that Hydra reads through this class."""
+        return "checked-file"
+
+    def _file(self, config_path: str) -> Path:
+        return Path(self.path, self._normalize_file_name(config_path))
+
+    def available(self) -> bool:
+        """Return whether the folder exists."""
+        return self.is_group("")
+
+    def is_group(self, config_path: str) -> bool:
+        """Return whether a path is a folder."""
+        return Path(self.path, config_path).is_dir()
+
+    def is_config(self, config_path: str) -> bool:
+        """Return whether a path names a YAML file."""
+        return self._file(config_path).is_file()
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        """Return the groups and configs in a folder."""
+        found: list[str] = []
+        for path in Path(self.path, config_path).iterdir():
+            self._list_add_result(found, os.path.join(config_path, path.name), path.name, results_filter)
+        return sorted(set(found))
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """Read one YAML file."""
+        path = self._file(config_path)
+        text = path.read_text(encoding="utf-8")
+        config = OmegaConf.create(text)
+        header = self._get_header_dict(text[:512])
+        return ConfigResult(provider=self.provider, path=self.full_path(), config=config, header=header)
+
+
+@contextmanager
+def _hydra_for(folders: OptionFolders) -> Iterator[None]:
+    """Initialise Hydra's Compose API; afterwards restore the state of the application that runs, if any."""
+    global _own_folder
+    with _LOCK:
+        plugins = Plugins.instance()
+        for plugin in (OwnOptions, CheckedFiles):
+            plugins.register(plugin)
+        application, version = GlobalHydra.instance(), VersionBase.instance()
+        state, base = application.hydra, version.version_base
+        job_name = JobRuntime.instance().get("name")
+        application.clear()
+        _own_folder = folders.own
+        try:
+            main = (folders.main or conf_dir()).absolute()
+            with hydra.initialize_config_dir(str(main), job_name=job_name, version_base=VERSION_BASE):
+                yield
+        finally:
+            _own_folder = None
+            application.hydra, version.version_base = state, base
+            GlobalHydra.set_instance(application)
