@@ -693,17 +693,47 @@ def test_a_refusal_leaves_stderr_clean(capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr().err == ""
 
 
-def test_what_a_codec_says_of_a_whole_picture_is_passed_on(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_codec_warning_is_logged_with_the_name_of_its_file(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream = io.BytesIO()
     noisy_picture().save(stream, "PNG")
     true_imdecode = cv2.imdecode
 
     def chatty(buffer: np.ndarray, flags: int) -> np.ndarray:
-        os.write(2, b"something harmless\n")
+        os.write(2, b"something\nharmless\n")
         return true_imdecode(buffer, flags)
 
     monkeypatch.setattr(cv2, "imdecode", chatty)
-    decode(stream.getvalue(), max_pixels=2**26, icc="ignore")
-    assert capfd.readouterr().err == "something harmless\n"
+    decode(stream.getvalue(), max_pixels=2**26, icc="ignore", name="sub/a.png")
+    assert caplog.messages == ["sub/a.png: something harmless"]
+    assert capfd.readouterr().err == ""
+
+
+def with_cicp(primaries: int, transfer: int, matrix: int = 0, full_range: int = 1, **options: object) -> bytes:
+    """Return a PNG that declares its colours by code points (cICP, before the pixels)."""
+    data = pillow(smooth(), "PNG", **options)
+    payload = b"cICP" + bytes((primaries, transfer, matrix, full_range))
+    chunk = struct.pack(">I", 4) + payload + struct.pack(">I", zlib.crc32(payload))
+    return data[:33] + chunk + data[33:]
+
+
+@pytest.mark.parametrize("icc", ["ignore", "refuse"])
+@pytest.mark.parametrize(("primaries", "transfer"), [(9, 16), (9, 18), (1, 16), (12, 16), (1, 8)])
+def test_png_of_high_dynamic_range_is_unsupported(primaries: int, transfer: int, icc: str) -> None:
+    assert reason_of(with_cicp(primaries, transfer), icc=icc) == "unsupported"
+
+
+@pytest.mark.parametrize(("matrix", "full_range"), [(9, 1), (0, 0)])
+def test_png_that_is_not_full_range_rgb_is_unsupported(matrix: int, full_range: int) -> None:
+    assert reason_of(with_cicp(1, 13, matrix, full_range)) == "unsupported"
+
+
+def test_other_primaries_of_a_png_are_treated_like_a_profile() -> None:
+    assert reason_of(with_cicp(12, 13), icc="refuse") == "icc"
+    np.testing.assert_array_equal(pixels_of(with_cicp(12, 13), icc="ignore"), smooth())
+
+
+def test_srgb_code_points_override_the_profile_of_a_png() -> None:
+    data = with_cicp(1, 13, icc_profile=swapped_primaries())
+    np.testing.assert_array_equal(pixels_of(data, icc="refuse"), smooth())

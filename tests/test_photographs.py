@@ -43,7 +43,7 @@ def test_black_and_white_stay_black_and_white_when_downscaled() -> None:
 def test_a_photograph_too_small_to_be_downscaled_is_unsupported(tmp_path: Path) -> None:
     Image.fromarray(pixels(1, 3, 9)).save(tmp_path / "small.png")
     config = SourceConfig(root=str(tmp_path), include=["*"], downscale=4)
-    with pytest.raises(SourceError, match=r"^unsupported: 9 x 3 pixels are fewer"):
+    with pytest.raises(SourceError, match=r"^unsupported: 9 x 3 pixels are less than one square"):
         load_source(config, list_photographs(config).sources[0])
 
 
@@ -101,3 +101,15 @@ def test_16_bit_photographs_are_not_dithered(dithered: object, settings: Setting
     deep = pixels(5, 20, 30, np.uint16)
     plain = plan_image(settings(), "d" * 64)
     np.testing.assert_array_equal(make_pair(deep, dithered).noisy, make_pair(deep, plain).noisy)  # type: ignore[arg-type]
+
+
+def test_dataset_of_a_single_picture_equals_that_of_its_folder(make: Make, tmp_path: Path) -> None:
+    picture = tmp_path / "photos" / "%one.png"
+    picture.parent.mkdir()
+    Image.fromarray(pixels(1, 9, 14)).save(picture)
+    make(picture, tmp_path / "one")
+    make(picture.parent, tmp_path / "all")
+
+    assert (tmp_path / "one" / "manifest.csv").read_bytes() == (tmp_path / "all" / "manifest.csv").read_bytes()
+    (replayed,) = replay(read_rows(tmp_path / "one" / "manifest.csv"), str(picture))
+    assert (replayed.source, replayed.complaint) == ("%25one.png", None)

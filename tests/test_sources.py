@@ -14,7 +14,17 @@ from hypothesis import strategies as st
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources import listing as sources
-from unprocess_gen.sources.listing import Listing, decode_name, encode_name, list_folder, number_twins, read_bytes
+from unprocess_gen.sources.listing import (
+    ClipSizes,
+    Listing,
+    clip_warnings,
+    decode_name,
+    encode_name,
+    list_folder,
+    number_twins,
+    read_bytes,
+    unmatched_sentence,
+)
 
 
 def listed(root: Path, *include: str, recursive: bool = True, limit: int | None = None) -> Listing:
@@ -64,9 +74,74 @@ def test_a_glob_with_a_slash_is_held_against_the_relative_path(tmp_path: Path) -
     assert paths(listed(tmp_path, "in/*")) == ["in/a.jpg"]
 
 
-def test_files_that_no_glob_matches_are_counted(tmp_path: Path) -> None:
-    fill(tmp_path, "a.jpg", "notes.txt", "sub/more.txt")
-    assert listed(tmp_path).not_matched == 2
+def test_unmatched_files_are_counted_by_suffix(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "notes.txt", "sub/more.TXT", "b.HEIC", "LICENSE")
+    listing = listed(tmp_path)
+    assert listing.unmatched == {".txt": 2, "": 1, ".heic": 1}
+    assert listing.not_matched == 4
+
+
+def test_unmatched_sentence_names_suffixes_and_what_to_do() -> None:
+    assert unmatched_sentence({}) == ""
+    assert unmatched_sentence({".heic": 1}).startswith("1 file is not matched by source.include (1 .heic); convert")
+    many = {f".{letter}": 9 for letter in "abcdefg"} | {"": 1}
+    sentence = unmatched_sentence(many)
+    assert "64 files are not matched" in sentence
+    assert "9 .e, 19 others" in sentence
+
+
+def test_single_picture_is_a_root_whatever_the_globs(tmp_path: Path) -> None:
+    fill(tmp_path, "=a.png", "b.png")
+    (source,) = listed(tmp_path / "=a.png", "*.jpg").sources
+    assert (source.index, source.name, source.path, source.size_bytes) == (0, "%3Da.png", "=a.png", 6)
+    assert read_bytes(str(tmp_path / "=a.png"), source) == b"=a.png"
+
+
+def test_single_picture_that_was_deleted_is_unreadable(tmp_path: Path) -> None:
+    fill(tmp_path, "a.png")
+    (source,) = listed(tmp_path / "a.png").sources
+    (tmp_path / "a.png").unlink()
+    with pytest.raises(SourceError, match=r"^unreadable"):
+        read_bytes(str(tmp_path / "a.png"), source)
+
+
+def test_folder_of_the_name_of_its_file_is_a_folder(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg/a.jpg")
+    assert read_bytes(f"{tmp_path}/a.jpg", only(tmp_path / "a.jpg")) == b"a.jpg/a.jpg"
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../secret.jpg", "sub/../../secret.jpg"])
+def test_path_outside_the_root_is_never_opened(tmp_path: Path, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path, "secret.jpg", "root/a.jpg")
+    monkeypatch.setattr(os, "open", lambda *_, **__: pytest.fail("opened"))
+    with pytest.raises(SourceError, match=r"^unreadable: .* leads outside source\.root"):
+        read_bytes(f"{tmp_path}/root", Source(0, path, path, 10))
+
+
+def test_folder_of_videos_only_is_refused_with_the_setting_that_reads_them(tmp_path: Path) -> None:
+    fill(tmp_path, "film.MP4", "notes.txt")
+    with pytest.raises(ConfigError, match=r"set source\.clips=true to read videos as clips"):
+        list_folder(str(tmp_path), ["*.jpg"], True, None, video=["*.mp4"])
+
+
+def test_one_folder_as_the_only_clip_gives_a_warning(tmp_path: Path) -> None:
+    fill(tmp_path, "a.jpg", "b.jpg")
+    numbered = sources.number_clips(str(tmp_path), listed(tmp_path).sources)
+    (warning,) = clip_warnings(numbered)
+    assert "all 2 photographs are in one folder" in warning
+
+
+def test_several_clips_or_one_photograph_give_no_warning(tmp_path: Path) -> None:
+    fill(tmp_path, "a/1.jpg", "a/2.jpg", "b/1.jpg")
+    assert clip_warnings(sources.number_clips(str(tmp_path), listed(tmp_path).sources)) == ()
+    assert clip_warnings(sources.number_clips(str(tmp_path), listed(tmp_path).sources[:1])) == ()
+
+
+def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
+    sizes = ClipSizes()
+    assert [sizes.warning("a", 4, 3), sizes.warning("b", 8, 6), sizes.warning("a", 4, 3)] == ["", "", ""]
+    assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in sizes.warning("a", 3, 4)
+    assert sizes.warning("a", 5, 5) == ""
 
 
 def test_sub_folders_are_left_alone_when_not_recursive(tmp_path: Path) -> None:
@@ -178,9 +253,9 @@ def test_a_dangling_link_that_no_glob_matches_is_nobodys_business(tmp_path: Path
     assert paths(listed(tmp_path)) == ["a.jpg"]
 
 
-@pytest.mark.parametrize("name", ["missing", "file", "nul\0"])
-def test_a_root_that_is_no_folder_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
-    fill(tmp_path, "file")
+@pytest.mark.parametrize("name", ["missing", "pipe", "nul\0"])
+def test_root_of_other_kind_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ConfigError, match=r"^source\.root=") as caught:
         list_folder(f"{tmp_path}/{name}", ["*.jpg"], True, None)
     assert "\n" not in str(caught.value)

@@ -90,8 +90,10 @@ def validate_config(config: Config) -> None:
 def _check_source(source: SourceConfig) -> None:
     if source.root == "":
         raise ConfigError("source.root='': expected a folder; null stands for the built-in scenes")
-    if source.root is not None and not Path(source.root).is_dir():
-        raise ConfigError(f"source.root={source.root}: no such folder; null stands for the built-in scenes")
+    if source.root is not None and not Path(source.root).exists():
+        raise ConfigError(
+            f"source.root={source.root}: no such folder or file; expected photographs, or null for the built-in scenes"
+        )
     if not source.include and not (source.clips and source.video):
         raise ConfigError("source.include=[]: expected at least one pattern such as '*.jpg'")
     if source.clips and source.root is None:

@@ -45,6 +45,7 @@ from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.sources.listing import source_file
 from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches
 from unprocess_gen.sources.video.decode import is_installed
@@ -343,7 +344,7 @@ def _add_frames(
 
 
 def _is_there(config: Config, source: Source) -> bool:
-    return Path(config.source.root or "", source.path).exists()
+    return Path(source_file(config.source.root or "", source.path)).exists()
 
 
 def _settle(coordinator_pid: int) -> None:

@@ -1,4 +1,4 @@
-"""The photographs of a run, wherever they come from: a folder, the videos in it, or the built-in scenes."""
+"""List and load the source images of a run: photographs of a folder, frames of videos, or built-in scenes."""
 
 from __future__ import annotations
 
@@ -14,35 +14,51 @@ from unprocess_gen.config.derived import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
-from unprocess_gen.sources import listing as sources
+from unprocess_gen.sources import listing
 from unprocess_gen.sources.image import decode
 from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.video.decode import Video, is_installed
 
-FILMS_OPEN = 2
-"""Videos that a process keeps open: the one its shard is in, and the next."""
+OPEN_VIDEOS = 2
+"""Videos that a process keeps open: that of the current shard, and the next one."""
 
 
-def list_photographs(config: SourceConfig) -> sources.Listing:
-    """Return every photograph of the run in source order, identical files numbered; reads no pixel.
+def list_photographs(config: SourceConfig) -> listing.Listing:
+    """List every source of the run in order, with identical files and frames of clips numbered.
 
-    With ``clips``, files that ``video`` matches are clips: a source for every frame, one for a video that has none to
-    give. Raises ConfigError where the folder is missing, cannot be read or holds nothing that ``include`` matches, and
-    where there is a video and nothing to read it with.
+    Parameters
+    ----------
+    config : SourceConfig
+        Validated settings of the source. With ``clips``, a file that ``video`` matches becomes one source for each
+        frame, or one failed source if it has no readable frame.
+
+    Returns
+    -------
+    Listing
+        No pixel has been decoded for it.
+
+    Raises
+    ------
+    ConfigError
+        If the folder does not exist, cannot be read or contains no matching file; if a video matches and PyAV is not
+        installed.
+    MachineError
+        If a file changes while it is hashed.
     """
     if config.root is None:
         scenes = synthetic.listing(config.limit)
-        listed = tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes))
-        return sources.Listing(listed, not_matched=0, skipped_links=0)
+        return listing.Listing(tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes)))
     include = [*config.include, *(config.video if config.clips else ())]
-    listing = sources.list_folder(config.root, include, config.recursive, config.limit)
-    numbered = sources.number_twins(config.root, listing.sources)
+    video = () if config.clips else config.video
+    listed = listing.list_folder(config.root, include, config.recursive, config.limit, video)
+    numbered = listing.number_twins(config.root, listed.sources)
     if config.clips:
         framed = itertools.islice(_framed(config, numbered), config.limit)
-        numbered = sources.number_clips(
+        numbered = listing.number_clips(
             config.root, [replace(source, index=index) for index, source in enumerate(framed)]
         )
-    return sources.Listing(numbered, listing.not_matched, listing.skipped_links)
+    warnings = listing.clip_warnings(numbered) if config.clips else ()
+    return replace(listed, sources=numbered, warnings=warnings)
 
 
 def evenly_spaced(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
@@ -53,20 +69,39 @@ def evenly_spaced(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]
 
 
 def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:
-    """Return the SHA-256 of a source's bytes (of a scene's pixels) and its pixels, decoded and downscaled.
+    """Read, decode and downscale one source.
 
-    Raises SourceError, with the digest as ``sha256`` where the bytes could be read, also where no patch fits into the
-    pixels, or no 2x2 tile that packed planes could be made of; MachineError where the file is not the one that was
-    listed.
+    Parameters
+    ----------
+    config : SourceConfig
+        Validated settings of the source.
+    source : Source
+        One entry of the listing.
+    layout : {"mosaic", "packed"}
+        Layout of the frames; packed planes need at least one 2 x 2 tile.
+
+    Returns
+    -------
+    sha256 : str
+        SHA-256 of the file's bytes; of the pixels for a built-in scene.
+    photograph : Photograph
+        Pixels, upright, downscaled by ``config.downscale``.
+
+    Raises
+    ------
+    SourceError
+        If the source cannot be used, or no patch or tile fits into it; ``sha256`` is set if the bytes could be read.
+    MachineError
+        If the file is not the one that was listed.
     """
     digest, photograph = _full_frame(config, source)
     height, width = photograph.srgb.shape[:2]
-    law = patch_rule(config)
-    if law is not None and min(height, width) < law.side:
-        text = f"{width} x {height} pixels hold no patch of {law.side} x {law.side} (source.patch)"
+    rule = patch_rule(config)
+    if rule is not None and min(height, width) < rule.side:
+        text = f"{width} x {height} pixels contain no patch of {rule.side} x {rule.side} (source.patch)"
         raise SourceError("unsupported", text, digest)
     if layout == PACKED and min(height, width) < 2:
-        text = f"{width} x {height} pixels hold no 2 x 2 sites, one for each plane (output.layout=packed)"
+        text = f"{width} x {height} pixels contain no 2 x 2 tile (output.layout=packed)"
         raise SourceError("unsupported", text, digest)
     return digest, photograph
 
@@ -77,16 +112,25 @@ def _full_frame(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
         return digest, photograph
     height, width = photograph.srgb.shape[:2]
     if min(height, width) < config.downscale:
-        text = f"{width} x {height} pixels are fewer than source.downscale={config.downscale} takes for one"
+        text = f"{width} x {height} pixels are less than one square of source.downscale={config.downscale}"
         raise SourceError("unsupported", text, digest)
     return digest, replace(photograph, srgb=downscaled(photograph.srgb, config.downscale))
 
 
 def downscaled(srgb: Srgb, side: int) -> Srgb:
-    """Return the mean of each square of pixels as uint16 ``[H // side, W // side, 3]``, the nearest of 65536 codes.
+    """Average squares of pixels in integer arithmetic.
 
-    In whole numbers throughout, so that the extra bits that averaging gives are kept exactly; code k of 255 is k·257.
-    Rows and columns that fill no square are left out.
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes.
+    side : int
+        Side of a square in pixels; rows and columns that fill no square are omitted.
+
+    Returns
+    -------
+    ndarray of uint16, [H // side, W // side, 3]
+        The code nearest to each mean; 8-bit code k counts as k·257.
     """
     height, width = (length // side for length in srgb.shape[:2])
     squares = srgb[: height * side, : width * side].reshape(height, side, width, side, 3)
@@ -101,26 +145,29 @@ def _decoded(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
         return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)
     if source.is_video:
         return _frame(config, config.root, source)
-    content = sources.read_bytes(config.root, source)
+    content = listing.read_bytes(config.root, source)
     digest = hashlib.sha256(content).hexdigest()
     _check_digest(source, digest)
     try:
-        return digest, decode.decode(content, max_pixels=config.max_pixels, icc=config.icc)
+        return digest, decode.decode(content, max_pixels=config.max_pixels, icc=config.icc, name=source.name)
     except SourceError as error:
         raise SourceError(error.reason, error.text, digest) from error
 
 
 def _check_digest(source: Source, digest: str) -> None:
     if source.sha256 not in (None, digest):
-        raise MachineError(f"source {source.name} changed while the run was on; start again into another out")
+        raise MachineError(
+            f"source {source.name} has other bytes than when it was listed; expected unchanged sources; "
+            "rerun with another out"
+        )
 
 
 # ------------------------------------------------------------------------------------------------------------ videos
 
 
 def _framed(config: SourceConfig, found: tuple[Source, ...]) -> Iterator[Source]:
-    """Yield the sources, and in place of each video one for each of its frames."""
-    is_video = sources.matcher(config.video)
+    """Yield the sources; each video is replaced by one source for each of its frames."""
+    is_video = listing.matcher(config.video)
     for source in found:
         if source.reason is not None or not is_video(source.path) or source.name == NO_CLIP:
             yield source
@@ -131,42 +178,42 @@ def _framed(config: SourceConfig, found: tuple[Source, ...]) -> Iterator[Source]
 
 
 def _frames(config: SourceConfig, source: Source) -> tuple[str | None, int]:
-    """Return a video's digest and how many sources it is: its frames, or one for the row that says why it has none."""
+    """Return a video's digest and its number of sources: its frames, or one that fails if it cannot be read."""
     assert config.root is not None
     try:
-        digest, film = _film(config.root, source)
-        film.refuse(config.max_pixels, config.icc)
+        digest, video = _video(config.root, source)
+        video.refuse(config.max_pixels, config.icc)
     except SourceError as error:
         return error.sha256, 1
-    return digest, len(film)
+    return digest, len(video)
 
 
 def _frame(config: SourceConfig, root: str, source: Source) -> tuple[str, Photograph]:
-    digest, film = _film(root, source)
+    digest, video = _video(root, source)
     _check_digest(source, digest)
     try:
-        stored, orientation = film.frame(source.frame, config.max_pixels, config.icc)
+        stored, orientation = video.frame(source.frame, config.max_pixels, config.icc)
     except SourceError as error:
         raise SourceError(error.reason, error.text, digest) from error
     return digest, Photograph(decode.upright(stored, orientation), orientation)
 
 
-def _film(root: str, source: Source) -> tuple[str, Video]:
-    """Return a video's digest and the video, both of them as long as its file stays untouched."""
+def _video(root: str, source: Source) -> tuple[str, Video]:
+    """Return a video's digest and the open video; both are cached until the file changes."""
     if not is_installed():
         raise ConfigError(
-            f"source.video: {source.name} is a video, which needs PyAV: pip install 'unprocess_gen[video]'; "
-            "or leave videos out with source.video=[]"
+            f"source.video: {source.name} is a video, which needs PyAV; install it with "
+            "pip install 'unprocess_gen[video]', or omit videos with source.video=[]"
         )
     whole = replace(source, index=0, occurrence=0, sha256=None, frame=0, frames=1, clip_sha256=None, clip_occurrence=0)
-    return _opened_film(root, whole, sources.stamp(root, source))
+    return _open_video(root, whole, listing.stamp(root, source))
 
 
-@lru_cache(maxsize=FILMS_OPEN)
-def _opened_film(root: str, source: Source, stamp: sources.Stamp) -> tuple[str, Video]:
+@lru_cache(maxsize=OPEN_VIDEOS)
+def _open_video(root: str, source: Source, stamp: listing.Stamp) -> tuple[str, Video]:
     if source.size_bytes == 0:
         raise SourceError("empty", f"{source.name} has 0 bytes")
-    file = sources.keep_open(root, source, stamp)
+    file = listing.keep_open(root, source, stamp)
     digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
     try:
         return digest, Video(file)

@@ -1,37 +1,31 @@
-"""From the bytes of a photograph to its pixels, and the policy of which photographs we take.
+"""Decode image files to pixels, and refuse those that are not opaque, still photographs in RGB or gray.
 
-Everything that is not a whole, opaque, still photograph in RGB or gray is refused with a reason, from its header where
-that can be told there (`headers`); no file that was cut is ever half decoded. Pillow does what we could not do better,
-colour profiles, and only where they are asked for.
+The header decides where it can (`headers`); no file that was cut is decoded in part. Pillow evaluates colour profiles,
+and only if ``source.icc=refuse`` asks for it.
 
-**What OpenCV does** (4.13 and 5.0 agree in all of it; 4.12 says nothing of broken TIFF data), and what is done:
+What OpenCV does (4.13 and 5.0 agree), and what this module does about it:
 
-* Orientation: JPEG, PNG and WebP stay as stored under ``IMREAD_IGNORE_ORIENTATION``. TIFFs of 8 bits are turned
-  whatever the flags say, those of 16 bits under some. So tag 274 is set to 1 in a copy, and we turn.
-* 16-bit TIFF: under ``IMREAD_COLOR_RGB`` the swap of channels hits half of the bytes, so these are decoded as stored.
-  Then "white is zero" is not undone (at 8 bits it is), and separate planes come out as memory never written: the first
-  is undone here, the second refused.
-* Alpha: the transparent gray of a PNG (tRNS) and the alpha of a gray TIFF are dropped without a word. The first is
-  looked up in the pixels, the second refused.
-* 16-bit BMP: its white is 248; refused. CMYK JPEG: converted without a profile; refused. TIFF tiles narrower than 32
-  pixels at 8 bits: an error; refused. TIFF tiles are allocated at the size they claim: limited.
-* Memory: OpenCV's Python layer copies what it decoded, so a decode peaks at twice the array: 6.0 bytes for each pixel
-  of a 20-megapixel JPEG (baseline, progressive or turned), of which 3 stay; 12 for 16-bit RGB, 16 for 16-bit RGBA.
-  What is done here afterwards stays under that peak.
-* Damage: libjpeg and libtiff fill in for data that are broken, return a picture and tell stderr. So stderr (file
-  descriptor 2, of the whole process, under a lock) goes into a file while a picture is decoded, 30 microseconds; what
-  tells of damage is a refusal, anything else is passed on. libjpeg tells the first trouble of a file only, so whatever
-  it says is damage: a strange JFIF version may hide a lost half. Bit rot that still decodes as Huffman codes, and
-  damage within a lossy WebP, is told by nobody but a hash recorded earlier.
+* Orientation: JPEG, PNG and WebP stay as stored under ``IMREAD_IGNORE_ORIENTATION``; 8-bit TIFFs are rotated whatever
+  the flags are, 16-bit ones under some. Tag 274 is therefore set to 1 in a copy, and `upright` rotates.
+* 16-bit TIFF: under ``IMREAD_COLOR_RGB`` half of the bytes are swapped, so these files are decoded as stored. Then
+  "white is zero" is not inverted (at 8 bits it is), and separate planes contain uninitialised memory. The first is
+  inverted here, the second refused.
+* Alpha: the transparent gray of a PNG (tRNS) and the alpha of a gray TIFF are dropped silently. The first is searched
+  in the pixels, the second refused.
+* Refused because OpenCV decodes them wrongly: 16-bit BMP (white becomes 248), CMYK JPEG (no profile is applied), TIFF
+  tiles narrower than 32 pixels at 8 bits. TIFF tiles are allocated at the size they declare, so it is limited.
+* Damage: codecs report it on standard error only (`codec_messages`). libjpeg reports the first problem of a file only,
+  so any report of it counts as damage. Damage that still decodes as Huffman codes, and damage within a lossy WebP, is
+  found by a recorded hash only.
+
+Measured memory and decisions: ``docs/design/decoding.md``.
 """
 
 from __future__ import annotations
 
 import io
-import os
+import logging
 import re
-import tempfile
-import threading
 from functools import lru_cache
 from typing import cast
 
@@ -40,30 +34,37 @@ import numpy as np
 
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.types import Photograph, Srgb
+from unprocess_gen.sources.image.codec_messages import captured
 from unprocess_gen.sources.image.headers import Header, max_side, png_transparent_gray, probe, tiff_without_orientation
 
-# libtiff's complaints go through OpenCV's log, which OPENCV_LOG_LEVEL could silence.
+_LOGGER = logging.getLogger(__name__)
+
+# libtiff's messages go through OpenCV's log, which OPENCV_LOG_LEVEL could silence.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_WARNING)
 
 ICC_CHOICES = ("ignore", "refuse")
 
 SRGB_TOLERANCE = 2
-"""Codes (of 255) that a profile may move a colour by and still count as sRGB; real sRGB profiles move 1."""
+"""Largest difference, in 8-bit codes, between a profile and sRGB that still counts as sRGB; real ones differ by 1."""
 
 DECODE_PEAK = 8
-"""Samples a pixel that must fit into memory before a failed decode is put down to the file; decoding peaks at 6."""
+"""Samples per pixel that must fit into memory before a failed decode is attributed to the file; the peak is 6."""
 
 CV2_MAX_PIXELS = 2**30
-"""OpenCV refuses more, unless an environment variable says otherwise."""
+"""OpenCV refuses more, unless an environment variable changes its limit."""
 
-# What libjpeg (all of its warnings but one: a few bytes before the end marker, as some cameras write) and libtiff say
-# when they fill in for data that are missing or broken, and go on.
+CICP_SRGB = (1, 13, 0, 1)
+"""Primaries, transfer function, matrix coefficients and full-range flag of sRGB (ITU-T H.273)."""
+CICP_HDR_TRANSFERS = {8: "linear", 16: "PQ", 18: "HLG"}
+"""Transfer functions whose codes are not display-referred (ITU-T H.273, table 3)."""
+
+# What libjpeg and libtiff write when they fill in missing or broken data and continue. One libjpeg warning is harmless:
+# a few bytes before the end marker, as some cameras write them.
 _DAMAGE = re.compile(
     rb"[Pp]remature end|Corrupt JPEG data(?!: \d{1,2} extraneous bytes before marker 0xd9)|bad Huffman code"
     rb"|[Ii]nconsistent progression|Invalid SOS parameters|unknown JFIF revision|Unknown Adobe color"
     rb"|Unsupported marker|JPEGLib:|Improper JPEG strip/tile size|PackBitsDecode: Discarding|TIFF_Error"
 )
-_DECODING = threading.Lock()
 
 _UNCHANGED = cv2.IMREAD_UNCHANGED
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -82,33 +83,40 @@ _TURNS = {
 }
 
 
-def decode(data: bytes, *, max_pixels: int, icc: str) -> Photograph:
-    """Decodes one photograph to uint8 or uint16 ``[H, W, 3]`` in R, G, B order, upright and contiguous.
+def decode(data: bytes, *, max_pixels: int, icc: str, name: str = "image") -> Photograph:
+    """Decode one photograph to uint8 or uint16 ``[H, W, 3]`` in R, G, B order, upright and contiguous.
 
     Parameters
     ----------
-    data
-        The whole file.
-    max_pixels
-        Refuse more than so many, judged by the header.
-    icc
-        ``refuse`` photographs whose profile is not sRGB, or ``ignore`` profiles.
+    data : bytes
+        The complete file.
+    max_pixels : int
+        Largest number of pixels, judged by the header.
+    icc : {"ignore", "refuse"}
+        Whether to refuse photographs whose colour profile is not sRGB.
+    name : str
+        Name of the file in log messages.
+
+    Returns
+    -------
+    Photograph
+        Pixels and the EXIF orientation that was applied.
 
     Raises
     ------
     SourceError
         With the first reason found of: ``empty``, ``unsupported``, ``truncated``, ``too_large``, ``animated``,
-        ``cmyk``, ``icc``, ``corrupt``, ``alpha``. (A gray TIFF with alpha, and a header that makes no sense, are
-        ``alpha`` and ``corrupt`` at once.)
+        ``cmyk``, ``icc``, ``corrupt``, ``alpha``. Headers that are refused while they are read (a gray TIFF with
+        alpha, an impossible header) give ``alpha`` or ``corrupt`` before the others are checked.
     """
     if icc not in ICC_CHOICES:
         raise ValueError(f"icc is {icc!r}, expected one of {', '.join(ICC_CHOICES)}")
     header = probe(data)
     _refuse(header, max_pixels, icc)
-    return Photograph(upright(_pixels(data, header), header.orientation), header.orientation)
+    return Photograph(upright(_pixels(data, header, name), header.orientation), header.orientation)
 
 
-# The policy -----------------------------------------------------------------------------------------------------------
+# Policy ---------------------------------------------------------------------------------------------------------------
 
 
 def _refuse(header: Header, max_pixels: int, icc: str) -> None:
@@ -126,13 +134,30 @@ def _refuse(header: Header, max_pixels: int, icc: str) -> None:
         raise SourceError("animated", f"the file holds {header.frames} pictures, expected 1")
     if header.mode == "cmyk":
         raise SourceError("cmyk", "the pixels are printing inks (CMYK); convert the picture to sRGB")
-    if icc == "refuse" and header.icc is not None and (objection := _profile_objection(header.icc)):
+    if header.cicp is not None:
+        _refuse_cicp(header.cicp, icc)
+    elif icc == "refuse" and header.icc is not None and (objection := _profile_objection(header.icc)):
         raise SourceError("icc", f"{objection}; convert the picture to sRGB, or set source.icc=ignore")
+
+
+def _refuse_cicp(cicp: tuple[int, int, int, int], icc: str) -> None:
+    """Raise SourceError for colours declared by code points (H.273) that sRGB code would misread.
+
+    Under ``ignore``, other primaries and curves of standard dynamic range count as sRGB, as ICC profiles do.
+    """
+    primaries, transfer, matrix, full_range = cicp
+    declared = f"the colours are declared as primaries {primaries}, transfer {transfer}, matrix {matrix} (cICP)"
+    if transfer in CICP_HDR_TRANSFERS:
+        raise SourceError("unsupported", f"{declared}: {CICP_HDR_TRANSFERS[transfer]}, not display-referred")
+    if matrix != 0 or full_range != 1:
+        raise SourceError("unsupported", f"{declared}, full range {full_range}: not full-range RGB")
+    if icc == "refuse" and cicp != CICP_SRGB:
+        raise SourceError("icc", f"{declared}; convert the picture to sRGB, or set source.icc=ignore")
 
 
 @lru_cache(maxsize=32)
 def _profile_objection(icc: bytes) -> str:
-    """Why an embedded profile is not sRGB, or an empty text. Judged by what it does: names of profiles say little."""
+    """Return why an embedded profile is not sRGB, or an empty text; judged by its effect, since names prove little."""
     from PIL import ImageCms
 
     try:
@@ -143,7 +168,7 @@ def _profile_objection(icc: bytes) -> str:
 
 
 def _codes_moved(icc: bytes) -> int:
-    """How far a profile's colours lie from sRGB: the largest difference, in codes, over a grid or over all grays."""
+    """Return the largest difference from sRGB, in 8-bit codes, over a grid of colours or over all grays."""
     from PIL import Image, ImageCms
 
     profile = ImageCms.ImageCmsProfile(io.BytesIO(icc))
@@ -152,23 +177,25 @@ def _codes_moved(icc: bytes) -> int:
     colours = Image.fromarray(grid if mode == "RGB" else np.arange(256, dtype=np.uint8)[None])
     intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
     transform = ImageCms.buildTransform(profile, ImageCms.createProfile("sRGB"), mode, "RGB", renderingIntent=intent)
-    seen = np.asarray(ImageCms.applyTransform(colours, transform)).astype(int)
-    return int(np.abs(seen - np.asarray(colours.convert("RGB"))).max())
+    converted = np.asarray(ImageCms.applyTransform(colours, transform)).astype(int)
+    return int(np.abs(converted - np.asarray(colours.convert("RGB"))).max())
 
 
 # Pixels ---------------------------------------------------------------------------------------------------------------
 
 
-def _pixels(data: bytes, header: Header) -> Srgb:
-    """The pixels as stored, ``[height, width, 3]``, R, G, B."""
+def _pixels(data: bytes, header: Header, name: str) -> Srgb:
+    """Return the pixels as stored, ``[height, width, 3]``, R, G, B."""
     flags = _flags(header)
-    decoded, said = _imdecode(tiff_without_orientation(data) if header.format == "tiff" else data, flags)
+    decoded, messages = _imdecode(tiff_without_orientation(data) if header.format == "tiff" else data, flags)
     if decoded is None:
         _check_memory(header)
-    if decoded is None or _DAMAGE.search(said):
-        complaint = " ".join(said.decode(errors="replace").split())[:200] or "it gives no reason"
-        raise SourceError("corrupt", f"OpenCV cannot decode the {header.format} data whole: {complaint}")
-    os.write(2, said)
+    text = " ".join(messages.decode(errors="replace").split())
+    if decoded is None or _DAMAGE.search(messages):
+        complaint = text[:200] or "it gives no reason"
+        raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {complaint}")
+    if text:
+        _LOGGER.warning("%s: %s", name, text)
     _check_array(decoded, header)
     if header.has_alpha:
         _check_opaque(decoded, data, header)
@@ -184,23 +211,18 @@ def _flags(header: Header) -> int:
 
 
 def _imdecode(data: bytes | bytearray, flags: int) -> tuple[Srgb | None, bytes]:
-    """Decode, and return what the codec said to stderr meanwhile: the one place where it tells of half a picture."""
-    with _DECODING, tempfile.TemporaryFile(buffering=0) as spool:
-        stderr = os.dup(2)
-        os.dup2(spool.fileno(), 2)
+    """Return the decoded array, None if the codec fails, and what the codec wrote to standard error."""
+    decoded: Srgb | None = None
+    with captured() as messages:
         try:
             decoded = cast("Srgb | None", cv2.imdecode(np.frombuffer(data, np.uint8), flags))
         except cv2.error:
             decoded = None
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-        spool.seek(0)
-        return decoded, spool.read()
+    return decoded, messages.text
 
 
 def _check_memory(header: Header) -> None:
-    """MemoryError where there is none for these pixels: codecs tell of that in many ways, or not at all."""
+    """Raise MemoryError if these pixels do not fit into memory; codecs report that in many ways, or not at all."""
     np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
 
 
@@ -208,7 +230,7 @@ def _check_array(decoded: Srgb, header: Header) -> None:
     expected = (header.height, header.width, f"uint{header.bits}")
     found = (*decoded.shape[:2], decoded.dtype.name)
     if found != expected:
-        raise SourceError("corrupt", f"the header says {expected} (rows, columns, type), the data {found}")
+        raise SourceError("corrupt", f"the header declares {expected} (rows, columns, type), the data have {found}")
 
 
 def _check_opaque(decoded: Srgb, data: bytes, header: Header) -> None:
@@ -225,14 +247,14 @@ def _white(header: Header) -> int:
 
 
 def _as_rgb(stored: Srgb) -> Srgb:
-    """Gray, BGR or BGRA to RGB."""
+    """Convert gray, BGR or BGRA to RGB."""
     if stored.ndim == 2:
         return cast(Srgb, np.repeat(stored[..., None], 3, axis=2))
     return cast(Srgb, np.ascontiguousarray(stored[..., 2::-1]))
 
 
 def upright(srgb: Srgb, orientation: int) -> Srgb:
-    """Turns pixels as stored by an EXIF orientation."""
+    """Return stored pixels rotated and mirrored by an EXIF orientation, 1 to 8 (EXIF tag 274)."""
     swap, row_step, column_step = _TURNS[orientation]
     turned = srgb.swapaxes(0, 1) if swap else srgb
     return cast(Srgb, np.ascontiguousarray(turned[::row_step, ::column_step]))

@@ -50,6 +50,7 @@ class Header:
     orientation: int = 1
     frames: int = 1
     icc: bytes | None = None
+    cicp: tuple[int, int, int, int] | None = None
     missing: str = ""
 
 
@@ -188,6 +189,7 @@ def _png(data: bytes) -> Header:
         orientation=_exif_orientation(_png_chunk(data, b"eXIf") or b""),
         frames=2 if b"acTL" in kinds else 1,
         icc=_png_profile(_png_chunk(data, b"iCCP")),
+        cicp=_png_cicp(_png_chunk(data, b"cICP")),
         missing="" if b"IEND" in kinds else "its IEND chunk",
     )
 
@@ -200,6 +202,15 @@ def _png_profile(chunk: bytes | None) -> bytes | None:
         return zlib.decompressobj().decompress(chunk.partition(b"\0")[2][1:], _MAX_PROFILE_BYTES)
     except zlib.error:
         return b""
+
+
+def _png_cicp(chunk: bytes | None) -> tuple[int, int, int, int] | None:
+    """Return primaries, transfer, matrix and full-range flag (PNG 3rd edition, cICP); they override iCCP."""
+    if chunk is None:
+        return None
+    if len(chunk) != 4:
+        raise SourceError("corrupt", f"the cICP chunk has {len(chunk)} bytes, expected 4")
+    return chunk[0], chunk[1], chunk[2], chunk[3]
 
 
 def png_transparent_gray(data: bytes) -> int:
