@@ -112,4 +112,4 @@ def test_dataset_of_a_single_picture_equals_that_of_its_folder(make: Make, tmp_p
 
     assert (tmp_path / "one" / "manifest.csv").read_bytes() == (tmp_path / "all" / "manifest.csv").read_bytes()
     (replayed,) = replay(read_rows(tmp_path / "one" / "manifest.csv"), str(picture))
-    assert (replayed.source, replayed.complaint) == ("%25one.png", None)
+    assert (replayed.source, replayed.complaint) == ("%25one.png", "")
