@@ -15,8 +15,8 @@ ONLY_IN = {
     "hydra": {"cli.hydra_app", "config.composition", "config.composition_errors"},
     "omegaconf": {"cli.hydra_app", "config.composition", "config.composition_errors", "config.serialization"},
     "joblib": {"pipeline.generate"},
-    "llvmlite": {"simulation.kernels.simd", "core.shortcuts"},
-    "numba": {"core.jit", "simulation.kernels.simd", "core.shortcuts"},
+    "llvmlite": {"simulation.kernels.simd"},
+    "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "reports.dataset_report", "reports.contact_sheet"),
         *("simulation.reference.isp", "pipeline.generate"),

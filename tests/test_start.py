@@ -27,7 +27,7 @@ assert cli.main() == 0
 print(*sys.modules)
 """
 
-NEVER = {"numba.np.linalg", "numba.np.arraymath", "scipy.linalg", "joblib", "asyncio", "matplotlib", "PIL", "av"}
+NEVER = {"joblib", "asyncio", "matplotlib", "PIL", "av"}
 """What a run of one job from a folder of photographs has no use for, and what is slow or large to load."""
 
 HYDRAS = {"hydra", "omegaconf", "antlr4"}

@@ -1,69 +1,144 @@
-"""How loops become machine code. Numba is named here, in `lanes` and in `shortcuts`, nowhere else.
+"""Compile kernels with Numba and cache their machine code on disk.
 
-No fastmath: nothing is reordered and no multiply-add is fused, so every processor rounds alike.
+Numba is imported here and in `simulation.kernels.simd` only. Kernels are compiled without fastmath: the compiler
+neither reorders operations nor fuses multiply-add, so all CPUs round alike.
+
+Compiled kernels contain the machine code of the kernels that they call. Numba checks only the file of the outer kernel,
+so its cache could return machine code of an older version of another file: wrong bytes. `kernel_cache_folder` prevents
+this. Its name contains a digest of all files below `core` and `simulation`, the packages that kernels may depend on.
+Editing any other package, or the modification time of a file, does not change it. A kernel in another package may call
+only kernels of these two packages or of its own file, which Numba checks itself.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from numba import njit, version_info
+import numba
 
-TRIED = (0, 68)
-"""The last Numba that `shortcuts` was tried with, from the oldest allowed on; a newer one goes its own way."""
+numba_config: Any = numba.config
+"""Numba's settings: public names without types, assigned when Numba is imported."""
+
+KERNEL_PACKAGES = ("core", "simulation")
+"""The packages whose files determine the machine code of kernels."""
+
+PREFIX = "unprocess_gen-"
+"""The beginning of the name of a folder of machine code; the digest of the sources follows."""
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a kernel, and keep the machine code between processes where there is a place for it.
+    """Compile a kernel that Python calls, and cache its machine code.
 
-    Numba keeps it beside the kernel's file or below the user's cache folder; where neither can be written, every worker
-    compiles for itself (5 to 20 seconds).
+    Parameters
+    ----------
+    function : callable
+        Function in the subset of Python that Numba compiles.
+
+    Returns
+    -------
+    callable
+        Numba dispatcher. It compiles at the first call with new argument types.
     """
-    return _compiled(function, no_cfunc_wrapper=True)
+    return _compile(function, no_cfunc_wrapper=True)
 
 
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a kernel that only kernels call: without a way in from Python, and no farther than they need it.
+    """Compile a kernel that only other kernels call, without the entry point for Python.
 
-    A third of the time is spared, and half of it with `shortcuts.InnerCompiler`.
+    Omitting the entry point saves a third of the compilation time.
     """
-    more: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    if version_info.short <= TRIED:
-        from unprocess_gen.core.shortcuts import InnerCompiler
-
-        more["pipeline_class"] = InnerCompiler
-    return _compiled(function, **more)
+    return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-def is_kept(function: Callable[..., Any]) -> bool:
-    """Whether a kernel's machine code lies ready, here or from another process; True where that cannot be told."""
-    try:
-        return bool(cast(Any, function).signatures or cast(Any, function)._cache._cache_file._load_index())
-    except (AttributeError, OSError):
+def is_cached(function: Callable[..., Any]) -> bool:
+    """Return whether a kernel is compiled in this process or has machine code in the cache.
+
+    Parameters
+    ----------
+    function : callable
+        Return value of `kernel`.
+
+    Returns
+    -------
+    bool
+        True also if nothing is compiled at all (``NUMBA_DISABLE_JIT=1``).
+    """
+    dispatcher = cast(Any, function)
+    if not hasattr(dispatcher, "stats") or dispatcher.signatures:
         return True
+    folder = dispatcher.stats.cache_path
+    return folder is not None and any(Path(folder).glob(f"*.{function.__qualname__}-*.nbi"))
 
 
 @functools.cache
-def _sources() -> str:
-    """Return what tells the package's files from what they were: a kernel is made of those that it calls, too."""
-    files = sorted(Path(__file__).parents[1].rglob("*.py"))
-    stamps = [(file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files]
-    return hashlib.sha256(repr(stamps).encode()).hexdigest()
+def kernel_cache_folder() -> Path | None:
+    """Return the folder for machine code of the current sources, or None if there is no place to write it.
 
-
-def _compiled(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False, **more}
+    The folder is in ``NUMBA_CACHE_DIR`` if this variable is set, else in the package's ``__pycache__``, else in
+    ``$XDG_CACHE_HOME/unprocess_gen`` (``~/.cache/unprocess_gen`` by default).
+    """
+    package = Path(__file__).parents[1]
     try:
-        compiled = njit(cache=True, **options)(function)
-    except RuntimeError:
-        return cast(Callable[..., Any], njit(**options)(function))
-    if version_info.short <= TRIED:
-        from unprocess_gen.core.shortcuts import keep_for, load_alone
+        name = PREFIX + source_digest(package)
+    except OSError:  # the sources are not readable, for example in a frozen application
+        return None
+    in_package = package / "__pycache__"
+    in_home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "unprocess_gen"
+    given = numba_config.CACHE_DIR
+    for parent in [Path(given)] if given else [in_package, in_home]:
+        folder = parent / name
+        try:
+            is_new = not folder.exists()
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            if is_new and parent == in_package:
+                _remove_others(folder)
+            return folder
+    return None
 
-        keep_for(cast(Any, compiled), _sources())
-        load_alone(cast(Any, compiled))
-    return cast(Callable[..., Any], compiled)
+
+def source_digest(package: Path) -> str:
+    """Return a digest of the names and contents of all files below `KERNEL_PACKAGES`, 16 hex digits."""
+    digest = hashlib.sha256()
+    for name in KERNEL_PACKAGES:
+        paths = sorted((package / name).rglob("*.py"))
+        if not paths:
+            raise FileNotFoundError(package / name)
+        for path in paths:
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(package).as_posix()}\0{len(content)}\0".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+def _remove_others(folder: Path) -> None:
+    """Remove machine code of earlier versions of the sources; each version takes up to 20 MB."""
+    for other in folder.parent.glob(f"{PREFIX}*"):
+        if other != folder:
+            shutil.rmtree(other, ignore_errors=True)
+
+
+def _compile(function: Callable[..., Any], **options: bool) -> Callable[..., Any]:
+    """Return Numba's dispatcher, with a cache only if it is in `kernel_cache_folder`."""
+    compiler = functools.partial(numba.njit, nogil=True, error_model="numpy", fastmath=False, **options)
+    folder = kernel_cache_folder()
+    if folder is None:
+        return cast(Callable[..., Any], compiler()(function))
+    given, numba_config.CACHE_DIR = numba_config.CACHE_DIR, str(folder)
+    try:
+        dispatcher: Any = compiler(cache=True)(function)
+    except RuntimeError:  # Numba caches no function that has no file
+        return cast(Callable[..., Any], compiler()(function))
+    finally:
+        numba_config.CACHE_DIR = given
+    if hasattr(dispatcher, "stats") and not Path(dispatcher.stats.cache_path).is_relative_to(folder):
+        # a Numba that ignores CACHE_DIR could return machine code of other sources
+        return cast(Callable[..., Any], compiler()(function))
+    return cast(Callable[..., Any], dispatcher)

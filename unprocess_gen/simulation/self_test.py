@@ -18,7 +18,7 @@ import numpy as np
 
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.jit import is_kept, kernel
+from unprocess_gen.core.jit import is_cached, kernel
 from unprocess_gen.core.lookup_tables import linear_table, normal_table
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.types import FLOAT32, IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
@@ -157,7 +157,7 @@ OUTER = {
 
 def are_compiled(kernels: str) -> bool:
     """Whether the machine code of some of `PROVED_BY` lies ready, so that the first pair does not wait for it."""
-    return all(is_kept(kernel) for kernel in OUTER[kernels])
+    return all(is_cached(kernel) for kernel in OUTER[kernels])
 
 
 def kernels(plan: Plan) -> str:
