@@ -367,7 +367,7 @@ def _explain(error: BaseException, arguments: Sequence[str]) -> str:
     """Return one sentence with the key, the value and what is allowed."""
     from omegaconf.errors import OmegaConfBaseException
 
-    from unprocess_gen.config.serialization import error_in_one_line
+    from unprocess_gen.config.values import error_in_one_line
 
     chain: list[BaseException] = []
     link: BaseException | None = error

@@ -10,7 +10,7 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.serialization import error_in_one_line
+from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.suggestions import did_you_mean
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
 from unprocess_gen.config.derived import patch_setting
 from unprocess_gen.config.schema import Config
-from unprocess_gen.config.values import is_number, value_text
+from unprocess_gen.config.validation import check_values
+from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
+from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_text
 from unprocess_gen.core.errors import ConfigError
 
 Option = TypeVar("Option")
@@ -27,6 +29,9 @@ NUMBERS_OR_LAWS = {
     "scene": ("iso", "exposure_s", "temperature_c", "exposure_ratio"),
 }
 """Keys whose numbers can be spelled in two ways, 1 and 1.0."""
+
+
+SOURCE_KINDS = ("folder", "synthetic")
 
 
 def source_kind(config: Config) -> str:
@@ -54,20 +59,103 @@ def _canonical(value: Any) -> Any:
 
 
 def read_dataset_yaml(path: Path) -> tuple[Config, str]:
-    """Return the settings a dataset was made with and its source kind; ConfigError where the file cannot be read."""
-    from omegaconf import OmegaConf  # heavy, and a run whose settings are composed elsewhere has no use for it
-    from omegaconf.errors import OmegaConfBaseException
+    """Read the ``config.yaml`` of a dataset.
 
+    Parameters
+    ----------
+    path : Path
+        The file, as `dataset_yaml` writes it.
+
+    Returns
+    -------
+    config : Config
+        The configuration, with values that `check_values` accepts. Keys of `NOT_DATA` have their defaults.
+    kind : str
+        ``folder`` or ``synthetic``.
+
+    Raises
+    ------
+    ConfigError
+        If the file does not exist, is not YAML, lacks a key, has an unknown key, or has a value of the wrong type or
+        out of range: one line that names the file, the key and the value.
+    """
     try:
-        loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-        kind = str(loaded["source"].pop("kind"))
-        config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), loaded))
+        config, kind = parse_dataset_yaml(read_yaml_text(path))
+        check_values(config)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; expected the config.yaml of a dataset") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except (OSError, ValueError, ConfigError) as error:
         raise ConfigError(f"{path}: not the config.yaml of a dataset ({error_in_one_line(error)})") from error
-    assert isinstance(config, Config)
     return config, kind
+
+
+def parse_dataset_yaml(text: str) -> tuple[Config, str]:
+    """Parse the text of a ``config.yaml``; check keys and types, not ranges.
+
+    Strings are taken literally: ``${…}`` is no interpolation here.
+
+    Parameters
+    ----------
+    text : str
+        All keys of `Config` except those of `NOT_DATA`, and ``source.kind``.
+
+    Returns
+    -------
+    config : Config
+        The configuration. Keys of `NOT_DATA` have their defaults.
+    kind : str
+        ``folder`` or ``synthetic``.
+
+    Raises
+    ------
+    ValueError
+        If the text breaks a rule of `parse_yaml_mapping`.
+    ConfigError
+        If a key is missing or unknown, or a value has the wrong type.
+    """
+    loaded = parse_yaml_mapping(text)
+    if not isinstance(loaded.get("source"), dict) or "kind" not in loaded["source"]:
+        raise ConfigError("missing key source.kind")
+    kind = loaded["source"].pop("kind")
+    one_of("source.kind", kind, SOURCE_KINDS)
+    config = _build(Config, loaded, "")
+    assert isinstance(config, Config)
+    return config, str(kind)
+
+
+def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
+    """Return a dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
+    if not isinstance(loaded, dict):
+        raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
+    omitted = NOT_DATA.get(prefix[:-1], ())
+    fields = {one.name: one for one in dataclasses.fields(group) if one.name not in omitted}
+    for problem, keys in (("missing", fields.keys() - loaded.keys()), ("unknown", loaded.keys() - fields.keys())):
+        if keys:
+            raise ConfigError(f"{problem} key {', '.join(prefix + key for key in sorted(keys))[:200]}")
+    types = get_type_hints(group)
+    return group(**{key: _convert(types[key], value, prefix + key) for key, value in loaded.items()})
+
+
+def _convert(kind: Any, value: Any, key: str) -> Any:
+    """Return a value as the type of its field; ConfigError if the type does not fit."""
+    if kind is Any:
+        return value
+    if get_origin(kind) is Union:
+        return None if value is None else _convert(get_args(kind)[0], value, key)
+    if dataclasses.is_dataclass(kind):
+        return _build(cast(type[Any], kind), value, f"{key}.")
+    if get_origin(kind) is list:
+        if isinstance(value, list):
+            (item,) = get_args(kind)
+            return [_convert(item, one, f"{key}[{index}]") for index, one in enumerate(value)]
+    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif kind is str and isinstance(value, str | bool | int | float):
+        return str(value)  # on and off without quotes are booleans in YAML; a name may be a number
+    elif type(value) is kind:
+        return value
+    name = "list" if get_origin(kind) is list else kind.__name__
+    raise ConfigError(f"{key}={value_text(value)[:60]}: expected a value of type {name}")
 
 
 def read_option(path: Path, group: type[Option]) -> Option:
@@ -80,8 +168,24 @@ def read_option(path: Path, group: type[Option]) -> Option:
 
 
 def differences(ours: str, theirs: str) -> list[str]:
-    """Return what differs between two ``config.yaml`` texts, as ``key=value (there: value)``."""
-    here, there = _flat(yaml.safe_load(ours)), _flat(yaml.safe_load(theirs))
+    """List the differences between two ``config.yaml`` texts.
+
+    Parameters
+    ----------
+    ours, theirs : str
+        The texts; ``theirs`` may have been edited by hand.
+
+    Returns
+    -------
+    list of str
+        ``key=value (there: value)``, sorted by key.
+
+    Raises
+    ------
+    ValueError
+        If a text breaks a rule of `parse_yaml_mapping`.
+    """
+    here, there = _flat(parse_yaml_mapping(ours)), _flat(parse_yaml_mapping(theirs))
     return [
         f"{key}={value_text(here.get(key))} (there: {value_text(there.get(key))})"
         for key in sorted(here.keys() | there.keys())
@@ -96,8 +200,3 @@ def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:
     for key, value in settings.items():
         flat |= _flat(value, f"{prefix}{key}.")
     return flat
-
-
-def error_in_one_line(error: BaseException) -> str:
-    """Return an exception's message on one line."""
-    return " ".join(str(error).split()) or type(error).__name__

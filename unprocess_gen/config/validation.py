@@ -60,7 +60,36 @@ MAX_PAIRS_PER_SHARD = 10**6
 
 
 def validate_config(config: Config) -> None:
-    """Refuse settings that cannot be meant: ConfigError with the key, the value and what is allowed."""
+    """Check a configuration before a run.
+
+    Parameters
+    ----------
+    config : Config
+        The composed configuration.
+
+    Raises
+    ------
+    ConfigError
+        If a value is not allowed, or does not fit this machine: no such ``source.root``, Pillow not installed. One
+        line with the key, the value and what is allowed.
+    """
+    check_values(config)
+    _check_environment(config.source)
+
+
+def check_values(config: Config) -> None:
+    """Check the values of a configuration, independent of files and installed packages.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration, composed or read from the ``config.yaml`` of a dataset.
+
+    Raises
+    ------
+    ConfigError
+        If a value is not allowed: one line with the key, the value and what is allowed.
+    """
     in_range("seed", config.seed, 0, 2**63 - 1)
     if config.n_jobs != -1:
         in_range("n_jobs", config.n_jobs, 1, 1024, " or -1 for one a core")
@@ -87,17 +116,22 @@ def validate_config(config: Config) -> None:
     in_range("output.pairs_per_shard", config.output.pairs_per_shard, 1, MAX_PAIRS_PER_SHARD)
 
 
-def _check_source(source: SourceConfig) -> None:
+def _check_environment(source: SourceConfig) -> None:
     if source.root == "":
-        raise ConfigError("source.root='': expected a folder; null stands for the built-in scenes")
+        raise ConfigError("source.root='': expected a folder or file; null selects the built-in scenes")
     if source.root is not None and not Path(source.root).exists():
         raise ConfigError(
             f"source.root={source.root}: no such folder or file; expected photographs, or null for the built-in scenes"
         )
-    if not source.include and not (source.clips and source.video):
-        raise ConfigError("source.include=[]: expected at least one pattern such as '*.jpg'")
     if source.clips and source.root is None:
         raise ConfigError("source.clips=true: the built-in scenes are no clips; give source.root=…")
+    if source.icc == "refuse" and find_spec("PIL") is None:
+        raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
+
+
+def _check_source(source: SourceConfig) -> None:
+    if not source.include and not (source.clips and source.video):
+        raise ConfigError("source.include=[]: expected at least one pattern such as '*.jpg'")
     if source.limit is not None:
         in_range("source.limit", source.limit, 1, 10**9, " or null")
     in_range("source.max_pixels", source.max_pixels, 1, 2**40)
@@ -106,8 +140,6 @@ def _check_source(source: SourceConfig) -> None:
     one_of("source.dequantize", dequantize_method(source), ("off", "dither"))
     patch_rule(source)
     one_of("source.icc", source.icc, ("ignore", "refuse"))
-    if source.icc == "refuse" and find_spec("PIL") is None:
-        raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
 
 
 def _check_camera(camera: CameraConfig) -> None:

@@ -45,3 +45,19 @@ def value_text(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(value_text(item) for item in value) + "]"
     return "null" if value is None else str(value)
+
+
+def error_in_one_line(error: BaseException) -> str:
+    """Return the message of an exception with each run of white space replaced by one space.
+
+    Parameters
+    ----------
+    error : BaseException
+        Any exception.
+
+    Returns
+    -------
+    str
+        The message, or the name of the exception's class if the message is empty.
+    """
+    return " ".join(str(error).split()) or type(error).__name__

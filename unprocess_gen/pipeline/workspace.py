@@ -32,7 +32,8 @@ from typing import Any, TextIO
 
 from yaml import YAMLError
 
-from unprocess_gen.config.serialization import differences, error_in_one_line
+from unprocess_gen.config.serialization import differences
+from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
 from unprocess_gen.core.files import commit_file, machine_error
 from unprocess_gen.core.types import Row, Source
