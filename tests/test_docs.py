@@ -12,7 +12,7 @@ from unprocess_gen.cli.main import HELP, VERBS
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.config.validation import RATES
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.dataset.manifest import COLUMNS
+from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.planning.noise_profile import FORMS
 
 ROOT = Path(__file__).parents[1]

@@ -21,11 +21,10 @@ from unprocess_gen.config.accuracy import STAGES, methods_of_stage
 from unprocess_gen.config.validation import RATES
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import Counts, Facts, Pair, Patch, Physics, Plan, Row, Source
+from unprocess_gen.dataset.columns import COLUMNS, NAMES, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
-    COLUMNS,
     JSON_BYTES,
-    NAMES,
     failed_row,
     json_size,
     pair_row,
@@ -132,34 +131,49 @@ def through_csv(rows: list[Row], folder: Path) -> list[Row]:
     return list(read_rows(path))
 
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
-count = st.integers(0, 2**40)
+BY_NAME = {column.name: column for column in COLUMNS}
+
+
+def number(name: str) -> st.SearchStrategy[float]:
+    """Any number that a column allows."""
+    allowed = BY_NAME[name].allowed
+    assert isinstance(allowed, Range)
+    return st.floats(allowed.low, allowed.high)
+
+
+def levels(bits: int) -> st.SearchStrategy[tuple[int, int, int]]:
+    """Bits, black level and white level that a sensor can have."""
+    black = st.integers(0, 2**bits - 2)
+    return black.flatmap(lambda low: st.tuples(st.just(bits), st.just(low), st.integers(low + 1, 2**bits - 1)))
+
+
 word = st.text(st.characters(codec="ascii", categories=["Ll", "Nd"]), min_size=1, max_size=9)
 physics = st.builds(
     Physics,
-    iso=finite,
-    exposure_s=finite,
-    temperature_c=finite,
-    dn_per_e=finite,
-    prnu_std=finite,
-    dark_e=finite,
+    iso=number("iso"),
+    exposure_s=number("exposure_s"),
+    temperature_c=number("temperature_c"),
+    dn_per_e=st.floats(1e-9, 1e20),
+    prnu_std=number("prnu_std"),
+    dark_e=number("dark_e"),
     dark_offset=st.sampled_from(["removed", "kept"]),
-    hot_pixel_share=finite,
-    hot_pixel_e=finite,
-    full_well_e=finite,
+    hot_pixel_share=number("hot_pixel_share"),
+    hot_pixel_e=number("hot_pixel_e"),
+    full_well_e=number("full_well_e"),
     read_law=st.sampled_from(["gaussian", "tukey"]),
-    read_shape=finite,
-    read_std_dn=finite,
-    row_std_dn=finite,
-    column_std_dn=finite,
-    black_error_dn=st.tuples(*[finite] * 4),
-    dead_pixel_share=finite,
+    read_shape=number("read_shape"),
+    read_std_dn=number("read_std_dn"),
+    row_std_dn=number("row_std_dn"),
+    column_std_dn=number("column_std_dn"),
+    black_error_dn=st.tuples(*[number("black_error_dn_00")] * 4),
+    dead_pixel_share=number("dead_pixel_share"),
     sensor_unit=st.integers(0, 2**64 - 1).map("{:016x}".format) | st.integers(0, 10**6).map(str),
     body_key=st.integers(0, 2**64 - 1),
     fixed_pattern_in_clean=st.booleans(),
 )
 plans = st.builds(
-    Plan,
+    lambda sensor, **values: Plan(bits=sensor[0], black_level_dn=sensor[1], white_level_dn=sensor[2], **values),
+    sensor=st.integers(1, 16).flatmap(levels),
     seed=st.integers(0, 2**63 - 1),
     stream_key=st.integers(0, 2**64 - 1),
     downscale=st.integers(1, 64),
@@ -168,27 +182,24 @@ plans = st.builds(
     draw=st.integers(0, 99),
     frame=st.integers(0, 10**9),
     scene=word,
-    exposure_ratio=finite,
+    exposure_ratio=number("exposure_ratio"),
     camera=word,
-    weights=st.tuples(*[finite] * 4),
-    rgb2cam=st.tuples(*[finite] * 9),
-    red_gain=finite,
-    blue_gain=finite,
-    inverse_rgb_gain=finite,
+    weights=st.tuples(*[number("w_nexus_6p")] * 4),
+    rgb2cam=st.tuples(*[number("rgb2cam_00")] * 9),
+    red_gain=number("red_gain"),
+    blue_gain=number("blue_gain"),
+    inverse_rgb_gain=number("inverse_rgb_gain"),
     tone=st.sampled_from(["smoothstep", "none"]),
     gamma=st.just("srgb") | st.floats(0.1, 10),
     highlight=st.sampled_from(["per_channel", "gray_mean", "none"]),
-    highlight_threshold=finite,
+    highlight_threshold=number("highlight_threshold"),
     pattern=st.sampled_from(["RGGB", "BGGR", "GRBG", "GBRG"]),
-    bits=st.integers(1, 16),
-    black_level_dn=st.integers(0, 65534),
-    white_level_dn=st.integers(1, 65535),
     sensor_clip=st.sampled_from(["sensor", "black"]),
     saturated=st.sampled_from(["noisy", "pinned"]),
     noise=word,
     noise_law=st.sampled_from(["gaussian", "poisson"]),
-    a_dn=finite,
-    b_dn2=finite,
+    a_dn=number("a_dn"),
+    b_dn2=number("b_dn2"),
     effects=st.lists(word, max_size=3).map(tuple),
     skipped=st.lists(word, max_size=3).map(tuple),
     accuracy=word,
@@ -405,8 +416,9 @@ def test_json_takes_the_bytes_that_the_name_alone_decides(plan: Plan, name: str)
 
 def test_json_is_typed() -> None:
     loaded = json.loads(row_json([row_of()]))
-    assert loaded == dict(row_of())
-    assert_typed(loaded)
+    row = row_of()
+    assert loaded == {column.name: row[column.name] for column in COLUMNS if column.in_json}
+    assert_typed(row | loaded)
 
 
 def test_json_is_ascii_and_one_line() -> None:

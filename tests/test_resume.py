@@ -620,7 +620,8 @@ def test_an_out_that_vanishes_is_the_machines_failure(
 MERGE = """
 import json, os, resource, sys
 from pathlib import Path
-from unprocess_gen.dataset.manifest import NAMES, read_rows
+from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.generate import tally
 from unprocess_gen.pipeline.workspace import Workspace
 

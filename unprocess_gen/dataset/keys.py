@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterable, Iterator
 
 from unprocess_gen.core.types import Patch, Plan, Row
-
-KEY = re.compile(r"\d{8,}(-p\d{4,})?(-l\d\dd\d\d)?")
-"""A row's key: the source index, the patch where images are cut, level and draw where there are several of them."""
 
 
 def key_text(index: int) -> str:

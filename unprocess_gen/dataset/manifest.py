@@ -1,9 +1,12 @@
-"""The manifest: one row a pair, and a row is a plan. Its columns stand in one tuple.
+"""Build manifest rows, convert them to plans, and read and write ``manifest.csv`` and ``KEY.json``.
 
-A row is built once, by `pair_row` or `failed_row`, as a mapping from column to typed value; where a column does not
-apply, text is empty and a number None. In CSV, floats are Python's shortest round-trip spelling, so that a row read
-back is the same plan bit for bit. In the shards each row also stands as JSON, padded with blanks to a size that depends
-on the source's name alone: the size of a shard can then be told before it is made.
+A row maps each column of `columns.COLUMNS` to a typed value. If a column does not apply, text is empty and a number is
+None. Floats are written in Python's shortest round-trip spelling, so a row read back gives the same plan bit for bit.
+
+The shards hold each row as JSON too. It is padded with blanks to a size that depends only on the name of the source and
+the number of pairs. Therefore the size of a shard is known before it is made.
+
+Format and compatibility: ``docs/design/dataset_format.md``.
 """
 
 from __future__ import annotations
@@ -11,134 +14,30 @@ from __future__ import annotations
 import contextlib
 import csv
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO, NamedTuple, TextIO
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.types import Pair, Patch, Physics, Plan, Row, Source, Value, gamma_text
-from unprocess_gen.dataset.keys import KEY, key_text
-from unprocess_gen.simulation.reference.colour import matrix
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """One column: its name, its type and what it holds."""
-
-    name: str
-    type: Callable[[str], str | int | float]
-    meaning: str
-
-    @property
-    def empty(self) -> Value:
-        """What an empty cell reads as: no text, or no number."""
-        return "" if self.type is str else None
-
-
-def number_or_text(cell: str) -> str | int | float:
-    """Read a cell that holds a number, or a word instead."""
-    for kind in (int, float):
-        try:
-            return kind(cell)
-        except ValueError:
-            continue
-    return cell
-
-
-COLUMNS = (
-    Column("key", str, "source index as eight digits; then patch, and level and draw, where there are several"),
-    Column("source", str, "path below the source folder, percent-encoded where unsafe"),
-    Column("source_sha256", str, "SHA-256 of the source's bytes"),
-    Column("source_bytes", int, "size of the source; 0 for a built-in scene"),
-    Column("status", str, "ok or failed"),
-    Column("reason", str, "why it failed"),
-    Column("width", int, "of the arrays; twice that of packed planes"),
-    Column("height", int, "of the arrays; twice that of packed planes"),
-    Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8"),
-    Column("shard", int, "number of the shard"),
-    Column("seed", int, "seed of the run"),
-    Column("stream_key", str, "key of the image's random streams, 16 hex digits"),
-    Column("camera", str, "convex, or the camera"),
-    Column("w_nexus_6p", float, "weight of this camera in the mix; 0 where it is not part of it"),
-    Column("w_sony_a7r", float, "weight of this camera in the mix; 0 where it is not part of it"),
-    Column("w_olympus_em10", float, "weight of this camera in the mix; 0 where it is not part of it"),
-    Column("w_sony_rx100", float, "weight of this camera in the mix; 0 where it is not part of it"),
-    *(Column(f"rgb2cam_{i}{j}", float, "linear sRGB to camera, row and column") for i in range(3) for j in range(3)),
-    Column("red_gain", float, "forward white-balance gain of red"),
-    Column("blue_gain", float, "forward white-balance gain of blue"),
-    Column("inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it"),
-    Column("tone", str, "tone curve that was inverted: smoothstep or none"),
-    Column("gamma", number_or_text, "gamma that was expanded: a number or srgb"),
-    Column("highlight", str, "per_channel, gray_mean or none"),
-    Column("highlight_threshold", float, "intensity above which highlights are kept"),
-    Column("pattern", str, "Bayer pattern of the top-left 2x2 sites"),
-    Column("bits", int, "of the sensor"),
-    Column("black_level_dn", int, "DN of no light"),
-    Column("white_level_dn", int, "DN of saturation"),
-    Column("sensor_clip", str, "how the noisy frame was clipped: sensor, black or none"),
-    Column("noise", str, "name of the noise profile"),
-    Column("a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2"),
-    Column("b_dn2", float, "noise variance at black, DN²"),
-    Column("effects", str, "what was simulated, in order, separated by ;"),
-    Column("skipped", str, "what was not, each with its reason, separated by ;"),
-    Column("accuracy", str, "the accuracy asked for"),
-    Column("methods", str, "how each stage was computed, separated by ;"),
-    Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes"),
-    Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes"),
-    Column("clean_clipped_low", int, "clean sites below black before clipping"),
-    Column("clean_clipped_high", int, "clean sites above white before clipping"),
-    Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping"),
-    Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping"),
-    Column("saturated", int, "clean sites at the white level"),
-    Column("zero_variance", int, "sites to which the noise law gives no variance"),
-    Column("law_distance", float, "how far the distribution of shot and read noise may be from its law, at most"),
-    Column("scene", str, "what the scene was taken for"),
-    Column("exposure_ratio", float, "what the scene was darkened by"),
-    Column("saturated_as", str, "what noisy sites are where the clean ones are saturated: noisy, or pinned to white"),
-    Column("noise_law", str, "of a two-parameter profile: gaussian or poisson"),
-    Column(
-        "iso", float, "ISO of a physical profile; this and all columns to its right are 0 or none for other profiles"
-    ),
-    Column("exposure_s", float, "exposure time, seconds"),
-    Column("temperature_c", float, "of the sensor, degrees Celsius"),
-    Column("dn_per_e", float, "system gain K, DN per electron"),
-    Column("prnu_std", float, "relative deviation of the pixels' responses"),
-    Column("dark_e", float, "mean dark current of the exposure, electrons"),
-    Column("dark_offset", str, "whether its mean was removed or kept"),
-    Column("hot_pixel_share", float, "share of pixels that are hot"),
-    Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure, electrons"),
-    Column("full_well_e", float, "electrons that a pixel holds; 0: not known"),
-    Column("read_law", str, "gaussian or tukey"),
-    Column("read_shape", float, "shape of Tukey's lambda law"),
-    Column("read_std_dn", float, "deviation of the read noise, DN"),
-    Column("row_std_dn", float, "deviation of a row's offset, DN"),
-    Column("column_std_dn", float, "deviation of a column's offset, DN"),
-    *(
-        Column(f"black_error_dn_{i}{j}", float, "error of the black level at row, column of the 2x2 sites, DN")
-        for i in range(2)
-        for j in range(2)
-    ),
-    Column("dead_pixel_share", float, "share of pixels that read 0"),
-    Column("sensor_unit", str, "the camera body"),
-    Column("body_key", str, "key of the body's fixed patterns, 16 hex digits"),
-    Column("fixed_pattern_in_clean", int, "1 where the clean frame has the fixed patterns too"),
-    Column("level", int, "number of the noise level"),
-    Column("draw", int, "number of the draw at this level"),
-    Column("frame", int, "number of the frame in its clip"),
-    Column("clip", str, "the clip"),
-    Column("downscale", int, "side of the squares of source pixels that were averaged"),
-    Column("dequantize", str, "whether 8-bit codes were dithered: off or dither"),
-    Column("patch", int, "number of the patch in its image; 0 for a whole image too"),
-    Column("patch_y", int, "row of the full frame in which the arrays begin; even"),
-    Column("patch_x", int, "column of the full frame in which the arrays begin; even"),
-    Column("dtype", str, "of the arrays: uint16, DN, or float32, 0 at black and 1 at white"),
-    Column("layout", str, "of the arrays: mosaic, or packed planes"),
-)
-NAMES = tuple(column.name for column in COLUMNS)
+from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source, Value
+from unprocess_gen.dataset.columns import COLUMNS, FIRST, HEADERS, NAMES, Record, columns_of
+from unprocess_gen.dataset.keys import key_text
 
 JSON_BYTES = 5632
-"""Room for a row without its source's name: the longest numbers and reasons in every column take less."""
+"""Bytes of a row's JSON without the name of its source; the longest row takes less."""
+
+MAX_LINE_BYTES = 2**17
+"""Longest line of a manifest that is read. Paths have at most 4096 bytes, three characters each if encoded."""
+
+MAX_DETAIL = 300
+"""Characters of the column ``detail``."""
+
+FRAME_BYTES = 2**33 - 1024
+"""Most bytes of one array: a member of a USTAR archive has less than 8 GiB."""
+
+
+# ------------------------------------------------------------------------------------------------------------ rows
 
 
 def pair_row(
@@ -152,99 +51,115 @@ def pair_row(
     digests: tuple[str, str],
     patch: Patch,
 ) -> Row:
-    """Return the row of a pair; ``digests`` are the XXH3-128 of clean and noisy."""
-    values: dict[str, Value] = {
+    """Return the row of a pair.
+
+    Parameters
+    ----------
+    key : str
+        Key of the pair (`keys.pair_key`).
+    source : Source
+        Photograph, video frame or scene.
+    sha256 : str
+        SHA-256 of the source's bytes, 64 hexadecimal digits.
+    orientation : int
+        EXIF orientation applied to the source, 1 to 8.
+    shard : int
+        Number of the shard.
+    plan : Plan
+        All parameters of the pair.
+    pair : Pair
+        Frames and counts.
+    digests : tuple of str
+        XXH3-128 of the clean and of the noisy array, 32 hexadecimal digits each.
+    patch : Patch
+        Part of the full frame that the pair shows.
+
+    Returns
+    -------
+    Row
+        Value by column, in the order of `columns.COLUMNS`.
+    """
+    physics = (
+        {column.name: column.not_applicable for some in columns_of(Physics).values() for column in some}
+        if plan.physics is None
+        else _cells(plan.physics)
+    )
+    values = {
+        "key": key,
         "status": "ok",
-        "width": patch.width,
-        "height": patch.height,
         "orientation": orientation,
-        "stream_key": f"{plan.stream_key:016x}",
-        "camera": plan.camera,
-        **dict(zip(_WEIGHTS, plan.weights, strict=True)),
-        **dict(zip(_MATRIX, plan.rgb2cam, strict=True)),
-        "red_gain": plan.red_gain,
-        "blue_gain": plan.blue_gain,
-        "inverse_rgb_gain": plan.inverse_rgb_gain,
-        "tone": plan.tone,
-        "gamma": number_or_text(gamma_text(plan.gamma)),
-        "highlight": plan.highlight,
-        "highlight_threshold": plan.highlight_threshold,
-        "pattern": plan.pattern,
-        "bits": plan.bits,
-        "black_level_dn": plan.black_level_dn,
-        "white_level_dn": plan.white_level_dn,
-        "sensor_clip": plan.sensor_clip,
-        "noise": plan.noise,
-        "a_dn": plan.a_dn,
-        "b_dn2": plan.b_dn2,
-        "effects": ";".join(plan.effects),
-        "skipped": ";".join(plan.skipped),
-        "accuracy": plan.accuracy,
-        "methods": ";".join(plan.methods),
         "clean_xxh3": digests[0],
         "noisy_xxh3": digests[1],
-        "clean_clipped_low": pair.counts.clean_clipped_low,
-        "clean_clipped_high": pair.counts.clean_clipped_high,
-        "noisy_clipped_low": pair.counts.noisy_clipped_low,
-        "noisy_clipped_high": pair.counts.noisy_clipped_high,
-        "saturated": pair.counts.saturated,
-        "zero_variance": pair.counts.zero_variance,
-        "scene": plan.scene,
-        "exposure_ratio": plan.exposure_ratio,
-        "law_distance": plan.law_distance,
-        "saturated_as": plan.saturated,
-        "noise_law": plan.noise_law,
-        **_physics_values(plan.physics),
-        "level": plan.level,
-        "draw": plan.draw,
-        "frame": plan.frame,
         "clip": source.clip,
-        "downscale": plan.downscale,
-        "dequantize": plan.dequantize,
-        "patch": patch.number,
-        "patch_y": patch.y,
-        "patch_x": patch.x,
-        "dtype": plan.dtype,
-        "layout": plan.layout,
+        **_cells(plan),
+        **physics,
+        **_cells(patch),
+        **_cells(pair.counts),
     }
-    return _row(source, sha256, shard, plan.seed, values | {"key": key})
+    return _row(source, sha256, shard, plan.seed, values)
 
 
-def _physics_values(physics: Physics | None) -> dict[str, Value]:
-    if physics is None:
-        return {
-            column.name: "none" if column.type is str else column.type("0")
-            for column in COLUMNS[_PHYSICS_FROM:_PHYSICS_TO]
-        }
-    return {
-        **{name: getattr(physics, name) for name in _PHYSICS},
-        **dict(zip(_BLACK_ERRORS, physics.black_error_dn, strict=True)),
-        "body_key": f"{physics.body_key:016x}",
-        "fixed_pattern_in_clean": int(physics.fixed_pattern_in_clean),
-    }
+def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str, detail: str = "") -> Row:
+    """Return the row of a source that could not be used.
 
+    Parameters
+    ----------
+    source : Source
+        Photograph, video frame or scene.
+    sha256 : str or None
+        SHA-256 of the source's bytes; None if they could not be read.
+    shard : int
+        Number of the shard.
+    seed : int
+        Seed of the run.
+    reason : str
+        One of `errors.REASONS`.
+    detail : str
+        Explanation (`SourceError.text`); kept as one line of at most `MAX_DETAIL` characters.
 
-def failed_row(source: Source, sha256: str | None, shard: int, seed: int, reason: str) -> Row:
-    """Return the row of a photograph that could not be used; ``sha256`` is None where it could not even be read.
-
-    A frame of a video is told by its number alone, so its row has it even then.
+    Returns
+    -------
+    Row
+        Value by column. Only frames of a video have values for ``frame`` and ``clip``, which identify them.
     """
     place: dict[str, Value] = {"frame": source.frame, "clip": source.clip} if source.is_video else {}
-    return _row(source, sha256, shard, seed, {"status": "failed", "reason": reason, **place})
+    failure = {"status": "failed", "reason": reason, "detail": detail_text(detail)}
+    return _row(source, sha256, shard, seed, {**failure, **place})
 
 
-_WEIGHTS = tuple(name for name in NAMES if name.startswith("w_"))
-_MATRIX = tuple(name for name in NAMES if name.startswith("rgb2cam_"))
-_PHYSICS_FROM, _PHYSICS_TO = NAMES.index("iso"), NAMES.index("level")
-_BLACK_ERRORS = tuple(name for name in NAMES if name.startswith("black_error_dn_"))
-_PHYSICS = tuple(
-    field.name
-    for field in fields(Physics)
-    if field.name not in ("black_error_dn", "body_key", "fixed_pattern_in_clean")
-)
+def detail_text(text: str) -> str:
+    """Return an explanation as one line for the column ``detail``.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+        At most `MAX_DETAIL` characters, without control and bidirectional characters. A space precedes a leading
+        ``= + - @``, so that spreadsheets do not run it.
+    """
+    line = " ".join(_UNSAFE.sub("?", " ".join(text.split())).split())
+    line = f" {line}" if line.startswith(("=", "+", "-", "@")) else line
+    return line if len(line) <= MAX_DETAIL else line[: MAX_DETAIL - 1] + "…"
 
 
-def _row(source: Source, sha256: str | None, shard: int, seed: int, values: dict[str, Value]) -> Row:
+_UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def _cells(record: Plan | Physics | Patch | Counts) -> dict[str, Value]:
+    """Return the values of all columns that hold a record."""
+    cells: dict[str, Value] = {}
+    for field, columns in columns_of(type(record)).items():
+        value = getattr(record, field)
+        values = value if len(columns) > 1 else (value,)
+        cells |= {column.name: column.from_field(item) for column, item in zip(columns, values, strict=True)}
+    return cells
+
+
+def _row(source: Source, sha256: str | None, shard: int, seed: int, values: Mapping[str, Value]) -> Row:
     known: dict[str, Value] = {
         "key": key_text(source.index),
         "source": source.name,
@@ -257,203 +172,398 @@ def _row(source: Source, sha256: str | None, shard: int, seed: int, values: dict
     return {column.name: known.get(column.name, column.empty) for column in COLUMNS}
 
 
-def plan_from_row(row: Row) -> Plan:
-    """Return the plan that a row holds: replay needs the row and the source, nothing else.
+def row_of_values(values: Sequence[Value]) -> Row:
+    """Return the row of a list of values in column order.
 
-    Raises DamageError where a value is missing or of another type.
+    Parameters
+    ----------
+    values : sequence of str, int, float or None
+        One value for each column of any version.
+
+    Returns
+    -------
+    Row
+        The row; columns that were added after that version are empty.
+
+    Raises
+    ------
+    ValueError
+        If no version has as many columns.
+    """
+    if len(values) not in map(len, HEADERS):
+        raise ValueError(f"a row of {len(values)} values; expected {' or '.join(map(str, map(len, HEADERS)))}")
+    known = dict(zip(NAMES, values, strict=False))
+    return {column.name: known.get(column.name, column.empty) for column in COLUMNS}
+
+
+def plan_from_row(row: Row) -> Plan:
+    """Return the plan that a row holds.
+
+    Parameters
+    ----------
+    row : Row
+        Row of a pair, from ``manifest.csv`` or ``KEY.json``.
+
+    Returns
+    -------
+    Plan
+        All parameters of the pair. Together with the pixels of its source they give its arrays.
+
+    Raises
+    ------
+    DamageError
+        If a value is missing, of another type or not allowed.
     """
     try:
-        w0, w1, w2, w3 = (_float(row, name) for name in _WEIGHTS)
-        return Plan(
-            seed=_int(row, "seed"),
-            stream_key=int(_str(row, "stream_key"), 16),
-            downscale=_int(row, "downscale"),
-            dequantize=_str(row, "dequantize"),
-            scene=_str(row, "scene"),
-            exposure_ratio=_float(row, "exposure_ratio"),
-            camera=_str(row, "camera"),
-            weights=(w0, w1, w2, w3),
-            rgb2cam=matrix([_float(row, name) for name in _MATRIX]),
-            red_gain=_float(row, "red_gain"),
-            blue_gain=_float(row, "blue_gain"),
-            inverse_rgb_gain=_float(row, "inverse_rgb_gain"),
-            tone=_str(row, "tone"),
-            gamma="srgb" if row["gamma"] == "srgb" else _float(row, "gamma"),
-            highlight=_str(row, "highlight"),
-            highlight_threshold=_float(row, "highlight_threshold"),
-            pattern=_str(row, "pattern"),
-            bits=_int(row, "bits"),
-            black_level_dn=_int(row, "black_level_dn"),
-            white_level_dn=_int(row, "white_level_dn"),
-            sensor_clip=_str(row, "sensor_clip"),
-            saturated=_str(row, "saturated_as"),
-            noise=_str(row, "noise"),
-            noise_law=_str(row, "noise_law"),
-            a_dn=_float(row, "a_dn"),
-            b_dn2=_float(row, "b_dn2"),
-            effects=_list(row, "effects"),
-            skipped=_list(row, "skipped"),
-            accuracy=_str(row, "accuracy"),
-            methods=_list(row, "methods"),
-            law_distance=_float(row, "law_distance"),
-            physics=_physics_of(row),
-            level=_int(row, "level"),
-            draw=_int(row, "draw"),
-            frame=_int(row, "frame"),
-            dtype=_str(row, "dtype"),
-            layout=_str(row, "layout"),
-        )
-    except (TypeError, ValueError) as error:
-        raise DamageError(f"row {row.get('key')}: not a plan ({error})") from error
+        physics = None if row.get("read_law") == "none" else Physics(**_fields(row, Physics))
+        plan = Plan(**_fields(row, Plan), physics=physics)
+        _check_plan(plan)
+    except ValueError as error:
+        raise DamageError(f"row {_key_of(row)}: not a plan ({error})") from error
+    return plan
 
 
 def patch_from_row(row: Row) -> Patch:
-    """Return what of the full frame a row's pair is; DamageError as `plan_from_row`."""
+    """Return the part of the full frame that a row's pair shows.
+
+    Parameters
+    ----------
+    row : Row
+        Row of a pair.
+
+    Returns
+    -------
+    Patch
+        Number, corner and size; the complete frame is patch 0 at row 0, column 0.
+
+    Raises
+    ------
+    DamageError
+        If a value is missing, of another type or not allowed.
+    """
     try:
-        number, y, x, height, width = (_int(row, name) for name in ("patch", "patch_y", "patch_x", "height", "width"))
+        return Patch(**_fields(row, Patch))
     except ValueError as error:
-        raise DamageError(f"row {row.get('key')}: not a patch ({error})") from error
-    return Patch(number, y, x, height, width)
+        raise DamageError(f"row {_key_of(row)}: not a patch ({error})") from error
 
 
-def _physics_of(row: Row) -> Physics | None:
-    if row["read_law"] == "none":
-        return None
-    texts = ("dark_offset", "read_law", "sensor_unit")
-    e0, e1, e2, e3 = (_float(row, name) for name in _BLACK_ERRORS)
-    values: dict[str, Any] = {name: (_str if name in texts else _float)(row, name) for name in _PHYSICS}
-    return Physics(
-        **values,
-        black_error_dn=(e0, e1, e2, e3),
-        body_key=int(_str(row, "body_key"), 16),
-        fixed_pattern_in_clean=bool(_int(row, "fixed_pattern_in_clean")),
-    )
+def _fields(row: Row, record: Record) -> dict[str, Any]:
+    """Return the fields of a record from the columns that hold it; ValueError names the column."""
+    fields: dict[str, Any] = {}
+    for field, columns in columns_of(record).items():
+        values = tuple(column.to_field(row) for column in columns)
+        fields[field] = values if len(values) > 1 else values[0]
+    return fields
 
 
-def _float(row: Row, name: str) -> float:
-    return float(_present(row, name))
+def _check_plan(plan: Plan) -> None:
+    """Raise ValueError for values that are allowed one by one and contradict each other."""
+    if not plan.black_level_dn < plan.white_level_dn < 2**plan.bits:
+        raise ValueError(
+            f"white_level_dn={plan.white_level_dn}: expected more than black_level_dn={plan.black_level_dn} "
+            f"and less than 2^{plan.bits} (bits)"
+        )
+    if plan.physics is not None and not plan.physics.dn_per_e > 0:
+        raise ValueError(f"dn_per_e={plan.physics.dn_per_e}: expected more than 0")
 
 
-def _int(row: Row, name: str) -> int:
-    return int(_present(row, name))
+def _key_of(row: Row) -> str:
+    return str(row.get("key"))[:40]
 
 
-def _str(row: Row, name: str) -> str:
-    return str(_present(row, name))
+def check_row(row: Row) -> None:
+    """Check every value of a row.
+
+    Parameters
+    ----------
+    row : Row
+        Row from a file.
+
+    Raises
+    ------
+    ValueError
+        If a value is not allowed, or a row with status ``ok`` lacks a number or a word that its arrays depend on. The
+        sentence names the column and the value.
+    """
+    for column in COLUMNS:
+        value = row[column.name]
+        if value != column.empty:
+            column.check(value)
+    _check_together(row)
 
 
-def _list(row: Row, name: str) -> tuple[str, ...]:
-    text = row.get(name)
-    return tuple(str(text).split(";")) if text else ()
+def _check_together(row: Row) -> None:
+    if row["status"] not in ("ok", "failed"):
+        raise ValueError("status is empty")
+    if row["status"] != "ok":
+        return
+    for name in _NEEDED:
+        if row[name] is None or row[name] == "":
+            raise ValueError(f"{name} is empty")
+    size = int(row["width"] or 0) * int(row["height"] or 0) * (4 if row["dtype"] == "float32" else 2)
+    if size > FRAME_BYTES:
+        raise ValueError(
+            f"width={row['width']}, height={row['height']}: an array of {size} bytes; expected at most {FRAME_BYTES}"
+        )
 
 
-def _present(row: Row, name: str) -> str | int | float:
-    value = row.get(name)
-    if value is None or value == "":
-        raise ValueError(f"{name} is empty")
-    return value
+_NEEDED = (
+    "width",
+    "height",
+    "shard",
+    "level",
+    "draw",
+    "frame",
+    "dtype",
+    "layout",
+    "pattern",
+    "clean_xxh3",
+    "noisy_xxh3",
+)
+"""Columns without which the members of a pair can neither be found nor checked."""
 
 
 # ------------------------------------------------------------------------------------------------------------- CSV
 
 
-def write_rows(stream: TextIO, rows: Iterable[Row]) -> None:
-    """Write rows as CSV: ``\\n`` line ends, quotes only where needed, empty for None."""
+class Manifest(NamedTuple):
+    """Hold the opened file and the header of a manifest."""
+
+    stream: BinaryIO
+    header: tuple[str, ...]
+
+
+def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = NAMES) -> None:
+    r"""Write rows as CSV: ``\n`` line ends, quotes only if needed, empty cells for None.
+
+    Parameters
+    ----------
+    stream : text file
+        Opened with ``newline=""`` and UTF-8.
+    rows : iterable of Row
+        Rows in source order.
+    names : sequence of str
+        Header. `read_header` returns the one of an older manifest, whose bytes are thereby restored.
+    """
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(NAMES)
-    writer.writerows([_cell(row[name]) for name in NAMES] for row in rows)
+    writer.writerow(names)
+    writer.writerows([_cell(row[name]) for name in names] for row in rows)
 
 
 def _cell(value: Value) -> str:
     return "" if value is None else repr(value) if isinstance(value, float) else str(value)
 
 
-def read_rows(path: Path) -> Iterator[Row]:
-    """Yield the typed rows of a manifest, one at a time; unknown columns are left out.
+def read_header(path: Path) -> tuple[str, ...]:
+    """Return the columns that a manifest has.
 
-    Raises DamageError where the file is not a manifest or a value does not fit its column.
+    Parameters
+    ----------
+    path : Path
+        A ``manifest.csv``.
+
+    Returns
+    -------
+    tuple of str
+        Names of columns known to this version, in the order of `columns.NAMES`; a manifest of version 0.1 lacks those
+        added later.
+
+    Raises
+    ------
+    DamageError
+        If the file does not exist or is not a manifest.
+    """
+    with _opened(path) as manifest:
+        return tuple(name for name in NAMES if name in manifest.header)
+
+
+def read_rows(path: Path) -> Iterator[Row]:
+    """Read the typed rows of a manifest, one at a time.
+
+    Parameters
+    ----------
+    path : Path
+        A ``manifest.csv`` of this or an older version. Unknown columns are left out; missing newer ones are empty.
+
+    Returns
+    -------
+    iterator of Row
+        Rows in file order.
+
+    Raises
+    ------
+    DamageError
+        If the file is not a manifest, or a value is not allowed; the sentence names row, column and value.
     """
     return (row for _, row in rows_with_offsets(path))
 
 
 def rows_with_offsets(path: Path) -> Iterator[tuple[int, Row]]:
-    """Yield each row with the byte that it begins at; a row is one line, since names have no line ends in them.
+    """Read rows with the position of their lines. A row is one line, since no value contains a line end.
 
-    Raises DamageError as `read_rows` does.
+    Parameters
+    ----------
+    path : Path
+        A ``manifest.csv``.
+
+    Yields
+    ------
+    int
+        Byte offset of the line, for `read_row`.
+    Row
+        The row.
+
+    Raises
+    ------
+    DamageError
+        If the file is not a manifest, or a value is not allowed.
     """
-    try:
-        with path.open("rb") as stream:
-            header = _header(stream.readline(), path)
-            at = stream.tell()
-            for line in stream:
-                yield at, _typed(header, line)
-                at += len(line)
-    except (csv.Error, ValueError) as error:
-        raise DamageError(f"{path}: not a readable manifest ({error})") from error
-    except FileNotFoundError:
-        raise DamageError(f"{path}: no such manifest") from None
+    with _opened(path) as (stream, header):
+        at = stream.tell()
+        while line := stream.readline(MAX_LINE_BYTES + 1):
+            yield at, _typed(header, line)
+            at += len(line)
 
 
 def readable_rows(path: Path) -> Iterator[Row]:
-    """Yield the rows of those lines of a damaged manifest that still read as rows; none where there is no file."""
+    """Read those lines of a damaged manifest that are still rows.
+
+    Parameters
+    ----------
+    path : Path
+        A ``manifest.csv``; it need not exist.
+
+    Yields
+    ------
+    Row
+        Intact rows. The first line is ignored: each line is read with the header of the version that fits it.
+    """
     try:
         lines = path.read_bytes().splitlines(keepends=True)
     except OSError:
         return
     for line in lines[1:]:
-        with contextlib.suppress(csv.Error, ValueError):
-            yield _typed(NAMES, line)
+        for names in HEADERS:
+            with contextlib.suppress(csv.Error, ValueError):
+                yield _typed(names, line)
+                break
 
 
 def read_row(path: Path, at: int) -> Row:
-    """Return the row that begins at a byte told by `rows_with_offsets`; DamageError where none does."""
+    """Read one row.
+
+    Parameters
+    ----------
+    path : Path
+        A ``manifest.csv``.
+    at : int
+        Byte offset from `rows_with_offsets`.
+
+    Returns
+    -------
+    Row
+        The row whose line begins there.
+
+    Raises
+    ------
+    DamageError
+        If no row begins there.
+    """
     try:
-        with path.open("rb") as stream:
-            header = _header(stream.readline(), path)
+        with _opened(path) as (stream, header):
             stream.seek(at)
-            return _typed(header, stream.readline())
-    except (csv.Error, ValueError, OSError) as error:
+            return _typed(header, stream.readline(MAX_LINE_BYTES + 1))
+    except DamageError as error:
         raise DamageError(f"{path}: no row at byte {at} ({error})") from error
 
 
-def _header(line: bytes, path: Path) -> list[str]:
-    header = _cells(line)
-    missing = [name for name in NAMES if name not in header]
-    if missing:
-        raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
-    return header
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Manifest]:
+    """Open a manifest after its header; DamageError for everything that goes wrong until it is closed."""
+    try:
+        with path.open("rb") as stream:
+            header = tuple(_cells_of(stream.readline(MAX_LINE_BYTES + 1)))
+            missing = [column.name for column in COLUMNS if column.since == FIRST and column.name not in header]
+            if missing:
+                raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")
+            yield Manifest(stream, header)
+    except FileNotFoundError:
+        raise DamageError(f"{path}: no such manifest") from None
+    except (csv.Error, ValueError) as error:
+        raise DamageError(f"{path}: not a readable manifest ({error})") from error
+    except OSError as error:
+        raise DamageError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _cells(line: bytes) -> list[str]:
+def _cells_of(line: bytes) -> list[str]:
     return next(csv.reader([line.decode("utf-8")], strict=True), [])
 
 
 def _typed(header: Sequence[str], line: bytes) -> Row:
+    """Return the row of a line; ValueError or csv.Error names what is wrong with it."""
     if not line.endswith(b"\n"):
-        raise ValueError("the last line is cut")
-    cells = dict(zip(header, _cells(line), strict=True))
-    if not KEY.fullmatch(cells["key"]):
-        raise ValueError(f"the key is {cells['key'][:40]!r}, expected eight digits")
-    return {column.name: column.type(cell) if (cell := cells[column.name]) else column.empty for column in COLUMNS}
+        long = f"a line has more than {MAX_LINE_BYTES} bytes" if len(line) > MAX_LINE_BYTES else "the last line is cut"
+        raise ValueError(long)
+    cells = dict(zip(header, _cells_of(line), strict=True))
+    key = cells["key"]
+    if not key or key not in COLUMNS[0].allowed:
+        raise ValueError(f"the key is {key[:40]!r}, expected eight digits")
+    try:
+        row = {column.name: column.parse(cells.get(column.name, "")) for column in COLUMNS}
+        _check_together(row)
+    except ValueError as error:
+        raise ValueError(f"row {key}: {error}") from None
+    return row
 
 
 # ------------------------------------------------------------------------------------------------------------ JSON
 
 
+OTHERS = "others"
+"""The key under which a sample's JSON holds the rows of all its pairs except the first."""
+
+_JSON_COLUMNS = tuple(column for column in COLUMNS if column.in_json)
+
+
 def json_size(source_name: str, pairs: int = 1) -> int:
-    """Return the bytes of a sample's JSON in the shard, padding included: its source's name and its pairs decide."""
-    named = 2 * len(json.dumps(source_name))  # its clip is named by a part of it, a video's by all of it
+    """Return the size of a sample's JSON in the shard.
+
+    Parameters
+    ----------
+    source_name : str
+        The column ``source``.
+    pairs : int
+        Noisy frames of the sample.
+
+    Returns
+    -------
+    int
+        Bytes, padding included; a multiple of 512.
+    """
+    named = 2 * len(json.dumps(source_name))  # the name of its clip is a part of it, or equal to it
     return -(-(JSON_BYTES + named) * pairs // 512) * 512
 
 
-OTHERS = "others"
-"""The key under which a sample's JSON holds the rows of its pairs but the first."""
-
-
 def row_json(rows: Sequence[Row]) -> bytes:
-    """Return a sample's rows as typed JSON: the first one, and the others in a list; padded to `json_size`."""
-    first, others = dict(rows[0]), [dict(row) for row in rows[1:]]
-    content = first | {OTHERS: others} if others else first
+    """Return the JSON of a sample.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of one clean frame, in order; columns that are not in JSON are left out.
+
+    Returns
+    -------
+    bytes
+        ASCII, one line: the first row, with the others as a list; padded to `json_size`.
+
+    Raises
+    ------
+    ValueError
+        If the text is longer than that.
+    """
+    first, *others = ({column.name: row[column.name] for column in _JSON_COLUMNS} for row in rows)
+    content = {**first, OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
     size = json_size(str(first["source"]), len(rows))
     if len(text) >= size:
@@ -461,7 +571,42 @@ def row_json(rows: Sequence[Row]) -> bytes:
     return text.ljust(size - 1) + b"\n"
 
 
-def rows_of_json(content: dict[str, Any]) -> list[Row]:
-    """Return the rows that a sample's JSON holds."""
-    others = content.pop(OTHERS, [])
-    return [content, *others]
+def rows_of_json(content: bytes) -> list[Row]:
+    """Return the rows of a sample.
+
+    Parameters
+    ----------
+    content : bytes
+        Member ``KEY.json`` of a shard.
+
+    Returns
+    -------
+    list of Row
+        One row for each pair, with all columns.
+
+    Raises
+    ------
+    DamageError
+        If the JSON is malformed, or a value is missing, of another type or not allowed.
+    """
+    try:
+        loaded = json.loads(content)
+        if not isinstance(loaded, dict) or not isinstance(others := loaded.pop(OTHERS, []), list):
+            raise ValueError("expected an object")
+        return [_row_of_json(one) for one in (loaded, *others)]
+    except (ValueError, RecursionError) as error:
+        raise DamageError(f"the JSON of a sample cannot be read ({str(error)[:200]})") from error
+
+
+def _row_of_json(content: Any) -> Row:
+    if not isinstance(content, dict):
+        raise ValueError("expected an object")
+    missing = [column.name for column in _JSON_COLUMNS if column.name not in content]
+    if missing:
+        raise ValueError(f"row {_key_of(content)}: {missing[0]} is missing")
+    row = {column.name: content[column.name] if column.in_json else column.empty for column in COLUMNS}
+    try:
+        check_row(row)
+    except ValueError as error:
+        raise ValueError(f"row {_key_of(content)}: {error}") from None
+    return row

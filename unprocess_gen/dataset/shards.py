@@ -12,7 +12,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import io
-import json
 import math
 import mmap
 import os
@@ -22,7 +21,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import xxhash
@@ -34,6 +33,9 @@ from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame
 RECORD = 512
 END = b"\0" * (2 * RECORD)
 CLEAN, ROW = "clean.npy", "json"
+
+MAX_JSON_BYTES = 2**27
+"""Largest JSON member that is read: the rows of 99 levels with 99 draws take half of it."""
 
 
 def noisy_member(level: int, draw: int) -> str:
@@ -289,16 +291,34 @@ def salvage(path: Path, images: Sequence[Expected]) -> Iterator[dict[str, Frame]
         yield frames
 
 
-def json_inside(path: Path) -> list[dict[str, Any]]:
-    """Return what the JSON members of a sound shard hold, in its order."""
-    index = read_index(path)
+def json_inside(path: Path) -> list[bytes]:
+    """Return the JSON members of an intact shard.
+
+    Parameters
+    ----------
+    path : Path
+        The shard.
+
+    Returns
+    -------
+    list of bytes
+        Content of each ``KEY.json``, in the order of the shard; `manifest.rows_of_json` reads it.
+
+    Raises
+    ------
+    DamageError
+        If the file is not a complete tar archive, or a member has more than `MAX_JSON_BYTES`.
+    """
+    members = [member for name, member in read_index(path).items() if name.endswith(f".{ROW}")]
+    if any(member.size > MAX_JSON_BYTES for member in members):
+        raise DamageError(f"{path}: a JSON member has more than {MAX_JSON_BYTES} bytes")
     with path.open("rb") as stream:
-        rows = []
-        for name, member in index.items():
-            if name.endswith(".json"):
-                stream.seek(member.offset)
-                rows.append(json.loads(stream.read(member.size)))
-    return rows
+        return [_read_at(stream, member) for member in members]
+
+
+def _read_at(stream: BinaryIO, member: Member) -> bytes:
+    stream.seek(member.offset)
+    return stream.read(member.size)
 
 
 def _check_bytes(stream: BinaryIO, wanted: bytes, what: str) -> Iterator[str]:

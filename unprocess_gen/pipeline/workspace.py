@@ -37,7 +37,8 @@ from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
 from unprocess_gen.core.files import commit_file, machine_error
 from unprocess_gen.core.types import Row, Source
-from unprocess_gen.dataset.manifest import NAMES, read_rows, write_rows
+from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.dataset.manifest import read_rows, row_of_values, write_rows
 from unprocess_gen.dataset.shards import shard_name
 
 REPORT = "report.html"
@@ -246,7 +247,7 @@ class Workspace:
         """Yield the rows of committed shards, shard by shard."""
         for shard in shards:
             for values in self._record(shard)["rows"]:
-                yield dict(zip(NAMES, values, strict=True))
+                yield row_of_values(values)
 
     def _record(self, shard: int) -> dict[str, Any]:
         record: dict[str, Any] = json.loads(self._rows_path(shard).read_text(encoding="utf-8"))

@@ -26,8 +26,9 @@ import yaml
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Float, Row
+from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.dataset.keys import image_key, sample_key
-from unprocess_gen.dataset.manifest import COLUMNS, read_rows
+from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.workspace import REPORT, read_dataset

@@ -1,0 +1,369 @@
+"""Define the columns of a manifest: names, types, allowed values and the fields that they hold.
+
+`COLUMNS` is the only table. A column with ``of=Plan`` holds a field of `Plan` in the type and spelling given here.
+`manifest.pair_row` writes rows by this table, and `manifest.plan_from_row` reads plans by it. A new parameter is a new
+field of its dataclass and one line below.
+
+Allowed values are wider than those that a configuration can lead to. They keep edited files from causing huge
+allocations, overflow and endless loops.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from unprocess_gen.core.types import (
+    FLOAT32,
+    MOSAIC,
+    PACKED,
+    UINT16,
+    Counts,
+    Patch,
+    Physics,
+    Plan,
+    Source,
+    Value,
+    gamma_text,
+)
+
+FIRST = "0.1"
+"""The version of the first manifests. Every manifest has the columns of this version."""
+
+
+class Range(NamedTuple):
+    """Hold the least and greatest number that a column allows; NaN is in no range."""
+
+    low: float
+    high: float
+    words: tuple[str, ...] = ()
+
+    def __contains__(self, value: object) -> bool:
+        if isinstance(value, str):
+            return value in self.words
+        return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        return " or ".join([f"a number from {self.low:.12g} to {self.high:.12g}", *self.words])
+
+
+class Words(tuple[str, ...]):
+    """Hold the words that a column allows."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return " or ".join(filter(None, self))
+
+
+class Text(NamedTuple):
+    """Hold the regular expression that a column's text matches, and its description."""
+
+    pattern: re.Pattern[str]
+    description: str
+
+    def __contains__(self, value: object) -> bool:
+        return isinstance(value, str) and self.pattern.fullmatch(value) is not None
+
+    def __str__(self) -> str:
+        return self.description
+
+
+Allowed = Range | Words | Text
+Record = type[Plan] | type[Physics] | type[Patch] | type[Counts] | type[Source]
+
+
+class Spelling(NamedTuple):
+    """Hold how a field's value becomes the value of a column, and back."""
+
+    write: Callable[[Any], Value]
+    read: Callable[[Any], Any]
+
+
+def number_or_text(cell: str) -> str | int | float:
+    """Return the number that a cell holds, or its text."""
+    for kind in (int, float):
+        try:
+            return kind(cell)
+        except ValueError:
+            continue
+    return cell
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+_SPELLINGS: Mapping[Any, Spelling] = {
+    int: Spelling(_same, int),
+    float: Spelling(_same, float),
+    str: Spelling(_same, _same),
+}
+HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
+LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
+SWITCH = Spelling(int, bool)
+GAMMA = Spelling(
+    lambda gamma: number_or_text(gamma_text(gamma)), lambda value: value if value == "srgb" else float(value)
+)
+
+FINITE = Range(-1.7976931348623157e308, 1.7976931348623157e308)
+NOT_NEGATIVE = Range(0, FINITE.high)
+COUNT = Range(0, 2**63 - 1)
+SHARE = Range(0, 1)
+COORDINATE = Range(0, 2**32 - 1)
+"""Pixel coordinates and frame numbers are 32-bit counters of the random streams."""
+SIDE = Range(1, 2**32)
+MATRIX_ENTRY = Range(-1e10, 1e10)
+GAIN = Range(1e-4, 1e4)
+ELECTRONS = Range(0, 1e9)
+ANY_TEXT = Text(re.compile(r"[^\x00-\x1f\x7f]*"), "text without control characters")
+KEY_TEXT = Text(re.compile(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?"), "eight digits, then -pNNNN and -lNNdNN if present")
+HEX_64 = Text(re.compile(r"([0-9a-f]{16})?|none"), "16 hexadecimal digits")
+HEX_128 = Text(re.compile(r"([0-9a-f]{32})?"), "32 hexadecimal digits")
+HEX_256 = Text(re.compile(r"([0-9a-f]{64})?"), "64 hexadecimal digits")
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Describe one column.
+
+    Attributes
+    ----------
+    name : str
+        Name in the header of ``manifest.csv`` and in ``KEY.json``.
+    type : callable
+        Converts a cell's text to its value: `int`, `float`, `str` or `number_or_text`.
+    meaning : str
+        Description for users.
+    allowed : Range, Words or Text
+        Values other than the empty cell.
+    of : type, optional
+        Dataclass whose field the column holds.
+    field : str
+        Name of that field; empty if it is the name of the column. Columns that share a field hold its items in order.
+    spelling : Spelling, optional
+        Conversion between field and value; None: the one of ``type``.
+    since : str
+        First version of unprocess_gen that writes the column. Older manifests do not have it; it then reads as empty.
+    in_json : bool
+        Whether ``KEY.json`` has the column.
+    """
+
+    name: str
+    type: Callable[[str], str | int | float]
+    meaning: str
+    allowed: Allowed
+    of: Record | None = None
+    field: str = ""
+    spelling: Spelling | None = None
+    since: str = FIRST
+    in_json: bool = True
+
+    @property
+    def empty(self) -> Value:
+        """Return the value of an empty cell, and of a column that a manifest does not have."""
+        return "" if self.type is str else None
+
+    @property
+    def not_applicable(self) -> Value:
+        """Return the value for pairs to which the column does not apply: ``none`` or 0."""
+        return "none" if self.type is str else self.type("0")
+
+    def parse(self, cell: str) -> Value:
+        """Return the value of a cell; ValueError for another type, and for a value that is not allowed."""
+        if not cell:
+            return self.empty
+        try:
+            value = self.type(cell)
+        except ValueError:
+            raise ValueError(f"{self.name}={cell[:40]!r}: expected {self.allowed}") from None
+        self.check(value)
+        return value
+
+    def check(self, value: Value) -> None:
+        """Raise ValueError if the column does not allow a value."""
+        if value not in self.allowed or (self.type is int and not isinstance(value, int)):
+            raise ValueError(f"{self.name}={_short(value)}: expected {self.allowed}")
+
+    def from_field(self, value: Any) -> Value:
+        """Return the value of the column for a value of its field."""
+        return (self.spelling or _SPELLINGS[self.type]).write(value)
+
+    def to_field(self, row: Mapping[str, Value]) -> Any:
+        """Return the value of the field for a row; ValueError if the row's value is missing or not allowed."""
+        value = row.get(self.name)
+        if value is None or (value == "" and self.spelling is not LIST):
+            raise ValueError(f"{self.name} is empty")
+        self.check(value)
+        return (self.spelling or _SPELLINGS[self.type]).read(value)
+
+
+def _short(value: object) -> str:
+    text = value if isinstance(value, str) else repr(value) if isinstance(value, int | float) else type(value).__name__
+    return repr(text[:40]) if isinstance(value, str) else text[:40]
+
+
+COLUMNS = (
+    Column(
+        "key", str, "source index as eight digits; then patch, and level and draw, where there are several", KEY_TEXT
+    ),
+    Column("source", str, "path below the source folder, percent-encoded where unsafe", ANY_TEXT, Source, "name"),
+    Column("source_sha256", str, "SHA-256 of the source's bytes", HEX_256),
+    Column("source_bytes", int, "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes"),
+    Column("status", str, "ok or failed", Words(("ok", "failed"))),
+    Column("reason", str, "why it failed", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt")),
+    Column("width", int, "of the arrays; twice that of packed planes", SIDE, Patch),
+    Column("height", int, "of the arrays; twice that of packed planes", SIDE, Patch),
+    Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8", Range(1, 8)),
+    Column("shard", int, "number of the shard", Range(0, 10**9)),
+    Column("seed", int, "seed of the run", COUNT, Plan),
+    Column("stream_key", str, "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
+    Column("camera", str, "convex, or the camera", ANY_TEXT, Plan),
+    *(
+        Column(
+            f"w_{camera}", float, "weight of this camera in the mix; 0 where it is not part of it",
+            SHARE, Plan, "weights",
+        )
+        for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
+    ),
+    *(
+        Column(f"rgb2cam_{i}{j}", float, "linear sRGB to camera, row and column", MATRIX_ENTRY, Plan, "rgb2cam")
+        for i in range(3)
+        for j in range(3)
+    ),
+    Column("red_gain", float, "forward white-balance gain of red", GAIN, Plan),
+    Column("blue_gain", float, "forward white-balance gain of blue", GAIN, Plan),
+    Column("inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it", GAIN, Plan),
+    Column("tone", str, "tone curve that was inverted: smoothstep or none", Words(("smoothstep", "none")), Plan),
+    Column(
+        "gamma", number_or_text, "gamma that was expanded: a number or srgb", Range(0.1, 10, ("srgb",)), Plan,
+        spelling=GAMMA,
+    ),
+    Column("highlight", str, "per_channel, gray_mean or none", Words(("per_channel", "gray_mean", "none")), Plan),
+    Column(
+        "highlight_threshold", float, "intensity above which highlights are kept",
+        Range(0, math.nextafter(1, 0)), Plan,
+    ),
+    Column("pattern", str, "Bayer pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), Plan),
+    Column("bits", int, "of the sensor", Range(1, 16), Plan),
+    Column("black_level_dn", int, "DN of no light", Range(0, 65534), Plan),
+    Column("white_level_dn", int, "DN of saturation", Range(1, 65535), Plan),
+    Column(
+        "sensor_clip", str, "how the noisy frame was clipped: sensor, black or none",
+        Words(("sensor", "black", "none")), Plan,
+    ),
+    Column("noise", str, "name of the noise profile", ANY_TEXT, Plan),
+    Column(
+        "a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2", Range(0, 1e30), Plan
+    ),
+    Column("b_dn2", float, "noise variance at black, DN²", FINITE, Plan),
+    Column("effects", str, "what was simulated, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("skipped", str, "what was not, each with its reason, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("accuracy", str, "the accuracy asked for", ANY_TEXT, Plan),
+    Column("methods", str, "how each stage was computed, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes", HEX_128),
+    Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
+    Column("clean_clipped_low", int, "clean sites below black before clipping", COUNT, Counts),
+    Column("clean_clipped_high", int, "clean sites above white before clipping", COUNT, Counts),
+    Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping", COUNT, Counts),
+    Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping", COUNT, Counts),
+    Column("saturated", int, "clean sites at the white level", COUNT, Counts),
+    Column("zero_variance", int, "sites to which the noise law gives no variance", COUNT, Counts),
+    Column(
+        "law_distance", float, "how far the distribution of shot and read noise may be from its law, at most",
+        NOT_NEGATIVE, Plan,
+    ),
+    Column("scene", str, "what the scene was taken for", ANY_TEXT, Plan),
+    Column("exposure_ratio", float, "what the scene was darkened by", Range(1e-4, 1e7), Plan),
+    Column(
+        "saturated_as", str, "what noisy sites are where the clean ones are saturated: noisy, or pinned to white",
+        Words(("noisy", "pinned")), Plan, "saturated",
+    ),
+    Column(
+        "noise_law", str, "of a two-parameter profile: gaussian or poisson", Words(("gaussian", "poisson")), Plan
+    ),
+    Column(
+        "iso", float, "ISO of a physical profile; this and all columns to its right are 0 or none for other profiles",
+        Range(0, 1e9), Physics,
+    ),
+    Column("exposure_s", float, "exposure time, seconds", Range(0, 1e7), Physics),
+    Column("temperature_c", float, "of the sensor, degrees Celsius", Range(-300, 1000), Physics),
+    Column("dn_per_e", float, "system gain K, DN per electron", Range(0, 1e20), Physics),
+    Column("prnu_std", float, "relative deviation of the pixels' responses", SHARE, Physics),
+    Column("dark_e", float, "mean dark current of the exposure, electrons", ELECTRONS, Physics),
+    Column(
+        "dark_offset", str, "whether its mean was removed or kept", Words(("removed", "kept", "none")), Physics
+    ),
+    Column("hot_pixel_share", float, "share of pixels that are hot", SHARE, Physics),
+    Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure, electrons", ELECTRONS, Physics),
+    Column("full_well_e", float, "electrons that a pixel holds; 0: not known", ELECTRONS, Physics),
+    Column("read_law", str, "gaussian or tukey", Words(("gaussian", "tukey", "none")), Physics),
+    Column("read_shape", float, "shape of Tukey's lambda law", Range(-0.5, 10), Physics),
+    Column("read_std_dn", float, "deviation of the read noise, DN", NOT_NEGATIVE, Physics),
+    Column("row_std_dn", float, "deviation of a row's offset, DN", NOT_NEGATIVE, Physics),
+    Column("column_std_dn", float, "deviation of a column's offset, DN", NOT_NEGATIVE, Physics),
+    *(
+        Column(
+            f"black_error_dn_{i}{j}", float, "error of the black level at row, column of the 2x2 sites, DN",
+            FINITE, Physics, "black_error_dn",
+        )
+        for i in range(2)
+        for j in range(2)
+    ),
+    Column("dead_pixel_share", float, "share of pixels that read 0", SHARE, Physics),
+    Column("sensor_unit", str, "the camera body", ANY_TEXT, Physics),
+    Column("body_key", str, "key of the body's fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
+    Column(
+        "fixed_pattern_in_clean", int, "1 where the clean frame has the fixed patterns too", SHARE, Physics,
+        spelling=SWITCH,
+    ),
+    Column("level", int, "number of the noise level", Range(0, 99), Plan),
+    Column("draw", int, "number of the draw at this level", Range(0, 99), Plan),
+    Column("frame", int, "number of the frame in its clip", COORDINATE, Plan),
+    Column("clip", str, "the clip", ANY_TEXT, Source),
+    Column("downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan),
+    Column("dequantize", str, "whether 8-bit codes were dithered: off or dither", Words(("off", "dither")), Plan),
+    Column("patch", int, "number of the patch in its image; 0 for a whole image too", COORDINATE, Patch, "number"),
+    Column("patch_y", int, "row of the full frame in which the arrays begin; even", COORDINATE, Patch, "y"),
+    Column("patch_x", int, "column of the full frame in which the arrays begin; even", COORDINATE, Patch, "x"),
+    Column(
+        "dtype", str, "of the arrays: uint16, DN, or float32, 0 at black and 1 at white", Words((UINT16, FLOAT32)), Plan
+    ),
+    Column("layout", str, "of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), Plan),
+    Column(
+        "detail", str, "of a failed source: what was found, one line", ANY_TEXT, since="0.2", in_json=False
+    ),
+)  # fmt: skip
+"""All columns, in the order of ``manifest.csv``. New columns are appended."""
+
+NAMES = tuple(column.name for column in COLUMNS)
+
+HEADERS = tuple(
+    NAMES[: max(place for place, column in enumerate(COLUMNS) if column.since == version) + 1]
+    for version in dict.fromkeys(column.since for column in COLUMNS)
+)
+"""The header that each version wrote, oldest version first; new columns are appended, so each begins with the last."""
+
+
+def columns_of(record: Record) -> dict[str, tuple[Column, ...]]:
+    """Return the columns that hold a dataclass, by field.
+
+    Parameters
+    ----------
+    record : type
+        `Plan`, `Physics`, `Patch`, `Counts` or `Source`.
+
+    Returns
+    -------
+    dict of str to tuple of Column
+        One column for a scalar field, several for a tuple.
+    """
+    fields: dict[str, tuple[Column, ...]] = {}
+    for column in COLUMNS:
+        if column.of is record:
+            name = column.field or column.name
+            fields[name] = (*fields.get(name, ()), column)
+    return fields
