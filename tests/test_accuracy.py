@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from unprocess_gen.cli.hydra_app import conf_dir
 from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
-from unprocess_gen.config.derived import accuracy_budget
+from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import FORMS, METHODS, STAGES, Budget, choose_methods, method, methods_of_stage
-from unprocess_gen.config.derived import accuracy_budget
+from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError

@@ -25,7 +25,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from moments import REACH, SAMPLER_ERROR, bernstein
 
-from unprocess_gen.config.derived import branch_of
+from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table

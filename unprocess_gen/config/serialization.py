@@ -8,7 +8,7 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import yaml
 
-from unprocess_gen.config.derived import patch_setting
+from unprocess_gen.config.interpretation import patch_setting
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from unprocess_gen.config.accuracy import choose_methods
-from unprocess_gen.config.derived import (
+from unprocess_gen.config.distributions import highest, lowest, parse_distribution
+from unprocess_gen.config.interpretation import (
     A_DISTRIBUTIONS,
     MOST_LEVELS,
     NO_CLIP,
@@ -30,7 +31,6 @@ from unprocess_gen.config.derived import (
     patch_rule,
     uses_physics,
 )
-from unprocess_gen.config.distributions import highest, lowest, parse_distribution
 from unprocess_gen.config.schema import (
     BranchConfig,
     CameraConfig,
@@ -40,7 +40,7 @@ from unprocess_gen.config.schema import (
     SensorConfig,
     SourceConfig,
 )
-from unprocess_gen.config.values import check_name, in_range, is_number, is_whole, one_of, value_text
+from unprocess_gen.config.values import check_name, in_range, is_integer, is_number, one_of, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, MOSAIC, PACKED, UINT16
 from unprocess_gen.simulation.reference import cfa as bayer
@@ -177,7 +177,7 @@ def _check_sensor(sensor: SensorConfig) -> None:
     one_of("sensor.clip", sensor.clip, ("sensor", "black", NO_CLIP))
     one_of("sensor.saturated", sensor.saturated, ("noisy", "pinned"))
     one_of("sensor.dark_offset", sensor.dark_offset, ("removed", "kept"))
-    if sensor.units != "image" and not (is_whole(sensor.units) and 1 <= sensor.units <= 10**6):
+    if sensor.units != "image" and not (is_integer(sensor.units) and 1 <= sensor.units <= 10**6):
         raise ConfigError(
             f"sensor.units={value_text(sensor.units)}: expected image, or a number of bodies, 1 to 1000000"
         )

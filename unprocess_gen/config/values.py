@@ -30,7 +30,7 @@ def in_range(key: str, value: int, low: int, high: int, remark: str = "") -> Non
         raise ConfigError(f"{key}={value}: expected {low} to {high}{remark}")
 
 
-def is_whole(value: Any) -> bool:
+def is_integer(value: Any) -> bool:
     """Return whether a value is an integer; a bool is not."""
     return isinstance(value, int) and not isinstance(value, bool)
 

@@ -31,7 +31,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from unprocess_gen.config.derived import patch_rule
+from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.errors import MachineError, SourceError

@@ -22,7 +22,13 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 
-from unprocess_gen.config.derived import EFFECT_NUMBERS, effect_switch, is_normalised, is_physical, missing_number
+from unprocess_gen.config.interpretation import (
+    EFFECT_NUMBERS,
+    effect_switch,
+    is_normalised,
+    is_physical,
+    missing_number,
+)
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.lookup_tables import linear_table
 from unprocess_gen.core.types import Facts, Physics, Srgb

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from unprocess_gen.config.accuracy import choose_methods, is_steep
-from unprocess_gen.config.derived import (
+from unprocess_gen.config.distributions import draw_parameter, parse_distribution
+from unprocess_gen.config.interpretation import (
     SCENE_DISTRIBUTIONS,
     accuracy_budget,
     dequantize_method,
@@ -22,7 +23,6 @@ from unprocess_gen.config.derived import (
     noise_levels,
     uses_physics,
 )
-from unprocess_gen.config.distributions import draw_parameter, parse_distribution
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Facts, Plan

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.derived import is_physical, noise_levels, patch_rule
+from unprocess_gen.config.interpretation import is_physical, noise_levels, patch_rule
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from unprocess_gen.config.derived import patch_rule
+from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb

@@ -50,7 +50,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from unprocess_gen.config.accuracy import METHODS, STAGES, Budget, Method, choose_methods, methods_of_stage
-from unprocess_gen.config.derived import accuracy_budget, is_normalised, is_physical
+from unprocess_gen.config.interpretation import accuracy_budget, is_normalised, is_physical
 from unprocess_gen.config.schema import AccuracyConfig, CleanConfig, Config, EffectsConfig, NoiseConfig, SensorConfig
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError

@@ -16,7 +16,7 @@ from unprocess_gen.config.schema import (
     NoiseConfig,
     SourceConfig,
 )
-from unprocess_gen.config.values import is_number, is_whole, value_text
+from unprocess_gen.config.values import is_integer, is_number, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
 
@@ -77,7 +77,7 @@ def dequantize_method(source: SourceConfig) -> str:
 
 def patch_rule(source: SourceConfig) -> PatchRule | None:
     """Return how images are cut into patches, None where they stay whole; ConfigError where it cannot be meant."""
-    match ["grid", source.patch] if is_whole(source.patch) else source.patch:
+    match ["grid", source.patch] if is_integer(source.patch) else source.patch:
         case None:
             return None
         case ["grid", side] if _is_patch_length(side):
@@ -94,11 +94,11 @@ def patch_rule(source: SourceConfig) -> PatchRule | None:
 
 
 def _is_patch_length(value: Any) -> bool:
-    return is_whole(value) and MIN_PATCH <= value <= MAX_PATCH and value % 2 == 0
+    return is_integer(value) and MIN_PATCH <= value <= MAX_PATCH and value % 2 == 0
 
 
 def _is_patch_count(value: Any) -> bool:
-    return is_whole(value) and 1 <= value <= MOST_RANDOM_PATCHES
+    return is_integer(value) and 1 <= value <= MOST_RANDOM_PATCHES
 
 
 def patch_setting(source: SourceConfig) -> list[Any] | None:
@@ -110,7 +110,7 @@ def patch_setting(source: SourceConfig) -> list[Any] | None:
 def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
     """Return the profile of each noise level; ConfigError where ``noise.levels`` is no list and no number of levels."""
     levels = 1 if noise.levels is None else noise.levels
-    if is_whole(levels) and 1 <= levels <= MOST_LEVELS:
+    if is_integer(levels) and 1 <= levels <= MOST_LEVELS:
         return (noise,) * levels
     if not isinstance(levels, list) or not 1 <= len(levels) <= MOST_LEVELS:
         raise ConfigError(
