@@ -315,16 +315,16 @@ def _pairs(
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
             at = y * width + start
-            is_integer = length == blocks * BLOCK
+            is_whole = length == blocks * BLOCK
             codes, frame = bare(srgb, 3 * at), bare(clean, at)
             fill_clean(codes, srgb.itemsize == 1, y, first, length, bared, run, frame, bare(counts, 0))
             for plan in range(noisy.shape[0]):
                 key, law = key_of(keys, plan), _law(laws, plan, scene.levels_dn[0])
                 fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
                 to = plan * height * width + at
-                frame = bare(noisy, to) if is_integer else run.noisy
+                frame = bare(noisy, to) if is_whole else run.noisy
                 _fill_noisy(blocks, (first, after), law, quadratics, run, frame, bare(counts, 6 * plan))
-                if not is_integer:
+                if not is_whole:
                     copy(length, bare(run.noisy, first), bare(noisy, to))
 
 
@@ -484,15 +484,15 @@ def fill_clean(
     fill_signal(codes, of_bytes, y, length, scene, bare(run.signal, first))
     of_row = (y & 1) * CHUNK + (first & 1)
     gains = load(bare(scene.site_gains, of_row), _0)
-    is_integer = length == blocks * BLOCK
-    frame = clean if is_integer else run.clean
+    is_whole = length == blocks * BLOCK
+    frame = clean if is_whole else run.clean
     some_below, some_bright = fill_dim(blocks, gains, scene, run, frame)
     if some_below:
         tally[0] += count_below(first, after, run.signal)
     if some_bright:
         fill_bright(blocks, gains, load(bare(scene.site_headroom, of_row), _0), scene, run, frame)
         _count_bright((first, after), scene, run, tally)
-    if not is_integer:
+    if not is_whole:
         copy(length, bare(run.clean, first), clean)
 
 

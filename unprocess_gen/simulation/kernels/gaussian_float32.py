@@ -213,28 +213,28 @@ def _pairs32(
         for start in range(0, width, RUN):
             length = min(RUN, width - start)
             first, after, block, blocks = blocks_of(origin[1] + start, length)
-            at, is_integer = y * width + start, length == blocks * BLOCK
+            at, is_whole = y * width + start, length == blocks * BLOCK
             if light.by_gray:
                 _fill_light_by_gray(srgb[y, start : start + length], products, y, light, room.signal[first:after])
             else:
                 look_up(bare(srgb, 3 * at), even, odd, codes, length, of_bytes, bare(run.signal, first))
             of_sites = bright_sites(sites, y & 1, first)
-            frame = bare(clean, at) if is_integer else run.clean
+            frame = bare(clean, at) if is_whole else run.clean
             some_below, some_bright = fill_clean(blocks, of_sites[0], light, run, frame)
             if some_below:
                 tally[0] += count_below(first, after, run.signal)
             if some_bright:
                 fill_bright(blocks, of_sites, light, run, frame)
                 _count_bright((first, after), light, run, tally)
-            if not is_integer:
+            if not is_whole:
                 copy(length, bare(run.clean, first), bare(clean, at))
             for plan in range(noisy.shape[0]):
                 key, law = key_of(keys, plan), _law(laws, plan)
                 fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
                 to = plan * height * width + at
-                frame = bare(noisy, to) if is_integer else run.noisy
+                frame = bare(noisy, to) if is_whole else run.noisy
                 _fill_noisy(blocks * BLOCK, (first, after), law, light.black, run, frame, bare(counts, 6 * plan))
-                if not is_integer:
+                if not is_whole:
                     copy(length, bare(run.noisy, first), bare(noisy, to))
 
 
