@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Source
 from unprocess_gen.reports.estimate import SAMPLE, estimate_run, format_estimate
 from unprocess_gen.simulation.reference.noise import EFFECTS
-from unprocess_gen.sources.loader import evenly_spaced
 
 Settings = Callable[..., Any]
 

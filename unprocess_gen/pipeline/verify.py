@@ -21,6 +21,7 @@ import numpy as np
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, file_sha256
+from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
 from unprocess_gen.dataset.keys import group_by_sample, image_key, sample_key
 from unprocess_gen.dataset.manifest import (
@@ -179,8 +180,7 @@ def source_root(manifest: Path, root: str | None) -> str | None:
 def spread(manifest: Path, count: int) -> Iterator[Row]:
     """Yield ``count`` rows of pairs (or all there are), evenly spread over a manifest."""
     places = [at for at, row in rows_with_offsets(manifest) if row["status"] == "ok"]
-    count = min(count, len(places))
-    return (read_row(manifest, places[i * len(places) // count]) for i in range(count))
+    return (read_row(manifest, at) for at in evenly_spaced(places, count))
 
 
 def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[Replayed]:

@@ -24,6 +24,7 @@ from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Float, Frame, Plan, Row, Srgb
 from unprocess_gen.dataset.keys import image_key, sample_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
@@ -153,8 +154,7 @@ def _part_of(photograph: Srgb | None, missing_source: str, row: Row) -> tuple[Sr
 def _spread(folder: Path, pairs: int) -> list[int]:
     if not pairs:
         raise ConfigError(f"{folder}: every photograph failed, so there is no pair to show")
-    count = min(SHEETS, pairs)
-    return [i * pairs // count for i in range(count)]
+    return evenly_spaced(range(pairs), SHEETS)
 
 
 def _numbers(manifest: Path, keys: Sequence[str]) -> list[int]:

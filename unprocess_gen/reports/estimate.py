@@ -20,6 +20,7 @@ from unprocess_gen.config.interpretation import is_physical, noise_levels, patch
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Plan, Source
 from unprocess_gen.dataset.manifest import json_size
 from unprocess_gen.dataset.shards import form_of, image_bytes, shard_bytes
@@ -27,7 +28,7 @@ from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_f
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark import measure as accuracy
 from unprocess_gen.simulation.pair import make_pairs
-from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_source
+from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches, pixels_in_none
 
 SAMPLE = 16

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Float, Frame, Plan, Source, Srgb
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports import markup
@@ -37,7 +38,7 @@ from unprocess_gen.simulation.reference.unprocess import (
     invert_gains_per_channel,
     linear_light,
 )
-from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_source
+from unprocess_gen.sources.loader import list_photographs, load_source
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

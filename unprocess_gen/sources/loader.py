@@ -61,13 +61,6 @@ def list_photographs(config: SourceConfig) -> listing.Listing:
     return replace(listed, sources=numbered, warnings=warnings)
 
 
-def evenly_spaced(sources: tuple[Source, ...], count: int) -> tuple[Source, ...]:
-    """Return at most ``count`` sources, evenly spread over the listing."""
-    if len(sources) <= count:
-        return sources
-    return tuple(sources[i * len(sources) // count] for i in range(count))
-
-
 def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:
     """Read, decode and downscale one source.
 

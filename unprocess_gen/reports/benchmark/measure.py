@@ -57,6 +57,7 @@ from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import linear_table, normal_table
 from unprocess_gen.core.random_streams import BLOCK, Words
+from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import MOSAIC, Float, Frame, Pair, Plan, Raw, Srgb
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
@@ -90,7 +91,7 @@ from unprocess_gen.simulation.reference.poisson import Tables as PoissonTables
 from unprocess_gen.simulation.reference.poisson import gaussian_from, poisson_tables
 from unprocess_gen.simulation.reference.sensor import quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
-from unprocess_gen.sources.loader import evenly_spaced, list_photographs, load_source
+from unprocess_gen.sources.loader import list_photographs, load_source
 
 
 @dataclass(frozen=True, slots=True)
