@@ -18,7 +18,7 @@ from unprocess_gen.reports.benchmark.measure import Measurement
 from unprocess_gen.reports.benchmark.report import markdown_table
 
 HERE = Path(__file__).parent
-README = HERE.parent / "README.md"
+README = HERE.parent / "docs" / "accuracy.md"
 TABLE = re.compile(r"(<!-- accuracy: [^>]*-->\n).*?(<!-- end of accuracy -->)", re.DOTALL)
 TEXTS = ("stage", "method", "tier", "error_unit")
 

@@ -37,7 +37,7 @@ BANNED = {
     r"says? (it|so|that)|said": "reports, states, is set to",
     r"but for": "except",
     r"whole": "complete, intact, entire; integer",
-    r"machine failed us|for people": "system error; readable",
+    r"machine failed us": "system error",
     r"(?-i:us|our|ours|we)": "no first person",
     r"(?-i:TODO|FIXME|XXX)": "unfinished work",
 }
