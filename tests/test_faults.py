@@ -31,7 +31,7 @@ from test_resume import LOKY_TRACKER, ONE, Killed, assert_whole, committed, runn
 
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline import verify
+from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.workspace import Workspace
 
 Make = Callable[..., Any]
@@ -595,7 +595,7 @@ def test_a_photograph_replaced_after_it_was_committed_keeps_its_row_and_verify_t
     rows = list(read_rows(tmp_path / "ds/manifest.csv"))
     assert (rows[0]["source"], rows[0]["source_sha256"]) == ("000.bmp", hashlib.sha256(old).hexdigest())
     assert (tmp_path / "ds/shards/shard-00000.tar").read_bytes() == shard
-    assert [one.source for one in verify.replay(rows, str(source)) if one.complaint] == ["000.bmp"]
+    assert [one.source for one in replay(rows, str(source)) if one.complaint] == ["000.bmp"]
 
 
 @pytest.mark.parametrize("state", ["begun", "finished"])

@@ -23,7 +23,8 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.lookup_tables import tukey_table
 from unprocess_gen.core.types import READABLE, Frame, Plan
-from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.reports import photon_transfer as transfer

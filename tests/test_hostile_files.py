@@ -38,7 +38,8 @@ from PIL import Image
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import REASONS, SourceError
 from unprocess_gen.core.types import Source
-from unprocess_gen.pipeline.generate import RunContext, ShardTask, make_shard
+from unprocess_gen.pipeline.tasks import RunContext, ShardTask
+from unprocess_gen.pipeline.worker import make_shard
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources.image.decode import decode

@@ -29,7 +29,7 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.selection import select_rows
-from unprocess_gen.pipeline.verify import replay
+from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.sources.listing import decode_name, encode_name, list_folder, read_bytes
 
 FORMULA_STARTS = tuple("=+-@\t\r")

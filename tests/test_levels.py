@@ -19,7 +19,8 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
 
 Settings = Callable[..., Config]
 
@@ -126,7 +127,7 @@ def test_a_damaged_draw_is_named_and_mended_alone(
 
     assert [(one.key, one.member) for one in verify(tmp_path / "ds")] == [("00000001", "noisy.l01d01.npy")]
     said = door("verify", tmp_path / "ds", "--repair").out
-    assert "shards/shard-00000.tar: 1 of 12 pairs made again" in said
+    assert "shards/shard-00000.tar: 1 of 12 pairs regenerated" in said
     assert path.read_bytes() == (many / "shards" / "shard-00000.tar").read_bytes()
 
 

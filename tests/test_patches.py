@@ -26,8 +26,9 @@ from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.types import Patch, PatchRule
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
-from unprocess_gen.pipeline import repair
-from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.pipeline import repair, worker
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.sources import loader as photographs
@@ -415,10 +416,10 @@ def test_a_photograph_is_decoded_once_and_only_pixels_of_its_patches_are_made(
 ) -> None:
     decoded: list[int] = []
     made: list[int] = []
-    decode, make_pairs = photographs.decode.decode, runner.make_pairs
+    decode, make_pairs = photographs.decode.decode, worker.make_pairs
     monkeypatch.setattr(photographs.decode, "decode", lambda *a, **b: (decoded.append(1), decode(*a, **b))[1])
     monkeypatch.setattr(
-        runner, "make_pairs", lambda srgb, *a: (made.append(srgb[..., 0].size), make_pairs(srgb, *a))[1]
+        worker, "make_pairs", lambda srgb, *a: (made.append(srgb[..., 0].size), make_pairs(srgb, *a))[1]
     )
     make(sources, tmp_path / "ds", "source.patch=[random,10,4]")
     assert (len(decoded), made) == (4, [100] * 12)
@@ -474,7 +475,7 @@ def test_a_damaged_patch_is_named_and_mended_alone(cut_up: Path, door: Door, tmp
     path.write_bytes(content)
 
     assert [(one.key, one.member) for one in verify(copy)] == [("00000001-p0003", "noisy.l01d01.npy")]
-    assert "shards/shard-00000.tar: 1 of 40 pairs made again" in door("verify", copy, "--repair").out
+    assert "shards/shard-00000.tar: 1 of 40 pairs regenerated" in door("verify", copy, "--repair").out
     assert path.read_bytes() == (cut_up / "shards" / "shard-00000.tar").read_bytes()
 
 

@@ -16,7 +16,7 @@ from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.lookup_tables import linear_table
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline.verify import replay
+from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.unprocess import dequantise

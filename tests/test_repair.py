@@ -1,4 +1,4 @@
-"""Whatever is damaged is made again to the same bytes, nothing else is touched, and what cannot be mended is said."""
+"""Whatever is damaged is made again to the same bytes, nothing else is touched, and what cannot be repaired is said."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_only_damaged_pairs_are_made_again(whole: Path, copy: Path, door: Door, 
 
     said = assert_mended(copy, whole, door, f"source.root={only}")
 
-    assert said.splitlines()[0] == f"{FILES[4]}: 1 of {len(rows)} pairs made again, the others kept"
+    assert said.splitlines()[0] == f"{FILES[4]}: 1 of {len(rows)} pairs regenerated, the others kept"
 
 
 def _json_rows(folder: Path, shard: int) -> list[str]:
@@ -171,7 +171,7 @@ def test_a_lost_manifest_needs_no_source_while_the_shards_are_sound(
 
     done = door("verify", tmp_path / "scenes", "--repair")
 
-    assert done.out.splitlines()[0] == "manifest.csv: written again from the rows in the shards"
+    assert done.out.splitlines()[0] == "manifest.csv: restored from the rows in the shards"
     assert contents(tmp_path / "scenes") == before
 
 
@@ -182,7 +182,7 @@ def test_a_lost_dataset_json_is_written_anew_and_says_so(whole: Path, copy: Path
 
     new, old = (json.loads((folder / "dataset.json").read_text()) for folder in (copy, whole))
     assert done.code == 0
-    assert "which machine made the dataset, when and with what, is lost" in done.out
+    assert "host, time and versions of the run are lost" in done.out
     assert {name for name in old if old[name] != new[name]} == {
         *("dataset_sha256", "not_matched", "run", "skipped_links", "source", "versions")
     }
@@ -199,9 +199,9 @@ def test_a_changed_source_is_named_and_the_rest_is_mended(
 
     done = door("verify", copy, "--repair", f"source.root={changed}")
 
-    assert done.code == 4
-    assert f"{FILES[4]}: cannot be mended: " in done.err
-    assert f"cannot be mended: source {row['source']}" in done.err
+    assert done.code == 5
+    assert f"{FILES[4]}: cannot be repaired: " in done.err
+    assert f"cannot be repaired: source {row['source']}" in done.err
     assert (copy / FILES[5]).read_bytes() == (whole / FILES[5]).read_bytes()
     assert not (copy / ".work").exists()
 
@@ -214,7 +214,9 @@ def test_what_no_part_holds_any_more_is_refused_in_one_line(other: str, copy: Pa
     done = door("verify", copy, "--repair")
 
     assert done.code == 4
-    assert done.err.splitlines()[-1].startswith(f"gen-dataset: {copy}: both {other} and dataset.json are damaged; make")
+    assert done.err.splitlines()[-1].startswith(
+        f"gen-dataset: {copy}: both {other} and dataset.json are damaged; regenerate"
+    )
 
 
 def test_a_dataset_that_a_run_holds_is_left_alone(copy: Path, door: Door) -> None:

@@ -20,6 +20,7 @@ from conftest import COMMAND, Cli, environment, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
+from unprocess_gen.cli.messages import log_to_stderr
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError, MachineError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
@@ -236,6 +237,7 @@ def test_a_committed_shard_that_is_not_whole_is_made_again(
 
 
 def test_progress_begins_where_the_earlier_run_ended(begun: Path, make: Make, capfd: Any) -> None:
+    log_to_stderr()
     make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
     assert "gen-dataset: 6/6 images" in capfd.readouterr().err
 
@@ -255,7 +257,7 @@ CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
     ("isp=srgb", lambda source: None, r"was begun with other settings: isp.gamma=srgb \(there: 2.2\); isp.tone=none"),
     ("source.limit=5", lambda source: None, r"was begun with other settings: source.limit=5 \(there: null\)"),
     ("seed=0", add, r"was begun with other sources: new.png is new"),
-    ("seed=0", lambda source: (source / "003.png").unlink(), r"was begun with other sources: 003.png is gone"),
+    ("seed=0", lambda source: (source / "003.png").unlink(), r"was begun with other sources: 003.png was deleted"),
     (
         "seed=0",
         lambda source: (source / "003.png").write_bytes(b"x"),
@@ -264,12 +266,12 @@ CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
     (
         "seed=0",
         lambda source: (source / "003.png").rename(source / "x.png"),
-        r"was begun with other sources: x.png is new; 003.png is gone",
+        r"was begun with other sources: x.png is new; 003.png was deleted",
     ),
     (
         "seed=0",
         lambda source: [path.unlink() for path in sorted(source.iterdir())[:5]],
-        r"000.png is gone; 001.png is gone; 002.png is gone; and 2 more",
+        r"000.png was deleted; 001.png was deleted; 002.png was deleted; and 2 more",
     ),
 ]
 
@@ -313,12 +315,12 @@ def test_a_finished_dataset_whose_shard_is_missing_is_damage(finished: Path, doo
     (finished / "ds/shards/shard-00001.tar").unlink()
     done = door("source.root=p", "output.pairs_per_shard=2")
     assert (done.code, done.err.count("\n")) == (4, 1)
-    assert "shard-00001.tar: is missing, the dataset says " in done.err
+    assert "shard-00001.tar: is missing, expected " in done.err
 
 
 def test_a_finished_dataset_whose_shard_has_another_size_is_damage(finished: Path, make: Make) -> None:
     os.truncate(finished / "ds/shards/shard-00001.tar", 700)
-    with pytest.raises(DamageError, match=r"shard-00001.tar: has 700 bytes, the dataset says \d+"):
+    with pytest.raises(DamageError, match=r"shard-00001.tar: has 700 bytes, expected \d+ bytes"):
         make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
 
 
@@ -391,7 +393,7 @@ def test_a_folder_with_files_of_anyone_else_is_refused_and_left_alone(name: str,
 
 def test_a_shard_that_no_run_made_is_refused(begun: Path, make: Make) -> None:
     (begun / "ds/shards/shard-00009.tar").write_text("stale")
-    with pytest.raises(ConfigError, match=r"holds .*shard-00009.tar, which no run of ours made"):
+    with pytest.raises(ConfigError, match=r"unexpected file .*shard-00009.tar; expected only committed shards"):
         make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
 
 
@@ -429,7 +431,7 @@ def test_two_runs_at_once_make_one_dataset(forty: Path, undisturbed: str, tree_h
 def test_a_folder_with_other_files_is_refused_and_left_alone(make: Make, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds/thesis.tex").write_text("mine")
-    with pytest.raises(ConfigError, match=r"out=.*/ds: holds thesis.tex, which is not of a dataset; choose an empty"):
+    with pytest.raises(ConfigError, match=r"out=.*/ds: contains thesis.tex, which is not of a dataset; choose"):
         make(fill(tmp_path / "p", 1), tmp_path / "ds")
     assert os.listdir(tmp_path / "ds") == ["thesis.tex"]
 
@@ -611,7 +613,7 @@ def test_an_out_that_vanishes_is_the_machines_failure(
             yield made
 
     monkeypatch.setattr(runner, "run_tasks", vanishing)
-    with pytest.raises(MachineError, match=r"the folder is gone"):
+    with pytest.raises(MachineError, match=r"was deleted or moved"):
         make(fill(tmp_path / "p", 1), tmp_path / "ds")
 
 

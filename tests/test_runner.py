@@ -19,12 +19,14 @@ from conftest import PHOTOS, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
+from unprocess_gen.cli.messages import log_to_stderr
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.executors import local
 
 Make = Callable[..., runner.Summary]
 Hash = Callable[[Path], str]
@@ -334,13 +336,13 @@ def test_a_source_that_changes_while_the_run_is_on_stops_it(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = fill(tmp_path / "p", 2)
-    make_shard = runner.make_shard
+    make_shard = local.make_shard
 
     def changed_before(*arguments: Any) -> Any:
         (source / "001.png").write_bytes(b"shorter")
         return make_shard(*arguments)
 
-    monkeypatch.setattr(runner, "make_shard", changed_before)
+    monkeypatch.setattr(local, "make_shard", changed_before)
     with pytest.raises(MachineError, match=r"source 001.png changed since it was listed: \d+ bytes then, 7 now"):
         make(source, tmp_path / "ds")
     assert not (tmp_path / "ds/dataset.json").exists()
@@ -444,16 +446,17 @@ def test_shard_tasks_split_the_listing_in_order(count: int, per_shard: int, leng
 
 
 def test_no_more_workers_than_tasks_and_at_least_one() -> None:
-    assert [runner.effective_jobs(4, tasks) for tasks in (0, 1, 3, 9)] == [1, 1, 3, 4]
+    assert [local.effective_jobs(4, tasks) for tasks in (0, 1, 3, 9)] == [1, 1, 3, 4]
 
 
 def test_minus_one_worker_stands_for_the_cores_this_process_may_use() -> None:
-    assert runner.effective_jobs(-1, 10**6) == len(os.sched_getaffinity(0))
+    assert local.effective_jobs(-1, 10**6) == len(os.sched_getaffinity(0))
 
 
 def test_progress_is_plain_lines_where_there_is_no_terminal(
     make: Make, photos: Path, tmp_path: Path, capfd: Any
 ) -> None:
+    log_to_stderr()
     make(photos, tmp_path / "ds")
     out, err = capfd.readouterr()
     assert out == ""
@@ -461,7 +464,7 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(
 
 
 def test_the_first_run_of_a_machine_says_that_it_compiles_and_no_other(cli: Cli, tmp_path: Path) -> None:
-    line = "gen-dataset: 0/1 images, compiling kernels: 5 to 20 seconds, once on a machine"
+    line = "gen-dataset: 0/1 images, compiling kernels (needed once per machine and version)"
     said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
 
     assert [line in one for one in said] == [True, False]

@@ -196,9 +196,9 @@ def test_where_a_child_dies_settings_are_composed_here(
 KEEPING = """
 import resource, sys
 import numpy as np
-from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.worker import keep_memory
 if sys.argv[1] == "keep":
-    runner._keep_memory()
+    keep_memory()
 faults = [resource.getrusage(resource.RUSAGE_SELF).ru_minflt]
 for _ in range(9):
     array = np.ones(40_000_000, dtype=np.uint8)

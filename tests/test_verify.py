@@ -18,7 +18,8 @@ from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.dataset.shards import read_index
-from unprocess_gen.pipeline.verify import replay, spread, verify
+from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay
+from unprocess_gen.pipeline.verify import verify
 
 FILES = ("config.yaml", "manifest.csv", "dataset.json", "shards/shard-00000.tar", "shards/shard-00001.tar")
 
@@ -169,7 +170,7 @@ def test_the_digests_of_a_manifest_that_fits_its_shards_but_was_edited_do_not_fi
 
 
 def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DamageError, match=r"neither dataset.json nor manifest.csv is here"):
+    with pytest.raises(DamageError, match=r"contains neither dataset.json nor manifest.csv"):
         verify(tmp_path)
 
 
@@ -255,7 +256,7 @@ def test_verify_names_a_source_that_changed(whole: Path, door: Door, tmp_path: P
     shutil.copytree(whole.parent / "p", tmp_path / "q")
     changed(sorted((tmp_path / "q").iterdir())[0])
     done = door("verify", whole, "--regenerate=99", "source.root=q")
-    assert done.code == 4
+    assert done.code == 5
     assert "its source has changed" in done.err
 
 
@@ -275,8 +276,8 @@ def test_a_choice_of_nothing_that_is_there_is_refused(rows: str | None, keys: st
 
 def test_a_sample_is_spread_over_the_manifest(whole: Path) -> None:
     manifest = whole / "manifest.csv"
-    assert [row["key"] for row in spread(manifest, 2)] == ["00000000", "00000001"]
-    assert len(list(spread(manifest, 99))) == 3
+    assert [row["key"] for row in evenly_spaced_rows(manifest, 2)] == ["00000000", "00000001"]
+    assert len(list(evenly_spaced_rows(manifest, 99))) == 3
 
 
 def test_dataset_json_holds_its_own_digest_last(whole: Path) -> None:

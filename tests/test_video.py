@@ -23,7 +23,8 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline.verify import replay, verify
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.sources import loader as photographs
 from unprocess_gen.sources.loader import list_photographs, load_source
 
@@ -700,7 +701,7 @@ def test_a_damaged_frame_is_made_again(films: Path, filmed: Path, door: Door, tm
     content[content.index(b"00000010.noisy.npy") + 512 + 200] ^= 1
     path.write_bytes(content)
     done = door("verify", copy, "--repair", f"source.root={films}")
-    assert (done.code, "1 of 8 pairs made again" in done.out) == (0, True)
+    assert (done.code, "1 of 8 pairs regenerated" in done.out) == (0, True)
     assert path.read_bytes() == (filmed / "shards" / "shard-00001.tar").read_bytes()
 
 

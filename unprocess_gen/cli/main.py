@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from unprocess_gen import __version__
 from unprocess_gen.cli.hydra_app import complain, compose
+from unprocess_gen.cli.messages import log_to_stderr
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 
@@ -111,6 +112,7 @@ def main() -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that cannot show a sign is no reason to stop
+    log_to_stderr()
     try:
         return run(sys.argv[1:])
     except UnprocessGenError as error:
@@ -209,10 +211,10 @@ def plan(arguments: list[str]) -> int:
 
 
 def _plan(config: Config, read_all: bool) -> tuple[int, None]:
-    from unprocess_gen.pipeline import generate as runner
+    from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports import estimate as forecast
 
-    told = forecast.estimate_run(config, runner.effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
+    told = forecast.estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
     print(f"out       {config.out}")
     print(forecast.format_estimate(config, told))
     return 0, None
@@ -355,27 +357,31 @@ def _values(verb: str, known: Mapping[str, Callable[[str], Any]], arguments: Seq
 
 def verify(arguments: list[str]) -> int:
     """``gen-dataset verify DIR [--regenerate N] [--repair] [--noise] …``: check every byte, mend, fit the noise."""
-    from unprocess_gen.pipeline import repair
+    from unprocess_gen.cli.sweep import worst
+    from unprocess_gen.pipeline import repair, replay
     from unprocess_gen.pipeline import verify as room
 
     mend, noise = "--repair" in arguments, "--noise" in arguments
     arguments = [argument for argument in arguments if argument not in ("--repair", "--noise")]
     folder, chosen = _first("verify", arguments), _values("verify", VERIFY_KEYS, arguments[1:])
     damages = _told(folder, room.verify(folder))
+    codes: list[int] = []
     if damages and mend:
-        for step in repair.repair(folder, room.source_root(folder / "manifest.csv", chosen.get("source.root"))):
-            print(step, file=sys.stdout if step.mended else sys.stderr)
+        for step in repair.repair(folder, replay.source_root(folder / "manifest.csv", chosen.get("source.root"))):
+            print(step, file=sys.stdout if step.repaired else sys.stderr)
+            codes.append(step.exit_code)
         damages = _told(folder, room.verify(folder))
     manifest, count, again = folder / "manifest.csv", chosen.get("--regenerate", 0), 0
     if count and not damages:
-        root = room.source_root(manifest, chosen.get("source.root"))
-        replayed = list(room.replay(room.spread(manifest, count), root))
+        root = replay.source_root(manifest, chosen.get("source.root"))
+        replayed = list(replay.replay(replay.evenly_spaced_rows(manifest, count), root))
+        codes = [result.exit_code for result in replayed]
         again = len(replayed)
         damages += _told(folder, (f"{one.key} ({one.source}): {one.complaint}" for one in replayed if one.complaint))
     if noise and not damages:
         damages += _check_noise(folder, chosen.get("--to"))
     if damages:
-        return 4
+        return worst(codes) or 4
     print(f"{folder} is whole" + (f"; {again} pairs were made again, bit for bit" if again else ""))
     return 0
 
@@ -404,8 +410,9 @@ def _told(folder: Path, damages: Iterable[object]) -> list[str]:
 
 def replay(arguments: list[str]) -> int:
     """``gen-dataset replay MANIFEST [--rows A:B] [--keys K,…] [--to FOLDER] [source.root=…]``: make rows again."""
+    from unprocess_gen.cli.sweep import worst
     from unprocess_gen.dataset.selection import select_rows
-    from unprocess_gen.pipeline import verify as room
+    from unprocess_gen.pipeline import replay as room
 
     manifest = _first("replay", arguments, "a manifest.csv, or the folder of a dataset")
     chosen = _values("replay", REPLAY_KEYS, arguments[1:])
@@ -413,12 +420,14 @@ def replay(arguments: list[str]) -> int:
     to = Path(chosen["--to"]) if "--to" in chosen else None
     rows = select_rows(manifest, chosen.get("--rows"), chosen.get("--keys"))
     same = different = 0
+    codes: list[int] = []
     for one in room.replay(rows, room.source_root(manifest, chosen.get("source.root")), to):
         same, different = same + (not one.complaint), different + bool(one.complaint)
+        codes.append(one.exit_code)
         if one.complaint:
             print(f"gen-dataset: {one.key} ({one.source}): {one.complaint}", file=sys.stderr)
     print(f"{same} pairs are the same, bit for bit; {different} are not" + (f"; arrays in {to}" if to else ""))
-    return 4 if different else 0
+    return worst(codes)
 
 
 def report(arguments: list[str]) -> int:

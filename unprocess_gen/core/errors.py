@@ -55,6 +55,10 @@ class MachineError(UnprocessGenError):
     exit_code = 5
 
 
+class SourceChangedError(MachineError):
+    """Report that a source was changed or deleted since its row was made: one sentence with what to do."""
+
+
 class LockedError(UnprocessGenError):
     """Another run holds the output folder."""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,42 +15,124 @@ import xxhash
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.types import DESCRIPTIONS, Frame
 
+RESUME = "finished shards are kept; rerun to resume"
+"""What to do after a run failed: the advice that `machine_error` appends."""
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors for which the free space of the disk is worth reporting."""
+
 
 def array_xxh3(array: Frame) -> str:
-    """Return the XXH3-128 of an array's little-endian bytes, 32 hex digits."""
+    """Return the XXH3-128 of an array's little-endian bytes.
+
+    Parameters
+    ----------
+    array : ndarray
+        Any shape; of a dtype that a dataset can hold.
+
+    Returns
+    -------
+    str
+        32 hex digits.
+    """
     return xxhash.xxh3_128_hexdigest(little_endian(array).data)
 
 
 def little_endian(array: Frame) -> Frame:
-    """Return an array as contiguous little-endian numbers; a copy only where it is not already."""
+    """Return an array as contiguous little-endian numbers.
+
+    Parameters
+    ----------
+    array : ndarray
+        Any shape; of a dtype that a dataset can hold.
+
+    Returns
+    -------
+    ndarray
+        The array itself if it is contiguous and little-endian, a copy otherwise.
+    """
     return np.ascontiguousarray(array, dtype=DESCRIPTIONS[array.dtype.name])
 
 
 def file_sha256(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Return the SHA-256 of a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    str
+        64 hex digits.
+    """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def machine_error(error: OSError, path: Path) -> MachineError:
-    """Return the one sentence for a failed write: what failed, where, and how many bytes are free there."""
-    try:
-        free = f"{shutil.disk_usage(path).free} bytes free"
-    except OSError:
-        free = "the folder is gone"
-    what = error.strerror or str(error)
-    return MachineError(f"{error.filename or path}: {what} ({free}); what is committed is kept, run again to go on")
+def machine_error(error: OSError, path: Path, advice: str = "") -> MachineError:
+    """Turn a failed file operation into one sentence: which path, why, and how much space is free if it matters.
+
+    Parameters
+    ----------
+    error : OSError
+        What the operating system reported.
+    path : Path
+        The file or folder in use, for errors that name none.
+    advice : str
+        What to do, appended to the sentence.
+
+    Returns
+    -------
+    MachineError
+        For the caller to raise.
+    """
+    reason = error.strerror or str(error)
+    if error.errno in NO_SPACE:
+        with suppress(OSError):
+            reason += f" ({free_bytes(path)} bytes free)"
+    if error.errno == errno.ENOENT and not path.exists():
+        reason += f" ({path} was deleted or moved)"
+    return MachineError(f"{error.filename or path}: {reason}" + (f"; {advice}" if advice else ""))
 
 
-def commit_file(aside: Path, path: Path) -> None:
-    """Put a finished file where it belongs, durably; another of its name is replaced."""
-    sync(aside)
-    os.replace(aside, path)
+def free_bytes(path: Path) -> int:
+    """Return the bytes that are free on the disk of a path.
+
+    Parameters
+    ----------
+    path : Path
+        A file or folder; if it does not exist, its nearest parent that does is used.
+
+    Returns
+    -------
+    int
+        Free bytes for an unprivileged user.
+    """
+    path = Path(os.path.abspath(path))
+    while not path.exists() and path != path.parent:
+        path = path.parent
+    return shutil.disk_usage(path).free
+
+
+def commit_file(temporary: Path, path: Path) -> None:
+    """Rename a finished file to its final name, durably; a file of that name is replaced.
+
+    Parameters
+    ----------
+    temporary : Path
+        The finished file, on the same file system.
+    path : Path
+        Its final name.
+    """
+    sync(temporary)
+    os.replace(temporary, path)
     sync(path.parent)
 
 
 def sync(path: Path) -> None:
-    """Have what was written to a file, or renamed into a folder, survive a loss of power."""
+    """Make a file's contents, or a folder's renames, survive a loss of power."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

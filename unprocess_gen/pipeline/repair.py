@@ -1,14 +1,14 @@
-"""Repair a dataset: make again just what is damaged, to the same bytes, and prove it.
+"""Repair a dataset: regenerate only what is damaged, to the same bytes, and prove it.
 
-Each part is held by another, so any one can be lost: ``dataset.json`` holds the settings' text and the digests of all
-else; ``manifest.csv`` holds every row, and the shards hold the rows of their pairs; a pair follows from its row and its
-source. What is sound is kept: of a damaged shard only the pairs whose arrays do not fit their digests are made again.
-Everything is written aside and compared before it takes the place of what was there. Files that are not of the dataset
-are not thrown away but moved to ``set_aside``.
+Each file can be restored from others. ``dataset.json`` contains the text of the config and the digests of all other
+files. ``manifest.csv`` contains every row; the shards contain the rows of their pairs. A pair follows from its row and
+its source. Intact data are kept: in a damaged shard only pairs whose arrays differ from their digests are regenerated.
+Every file is written to a temporary file and checked before it replaces the damaged one. Files that are not part of the
+dataset are moved to ``set_aside``.
 
-What cannot be had back is the part of ``dataset.json`` that only the run knew (its time, host and versions), where that
-file is the damaged one and the damage lies there: it is then written anew, and says so. One process does all the work:
-a dataset that is damaged throughout is made faster by ``gen-dataset again``.
+If ``dataset.json`` itself is damaged, its facts about the run (time, host, versions) may be lost. It is then written
+without them, and the repair reports this. Repair uses one process; if most of a dataset is damaged, ``gen-dataset
+again`` is faster.
 """
 
 from __future__ import annotations
@@ -26,16 +26,25 @@ from typing import Any
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml, source_kind
-from unprocess_gen.core.errors import ConfigError, DamageError, SourceError, UnprocessGenError
+from unprocess_gen.core.errors import (
+    ConfigError,
+    DamageError,
+    MachineError,
+    SourceChangedError,
+    SourceError,
+    UnprocessGenError,
+)
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Frame, Row, Source
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import failed_row, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
-from unprocess_gen.pipeline.generate import RunContext, ShardTask, make_shard, shard_tasks, tally
-from unprocess_gen.pipeline.verify import Maker, expected, noisy_member_of, rows_by_shard
+from unprocess_gen.pipeline.generate import shard_tasks, tally
+from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
+from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
+from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, rows_by_shard
+from unprocess_gen.pipeline.worker import make_shard
 from unprocess_gen.pipeline.workspace import (
-    ShardResult,
     Workspace,
     dataset_facts,
     dataset_text,
@@ -48,78 +57,114 @@ Facts = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """What was done about one damaged file, or why nothing could be (``mended`` is then false)."""
+class RepairStep:
+    """Report what was done about one damaged file.
+
+    Attributes
+    ----------
+    file : str
+        Path below the dataset's folder.
+    what : str
+        What was done, or why the file could not be repaired.
+    exit_code : int
+        0 if the file was repaired; otherwise 4, or 5 if a source was changed or deleted.
+    """
 
     file: str
     what: str
-    mended: bool = True
+    exit_code: int = 0
+
+    @property
+    def repaired(self) -> bool:
+        """Whether the file is intact now."""
+        return self.exit_code == 0
 
     def __str__(self) -> str:
         return f"{self.file}: {self.what}"
 
 
-def repair(folder: Path, root: str | None) -> Iterator[Step]:
-    """Mend what is damaged, yielding each step; ``root`` is the folder of the sources, None for built-in scenes.
+def repair(folder: Path, root: str | None) -> Iterator[RepairStep]:
+    """Restore every damaged file of a dataset.
 
-    Raises LockedError where a run holds the folder, DamageError where settings or manifest cannot be had back,
-    ConfigError where sources are needed and ``root`` is not given, MachineError where nothing can be written or this
-    machine computes differently.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the dataset.
+    root : str or None
+        Folder of the sources; None for built-in scenes, or if no source is needed.
+
+    Yields
+    ------
+    RepairStep
+        One for each damaged or foreign file.
+
+    Raises
+    ------
+    LockedError
+        If a run holds the folder.
+    DamageError
+        If config or manifest cannot be restored.
+    ConfigError
+        If sources are needed and ``root`` is None.
+    SourceChangedError
+        If the manifest must be regenerated and a source was changed or deleted.
+    MachineError
+        If a file cannot be read or written, or the self-test fails.
     """
     with Workspace(folder, "") as workspace:
         workspace.hold()
         try:
-            with _bench(workspace) as aside:
-                yield from _repair(folder, root, aside)
+            with _temporary_folder(workspace) as temporary:
+                yield from _repair(folder, root, temporary)
         except OSError as error:
             raise machine_error(error, folder) from error
 
 
 @contextlib.contextmanager
-def _bench(workspace: Workspace) -> Iterator[Path]:
-    """Provide an empty folder to write in, on the dataset's own file system; nothing of it stays."""
-    aside = workspace.work / "repair"
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
+def _temporary_folder(workspace: Workspace) -> Iterator[Path]:
+    """Create an empty folder on the dataset's file system, and delete it afterwards."""
+    temporary = workspace.work / "repair"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
     try:
-        yield aside
+        yield temporary
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
-        with contextlib.suppress(OSError):  # what a run with provisional rows left there stays
+        shutil.rmtree(temporary, ignore_errors=True)
+        with contextlib.suppress(OSError):  # files of a run with provisional rows are kept
             workspace.work.rmdir()
 
 
-def _repair(folder: Path, root: str | None, aside: Path) -> Iterator[Step]:
-    facts = _sound_facts(folder)
-    text, step = _settings(folder, facts, aside)
+def _repair(folder: Path, root: str | None, temporary: Path) -> Iterator[RepairStep]:
+    facts = _intact_facts(folder)
+    text, step = _settings(folder, facts, temporary)
     yield from step
     config = _config(folder / "config.yaml", root)
-    yield from _manifest(folder, facts, config, aside)
+    yield from _manifest(folder, facts, config, temporary)
     rows = rows_by_shard(folder / "manifest.csv")
     for number in sorted(rows):
-        yield from _shard(folder, number, [row for row in rows[number] if row["status"] == "ok"], root, aside)
+        yield from _shard(folder, number, [row for row in rows[number] if row["status"] == "ok"], root, temporary)
     names = {shard_name(number) for number in rows if any(row["status"] == "ok" for row in rows[number])}
     yield from _set_aside(folder, names)
     if not facts:
-        yield _dataset(folder, text, rows, config, aside)
+        yield _dataset(folder, text, rows, config, temporary)
 
 
-def _sound_facts(folder: Path) -> Facts:
-    """Return what ``dataset.json`` says; nothing where a byte of it is wrong."""
+def _intact_facts(folder: Path) -> Facts:
+    """Return the contents of ``dataset.json``, empty if it is damaged."""
     try:
         return read_dataset(folder / "dataset.json")
     except DamageError:
         return {}
 
 
-def _place(aside: Path, path: Path) -> None:
-    """Put a finished file where it belongs, in a folder that may be gone too."""
+def _place(temporary: Path, path: Path) -> None:
+    """Rename a finished file to its final name; create its folder if that was deleted."""
     path.parent.mkdir(exist_ok=True)
-    commit_file(aside, path)
+    commit_file(temporary, path)
 
 
-def _write(aside: Path, path: Path, text: str) -> None:
-    part = aside / path.name
+def _write(temporary: Path, path: Path, text: str) -> None:
+    part = temporary / path.name
     part.write_bytes(text.encode("utf-8"))
     _place(part, path)
 
@@ -127,8 +172,8 @@ def _write(aside: Path, path: Path, text: str) -> None:
 # -------------------------------------------------------------------------------------------------------- settings
 
 
-def _settings(folder: Path, facts: Facts, aside: Path) -> tuple[str, list[Step]]:
-    """Return the text of ``config.yaml``, proved, and what had to be done for it."""
+def _settings(folder: Path, facts: Facts, temporary: Path) -> tuple[str, list[RepairStep]]:
+    """Return the text of ``config.yaml``, checked against its digest, and the steps that restored it."""
     path = folder / "config.yaml"
     try:
         text = path.read_bytes().decode("utf-8")
@@ -144,29 +189,30 @@ def _settings(folder: Path, facts: Facts, aside: Path) -> tuple[str, list[Step]]
     kept = str(facts.get("config", ""))
     if _sha256(kept) != facts["config_sha256"]:
         raise DamageError(f"{path}: dataset.json holds no copy of it; {AGAIN}")
-    _write(aside, path, kept)
-    return kept, [Step("config.yaml", "written again from dataset.json")]
+    _write(temporary, path, kept)
+    return kept, [RepairStep("config.yaml", "restored from dataset.json")]
 
 
-AGAIN = "make the dataset again with the settings and sources it was made from"
+AGAIN = "regenerate the dataset with the settings and sources it was made from"
 
 
 def _is_proved(folder: Path, *proofs: str) -> bool:
-    """Whether a damaged ``dataset.json`` still says one of the things that prove another file.
+    """Return whether a damaged ``dataset.json`` still contains one of the texts that prove another file intact.
 
-    Each file has more than one such proof, so that damage to one of them leaves the other. Where no digest is left at
-    all, with the whole file perhaps, there is nothing to contradict it either.
+    Without this check, a repair after damage to two files would certify the damaged one. Each file has two such texts,
+    so that a flipped bit in one leaves the other. If no digest at all is readable, nothing contradicts the file, and it
+    is accepted.
     """
     try:
         left = (folder / "dataset.json").read_bytes()
     except OSError:
         return True
-    says_any = re.search(rb'"[0-9a-f]{64}"', left)
-    return says_any is None or any(proof.encode() in left for proof in proofs)
+    any_digest = re.search(rb'"[0-9a-f]{64}"', left)
+    return any_digest is None or any(proof.encode() in left for proof in proofs)
 
 
 def _is_canonical(path: Path, text: str) -> bool:
-    """Whether ``config.yaml`` is just as a run writes it."""
+    """Return whether ``config.yaml`` is exactly as a run writes it."""
     try:
         return dataset_yaml(_config(path, None)) == text
     except ConfigError:
@@ -186,24 +232,27 @@ def _sha256(text: str) -> str:
 # -------------------------------------------------------------------------------------------------------- manifest
 
 
-def _manifest(folder: Path, facts: Facts, config: Config, aside: Path) -> Iterator[Step]:
-    """Make sure of ``manifest.csv``: as it is, from the shards, or from the sources; proved by its digest."""
+def _manifest(folder: Path, facts: Facts, config: Config, temporary: Path) -> Iterator[RepairStep]:
+    """Ensure that ``manifest.csv`` is intact; restore it from the shards, or from the sources, and check its digest."""
     path = folder / "manifest.csv"
     if not facts:
-        if not _is_whole_manifest(folder):
+        if not _is_intact_manifest(folder):
             raise DamageError(f"{folder}: both manifest.csv and dataset.json are damaged; {AGAIN}")
         return
     if path.is_file() and file_sha256(path) == facts["manifest_sha256"]:
         return
-    if _write_manifest(_kept_rows(folder, facts), path, facts, aside):
-        yield Step("manifest.csv", "written again from the rows in the shards")
-    elif _write_manifest(_remade_rows(folder, facts, config, aside), path, facts, aside):
-        yield Step("manifest.csv", "made again from the settings and the sources")
+    if _write_manifest(_readable_rows_in_order(folder, facts), path, facts, temporary):
+        yield RepairStep("manifest.csv", "restored from the rows in the shards")
+    elif _write_manifest(_regenerated_rows(folder, facts, config, temporary), path, facts, temporary):
+        yield RepairStep("manifest.csv", "regenerated from the settings and the sources")
     else:
-        raise DamageError(f"{path}: does not come out as it was: were these the same sources?")
+        raise SourceChangedError(
+            f"{path}: the regenerated manifest has another SHA-256 than the lost one: a source was changed, added or "
+            f"deleted; {ADVICE}"
+        )
 
 
-def _is_whole_manifest(folder: Path) -> bool:
+def _is_intact_manifest(folder: Path) -> bool:
     try:
         rows_by_shard(folder / "manifest.csv")
     except DamageError:
@@ -218,9 +267,9 @@ def _fingerprint(folder: Path) -> str:
         return "none"
 
 
-def _write_manifest(rows: Iterable[Row], path: Path, facts: Facts, aside: Path) -> bool:
-    """Put the rows in the manifest's place if they are the ones it was made of."""
-    part = aside / path.name
+def _write_manifest(rows: Iterable[Row], path: Path, facts: Facts, temporary: Path) -> bool:
+    """Write the rows as the manifest if they give its recorded digest; return whether they do."""
+    part = temporary / path.name
     with part.open("w", encoding="utf-8", newline="") as stream:
         write_rows(stream, rows)
     if file_sha256(part) != facts["manifest_sha256"]:
@@ -229,20 +278,20 @@ def _write_manifest(rows: Iterable[Row], path: Path, facts: Facts, aside: Path) 
     return True
 
 
-def _is_sound(folder: Path, entry: Facts) -> bool:
+def _is_intact(folder: Path, entry: Facts) -> bool:
     return entry["file"] is None or (
         (folder / entry["file"]).is_file() and file_sha256(folder / entry["file"]) == entry["sha256"]
     )
 
 
-def _kept_rows(folder: Path, facts: Facts) -> Iterator[Row]:
-    """Yield what rows there are, in order: pairs' from sound shards, failures' from the manifest's readable lines."""
+def _readable_rows_in_order(folder: Path, facts: Facts) -> Iterator[Row]:
+    """Yield the rows of pairs in intact shards and of failures in readable lines of the manifest, in order."""
     failures: dict[Any, list[Row]] = {}
     for row in readable_rows(folder / "manifest.csv"):
         if row["status"] == "failed":
             failures.setdefault(row["shard"], []).append(row)
     for number, entry in enumerate(facts["shards"]):
-        inside = _rows_inside(folder / entry["file"]) if entry["file"] and _is_sound(folder, entry) else []
+        inside = _rows_inside(folder / entry["file"]) if entry["file"] and _is_intact(folder, entry) else []
         yield from sorted([*inside, *failures.get(number, [])], key=lambda row: int(image_key(row)))
 
 
@@ -250,28 +299,28 @@ def _rows_inside(shard: Path) -> list[Row]:
     return [row for content in json_inside(shard) for row in rows_of_json(content)]
 
 
-def _remade_rows(folder: Path, facts: Facts, config: Config, aside: Path) -> Iterator[Row]:
-    """Yield every row: those in sound shards as they are, all others made again, and their shards mended with them."""
+def _regenerated_rows(folder: Path, facts: Facts, config: Config, temporary: Path) -> Iterator[Row]:
+    """Yield every row: read from intact shards, regenerated for damaged ones, which are replaced at the same time."""
     sources = list_photographs(_with_sources(config).source).sources
-    bench = RunContext(config, str(aside), os.getpid())
+    context = RunContext(config, str(temporary), os.getpid())
     for task, entry in zip(shard_tasks(sources, config.output.pairs_per_shard), facts["shards"], strict=False):
         if entry.get("provisional"):
-            yield from (failed_row(one, None, task.shard, config.seed, "worker_died") for one in task.sources)
-        elif _is_sound(folder, entry):
-            found = group_by_image(_rows_inside(folder / entry["file"]) if entry["file"] else ())
-            inside = {image_key(some[0]): some for some in found}
+            yield from (failed_row(source, None, task.shard, config.seed, "worker_died") for source in task.sources)
+        elif _is_intact(folder, entry):
+            rows = _rows_inside(folder / entry["file"]) if entry["file"] else []
+            inside = {image_key(of_image[0]): of_image for of_image in group_by_image(rows)}
             for source in task.sources:
                 yield from inside.get(key_text(source.index)) or [_failure(config, task, source)]
         else:
-            made = make_shard(bench, task)
-            if made.path is not None and made.sha256 == entry["sha256"]:
-                _place(Path(made.path), folder / entry["file"])
-            yield from made.rows
+            result = make_shard(context, task)
+            if result.path is not None and result.sha256 == entry["sha256"]:
+                _place(Path(result.path), folder / entry["file"])
+            yield from result.rows
 
 
 def _with_sources(config: Config) -> Config:
     if config.source.root == "":
-        raise ConfigError("repair: rows must be made again from the photographs: give source.root=…")
+        raise ConfigError("repair: rows must be regenerated from the photographs: give source.root=…")
     return config
 
 
@@ -279,53 +328,54 @@ def _failure(config: Config, task: ShardTask, source: Source) -> Row:
     try:
         load_source(config.source, source, config.output.layout)
     except SourceError as error:
-        return failed_row(source, error.sha256, task.shard, config.seed, error.reason)
-    raise DamageError(f"source {source.name}: failed when the dataset was made, and can be used now; {AGAIN}")
+        return failed_row(source, error.sha256, task.shard, config.seed, error.reason, error.text)
+    raise SourceChangedError(f"source {source.name}: failed when the dataset was made, and can be used now; {ADVICE}")
 
 
 # ---------------------------------------------------------------------------------------------------------- shards
 
 
-def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, aside: Path) -> Iterator[Step]:
-    """Mend a shard, pair by pair; what hinders it becomes a step, so that the others are mended all the same."""
+def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, temporary: Path) -> Iterator[RepairStep]:
+    """Repair a shard, pair by pair; an error becomes a step, so that other shards are repaired nevertheless."""
     path = folder / "shards" / shard_name(number)
-    wanted = expected(rows)
+    wanted = expected_samples(rows)
     if not rows or (path.is_file() and not any(check_members(path, wanted))):
         return
-    part = aside / path.name
-    kept, maker = 0, Maker(root)
+    part = temporary / path.name
+    kept, regenerator = 0, PairRegenerator(root)
     try:
         with ShardWriter(part) as writer:
             for sample, some, frames in zip(wanted, group_by_sample(rows), salvage(path, wanted), strict=True):
-                kept += _mend_sample(writer, sample, some, frames, maker)
+                kept += _repair_sample(writer, sample, some, frames, regenerator)
     except UnprocessGenError as error:
         part.unlink()
-        yield Step(f"shards/{path.name}", f"cannot be mended: {error}", mended=False)
+        exit_code = error.exit_code if isinstance(error, MachineError) else DamageError.exit_code
+        yield RepairStep(f"shards/{path.name}", f"cannot be repaired: {error}", exit_code)
         return
     if path.exists() and not path.is_file():
         _move_aside(folder, path)
     _place(part, path)
-    yield Step(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs made again, the others kept")
+    yield RepairStep(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs regenerated, the others kept")
 
 
-def _mend_sample(
-    writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Frame], maker: Maker
+def _repair_sample(
+    writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Frame], regenerator: PairRegenerator
 ) -> int:
-    """Append a sample, its frames kept or made again; return how many of its pairs were kept."""
-    whole = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]
-    made = {str(row["key"]): maker.make_again(row) for row in rows if row not in whole}
-    writer.add_frame(sample.key, CLEAN, kept[CLEAN] if CLEAN in kept else made[str(rows[0]["key"])].clean)
+    """Append a sample, with kept or regenerated frames; return how many of its pairs were kept."""
+    intact = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]
+    pairs = {str(row["key"]): regenerator.regenerate_exactly(row) for row in rows if row not in intact}
+    writer.add_frame(sample.key, CLEAN, kept[CLEAN] if CLEAN in kept else pairs[str(rows[0]["key"])].clean)
     for row in rows:
         member = noisy_member_of(row)
-        writer.add_frame(sample.key, member, kept[member] if row in whole else made[str(row["key"])].noisy)
+        writer.add_frame(sample.key, member, kept[member] if row in intact else pairs[str(row["key"])].noisy)
     writer.add_rows(sample.key, sample.json)
-    return len(whole)
+    return len(intact)
 
 
-def _set_aside(folder: Path, names: set[str]) -> Iterator[Step]:
-    """Move what is not of the dataset out of ``shards``."""
+def _set_aside(folder: Path, names: set[str]) -> Iterator[RepairStep]:
+    """Move files that are not part of the dataset out of ``shards``."""
     for name in sorted(set(os.listdir(folder / "shards")) - names if (folder / "shards").is_dir() else ()):
-        yield Step(f"shards/{name}", f"moved to {_move_aside(folder, folder / 'shards' / name)}")
+        yield RepairStep(f"shards/{name}", f"moved to {_move_aside(folder, folder / 'shards' / name)}")
 
 
 def _move_aside(folder: Path, path: Path) -> Path:
@@ -342,8 +392,8 @@ def _move_aside(folder: Path, path: Path) -> Path:
 # ---------------------------------------------------------------------------------------------------- dataset.json
 
 
-def _dataset(folder: Path, text: str, rows: dict[int, list[Row]], config: Config, aside: Path) -> Step:
-    """Write ``dataset.json`` again from all that it stands for; the same bytes, if its own digest can be met."""
+def _dataset(folder: Path, text: str, rows: dict[int, list[Row]], config: Config, temporary: Path) -> RepairStep:
+    """Restore ``dataset.json`` from the other files: to the same bytes if its facts about the run are readable."""
     path = folder / "dataset.json"
     old = _readable(path)
     pairs, failed, sites = tally(row for number in sorted(rows) for row in rows[number])
@@ -356,12 +406,12 @@ def _dataset(folder: Path, text: str, rows: dict[int, list[Row]], config: Config
     digest = old.pop("dataset_sha256", None)
     same = dataset_text(old | known)
     if json.loads(same)["dataset_sha256"] == digest:
-        _write(aside, path, same)
-        return Step(path.name, "written again, to the same bytes")
+        _write(temporary, path, same)
+        return RepairStep(path.name, "restored, to the same bytes")
     source = {"kind": source_kind(config), "root": config.source.root or None}
     lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
-    _write(aside, path, dataset_text(known | lost | {"source": source}))
-    return Step(path.name, "written anew from the rest; which machine made the dataset, when and with what, is lost")
+    _write(temporary, path, dataset_text(known | lost | {"source": source}))
+    return RepairStep(path.name, "rebuilt from the other files; host, time and versions of the run are lost")
 
 
 def _readable(path: Path) -> Facts:
@@ -373,7 +423,7 @@ def _readable(path: Path) -> Facts:
 
 
 def _entry(folder: Path, number: int, rows: Sequence[Row], old: Facts) -> Facts:
-    """Return what ``dataset.json`` says of a shard; of its self-test only the old file knows."""
+    """Return a shard's entry for ``dataset.json``; the result of its self-test is only in the old file."""
     path = folder / "shards" / shard_name(number)
     killer = "provisional" if all(row["reason"] == "worker_died" for row in rows) else None
     try:

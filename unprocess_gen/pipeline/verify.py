@@ -1,52 +1,35 @@
-"""Verify a finished dataset byte by byte, and make its pairs again from the manifest's rows.
+"""Verify a finished dataset byte by byte, or every dataset of a sweep.
 
-A row decides every byte of its pair's members but the arrays' contents, and of those it holds a digest: so each shard
-is held against the manifest member by member (`shards.check_members`), and whatever is wrong is named by shard, key and
-member. Above the shards, ``dataset.json`` holds the manifest, the settings, every shard and itself by SHA-256. It costs
-one pass over the data at the speed of SHA-256, about 1.5 GB/s, and a second one at that of XXH3.
+``dataset.json`` records the SHA-256 of itself, the manifest, the config and every shard. A manifest row determines
+every byte of its sample except the contents of the arrays, of which it records a digest. So each shard is compared with
+the manifest member by member (`shards.check_members`), and damage is reported by shard, key and member.
 
-A replay needs the row and the source, nothing else: no settings file, no other row.
+Each shard is read once for its members, at the speed of XXH3. If they are intact, it is read again for its SHA-256, at
+about 1.5 GB/s.
 """
 
 from __future__ import annotations
 
-import json
+import csv
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from unprocess_gen.config.schema import SourceConfig
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceError
-from unprocess_gen.core.files import array_xxh3, file_sha256
-from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
-from unprocess_gen.dataset.keys import group_by_sample, image_key, sample_key
-from unprocess_gen.dataset.manifest import (
-    patch_from_row,
-    plan_from_row,
-    read_row,
-    read_rows,
-    row_json,
-    rows_with_offsets,
-)
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.files import file_sha256, machine_error
+from unprocess_gen.core.types import Row
+from unprocess_gen.dataset.keys import group_by_sample, sample_key
+from unprocess_gen.dataset.manifest import read_rows, row_json
 from unprocess_gen.dataset.shards import CLEAN, Expected, check_members, form_of, noisy_member, shard_name
 from unprocess_gen.pipeline.workspace import read_dataset
-from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.sources import listing as sources
-from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.patches import crop_patch
 
-NO_LIMIT = 2**40
-"""Pixels a replay accepts: the run that wrote the row had a limit of its own."""
+SWEEP_TABLE = "sweep.csv"
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """One place that is not as it should be; ``key`` and ``member`` are empty where a whole file is meant."""
+    """Describe one difference from what a dataset records; ``key`` and ``member`` are empty if it is about a file."""
 
     file: str
     what: str
@@ -58,13 +41,46 @@ class Damage:
         return ": ".join(part for part in (self.file, place, self.what) if part)
 
 
-def verify(folder: Path) -> list[Damage]:
-    """Return every damage of a dataset; none means that each byte is the one its manifest stands for.
+@dataclass(frozen=True, slots=True)
+class SweepVerification:
+    """Hold the outcome for one dataset of a sweep: its folder's name in ``sweep.csv``, and its damage."""
 
-    Raises DamageError where there is no finished dataset at all.
+    folder: str
+    damages: tuple[Damage, ...]
+
+
+def verify(folder: Path) -> list[Damage]:
+    """Compare every byte of a finished dataset with what it records.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the dataset.
+
+    Returns
+    -------
+    list of Damage
+        Empty if every byte is as it was written.
+
+    Raises
+    ------
+    DamageError
+        If the folder contains no finished dataset.
+    MachineError
+        If a file exists but cannot be read.
     """
+    try:
+        return _verify(folder)
+    except OSError as error:
+        raise machine_error(error, folder) from error
+
+
+def _verify(folder: Path) -> list[Damage]:
     if not (folder / "dataset.json").exists() and not (folder / "manifest.csv").exists():
-        raise DamageError(f"{folder}: neither dataset.json nor manifest.csv is here; is this a finished dataset?")
+        raise DamageError(
+            f"{folder}: contains neither dataset.json nor manifest.csv; expected a finished dataset; "
+            "check the folder, or rerun gen-dataset to finish it"
+        )
     damages: list[Damage] = []
     facts: dict[str, Any] = {}
     rows: dict[int, list[Row]] | None = None
@@ -75,9 +91,88 @@ def verify(folder: Path) -> list[Damage]:
     damages += _check_files(folder, facts)
     try:
         rows = rows_by_shard(folder / "manifest.csv")
+        return damages + list(_check_shards(folder, facts.get("shards"), rows))
     except DamageError as error:
         damages.append(Damage("manifest.csv", _without_path(error)))
-    return damages + list(_check_shards(folder, facts.get("shards"), rows))
+    return damages + list(_check_shards(folder, facts.get("shards"), None))
+
+
+def is_sweep(folder: Path) -> bool:
+    """Return whether a folder is a sweep's: it has a ``sweep.csv`` and is no dataset.
+
+    Parameters
+    ----------
+    folder : Path
+        Any folder.
+
+    Returns
+    -------
+    bool
+        True for the folder of a sweep.
+    """
+    return (folder / SWEEP_TABLE).is_file() and not (folder / "dataset.json").exists()
+
+
+def verify_sweep(folder: Path) -> Iterator[SweepVerification]:
+    """Verify every dataset that ``sweep.csv`` lists.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the sweep.
+
+    Yields
+    ------
+    SweepVerification
+        One for each job, in the order of ``sweep.csv``. A job without a finished dataset has one damage.
+
+    Raises
+    ------
+    DamageError
+        If ``sweep.csv`` cannot be read.
+    """
+    table = folder / SWEEP_TABLE
+    try:
+        with table.open(encoding="utf-8", newline="") as stream:
+            jobs = [(row["folder"], row["exit"]) for row in csv.DictReader(stream, strict=True)]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise DamageError(f"{table}: cannot be read ({error}); expected the table of a sweep") from error
+    for name, exit_code in jobs:
+        if not name or Path(name).name != name or name == "..":
+            raise DamageError(f"{table}: {name!r} is not the name of a folder; expected a folder of the sweep")
+        dataset = folder / name
+        if (dataset / "dataset.json").exists() or (dataset / "manifest.csv").exists():
+            yield SweepVerification(name, tuple(verify(dataset)))
+        else:
+            what = f"is missing: the job ended with exit code {exit_code}; rerun the sweep to finish it"
+            yield SweepVerification(name, (Damage("dataset.json", what),))
+
+
+def have_same_rows(old: Path, new: Path) -> bool:
+    """Return whether a new manifest has the rows of an older one, in every column that the older one has.
+
+    Parameters
+    ----------
+    old, new : Path
+        Manifests; ``new`` may have columns that a later version added.
+
+    Returns
+    -------
+    bool
+        True if the number of rows and all cells of the columns of ``old`` are equal.
+    """
+    if file_sha256(old) == file_sha256(new):
+        return True
+    with old.open(encoding="utf-8", newline="") as first, new.open(encoding="utf-8", newline="") as second:
+        rows, others = csv.reader(first), csv.reader(second)
+        names, other_names = next(rows, []), next(others, [])
+        if not set(names) <= set(other_names):
+            return False
+        places = [other_names.index(name) for name in names]
+        try:
+            return all(row == [other[at] for at in places] for row, other in zip(rows, others, strict=True))
+        except (ValueError, IndexError):
+            return False
 
 
 def _without_path(error: DamageError) -> str:
@@ -92,11 +187,11 @@ def _check_files(folder: Path, facts: dict[str, Any]) -> Iterator[Damage]:
             yield Damage(name, f"cannot be read ({error.strerror})")
             continue
         if facts.get(field, found) != found:
-            yield Damage(name, f"its SHA-256 is {found}, dataset.json says {facts[field]}")
+            yield Damage(name, f"its SHA-256 is {found}, dataset.json records {facts[field]}")
 
 
 def rows_by_shard(manifest: Path) -> dict[int, list[Row]]:
-    """Return a manifest's rows by the number of their shard; DamageError where it cannot be read."""
+    """Return a manifest's rows by the number of their shard; raise DamageError if it cannot be read."""
     rows: dict[int, list[Row]] = {}
     for row in read_rows(manifest):
         shard = row["shard"]
@@ -109,7 +204,7 @@ def rows_by_shard(manifest: Path) -> dict[int, list[Row]]:
 def _check_shards(
     folder: Path, entries: list[dict[str, Any]] | None, rows: dict[int, list[Row]] | None
 ) -> Iterator[Damage]:
-    """Hold the shards against ``dataset.json`` and the manifest, or against the one of them that can be read."""
+    """Compare the shards with ``dataset.json`` and the manifest, or with the one of them that is readable."""
     listed = {number: entry for number, entry in enumerate(entries or []) if entry["file"] is not None}
     filled = {number for number, some in (rows or {}).items() if any(row["status"] == "ok" for row in some)}
     wanted = {shard_name(number): number for number in sorted(listed.keys() | filled)}
@@ -126,21 +221,21 @@ def _check_shards(
 
 
 def _check_members(path: Path, rows: Iterable[Row]) -> Iterator[Damage]:
-    for key, member, what in check_members(path, expected(rows)):
+    for key, member, what in check_members(path, expected_samples(rows)):
         yield Damage(f"shards/{path.name}", what, key, member)
 
 
 def _check_sha256(path: Path, entry: dict[str, Any] | None) -> Iterator[Damage]:
     if entry is not None and (found := file_sha256(path)) != entry["sha256"]:
-        yield Damage(f"shards/{path.name}", f"its SHA-256 is {found}, dataset.json says {entry['sha256']}")
+        yield Damage(f"shards/{path.name}", f"its SHA-256 is {found}, dataset.json records {entry['sha256']}")
 
 
-def expected(rows: Iterable[Row]) -> list[Expected]:
-    """Return what rows say of the members of each of their samples; DamageError where a value is missing."""
-    return [_expected(some) for some in group_by_sample(row for row in rows if row["status"] == "ok")]
+def expected_samples(rows: Iterable[Row]) -> list[Expected]:
+    """Return the members that a shard must contain for some rows; raise DamageError if a row lacks a value."""
+    return [_expected_sample(sample) for sample in group_by_sample(row for row in rows if row["status"] == "ok")]
 
 
-def _expected(rows: Sequence[Row]) -> Expected:
+def _expected_sample(rows: Sequence[Row]) -> Expected:
     width, height = rows[0]["width"], rows[0]["height"]
     if not isinstance(width, int) or not isinstance(height, int):
         raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
@@ -150,144 +245,5 @@ def _expected(rows: Sequence[Row]) -> Expected:
 
 
 def noisy_member_of(row: Row) -> str:
-    """Return the member that holds a row's noisy frame."""
+    """Return the name of the shard member that contains a row's noisy frame."""
     return noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
-
-
-# ---------------------------------------------------------------------------------------------------------- replay
-
-
-@dataclass(frozen=True, slots=True)
-class Replayed:
-    """What came of making one row again; ``complaint`` is empty where the pair is the same, bit for bit."""
-
-    key: str
-    source: str
-    complaint: str
-
-
-def source_root(manifest: Path, root: str | None) -> str | None:
-    """Return the folder of the sources: the one given, or the one that ``dataset.json`` beside the manifest names."""
-    if root is not None:
-        return root
-    try:
-        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))["source"]["root"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return None if recorded is None else str(recorded)
-
-
-def spread(manifest: Path, count: int) -> Iterator[Row]:
-    """Yield ``count`` rows of pairs (or all there are), evenly spread over a manifest."""
-    places = [at for at, row in rows_with_offsets(manifest) if row["status"] == "ok"]
-    return (read_row(manifest, at) for at in evenly_spaced(places, count))
-
-
-def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[Replayed]:
-    """Make the pairs of rows again, compare them with the rows' digests, and keep them in ``to`` if it is given.
-
-    ``root`` is the folder of the sources; rows of built-in scenes need none. Failed photographs have no pair and are
-    passed over. Raises ConfigError and MachineError as `Maker.make` does.
-    """
-    maker = Maker(root)
-    for row in rows:
-        if row["status"] != "ok":
-            continue
-        yield Replayed(str(row["key"]), str(row["source"]), _replay(row, maker, to))
-
-
-def _is_scene(row: Row) -> bool:
-    return row["source_bytes"] == 0
-
-
-def _replay(row: Row, maker: Maker, to: Path | None) -> str:
-    try:
-        pair = maker.make(row)
-    except DamageError as error:
-        return str(error)
-    if to is not None:
-        _keep(pair, to, str(row["key"]))
-    return _unlike(pair, row)
-
-
-class Maker:
-    """Make pairs again from rows and the folder of their sources, ``root``; built-in scenes need none.
-
-    The last photograph is kept decoded, since the pairs of one image stand side by side.
-    """
-
-    def __init__(self, root: str | None) -> None:
-        self._root = root
-        self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
-
-    def make(self, row: Row) -> Pair:
-        """Return a row's pair, whatever its digests.
-
-        Raises DamageError where its source has changed, ConfigError where it was made from a folder's file and there
-        is no folder, MachineError where this machine computes differently (`selftest`).
-        """
-        if self._root is None and not _is_scene(row):
-            raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
-        plan = plan_from_row(row)
-        selftest.check(selftest.kernels(plan))
-        try:
-            sha256, photograph = self._load(row)
-        except SourceError as error:
-            sha256 = error.sha256 or str(row["source_sha256"])
-            raise DamageError(_changed(sha256, row) or f"its source cannot be used ({error})") from error
-        except MachineError as error:
-            raise DamageError(str(error)) from error
-        if complaint := _changed(sha256, row):
-            raise DamageError(complaint)
-        patch = patch_from_row(row)
-        pixels = crop_patch(photograph.srgb, patch)
-        if pixels.shape[:2] != (patch.height, patch.width):
-            raise DamageError(
-                f"its {patch.width} x {patch.height} pixels from row {patch.y}, column {patch.x} on "
-                f"are not all in its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]}"
-            )
-        return make_pair(pixels, plan, patch.origin)
-
-    def make_again(self, row: Row) -> Pair:
-        """Return the pair of a row; raises as `make`, and DamageError where the pair is not the row's."""
-        pair = self.make(row)
-        if complaint := _unlike(pair, row):
-            raise DamageError(complaint)
-        return pair
-
-    def _load(self, row: Row) -> tuple[str, Photograph]:
-        root = None if _is_scene(row) else self._root
-        config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
-        source = source_of(row)
-        if self._kept is None or self._kept[:2] != (config, source):
-            self._kept = None  # two photographs at a time would take twice the memory
-            self._kept = config, source, *load_source(config, source)
-        return self._kept[2:]
-
-
-def _unlike(pair: Pair, row: Row) -> str:
-    return "; ".join(
-        f"the XXH3-128 of {name} is {found}, the row says {row[f'{name}_xxh3']}"
-        for name, found in (("clean", array_xxh3(pair.clean)), ("noisy", array_xxh3(pair.noisy)))
-        if found != row[f"{name}_xxh3"]
-    )
-
-
-def _changed(sha256: str, row: Row) -> str:
-    if sha256 == row["source_sha256"]:
-        return ""
-    return f"its source has changed: SHA-256 is {sha256}, the row says {row['source_sha256']}"
-
-
-def _keep(pair: Pair, to: Path, key: str) -> None:
-    to.mkdir(parents=True, exist_ok=True)
-    np.save(to / f"{key}.clean.npy", pair.clean)
-    np.save(to / f"{key}.noisy.npy", pair.noisy)
-
-
-def source_of(row: Row) -> Source:
-    """Return the source that a row was made from."""
-    name, size = str(row["source"]), row["source_bytes"]
-    path = sources.decode_name(name)
-    clip, frame = str(row["clip"]) or NO_CLIP, int(row["frame"] or 0)
-    return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)

@@ -1,17 +1,18 @@
-"""The folder of a dataset while it is made: who may write, what is done already, and what makes it final.
+"""The output folder of a run: lock, temporary files, commit of shards, manifest and ``dataset.json``.
 
-    out/config.yaml              the settings, from the first moment
-    out/.work/sources.json       names and sizes of all sources, as the first run found them
-    out/.work/tmp/               shards that workers are writing; swept at every start
+    out/config.yaml              the resolved config, written first
+    out/.work/sources.json       names and sizes of all sources, as the first run listed them
+    out/.work/tmp/               unfinished shards; emptied at every start
     out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists
     out/shards/                  committed shards only
-    out/manifest.csv             written when every shard is committed or given up for now
-    out/dataset.json             written last: the dataset is complete, and .work goes, unless a shard is provisional
-    out/report.html              a page for people, where one was asked for; no part of the dataset, nothing reads it
+    out/manifest.csv             written once every shard is committed or provisional
+    out/dataset.json             written last; then .work is deleted, unless a shard is provisional
+    out/report.html              the page of the verb ``report``; not part of the dataset
 
-Only the coordinator moves anything to its final name: synced first, rows before shard, so whatever moment a run is
-killed at, a shard in place has its rows, and all else is made again to the same bytes. The lock is the kernel's
-(flock on the folder itself): it leaves no file and dies with the process. Syncing and renaming cost 45 ms a shard.
+Only the coordinator renames files to their final names: it syncs them first, and commits a shard's rows before the
+shard. So a committed shard has its rows whenever a run is killed, and everything else is regenerated to the same bytes.
+The lock is the kernel's (flock on the folder): it needs no file and ends with the process. Syncing and renaming take
+45 ms per shard.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -35,51 +35,22 @@ from yaml import YAMLError
 from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
-from unprocess_gen.core.files import commit_file, machine_error
+from unprocess_gen.core.files import RESUME, commit_file, machine_error
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.columns import NAMES
 from unprocess_gen.dataset.manifest import read_rows, row_of_values, write_rows
 from unprocess_gen.dataset.shards import shard_name
+from unprocess_gen.pipeline.tasks import ShardResult
 
 REPORT = "report.html"
-"""The page of a dataset, the one file in its folder that is not of the dataset."""
+"""The page of a dataset, the one file in its folder that is not part of the dataset."""
 
 SHOWN = 3
-"""Differences named in an error; the rest is counted."""
-
-
-@dataclass(frozen=True, slots=True)
-class ShardResult:
-    """A shard that a worker finished: where it lies (None: no pair in it, no file), and its rows.
-
-    ``killer`` names the photograph at which workers died twice; then the rows are provisional and there is no file.
-    ``self_test`` says what was wrong with the process that made the shard, where the run was told to go on with it.
-    """
-
-    shard: int
-    path: str | None
-    bytes: int
-    sha256: str | None
-    rows: tuple[Row, ...]
-    killer: str | None = None
-    self_test: str | None = None
-
-    def entry(self) -> dict[str, Any]:
-        """Return what ``dataset.json`` says of the shard."""
-        pairs = sum(row["status"] == "ok" for row in self.rows)
-        return {
-            **({"provisional": True} if self.killer else {}),
-            **({"self_test": self.self_test} if self.self_test else {}),
-            "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
-            "pairs": pairs,
-            "failed": len(self.rows) - pairs,
-            "bytes": self.bytes,
-            "sha256": self.sha256,
-        }
+"""Differences named in an error; the others are counted."""
 
 
 class Workspace:
-    """An output folder, held by this process from `open` until `close`."""
+    """Hold an output folder for this process, from `open` until `close`."""
 
     def __init__(self, out: Path, config_yaml: str) -> None:
         self.out = out
@@ -97,16 +68,18 @@ class Workspace:
         self.close()
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Release the lock."""
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
     def open(self) -> None:
-        """Make the folder if need be and hold it.
+        """Create the folder if needed, and lock it.
 
-        Raises LockedError where another run holds it, ConfigError where it cannot be written or holds something else.
+        Raises LockedError if another run holds it, ConfigError if it cannot be written, contains other files or is
+        inside a dataset.
         """
+        self._refuse_datasets_around()
         try:
             self.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -115,7 +88,7 @@ class Workspace:
         self._refuse_foreign_files()
 
     def hold(self) -> None:
-        """Hold a folder that is there; raises LockedError and ConfigError as `open` does."""
+        """Lock an existing folder; raise LockedError or ConfigError as `open` does."""
         try:
             self._lock = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
@@ -127,70 +100,81 @@ class Workspace:
         except OSError as error:
             raise ConfigError(f"out={self.out}: this file system cannot lock it ({error.strerror})") from error
 
+    def _refuse_datasets_around(self) -> None:
+        """Refuse a folder inside a dataset, finished or begun, which would become a foreign file of that dataset."""
+        for parent in Path(os.path.realpath(self.out)).parents:
+            if (parent / "dataset.json").is_file() or (parent / ".work" / "sources.json").is_file():
+                raise ConfigError(f"out={self.out}: is inside the dataset {parent}; choose a folder outside of it")
+
     def _refuse_foreign_files(self) -> None:
-        """Refuse a folder that holds what no run of ours left there, so that nothing of anyone's is overwritten."""
+        """Refuse a folder that contains files but no dataset, so that no file of the user is overwritten."""
         foreign = sorted(set(os.listdir(self.out)) - {".work"})
         if foreign and not (self.out / "config.yaml").exists():
-            raise ConfigError(f"out={self.out}: holds {foreign[0]}, which is not of a dataset; choose an empty folder")
+            raise ConfigError(
+                f"out={self.out}: contains {foreign[0]}, which is not of a dataset; choose an empty folder"
+            )
 
     @property
     def complete(self) -> bool:
-        """Whether the dataset is finished: nothing is left to make, or to try again."""
+        """Whether the dataset is finished: no shard is missing or provisional."""
         path = self.out / "dataset.json"
         return path.exists() and not any(entry.get("provisional") for entry in read_dataset(path)["shards"])
 
     def begin(self, sources: Sequence[Source]) -> None:
-        """Start, or go on with what an earlier run began.
+        """Start a dataset, or continue one that an earlier run began.
 
-        Raises ConfigError where that run had other settings or other sources, naming what differs; ConfigError too
-        where the folder cannot be written.
+        Raises ConfigError if that run had other settings or sources, naming the differences, or if the folder cannot be
+        written; MachineError if the disk is full.
         """
-        self._same_settings()
+        self._check_same_settings()
         listing = self.work / "sources.json"
         if listing.exists():
-            self._same_sources(_read_listing(listing), sources)
+            self._check_same_sources(_read_listing(listing), sources)
         try:
             self.work.mkdir(exist_ok=True)
             self.rows.mkdir(exist_ok=True)
             shutil.rmtree(self.tmp, ignore_errors=True)
-            self.tmp.mkdir(exist_ok=True)  # a worker that outlives a killed run for a moment may have kept it
+            self.tmp.mkdir(exist_ok=True)  # rmtree can fail while an orphaned worker of a killed run still writes here
             if not listing.exists():
-                self._write(listing, json.dumps([[one.name, one.size_bytes, one.sha256] for one in sources]))
+                self._write(
+                    listing, json.dumps([[source.name, source.size_bytes, source.sha256] for source in sources])
+                )
             if not (self.out / "config.yaml").exists():
                 self._write(self.out / "config.yaml", self.config_yaml)
-            self.shards.mkdir(exist_ok=True)  # after config.yaml, by which a later run knows the folder for ours
+            self.shards.mkdir(exist_ok=True)  # after config.yaml, by which a later run recognises the folder
             self._refuse_foreign_shards()
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise machine_error(error, self.out) from error
+                raise machine_error(error, self.out, RESUME) from error
             raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
 
     def _refuse_foreign_shards(self) -> None:
         for path in sorted(self.shards.iterdir()):
             if not self._rows_path(_shard_number(path.name)).exists():
                 raise ConfigError(
-                    f"out={self.out}: holds {path}, which no run of ours made; remove it or choose another"
+                    f"out={self.out}: unexpected file {path}; expected only committed shards; remove it or choose "
+                    "another out"
                 )
 
     def check_complete(self, sources: Sequence[Source]) -> dict[str, Any]:
-        """Return the ``dataset.json`` of a finished dataset.
+        """Return the contents of a finished dataset's ``dataset.json``.
 
-        Raises ConfigError where it was made from other settings or sources, DamageError where a shard is missing or of
+        Raises ConfigError if it was made from other settings or sources, DamageError if a shard is missing or has
         another size.
         """
         if not (self.out / "config.yaml").exists():
             raise DamageError(f"{self.out}/config.yaml: is missing from a finished dataset; remove {self.out}")
-        self._same_settings()
+        self._check_same_settings()
         rows = read_rows(self.out / "manifest.csv")
         known = {str(row["source"]): (row["source_bytes"], row["source_sha256"]) for row in rows}
-        self._same_sources(known, sources)
+        self._check_same_sources(known, sources)
         facts = read_dataset(self.out / "dataset.json")
         for entry in facts["shards"]:
-            _same_size(self.out, entry)
+            _check_size(self.out, entry)
         shutil.rmtree(self.work, ignore_errors=True)
         return facts
 
-    def _same_settings(self) -> None:
+    def _check_same_settings(self) -> None:
         path = self.out / "config.yaml"
         if not path.exists():
             return
@@ -200,14 +184,14 @@ class Workspace:
             raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)}); choose another out") from error
         if differing:
             raise ConfigError(
-                f"out={self.out}: was begun with other settings: {_some(differing)}; choose another out, or remove it"
+                f"out={self.out}: was begun with other settings: {_first(differing)}; choose another out, or remove it"
             )
 
-    def _same_sources(self, known: dict[str, Any], sources: Sequence[Source]) -> None:
+    def _check_same_sources(self, known: dict[str, Any], sources: Sequence[Source]) -> None:
         found = {source.name: (source.size_bytes, source.sha256) for source in sources}
         differing = [
             *(f"{name} is new" for name in found if name not in known),
-            *(f"{name} is gone" for name in known if name not in found),
+            *(f"{name} was deleted" for name in known if name not in found),
             *(
                 f"{name} has {found[name][0]} bytes, had {known[name][0]}"
                 for name in found
@@ -221,11 +205,11 @@ class Workspace:
         ]
         if differing:
             raise ConfigError(
-                f"out={self.out}: was begun with other sources: {_some(differing)}; choose another out, or remove it"
+                f"out={self.out}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
             )
 
     def committed(self, count: int) -> list[int]:
-        """Return which of ``count`` shards are in place with their rows."""
+        """Return the numbers, below ``count``, of the shards that are committed."""
         return [shard for shard in range(count) if self._is_committed(shard)]
 
     def _is_committed(self, shard: int) -> bool:
@@ -234,13 +218,13 @@ class Workspace:
         except (FileNotFoundError, ValueError, KeyError):
             return False
         try:
-            _same_size(self.out, entry)
+            _check_size(self.out, entry)
         except DamageError:
             return False
         return True
 
     def entry(self, shard: int) -> dict[str, Any]:
-        """Return what ``dataset.json`` will say of a committed shard."""
+        """Return the entry of a committed shard in ``dataset.json``."""
         return dict(self._record(shard)["entry"])
 
     def committed_rows(self, shards: Iterable[int]) -> Iterator[Row]:
@@ -256,54 +240,57 @@ class Workspace:
     def _rows_path(self, shard: int) -> Path:
         return self.rows / f"{shard:05d}.json"
 
-    def commit(self, made: ShardResult) -> None:
-        """Put a finished shard into place, durably: its rows first, then the shard. MachineError if that fails."""
-        record = {"entry": made.entry(), "rows": [[row[name] for name in NAMES] for row in made.rows]}
+    def commit(self, result: ShardResult) -> None:
+        """Move a finished shard into place, durably: first its rows, then the file; raise MachineError on failure."""
+        record = {"entry": result.entry(), "rows": [[row[name] for name in NAMES] for row in result.rows]}
         try:
-            self._write(self._rows_path(made.shard), json.dumps(record, separators=(",", ":")))
-            if made.path is not None:
-                commit_file(Path(made.path), self.shards / shard_name(made.shard))
+            self._write(self._rows_path(result.shard), json.dumps(record, separators=(",", ":")))
+            if result.path is not None:
+                commit_file(Path(result.path), self.shards / shard_name(result.shard))
         except OSError as error:
-            raise machine_error(error, self.out) from error
+            raise machine_error(error, self.out, RESUME) from error
 
-    def finish(self, shards: int, given_up: dict[int, ShardResult], facts: dict[str, Any]) -> dict[str, Any]:
-        """Write ``manifest.csv`` and, last, ``dataset.json``; return what the latter says. MachineError on failure.
+    def finish(self, shards: int, provisional: dict[int, ShardResult], facts: dict[str, Any]) -> dict[str, Any]:
+        """Write ``manifest.csv``, then ``dataset.json``, and return the latter's contents.
 
-        Shards that are ``given_up`` for now have provisional rows; then ``.work`` stays, for the next run to go on.
+        Provisional shards get provisional rows; ``.work`` is then kept, so that the next run retries them. Raises
+        MachineError if a file cannot be written.
         """
         try:
-            manifest_sha256 = self._write_manifest(self.all_rows(shards, given_up))
-            entries = [given_up[shard].entry() if shard in given_up else self.entry(shard) for shard in range(shards)]
+            manifest_sha256 = self._write_manifest(self.all_rows(shards, provisional))
+            entries = [
+                provisional[shard].entry() if shard in provisional else self.entry(shard) for shard in range(shards)
+            ]
             dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, facts)
             self._write(self.out / "dataset.json", dataset_text(dataset))
-            shutil.rmtree(self.tmp if given_up else self.work)
+            shutil.rmtree(self.tmp if provisional else self.work)
         except OSError as error:
-            raise machine_error(error, self.out) from error
+            raise machine_error(error, self.out, RESUME) from error
         return dataset
 
-    def all_rows(self, shards: int, given_up: dict[int, ShardResult]) -> Iterator[Row]:
+    def all_rows(self, shards: int, provisional: dict[int, ShardResult]) -> Iterator[Row]:
         """Yield every row of the dataset, in source order."""
         for shard in range(shards):
-            yield from given_up[shard].rows if shard in given_up else self.committed_rows([shard])
+            yield from provisional[shard].rows if shard in provisional else self.committed_rows([shard])
 
     def _write_manifest(self, rows: Iterable[Row]) -> str:
         path = self.out / "manifest.csv"
-        with self._written_aside(path) as stream:
+        with self._written_durably(path) as stream:
             write_rows(stream, rows)
         with path.open("rb") as content:
             return hashlib.file_digest(content, "sha256").hexdigest()
 
     def _write(self, path: Path, text: str) -> None:
-        with self._written_aside(path) as stream:
+        with self._written_durably(path) as stream:
             stream.write(text)
 
     @contextlib.contextmanager
-    def _written_aside(self, path: Path) -> Iterator[TextIO]:
-        """Write a text file below ``.work``, sync it and rename it into place."""
-        aside = self.work / (path.name + ".part")
-        with aside.open("w", encoding="utf-8", newline="") as stream:
+    def _written_durably(self, path: Path) -> Iterator[TextIO]:
+        """Open a temporary text file below ``.work``; on leaving, sync it and rename it to ``path``."""
+        temporary = self.work / (path.name + ".part")
+        with temporary.open("w", encoding="utf-8", newline="") as stream:
             yield stream
-        commit_file(aside, path)
+        commit_file(temporary, path)
 
 
 def _read_listing(path: Path) -> dict[str, Any]:
@@ -318,7 +305,7 @@ def _read_listing(path: Path) -> dict[str, Any]:
 def dataset_facts(
     config_yaml: str, manifest_sha256: str, entries: list[dict[str, Any]], facts: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return what ``dataset.json`` says, the settings' text among it, so that ``config.yaml`` can be had back."""
+    """Return the contents of ``dataset.json``, including the text of ``config.yaml`` for `repair`."""
     config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
     return {
         "fingerprint": fingerprint(config_sha256, manifest_sha256),
@@ -332,26 +319,42 @@ def dataset_facts(
 
 
 def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
-    """Return the digest that stands for a dataset: of its settings, and of its manifest, which holds all others."""
+    """Return the digest that identifies a dataset, from those of its config and of its manifest."""
     return hashlib.sha256(f"{config_sha256}\n{manifest_sha256}\n".encode()).hexdigest()
 
 
 def dataset_text(facts: dict[str, Any]) -> str:
-    """Return ``dataset.json``: the facts, and last the SHA-256 of the text without it."""
+    """Return the text of ``dataset.json``: the facts and, as the last key, the SHA-256 of the text without it."""
     return _text(facts | {"dataset_sha256": hashlib.sha256(_text(facts).encode()).hexdigest()})
 
 
 def read_dataset(path: Path) -> dict[str, Any]:
-    """Return what a ``dataset.json`` says; DamageError where a byte of it is not as it was written."""
+    """Read a ``dataset.json`` and check it against its own SHA-256.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict
+        Its contents, without ``dataset_sha256``.
+
+    Raises
+    ------
+    DamageError
+        If the file cannot be read or any byte of it was changed.
+    """
     try:
         text = path.read_bytes().decode("ascii")
         facts = json.loads(text)
         facts.pop("dataset_sha256")
-        whole = dataset_text(facts) == text
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        intact = dataset_text(facts) == text
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
-    if not whole:
-        raise DamageError(f"{path}: is not as it was written: its own SHA-256 does not fit")
+    if not intact:
+        raise DamageError(f"{path}: was changed: its SHA-256 differs from dataset_sha256")
     return dict(facts)
 
 
@@ -359,7 +362,7 @@ def _text(facts: dict[str, Any]) -> str:
     return json.dumps(facts, indent=1) + "\n"
 
 
-def _same_size(out: Path, entry: dict[str, Any]) -> None:
+def _check_size(out: Path, entry: dict[str, Any]) -> None:
     if entry["file"] is None:
         return
     path = out / entry["file"]
@@ -367,7 +370,7 @@ def _same_size(out: Path, entry: dict[str, Any]) -> None:
     if size != entry["bytes"]:
         found = "is missing" if size is None else f"has {size} bytes"
         raise DamageError(
-            f"{path}: {found}, the dataset says {entry['bytes']}; gen-dataset verify {out} --repair mends it"
+            f"{path}: {found}, expected {entry['bytes']} bytes; gen-dataset verify {out} --repair restores it"
         )
 
 
@@ -377,6 +380,6 @@ def _shard_number(name: str) -> int:
     return int(found[1]) if found else -1
 
 
-def _some(differing: Sequence[str]) -> str:
+def _first(differing: Sequence[str]) -> str:
     rest = len(differing) - SHOWN
     return "; ".join(itertools.islice(differing, SHOWN)) + (f"; and {rest} more" if rest > 0 else "")

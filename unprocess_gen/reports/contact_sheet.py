@@ -29,7 +29,7 @@ from unprocess_gen.core.types import Float, Frame, Plan, Row, Srgb
 from unprocess_gen.dataset.keys import image_key, sample_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
-from unprocess_gen.pipeline.verify import NO_LIMIT, source_of, source_root
+from unprocess_gen.pipeline.replay import NO_LIMIT, source_of, source_root
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import mosaic, tile
 from unprocess_gen.simulation.reference.isp import develop, process, to_light

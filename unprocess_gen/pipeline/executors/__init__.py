@@ -1,0 +1,1 @@
+"""Run the shard tasks of a dataset: with joblib on one machine (`local`)."""

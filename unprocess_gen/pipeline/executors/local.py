@@ -1,0 +1,145 @@
+"""Run shard tasks in worker processes of this machine; the only module that uses joblib.
+
+What happens when a worker dies, usually because the system is out of memory:
+
+1. loky stops all workers of the pool within half a second and raises TerminatedWorkerError in `run_tasks`.
+2. `run_tasks` retries each shard that was in progress alone (`_run_alone`), then continues with a new pool.
+3. If the worker of such a shard dies again, the shard's rows get the provisional reason ``worker_died``; a later run
+   retries the shard.
+
+If the coordinator dies, its workers exit by themselves (`worker._exit_with_parent`). With ``n_jobs=1`` the coordinator
+does the work, so killing it ends the run; a rerun resumes.
+
+joblib does not limit how many finished shards wait for an earlier one: only their rows are in memory, the shards
+themselves are temporary files.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+
+from unprocess_gen.dataset.manifest import failed_row
+from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
+from unprocess_gen.pipeline.worker import make_shard
+
+TRACKER_FILTER = "ignore:resource_tracker:UserWarning"
+"""Silences loky's tracker process, which reports objects of an interrupted run after it has removed them."""
+
+
+def effective_jobs(n_jobs: int, tasks: int) -> int:
+    """Return the number of workers to start.
+
+    Parameters
+    ----------
+    n_jobs : int
+        The setting; -1 means all cores that this process may use.
+    tasks : int
+        Number of shards to make; more workers than shards are never started.
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
+    if n_jobs == -1:
+        from joblib import cpu_count
+
+        n_jobs = cpu_count()
+    return max(1, min(n_jobs, tasks))
+
+
+def own_cores() -> int:
+    """Return the number of cores this process may use, regardless of its container's share of CPU time."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_tasks(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardResult]:
+    """Yield the results of all tasks in order, except shards that are retried after a worker died.
+
+    With one job joblib is not imported (0.1 s, 8 MB) and the coordinator makes the shards.
+    """
+    if n_jobs == 1:
+        yield from (make_shard(context, task) for task in tasks)
+        return
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    waiting = list(tasks)
+    while waiting:
+        done: set[int] = set()
+        try:
+            for result in _run_pool(context, waiting, n_jobs):
+                done.add(result.shard)
+                yield result
+            return
+        except TerminatedWorkerError:
+            waiting = [task for task in waiting if task.shard not in done]
+        in_progress = [task for task in waiting if task.busy_path(context).exists()]
+        for task in in_progress or waiting[:n_jobs]:
+            yield from _run_alone(context, task)
+            waiting.remove(task)
+
+
+def _run_alone(context: RunContext, task: ShardTask) -> Iterator[ShardResult]:
+    """Retry one shard with no other worker running.
+
+    If the worker dies again, yield a result without a file; its rows have the provisional reason ``worker_died``.
+    """
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    try:
+        yield from _run_pool(context, [task], n_jobs=2)  # n_jobs=1 would make the coordinator do the work, and die
+    except TerminatedWorkerError:
+        killer = task.busy_source(context) or task.sources[0]
+        detail = f"two workers died at {killer.name}; its shard is retried by the next run"
+        rows = (
+            failed_row(source, None, task.shard, context.config.seed, "worker_died", detail) for source in task.sources
+        )
+        yield ShardResult(task.shard, None, 0, None, tuple(rows), killer=killer.name)
+
+
+def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardResult]:
+    """Yield the results of a pool of workers in order; raise TerminatedWorkerError if a worker dies."""
+    from joblib import Parallel, delayed
+
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # tasks cancelled by an interrupt
+        with _interrupts_ignored(), _tracker_silenced():
+            results = parallel(delayed(make_shard)(context, task) for task in tasks)
+        with closing(results):
+            yield from results
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore SIGINT while workers start; they inherit this, so that only the coordinator answers Ctrl-C.
+
+    Blocking the signal instead has no lasting effect, because loky's resource tracker unblocks it when it starts.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _tracker_silenced() -> Iterator[None]:
+    """Let processes that start now inherit `TRACKER_FILTER`."""
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, TRACKER_FILTER]))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before

@@ -1,0 +1,250 @@
+"""Regenerate pairs from manifest rows and compare them with the digests in the rows.
+
+A replay needs the row and the source; no config file and no other row. A source that was changed or deleted is not
+damage of the dataset: it is reported apart, with exit code 5 instead of 4.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
+from unprocess_gen.core.files import array_xxh3, machine_error
+from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
+from unprocess_gen.dataset.keys import image_key
+from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, rows_with_offsets
+from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.sources import listing
+from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.patches import crop_patch
+
+NO_LIMIT = 2**40
+"""Pixels that a replay accepts; ``source.max_pixels`` applied when the row was made."""
+
+ADVICE = "restore the file, or regenerate the dataset"
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """Hold the outcome for one row.
+
+    Attributes
+    ----------
+    key, source : str
+        Key and source of the row.
+    complaint : str
+        What differs; empty if the pair is the same, bit for bit.
+    source_changed : bool
+        Whether the source was changed or deleted, so that the row could not be checked.
+    """
+
+    key: str
+    source: str
+    complaint: str = ""
+    source_changed: bool = False
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code for this row alone: 0 same, 4 damage, 5 changed source."""
+        if not self.complaint:
+            return 0
+        return SourceChangedError.exit_code if self.source_changed else DamageError.exit_code
+
+
+def source_root(manifest: Path, root: str | None) -> str | None:
+    """Return the folder of the sources.
+
+    Parameters
+    ----------
+    manifest : Path
+        The manifest, next to its ``dataset.json``.
+    root : str or None
+        The folder that the user names; None for the recorded one.
+
+    Returns
+    -------
+    str or None
+        ``root``, or the root that ``dataset.json`` records; None for built-in scenes or without a record.
+    """
+    if root is not None:
+        return root
+    try:
+        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))["source"]["root"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return None if recorded is None else str(recorded)
+
+
+def evenly_spaced_rows(manifest: Path, count: int) -> Iterator[Row]:
+    """Return rows of pairs, evenly spaced over a manifest.
+
+    Parameters
+    ----------
+    manifest : Path
+        The manifest.
+    count : int
+        Number of rows; all rows if there are fewer.
+
+    Returns
+    -------
+    iterator of Row
+        Rows with status ``ok``, in the order of the manifest.
+    """
+    places = [at for at, row in rows_with_offsets(manifest) if row["status"] == "ok"]
+    return (read_row(manifest, at) for at in evenly_spaced(places, count))
+
+
+def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[ReplayResult]:
+    """Regenerate the pairs of rows and compare them with the rows' digests.
+
+    Parameters
+    ----------
+    rows : iterable of Row
+        Manifest rows; failed ones are skipped.
+    root : str or None
+        Folder of the sources; None if all rows are of built-in scenes.
+    to : Path, optional
+        Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
+
+    Yields
+    ------
+    ReplayResult
+        One for each row of a pair.
+
+    Raises
+    ------
+    ConfigError
+        If a row was made from a file and ``root`` is None.
+    MachineError
+        If the self-test fails, or the arrays cannot be written.
+    """
+    regenerator = PairRegenerator(root)
+    for row in rows:
+        if row["status"] == "ok":
+            yield _replay(row, regenerator, to)
+
+
+def _is_scene(row: Row) -> bool:
+    return row["source_bytes"] == 0
+
+
+def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayResult:
+    key, source = str(row["key"]), str(row["source"])
+    try:
+        pair = regenerator.regenerate(row)
+    except SourceChangedError as error:
+        return ReplayResult(key, source, str(error), source_changed=True)
+    except DamageError as error:
+        return ReplayResult(key, source, str(error))
+    if to is not None:
+        _save(pair, to, key)
+    return ReplayResult(key, source, _difference(pair, row))
+
+
+class PairRegenerator:
+    """Regenerate pairs from rows and the folder of their sources, ``root``; built-in scenes need none.
+
+    The last photograph stays decoded, because rows of one image are consecutive.
+    """
+
+    def __init__(self, root: str | None) -> None:
+        self._root = root
+        self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
+
+    def regenerate(self, row: Row) -> Pair:
+        """Return the pair of a row without comparing its digests.
+
+        Raises SourceChangedError if the source was changed or deleted, DamageError if the row has no valid plan,
+        ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
+        """
+        if self._root is None and not _is_scene(row):
+            raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
+        plan = plan_from_row(row)
+        self_test.check(self_test.kernels(plan))
+        sha256, photograph = self._load_unchanged(row)
+        if sha256 != row["source_sha256"]:
+            raise SourceChangedError(_changed(sha256, row))
+        patch = patch_from_row(row)
+        pixels = crop_patch(photograph.srgb, patch)
+        if pixels.shape[:2] != (patch.height, patch.width):
+            raise DamageError(
+                f"its {patch.width} x {patch.height} pixels from row {patch.y}, column {patch.x} on "
+                f"are not all in its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]}"
+            )
+        return make_pair(pixels, plan, patch.origin)
+
+    def regenerate_exactly(self, row: Row) -> Pair:
+        """Return the pair of a row; raise as `regenerate`, and DamageError if the pair has other digests."""
+        pair = self.regenerate(row)
+        if difference := _difference(pair, row):
+            raise DamageError(difference)
+        return pair
+
+    def _load_unchanged(self, row: Row) -> tuple[str, Photograph]:
+        """Load a row's source; raise SourceChangedError unless the file can be read and used as when it was listed."""
+        try:
+            return self._load(row)
+        except SourceError as error:
+            if error.sha256 not in (None, row["source_sha256"]):
+                raise SourceChangedError(_changed(str(error.sha256), row)) from error
+            text = f"its source cannot be used ({error})"
+            raise (DamageError(text) if error.sha256 else SourceChangedError(f"{text}; {ADVICE}")) from error
+        except MachineError as error:
+            raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
+
+    def _load(self, row: Row) -> tuple[str, Photograph]:
+        root = None if _is_scene(row) else self._root
+        config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
+        source = source_of(row)
+        if self._kept is None or self._kept[:2] != (config, source):
+            self._kept = None  # frees the last photograph first: two at a time would take twice the memory
+            self._kept = config, source, *load_source(config, source)
+        return self._kept[2:]
+
+
+def _difference(pair: Pair, row: Row) -> str:
+    return "; ".join(
+        f"the XXH3-128 of {name} is {found}, the row records {row[f'{name}_xxh3']}"
+        for name, found in (("clean", array_xxh3(pair.clean)), ("noisy", array_xxh3(pair.noisy)))
+        if found != row[f"{name}_xxh3"]
+    )
+
+
+def _changed(sha256: str, row: Row) -> str:
+    return f"its source has changed: SHA-256 is {sha256}, the row records {row['source_sha256']}; {ADVICE}"
+
+
+def _save(pair: Pair, to: Path, key: str) -> None:
+    try:
+        to.mkdir(parents=True, exist_ok=True)
+        np.save(to / f"{key}.clean.npy", pair.clean)
+        np.save(to / f"{key}.noisy.npy", pair.noisy)
+    except OSError as error:
+        raise machine_error(error, to) from error
+
+
+def source_of(row: Row) -> Source:
+    """Return the source that a row was made from.
+
+    Parameters
+    ----------
+    row : Row
+        A manifest row.
+
+    Returns
+    -------
+    Source
+        With the size that the row records, and its place in a clip.
+    """
+    name, size = str(row["source"]), row["source_bytes"]
+    path = listing.decode_name(name)
+    clip, frame = str(row["clip"]) or NO_CLIP, int(row["frame"] or 0)
+    return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)

@@ -1,0 +1,93 @@
+"""Records that travel between the coordinator and its workers: a run's context, a shard's task and its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.types import Row, Source
+from unprocess_gen.dataset.shards import shard_name
+
+
+@dataclass(frozen=True, slots=True)
+class RunContext:
+    """Hold what all tasks of a run share: config, folder for unfinished shards, coordinator PID.
+
+    ``core_to_spare``: whether each worker hashes and writes in a second thread (more cores than workers).
+    """
+
+    config: Config
+    tmp: str
+    coordinator_pid: int
+    core_to_spare: bool = False
+
+    @property
+    def compiling_path(self) -> Path:
+        """The file that a worker creates before it compiles kernels."""
+        return Path(self.tmp) / "compiling"
+
+
+@dataclass(frozen=True, slots=True)
+class ShardTask:
+    """Hold the work of one shard: its number and its sources."""
+
+    shard: int
+    sources: tuple[Source, ...]
+
+    def busy_path(self, context: RunContext) -> Path:
+        """Return the file that contains the index of the source in progress; it exists while the shard is made."""
+        return Path(context.tmp) / f"{self.shard}.busy"
+
+    def busy_source(self, context: RunContext) -> Source | None:
+        """Return the source at which the last worker of this shard ended, None if it was at none."""
+        try:
+            index = self.busy_path(context).read_text()
+        except OSError:
+            return None
+        return next((source for source in self.sources if str(source.index) == index), None)
+
+
+@dataclass(frozen=True, slots=True)
+class ShardResult:
+    """Hold a finished shard: its temporary file and its rows.
+
+    Attributes
+    ----------
+    shard : int
+        Number of the shard.
+    path : str or None
+        Temporary file; None if every source failed, because a shard without pairs has no file.
+    bytes : int
+        Size of the file; 0 without one.
+    sha256 : str or None
+        Hex digest of the file.
+    rows : tuple of Row
+        Manifest rows, in source order.
+    killer : str or None
+        Source at which two workers died. The rows are then provisional and there is no file.
+    self_test : str or None
+        Failures of the worker's self-test, if ``self_test=go_on`` accepts them.
+    """
+
+    shard: int
+    path: str | None
+    bytes: int
+    sha256: str | None
+    rows: tuple[Row, ...]
+    killer: str | None = None
+    self_test: str | None = None
+
+    def entry(self) -> dict[str, Any]:
+        """Return the shard's entry in ``dataset.json``."""
+        pairs = sum(row["status"] == "ok" for row in self.rows)
+        return {
+            **({"provisional": True} if self.killer else {}),
+            **({"self_test": self.self_test} if self.self_test else {}),
+            "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
+            "pairs": pairs,
+            "failed": len(self.rows) - pairs,
+            "bytes": self.bytes,
+            "sha256": self.sha256,
+        }

@@ -1,0 +1,170 @@
+"""Make one shard: decode its sources, simulate their pairs, write a temporary tar file, return the rows.
+
+A worker is a process of the pool, or the coordinator itself if ``n_jobs=1``. It writes only temporary files; the
+coordinator renames them. A worker process exits within a second once its coordinator has died (`_exit_with_parent`):
+loky alone would keep the process, and its memory, for minutes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from unprocess_gen.config.interpretation import patch_rule
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import MachineError, SourceError
+from unprocess_gen.core.files import RESUME, array_xxh3, machine_error
+from unprocess_gen.core.types import Pair, Patch, Plan, Row, Source, Srgb
+from unprocess_gen.dataset.keys import pair_key, patch_key
+from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
+from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
+from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
+from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.plan import plan_pairs
+from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.sources.listing import source_file
+from unprocess_gen.sources.loader import load_source
+from unprocess_gen.sources.patches import crop_patch, list_patches
+
+PARENT_POLL_S = 0.5
+WATCHDOG = "unprocess_gen watchdog"
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
+"""Parameters of glibc's mallopt (malloc.h)."""
+KEPT_BYTES = 2**29
+"""Freed memory that a worker keeps: the working memory of one 50-megapixel image."""
+
+
+def make_shard(context: RunContext, task: ShardTask) -> ShardResult:
+    """Write one shard to a temporary file and return its rows; raise MachineError if disk, memory or self-test fail."""
+    _prepare_process(context.coordinator_pid)
+    failures: dict[str, None] = {}
+    path = Path(context.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
+    busy = task.busy_path(context)
+    try:
+        with ShardWriter(path, beside=context.core_to_spare) as writer:
+            rows = tuple(_make_rows(context, task, writer, failures))
+        busy.unlink(missing_ok=True)
+        if any(row["status"] == "ok" for row in rows):
+            return ShardResult(
+                task.shard, str(path), writer.bytes, writer.sha256, rows, self_test="; ".join(failures) or None
+            )
+        path.unlink()
+        return ShardResult(task.shard, None, 0, None, rows)
+    except MemoryError as error:
+        if os.getpid() != context.coordinator_pid:
+            os._exit(1)  # same path as an OOM kill: the coordinator retries the shard alone
+        source = task.busy_source(context)
+        raise MachineError(f"source {source.name if source else task.shard}: out of memory; {RESUME}") from error
+    except OSError as error:
+        for unfinished in (path, busy):
+            with suppress(OSError):
+                unfinished.unlink()
+        raise machine_error(error, Path(context.tmp), RESUME) from error
+
+
+def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, failures: dict[str, None]) -> Iterator[Row]:
+    for source in task.sources:
+        task.busy_path(context).write_text(str(source.index))
+        yield from make_image(context, task.shard, source, writer, failures)
+
+
+def make_image(
+    context: RunContext, shard: int, source: Source, writer: ShardWriter, failures: dict[str, None]
+) -> list[Row]:
+    """Append one image, or its patches, to a shard and return the rows.
+
+    Adds failures of the self-test to ``failures``, each once, if ``self_test=go_on`` accepts them.
+    """
+    config = context.config
+    try:
+        sha256, photograph = load_source(config.source, source, config.output.layout)
+    except SourceError as error:
+        if error.reason == "unreadable" and source.reason is None and not _exists(config, source):
+            raise MachineError(
+                f"source.root={config.source.root}: {source.name} was deleted or moved after listing; expected the "
+                f"listed files; restore it and rerun"
+            ) from error
+        return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text)]
+    rule = patch_rule(config.source)
+    facts = facts_for(config, photograph.srgb, source.frames)
+    plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
+    failures |= dict.fromkeys(_self_test(context, plans))
+    rows: list[Row] = []
+    height, width = photograph.srgb.shape[:2]
+    for patch in list_patches(rule, plans[0].stream_key, height, width, config.output.layout):
+        key = patch_key(source.index, patch, several=rule is not None)
+        sample: list[Row] = []
+        for plan, pair, digests in _add_frames(writer, key, crop_patch(photograph.srgb, patch), patch, plans):
+            row_key = pair_key(key, plan, several=len(plans) > 1)
+            sample.append(pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch))
+        writer.add_rows(key, row_json(sample))
+        rows += sample
+    return rows
+
+
+def _add_frames(
+    writer: ShardWriter, key: str, srgb: Srgb, patch: Patch, plans: Sequence[Plan]
+) -> Iterator[tuple[Plan, Pair, tuple[str, str]]]:
+    """Append the clean frame of a patch and all its noisy frames; yield each pair with its digests."""
+    clean_xxh3 = ""
+    for plan, pair in zip(plans, make_pairs(srgb, plans, patch.origin), strict=True):
+        if plan is plans[0]:
+            clean_xxh3 = array_xxh3(pair.clean)
+            writer.add_frame(key, CLEAN, pair.clean)
+        writer.add_frame(key, noisy_member(plan.level, plan.draw), pair.noisy)
+        yield plan, pair, (clean_xxh3, array_xxh3(pair.noisy))
+
+
+def _exists(config: Config, source: Source) -> bool:
+    return Path(source_file(config.source.root or "", source.path)).exists()
+
+
+def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
+    """Test the kernels that an image's plans need; return the failures, or raise MachineError if ``self_test=stop``.
+
+    Tests only the kernels in use, because each takes seconds to compile.
+    """
+    failures: list[str] = []
+    for kernels in dict.fromkeys(map(self_test.kernels, plans)):
+        if not self_test.are_compiled(kernels):
+            context.compiling_path.touch()
+        if context.config.self_test == "stop":
+            self_test.check(kernels, ", or say self_test=go_on")
+        failures += self_test.failures(kernels)
+    return failures
+
+
+def _prepare_process(coordinator_pid: int) -> None:
+    """Limit OpenCV to one thread and keep freed memory; in a worker, also ignore Ctrl-C and start the watchdog."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    keep_memory()
+    if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        threading.Thread(target=_exit_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
+
+
+def keep_memory() -> None:
+    """Keep up to `KEPT_BYTES` of freed memory in this process for the next image.
+
+    Without this call a run takes 10 % longer: glibc returns large arrays to the system after each image, and the system
+    zeroes their pages again. Other C libraries lack mallopt and are left as they are.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_MAX, 0)
+        mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
+
+
+def _exit_with_parent(coordinator_pid: int) -> None:
+    while os.getppid() == coordinator_pid:
+        time.sleep(PARENT_POLL_S)
+    os._exit(1)
