@@ -295,7 +295,9 @@ def test_failed_photographs_have_rows_with_a_reason(broken: Path) -> None:
 def test_a_failed_row_says_nothing_about_a_pair(broken: Path) -> None:
     row = rows(broken)[2]
     filled = {name for name, value in row.items() if value not in (None, "")}
-    assert filled == {"key", "source", "source_sha256", "source_bytes", "status", "reason", "shard", "seed"}
+    assert filled == {
+        *("key", "source", "source_sha256", "source_bytes", "status", "reason", "shard", "seed", "detail")
+    }
 
 
 def test_a_file_that_could_not_be_read_has_no_digest(broken: Path) -> None:

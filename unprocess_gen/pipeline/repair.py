@@ -36,6 +36,7 @@ from unprocess_gen.core.errors import (
 )
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Frame, Row, Source
+from unprocess_gen.dataset.columns import HEADERS
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import failed_row, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
@@ -268,14 +269,18 @@ def _fingerprint(folder: Path) -> str:
 
 
 def _write_manifest(rows: Iterable[Row], path: Path, facts: Facts, temporary: Path) -> bool:
-    """Write the rows as the manifest if they give its recorded digest; return whether they do."""
-    part = temporary / path.name
-    with part.open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, rows)
-    if file_sha256(part) != facts["manifest_sha256"]:
-        return False
-    _place(part, path)
-    return True
+    """Write the rows as the manifest if they give its recorded digest; return whether they do.
+
+    Tries the header of every version, because the lost manifest may be of an older one.
+    """
+    part, rows = temporary / path.name, list(rows)
+    for names in HEADERS:
+        with part.open("w", encoding="utf-8", newline="") as stream:
+            write_rows(stream, rows, names)
+        if file_sha256(part) == facts["manifest_sha256"]:
+            _place(part, path)
+            return True
+    return False
 
 
 def _is_intact(folder: Path, entry: Facts) -> bool:
