@@ -257,7 +257,7 @@ COLUMNS = (
     ),
     Column("noise", str, "name of the noise profile", ANY_TEXT, Plan),
     Column(
-        "a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2", Range(0, 1e30), Plan
+        "a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2", Range(-1e30, 1e30), Plan
     ),
     Column("b_dn2", float, "noise variance at black, DN²", FINITE, Plan),
     Column("effects", str, "what was simulated, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST),

@@ -46,9 +46,9 @@ import numpy as np
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
-from unprocess_gen.dataset.manifest import plan_from_row, read_rows
+from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
-from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.reference.cfa import CHANNELS
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 
@@ -114,17 +114,13 @@ def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> Exported
 
 
 def _numbers(manifest: Path, keys: str) -> dict[str, int]:
-    """Return the key and the number of every pair that ``keys`` names; ConfigError for one that cannot be written."""
-    named = {str(row["key"]) for row in map(_writable, select_rows(manifest, None, keys))}
-    pairs = (str(row["key"]) for row in read_rows(manifest) if row["status"] == "ok")
-    return {key: number for number, key in enumerate(pairs) if key in named}
+    """Return the key and the number of every selected pair; ConfigError if a frame of one cannot be a DNG file."""
+    return {str(_writable(row)["key"]): number for number, row in select_pairs(manifest, keys).rows.items()}
 
 
 def _writable(row: Row) -> Row:
     """Return a row whose frames can be DNG files; ConfigError says why others cannot."""
     key, width, height = row["key"], int(row["width"] or 0), int(row["height"] or 0)
-    if row["status"] != "ok":
-        raise ConfigError(f"--keys {key}: failed ({row['reason']}), so it has no frames")
     if row["dtype"] != UINT16:
         raise ConfigError(
             f"--keys {key}: is of {row['dtype']} numbers, which LibRaw would round; a DNG needs output.dtype={UINT16}"

@@ -1,45 +1,188 @@
-"""Select manifest rows by position or by key."""
+"""Select manifest rows by position, source index or key: the options ``--rows`` and ``--keys`` of every verb."""
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Row
-from unprocess_gen.dataset.keys import image_key, sample_key
+from unprocess_gen.dataset.columns import KEY_TEXT
+from unprocess_gen.dataset.keys import image_key, key_text, sample_key
 from unprocess_gen.dataset.manifest import read_rows
 
+KEYS_FORM = (
+    "expected source indices and ranges such as 3,7-9, or keys: 00000003 names all pairs of an image, "
+    "00000003-p0007 those of a patch, 00000003-l01d02 a level and a draw"
+)
+"""What ``--keys`` takes, as messages and help texts describe it."""
 
-def select_rows(manifest: Path, rows: str | None, keys: str | None) -> Iterator[Row]:
-    """Yield the rows numbered ``A:B`` (from 0, B not included) or those with the ``keys`` K,…; all without either.
+_RANGE = re.compile(r"(\d{1,12})-(\d{1,12})")
+_INDEX = re.compile(r"\d{1,12}")
 
-    Raises ConfigError for a range that is none, and for keys that the manifest does not have.
+
+@dataclass(frozen=True, slots=True)
+class KeySelection:
+    """Hold what ``--keys`` names.
+
+    Attributes
+    ----------
+    names : dict of str to str
+        Keys of images, patches and pairs, and how the user wrote each.
+    ranges : dict of str to range
+        Source indices, by how the user wrote each range.
     """
-    if keys is not None:
-        yield from _with_keys(manifest, keys.split(","))
+
+    names: dict[str, str]
+    ranges: dict[str, range]
+
+    def named(self, row: Row) -> set[str]:
+        """Return the names that select a row: its own key, or the key of its patch or image."""
+        return self.names.keys() & {str(row["key"]), sample_key(row), image_key(row)}
+
+    def in_ranges(self, row: Row) -> set[str]:
+        """Return the ranges that a row's source index is in."""
+        index = int(image_key(row))
+        return {text for text, indices in self.ranges.items() if index in indices}
+
+
+class SelectedPairs(NamedTuple):
+    """Hold selected pairs.
+
+    Attributes
+    ----------
+    rows : dict of int to Row
+        Row of each pair by its number in `RawPairs`, in the order of the manifest.
+    failed : int
+        Failed rows that were skipped because a range contains them.
+    """
+
+    rows: dict[int, Row]
+    failed: int
+
+
+def parse_keys(text: str) -> KeySelection:
+    """Read the value of ``--keys``.
+
+    Parameters
+    ----------
+    text : str
+        Comma-separated source indices, ranges with both ends included, and keys: ``3,7-9,00000003-p0007``.
+
+    Returns
+    -------
+    KeySelection
+        The selection.
+
+    Raises
+    ------
+    ConfigError
+        If an item is neither, or a range ends before it begins.
+    """
+    names: dict[str, str] = {}
+    ranges: dict[str, range] = {}
+    for item in map(str.strip, text.split(",")):
+        if _INDEX.fullmatch(item):
+            names[key_text(int(item))] = item
+        elif found := _RANGE.fullmatch(item):
+            first, last = int(found[1]), int(found[2])
+            if last < first:
+                raise ConfigError(f"--keys {item}: ends before it begins; expected {last}-{first}")
+            ranges[item] = range(first, last + 1)
+        elif item in KEY_TEXT:
+            names[item] = item
+        else:
+            raise ConfigError(f"--keys {text[:60]}: {item[:40]!r} is no key; {KEYS_FORM}")
+    return KeySelection(names, ranges)
+
+
+def select_rows(
+    manifest: Path, rows: str | None = None, keys: str | None = None, skipped: list[Row] | None = None
+) -> Iterator[Row]:
+    """Select rows of a manifest.
+
+    Parameters
+    ----------
+    manifest : Path
+        A ``manifest.csv``.
+    rows : str, optional
+        ``A:B``: positions from 0, B not included. Ignored if ``keys`` is given.
+    keys : str, optional
+        See `parse_keys`. Neither: all rows.
+    skipped : list, optional
+        Failed rows that a range of ``keys`` contains are skipped and appended here. A failed row that is named by its
+        own index or key is selected.
+
+    Yields
+    ------
+    Row
+        Rows in the order of the manifest.
+
+    Raises
+    ------
+    ConfigError
+        If ``rows`` or ``keys`` cannot be read, or the manifest has no row for an index, a key or a complete range.
+    DamageError
+        If the manifest cannot be read.
+    """
+    if keys is None:
+        first, last = _positions(rows)
+        yield from itertools.islice(read_rows(manifest), first, last)
         return
-    first, last = _range(rows)
-    yield from itertools.islice(read_rows(manifest), first, last)
+    selection = parse_keys(keys)
+    found: set[str] = set()
+    ends = "", ""
+    for row in read_rows(manifest):
+        ends = ends[0] or str(row["key"]), str(row["key"])
+        named, ranges = selection.named(row), selection.in_ranges(row)
+        found |= named | ranges
+        if named or (ranges and row["status"] == "ok"):
+            yield row
+        elif ranges and skipped is not None:
+            skipped.append(row)
+    for name, written in {**selection.names, **dict.fromkeys(selection.ranges)}.items():
+        if name not in found:
+            known = f"it has keys from {ends[0]} to {ends[1]}" if ends[0] else "it has none"
+            raise ConfigError(f"--keys {written or name}: {manifest} has no such key; {known}; {KEYS_FORM}")
 
 
-def _range(rows: str | None) -> tuple[int, int | None]:
-    found = re.fullmatch(r"(\d*):(\d*)", rows if rows is not None else ":")
+def select_pairs(manifest: Path, keys: str) -> SelectedPairs:
+    """Select pairs of a dataset.
+
+    Parameters
+    ----------
+    manifest : Path
+        The dataset's ``manifest.csv``.
+    keys : str
+        See `parse_keys`.
+
+    Returns
+    -------
+    SelectedPairs
+        Rows by their number in `RawPairs`.
+
+    Raises
+    ------
+    ConfigError
+        As `select_rows`, and if a failed row is named by its own index or key.
+    DamageError
+        If the manifest cannot be read.
+    """
+    skipped: list[Row] = []
+    rows = {str(row["key"]): row for row in select_rows(manifest, None, keys, skipped)}
+    for row in rows.values():
+        if row["status"] != "ok":
+            raise ConfigError(f"--keys {row['key']}: failed ({row['reason']}), so it has no frames")
+    pairs = (str(row["key"]) for row in read_rows(manifest) if row["status"] == "ok")
+    return SelectedPairs({number: rows[key] for number, key in enumerate(pairs) if key in rows}, len(skipped))
+
+
+def _positions(rows: str | None) -> tuple[int, int | None]:
+    found = re.fullmatch(r"(\d{0,12}):(\d{0,12})", rows if rows is not None else ":")
     if found is None:
         raise ConfigError(f"--rows {rows}: expected A:B, such as 0:10")
     return int(found[1] or 0), int(found[2]) if found[2] else None
-
-
-def _with_keys(manifest: Path, keys: Sequence[str]) -> Iterator[Row]:
-    wanted = set(keys)
-    missing = set(keys)
-    for row in read_rows(manifest):
-        # the key of an image, or of a patch, stands for all of its pairs
-        named = {str(row["key"]), sample_key(row), image_key(row)} & wanted
-        if named:
-            missing -= named
-            yield row
-    if missing:
-        raise ConfigError(f"--keys {min(missing)}: {manifest} has no such key")
