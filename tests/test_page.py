@@ -1,6 +1,6 @@
-"""The page of a dataset: its figures are the manifest's, its names are harmless, its pictures are really there.
+"""The report of a dataset: it agrees with the manifest, escapes names, and shows every picture.
 
-It is opened in a real browser, as wide as a desk's screen and as a phone, where there is one (chromium).
+If Chromium is installed, the report is opened in it at the widths of a desktop screen and a phone.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 import re
 import shutil
 import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -26,6 +27,7 @@ import pytest
 from conftest import Door, Make, fill
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jinja2 import UndefinedError
 from PIL import Image
 
 from unprocess_gen import RawPairs
@@ -35,16 +37,19 @@ from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
 from unprocess_gen.planning import plan
-from unprocess_gen.reports import dataset_report as page
-from unprocess_gen.reports import markup, report_files
-from unprocess_gen.reports import photon_transfer as transfer
-from unprocess_gen.reports.benchmark import report
-from unprocess_gen.reports.dataset_report import PARAMETERS, WORDS, Histogram, ManifestStatistics, ValueCounts
+from unprocess_gen.reports import dataset_report, formatting, html_pages, photon_transfer, report_files
+from unprocess_gen.reports.manifest_statistics import (
+    PARAMETER_COLUMNS,
+    TEXT_COLUMNS,
+    Histogram,
+    ManifestStatistics,
+    ValueCounts,
+)
 
 TreeHash = Callable[[Path], str]
 
 HOSTILE = "<img src=x onerror=alert('&amp;')>\".png"
-"""A name that would be markup, were it not escaped."""
+"""A file name that is markup unless it is escaped."""
 
 
 OVERRIDES = ("output.pairs_per_shard=4", "noise=brooks2019")
@@ -52,7 +57,7 @@ OVERRIDES = ("output.pairs_per_shard=4", "noise=brooks2019")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
-    """A dataset in a folder of a hostile name: nine pairs, two photographs that cannot be read."""
+    """A dataset in a folder with a hostile name: nine pairs and two unreadable photographs."""
     top = tmp_path_factory.mktemp("page")
     photos = fill(top / "photos", 9)
     (photos / HOSTILE).write_bytes(b"no picture")
@@ -64,7 +69,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
 
 @pytest.fixture(scope="module")
 def text(made: Path) -> str:
-    return page.dataset_page(made)
+    return dataset_report.dataset_page(made)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +82,7 @@ def scenes(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def scenes_page(scenes: Path) -> str:
-    return page.dataset_page(scenes)
+    return dataset_report.dataset_page(scenes)
 
 
 def cells(folder: Path, column: str) -> list[str]:
@@ -85,14 +90,14 @@ def cells(folder: Path, column: str) -> list[str]:
         return [row[column] for row in csv.DictReader(stream) if row["status"] == "ok"]
 
 
-# Laws -----------------------------------------------------------------------------------------------------------------
+# Statistics -----------------------------------------------------------------------------------------------------------
 
 NUMBERS = st.floats(-1e15, 1e15, allow_nan=False).map(lambda value: value if abs(value) > 1e-12 else 0.0)
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.lists(NUMBERS, max_size=20), min_size=1, max_size=8))
-def test_a_histogram_has_every_value_in_its_bin(batches: list[list[float]]) -> None:
+def test_histogram_counts_every_value_in_its_bin(batches: list[list[float]]) -> None:
     histogram = Histogram()
     for batch in batches:
         histogram.add(np.array(batch, dtype=np.float64))
@@ -109,7 +114,7 @@ def test_a_histogram_has_every_value_in_its_bin(batches: list[list[float]]) -> N
         assert sum(histogram.bars()) == len(values)
 
 
-def test_a_histogram_of_uniform_values_is_flat() -> None:
+def test_histogram_of_uniform_values_is_flat() -> None:
     histogram = Histogram()
     for batch in np.random.default_rng(0).random((1000, 100)):
         histogram.add(batch)
@@ -119,7 +124,7 @@ def test_a_histogram_of_uniform_values_is_flat() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
-def test_a_tally_does_not_depend_on_how_rows_come(made: Path, size: int) -> None:
+def test_statistics_do_not_depend_on_batch_size(made: Path, size: int) -> None:
     def tallied(count: int) -> ManifestStatistics:
         tally, rows = ManifestStatistics(), list(read_rows(made / "manifest.csv"))
         for start in range(0, len(rows), count):
@@ -127,44 +132,54 @@ def test_a_tally_does_not_depend_on_how_rows_come(made: Path, size: int) -> None
         return tally
 
     one, other = tallied(size), tallied(100)
-    for name, spread in one.spreads.items():
-        assert spread.plain.counts == other.spreads[name].plain.counts
-    assert (one.rows, one.images, one.failed, one.skipped) == (other.rows, other.images, other.failed, other.skipped)
+    for name, statistics in one.parameters.items():
+        assert statistics.linear.counts == other.parameters[name].linear.counts
+    assert (one.rows, one.images, one.failed, one.omitted) == (other.rows, other.images, other.failed, other.omitted)
 
 
-def test_words_are_counted_and_too_many_are_summed_up() -> None:
+def test_values_are_counted_and_many_values_are_summarised() -> None:
     few, many, different = ValueCounts(), ValueCounts(), ValueCounts()
     for number in range(1000):
         few.add("ab"[number % 3 == 0])
         many.add(str(number % 70))
         different.add(str(number % 10)) if number < 10 else None
-    assert few.said() == "a (666), b (334)"
-    assert many.said() == "more than 64 different ones"
-    assert different.said() == "10 different ones"
+    assert few.summary() == "a (666), b (334)"
+    assert many.summary() == "more than 64 different values"
+    assert different.summary() == "10 different values"
 
 
-def test_every_drawn_parameter_has_a_column_on_the_page() -> None:
-    shown = {draw for one in PARAMETERS for draw in one.draws} | set(WORDS)
+def test_every_drawn_parameter_has_a_column_in_the_report() -> None:
+    shown = {draw for one in PARAMETER_COLUMNS for draw in one.draws} | set(TEXT_COLUMNS)
     assert set(plan.PARAMETERS) <= shown
 
 
-def test_text_becomes_html_that_shows_it_and_html_stays() -> None:
-    shown = markup.element("p", "<&\"'>", markup.element("b", "x"), title='"')
-    assert shown == '<p title="&quot;">&lt;&amp;&quot;&#x27;&gt;<b>x</b></p>'
+def test_values_are_escaped_in_text_and_attributes() -> None:
+    figure = {"title": "<&\"'>", "file": '" onerror="x', "caption": ["<b>"], "table": None}
+    page = html_pages.render_page("paper_figures.html", title="<t>", command="<c>", figures=[figure])
+
+    assert "<h2>&lt;&amp;&#34;&#39;&gt;</h2>" in page
+    assert 'src="&#34; onerror=&#34;x"' in page
+    assert "<p>&lt;b&gt;</p>" in page
+    assert "<title>&lt;t&gt;</title>" in page
+
+
+def test_missing_template_value_is_an_error() -> None:
+    with pytest.raises(UndefinedError):
+        html_pages.render_page("benchmark.html", title="x")
 
 
 @pytest.mark.parametrize("sign", ["\x00", "\x1b", "\x85", "\u202e", "\u2066", "\u2028", "\udcff", "\uffff"])
-def test_what_cannot_be_seen_is_spelled_out(sign: str) -> None:
-    shown = markup.escaped(f"a{sign}b")
-    assert sign not in shown
-    assert shown.encode() == b"a" + sign.encode("unicode_escape") + b"b"
+def test_invisible_characters_are_shown_as_escapes(sign: str) -> None:
+    page = html_pages.render_page("paper_figures.html", title=f"a{sign}b", command="", figures=[])
+    assert sign not in page
+    assert f"<h1>a{sign.encode('unicode_escape').decode()}b</h1>" in page
 
 
-# What it says ---------------------------------------------------------------------------------------------------------
+# Contents -------------------------------------------------------------------------------------------------------------
 
 
 class Reader(HTMLParser):
-    """What a browser would take from a page: its elements, their attributes, its text."""
+    """Collect the elements, attributes, addresses and text of a page."""
 
     def __init__(self, content: str) -> None:
         super().__init__()
@@ -199,12 +214,14 @@ TAGS |= {
     "svg",
     "rect",
     "img",
+    "thead",
+    "tbody",
 }
 ATTRIBUTES = {"lang", "charset", "name", "content", "class", "alt", "src", "viewbox", "preserveaspectratio", "role"}
-ATTRIBUTES |= {"aria-label", "x", "y", "width", "height"}
+ATTRIBUTES |= {"aria-label", "x", "y", "width", "height", "scope"}
 
 
-def test_names_are_escaped_and_nothing_but_known_elements_is_on_the_page(text: str) -> None:
+def test_names_are_escaped_and_only_known_elements_occur(text: str) -> None:
     read = Reader(text)
     assert read.tags <= TAGS
     assert read.attributes <= ATTRIBUTES
@@ -212,37 +229,39 @@ def test_names_are_escaped_and_nothing_but_known_elements_is_on_the_page(text: s
     assert "<b>&'\"{0} ds" in read.text
 
 
-def test_the_page_opens_offline(text: str) -> None:
+def test_report_opens_offline(text: str) -> None:
     addresses = Reader(text).addresses
     assert addresses and all(address.startswith("data:image/") for address in addresses)
     assert not re.search(r"@import|url\(|https?://(?!www\.w3\.org)", text)
 
 
-def test_failures_are_named_with_their_reasons(text: str) -> None:
-    rows = re.findall(r"<tr><td>(\d{8})</td><td>(.*?)</td><td>(\w+)</td></tr>", text)
-    assert {(html.unescape(source), reason) for _, source, reason in rows} == {
+def test_failures_are_listed_with_reason_and_detail(made: Path, text: str) -> None:
+    rows = re.findall(r"<tr><td>(\d{8})</td><td>(.*?)</td><td>(\w+)</td><td>(.*?)</td></tr>", text)
+    assert {(html.unescape(source), reason) for _, source, reason, _ in rows} == {
         (HOSTILE, "unsupported"),
         ("empty.png", "empty"),
     }
+    details = {str(row["source"]): str(row.get("detail") or "") for row in read_rows(made / "manifest.csv")}
+    assert all(html.unescape(detail) == details[html.unescape(source)] for _, source, _, detail in rows)
 
 
-def test_the_ends_and_means_of_what_was_drawn_are_the_manifests(made: Path, text: str) -> None:
+def test_ranges_and_means_agree_with_the_manifest(made: Path, text: str) -> None:
     for column in ("red_gain", "blue_gain", "inverse_rgb_gain", "w_nexus_6p", "a_dn", "b_dn2"):
         values = [float(cell) for cell in cells(made, column)]
-        (figure,) = re.findall(rf"<figure><figcaption><b>{column}</b>.*?</figure>", text)
+        (figure,) = re.findall(rf"(?s)<figure><figcaption><b>{column}</b>.*?</figure>", text)
         ends = [float(found) for found in re.findall(r"<span>(.*?)</span>", figure)]
         assert ends == [float(f"{end:.4g}") for end in (min(values), max(values))]
-        assert f"mean {report.spelled(sum(values) / len(values), 4)}" in figure
+        assert f"mean {formatting.short_number(sum(values) / len(values), 4)}" in figure
         assert figure.count("<rect ") >= 2
 
 
-def test_levels_over_decades_are_shown_by_their_magnitude(text: str) -> None:
+def test_wide_ranges_have_logarithmic_histograms(text: str) -> None:
     logarithmic = re.findall(r"<b>(\w+)</b>[^<]*, logarithmic", text)
     assert {"a_dn", "b_dn2"} <= set(logarithmic)
     assert not {"red_gain", "blue_gain"} & set(logarithmic)
 
 
-def test_clipping_is_the_manifests(made: Path, text: str) -> None:
+def test_clipped_sites_agree_with_the_manifest(made: Path, text: str) -> None:
     sites = sum(int(w) * int(h) for w, h in zip(cells(made, "width"), cells(made, "height"), strict=True))
     for column in ("saturated", "noisy_clipped_high"):
         count = sum(map(int, cells(made, column)))
@@ -250,16 +269,16 @@ def test_clipping_is_the_manifests(made: Path, text: str) -> None:
 
 
 @pytest.mark.slow
-def test_effects_that_were_left_out_have_their_reason(make: Make, tmp_path: Path) -> None:
+def test_omitted_effects_are_listed_with_their_reason(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=2", "noise=sony_a7s2", "effects.prnu=off", "source.patch=[random,64,3]")
-    text = page.dataset_page(tmp_path / "ds")
+    text = dataset_report.dataset_page(tmp_path / "ds")
     assert '<tr><td>prnu</td><td class="n">6</td><td>switched off</td></tr>' in text
     assert '<tr><td>column</td><td class="n">6</td><td>noise=sony_a7s2 gives no column_std_dn</td></tr>' in text
     assert "<b>read_std_dn</b>" in text
     assert "<dd>2, rows 6</dd>" in text
 
 
-def test_versions_hashes_settings_and_commands_are_there(made: Path, text: str) -> None:
+def test_versions_checksums_settings_and_commands_are_listed(made: Path, text: str) -> None:
     facts, read = read_dataset(made / "dataset.json"), Reader(text).text
     shards = [entry["sha256"] for entry in facts["shards"] if entry["sha256"]]
     assert len(shards) == 3
@@ -271,34 +290,35 @@ def test_versions_hashes_settings_and_commands_are_there(made: Path, text: str) 
     assert facts["source"]["root"] in read
 
 
-def test_noise_that_is_not_the_manifests_is_called_wrong(
+def test_noise_that_differs_from_the_manifest_is_reported(
     scenes: Path, scenes_page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "of 2 pairs, evenly spread (a: slope, b: intercept, with 95 % intervals). All are what" in scenes_page
-    true = transfer.fit_pair
-    monkeypatch.setattr(transfer, "fit_pair", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
-    assert "2 of them are not what the manifest says" in page.dataset_page(scenes)
+    assert "All agree with the manifest." in scenes_page
+    true = photon_transfer.fit_pair
+    monkeypatch.setattr(photon_transfer, "fit_pair", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
+    assert "2 of them differ from the manifest" in dataset_report.dataset_page(scenes)
 
 
-def test_where_every_photograph_failed_there_is_a_page_all_the_same(make: Make, tmp_path: Path) -> None:
+def test_dataset_without_pairs_has_a_report(make: Make, tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/a.png").touch()
     make(tmp_path / "photos", tmp_path / "ds", "source.max_failed=1")
-    text = page.dataset_page(tmp_path / "ds")
+    text = dataset_report.dataset_page(tmp_path / "ds")
     assert "0 pairs" in text and "1 failed" in text
+    assert "there is no pair to show" in text
     assert '<tr><td>empty</td><td class="n">1</td></tr>' in text
 
 
-# How to load it -------------------------------------------------------------------------------------------------------
+# Code that loads the data ---------------------------------------------------------------------------------------------
 
 
 def run_snippet(folder: Path, tool: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Run what the page says, from the folder that holds the dataset."""
+    """Run the code of the report in the folder that contains the dataset."""
     monkeypatch.chdir(folder.parent)
     first = RawPairs(folder)[0].row
     entries = read_dataset(folder / "dataset.json")["shards"]
     names: dict[str, Any] = {}
-    exec(page.snippets(folder, entries, (first["key"], first["shard"]), False)[tool], names)
+    exec(dataset_report.snippets(folder, entries, (first["key"], first["shard"]), False)[tool], names)
     return names
 
 
@@ -307,29 +327,29 @@ def loaded(request: pytest.FixtureRequest, made: Path, dataset: Path) -> Path:
     return made if request.param == "hostile" else dataset
 
 
-def test_the_lines_for_numpy_load_the_first_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numpy_code_loads_the_first_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run_snippet(loaded, "NumPy", monkeypatch)
     clean, noisy, _ = RawPairs(loaded)[0]
     np.testing.assert_array_equal(names["clean"], clean)
     np.testing.assert_array_equal(names["noisy"], noisy)
 
 
-@pytest.mark.filterwarnings("ignore")  # those of another library
-def test_the_lines_for_webdataset_load_every_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.filterwarnings("ignore")  # of another library
+def test_webdataset_code_loads_every_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("webdataset")
     names = run_snippet(loaded, "webdataset", monkeypatch)
     assert len(list(names["samples"])) == len(RawPairs(loaded))
     np.testing.assert_array_equal(names["noisy"], RawPairs(loaded)[len(RawPairs(loaded)) - 1].noisy)
-    gc.collect()  # while warnings of files it leaves open are ignored
+    gc.collect()  # closes its files while warnings are ignored
 
 
-def test_the_lines_for_pytorch_load_every_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pytorch_code_loads_every_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
     names = run_snippet(loaded, "PyTorch", monkeypatch)
     assert sum(map(len, names["loader"])) == len(RawPairs(loaded))
 
 
-# The command, and the dataset it leaves alone -------------------------------------------------------------------------
+# The verb report ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -338,11 +358,11 @@ def copy(made: Path, tmp_path: Path) -> Path:
     return tmp_path / "ds"
 
 
-def test_the_command_writes_one_file_and_the_dataset_stays_what_it_is(
+def test_report_writes_one_file_and_leaves_the_dataset_unchanged(
     copy: Path, made: Path, door: Door, tree_hash: TreeHash
 ) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in copy.iterdir() if path.is_file()}
-    for _ in range(2):  # an earlier page is overwritten
+    for _ in range(2):  # an earlier report is overwritten
         done = door("report", copy)
         assert (done.code, done.out, done.err) == (0, f"{copy}/report.html\n", "")
     after = {path.name: path.stat().st_mtime_ns for path in copy.iterdir() if path.is_file()}
@@ -351,7 +371,7 @@ def test_the_command_writes_one_file_and_the_dataset_stays_what_it_is(
     assert verify(copy) == []
 
 
-def test_a_dataset_with_a_page_is_complete_and_can_be_made_again_and_resumed(
+def test_dataset_with_report_can_be_regenerated_repaired_and_resumed(
     made: Path, copy: Path, door: Door, tmp_path: Path
 ) -> None:
     photos = made.parent / "photos"
@@ -366,7 +386,7 @@ def test_a_dataset_with_a_page_is_complete_and_can_be_made_again_and_resumed(
     assert door("verify", copy, "--repair").code == 0
     assert verify(copy) == []
     assert (copy / "report.html").exists()
-    (copy / "dataset.json").unlink()  # as a run that was killed before its end
+    (copy / "dataset.json").unlink()  # like a run that was killed
     (copy / "manifest.csv").unlink()
     shutil.rmtree(copy / "shards")
     assert door(*bare).code == 0
@@ -374,7 +394,7 @@ def test_a_dataset_with_a_page_is_complete_and_can_be_made_again_and_resumed(
     assert (copy / "report.html").exists()
 
 
-def test_the_page_can_be_written_elsewhere(copy: Path, door: Door, tmp_path: Path) -> None:
+def test_report_can_be_written_to_another_file(copy: Path, door: Door, tmp_path: Path) -> None:
     done = door("report", copy, "--to", tmp_path / "page.html")
     assert (done.code, done.out) == (0, f"{tmp_path}/page.html\n")
     assert not (copy / "report.html").exists()
@@ -385,10 +405,11 @@ def test_the_page_can_be_written_elsewhere(copy: Path, door: Door, tmp_path: Pat
     "to",
     ["ds/manifest.csv", "ds/config.yaml", "ds/dataset.json", "ds/shards/report.html", "ds/shards", "ds/.work/page"],
 )
-def test_a_file_of_the_dataset_is_no_place_for_the_page(to: str, copy: Path, door: Door, tree_hash: TreeHash) -> None:
+def test_report_does_not_replace_a_file_of_the_dataset(to: str, copy: Path, door: Door, tree_hash: TreeHash) -> None:
     before = tree_hash(copy)
     done = door("report", copy, "--to", to)
-    assert (done.code, done.err) == (2, f"gen-dataset: --to {to}: belongs to the dataset; name another file\n")
+    assert done.code == 2
+    assert done.err == f"gen-dataset: --to {to}: belongs to the dataset; expected another file; choose another name\n"
     assert tree_hash(copy) == before
 
 
@@ -399,25 +420,39 @@ def test_a_file_of_the_dataset_is_no_place_for_the_page(to: str, copy: Path, doo
         (("--to", "x"), "report: expected the folder of a dataset"),
         (("ds", "--too", "x"), "report: --too: expected --to"),
         (("ds", "--to", "."), "--to .: expected the name of a file"),
-        (("ds", "--to", "no/such.html"), "--to no/such.html: expected the name of a file in a folder that is there"),
+        (("ds", "--to", "no/such.html"), "--to no/such.html: expected the name of a file in a folder that exists"),
     ],
 )
-def test_a_mistake_costs_one_line(arguments: tuple[str, ...], sentence: str, copy: Path, door: Door) -> None:
+def test_wrong_arguments_give_one_line(arguments: tuple[str, ...], sentence: str, copy: Path, door: Door) -> None:
     done = door("report", *arguments)
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert done.err.startswith(f"gen-dataset: {sentence}")
     assert not (copy / "report.html").exists()
 
 
-def test_without_matplotlib_one_line_names_the_extra(copy: Path, door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
+@pytest.mark.parametrize(
+    ("library", "purpose"), [("matplotlib", "drawing needs matplotlib"), ("jinja2", "HTML pages need jinja2")]
+)
+def test_missing_library_gives_one_line_that_names_the_extra(
+    library: str, purpose: str, copy: Path, door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report_files, "find_spec", lambda name: None if name == library else "spec")
     done = door("report", copy)
     assert done.code == 2
-    assert done.err == "gen-dataset: report: drawing needs matplotlib; pip install 'unprocess_gen[figures]'\n"
+    assert done.err == f"gen-dataset: report: {purpose}; pip install 'unprocess_gen[figures]'\n"
+
+
+def test_import_of_the_dataset_report_leaves_numba_out() -> None:
+    code = (
+        "import sys, unprocess_gen.reports.dataset_report\n"
+        "print([name for name in ('numba', 'matplotlib', 'jinja2') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
 
 
 @pytest.mark.parametrize("name", ["manifest.csv", "config.yaml", "dataset.json"])
-def test_a_dataset_that_is_not_as_it_was_finished_has_no_page(name: str, copy: Path, door: Door) -> None:
+def test_changed_dataset_is_damage(name: str, copy: Path, door: Door) -> None:
     (copy / name).write_bytes((copy / name).read_bytes().replace(b"0", b"1", 1))
     done = door("report", copy)
     assert (done.code, done.out, done.err.count("\n")) == (4, "", 1)
@@ -425,17 +460,17 @@ def test_a_dataset_that_is_not_as_it_was_finished_has_no_page(name: str, copy: P
     assert not (copy / "report.html").exists()
 
 
-def test_an_unfinished_dataset_has_no_page(copy: Path, door: Door) -> None:
+def test_unfinished_dataset_is_damage(copy: Path, door: Door) -> None:
     (copy / "dataset.json").unlink()
     done = door("report", copy)
     assert (done.code, done.err) == (
         4,
-        f"gen-dataset: {copy}: dataset.json is not here; is this a finished dataset?\n",
+        f"gen-dataset: {copy}: dataset.json does not exist; expected a finished dataset\n",
     )
 
 
 @pytest.mark.slow
-def test_the_page_of_a_hundred_thousand_rows_is_small_and_needs_no_more_memory(
+def test_size_and_memory_do_not_grow_with_the_number_of_rows(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = list(read_rows(made / "manifest.csv"))
@@ -447,8 +482,10 @@ def test_the_page_of_a_hundred_thousand_rows_is_small_and_needs_no_more_memory(
 
     facts = read_dataset(made / "dataset.json")
     entries = facts["shards"][:1] * 12_500
-    monkeypatch.setattr(page, "_noise", lambda folder: [])  # no shard holds these pairs
-    monkeypatch.setattr(page, "_pictures", lambda folder, source, pairs: [])
+    monkeypatch.setattr(
+        dataset_report, "_noise_check", lambda folder: {"count": 0, "table": None}
+    )  # no shard holds these pairs
+    monkeypatch.setattr(dataset_report, "_contact_sheet", lambda folder, source: None)
     sizes, peaks = [], []
     for count in (10_000, 100_000):
         out = tmp_path / str(count)
@@ -461,20 +498,20 @@ def test_the_page_of_a_hundred_thousand_rows_is_small_and_needs_no_more_memory(
         signed["manifest_sha256"] = file_sha256(out / "manifest.csv")
         (out / "dataset.json").write_text(dataset_text(signed), encoding="ascii")
         tracemalloc.start()
-        sizes.append(len(page.dataset_page(out).encode()))
+        sizes.append(len(dataset_report.dataset_page(out).encode()))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert max(sizes) < 200_000
     assert peaks[1] < 1.1 * peaks[0] < 100e6
 
 
-# In a real browser ----------------------------------------------------------------------------------------------------
+# In a browser ---------------------------------------------------------------------------------------------------------
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    "--host-resolver-rules=MAP * ~NOTFOUND",  # whatever the page might ask the net for, it does not get
+    "--host-resolver-rules=MAP * ~NOTFOUND",  # block network requests
 )
 MEASURE = """<script>addEventListener("load", () => {
   const box = (one) => { const {x, y, width, height} = one.getBoundingClientRect(); return [x, y, width, height]; };
@@ -487,13 +524,13 @@ MEASURE = """<script>addEventListener("load", () => {
   }), "*");
 });</script>"""
 FRAME = """<!doctype html><body style="margin: 0"><script>
-  addEventListener("message", (told) => { document.body.dataset.measured = told.data; });
+  addEventListener("message", (message) => { document.body.dataset.measured = message.data; });
 </script><iframe src="%s" style="border: 0; display: block; width: %dpx; height: %dpx"></iframe></body>"""
-"""The page stands in a frame, since the window of a headless browser is never narrower than 500 pixels."""
+"""The report is shown in a frame, because the window of headless Chromium is at least 500 pixels wide."""
 
 
 def browse(content: str, width: int, folder: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """Open a page in chromium: what its elements measure, and what it looks like, ``[H, W, 3]``."""
+    """Return the sizes of the elements of a page in Chromium, and a screenshot, uint8 ``[H, W, 3]``."""
     if CHROMIUM is None:
         pytest.skip("chromium is not installed")
 
@@ -517,17 +554,15 @@ def browse(content: str, width: int, folder: Path) -> tuple[dict[str, Any], np.n
 
 
 def colours_in(picture: np.ndarray, box: list[float]) -> int:
-    """How many colours a part of a picture holds; ``box`` is left, top, width and height."""
+    """Return the number of colours in a part of a picture; ``box`` is left, top, width and height."""
     x, y, width, height = (round(length) for length in box)
     part = picture[y : y + height, x : x + width].astype(np.uint32)
-    assert part.size, f"{box} lies outside of the picture, {picture.shape}"
+    assert part.size, f"{box} is outside the picture, {picture.shape}"
     return len(np.unique(part[..., 0] << 16 | part[..., 1] << 8 | part[..., 2]))
 
 
 @pytest.mark.parametrize("width", [1200, 360])
-def test_a_browser_shows_every_picture_and_chart_and_nothing_sticks_out(
-    width: int, scenes_page: str, tmp_path: Path
-) -> None:
+def test_browser_shows_every_picture_without_overflow(width: int, scenes_page: str, tmp_path: Path) -> None:
     measured, shot = browse(scenes_page, width, tmp_path)
     assert measured["wide"] == [width, width]
     assert shot.shape[:2] == (measured["high"], width)
@@ -543,9 +578,7 @@ def test_a_browser_shows_every_picture_and_chart_and_nothing_sticks_out(
 
 
 @pytest.mark.slow
-def test_the_browser_would_see_a_page_that_sticks_out_and_a_picture_that_is_not_there(
-    scenes_page: str, tmp_path: Path
-) -> None:
+def test_overflow_and_missing_pictures_are_detected(scenes_page: str, tmp_path: Path) -> None:
     broken = scenes_page.replace(".wide { overflow-x: auto;", ".wide {").replace("pre, .wide", "pre, .narrow")
     broken = re.sub(r'src="data:[^"]*"', 'src="gone.png"', broken)
     measured, _ = browse(broken, 360, tmp_path)

@@ -26,8 +26,7 @@ from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Float, Frame, Plan, Source, Srgb
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.reports import markup
-from unprocess_gen.reports.markup import Html, element
+from unprocess_gen.reports.html_pages import PageTable, render_page
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.cfa import CHANNELS, tile
@@ -157,23 +156,24 @@ def write_figures(drawn: Sequence[PaperFigure], out: Path, command: str) -> list
     return list(contents)
 
 
-def figures_page(drawn: Sequence[PaperFigure], command: str) -> str:
-    """Return the page: every figure with its caption; the pictures lie beside it."""
-    return markup.page(
-        "The article's figures",
-        element("h1", "The article's figures"),
-        element("p", "Image Unprocessing: A Pipeline to Recover Raw Data from sRGB Images, Figures 2 to 7, made by"),
-        element("pre", command),
-        *(_on_page(one) for one in drawn),
+def figures_page(figures: Sequence[PaperFigure], command: str) -> str:
+    """Return the page of all figures with captions; it refers to the PNG files next to it."""
+    return render_page(
+        "paper_figures.html",
+        title="Figures of the article",
+        command=command,
+        figures=[
+            {
+                "title": figure.title,
+                "file": figure.file,
+                "caption": figure.caption,
+                "table": PageTable(figure.table[0], figure.table[1:], range(1, len(figure.table[0])))
+                if figure.table
+                else None,
+            }
+            for figure in figures
+        ],
     )
-
-
-def _on_page(one: PaperFigure) -> Html:
-    said = [element("p", text) for text in one.caption]
-    if one.table:
-        said.append(markup.table(one.table[0], one.table[1:], right=range(1, len(one.table[0]))))
-    picture = markup.image_at(one.file, one.title)
-    return markup.joined([element("h2", one.title), element("figure", picture, element("figcaption", *said))])
 
 
 # --------------------------------------------------------------------------------------------------- the photographs

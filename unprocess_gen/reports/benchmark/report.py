@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from unprocess_gen.config.accuracy import STAGES
-from unprocess_gen.reports import markup
 from unprocess_gen.reports.benchmark.measure import REFERENCE, BenchmarkReport, Measurement
 from unprocess_gen.reports.formatting import short_number
-from unprocess_gen.reports.markup import element
+from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import write_files
 
 if TYPE_CHECKING:
@@ -274,33 +273,28 @@ def _legend(figure: Figure, rows: Sequence[Measurement]) -> None:
 # ---------------------------------------------------------------------------------------------------------- page
 
 NOTES = (
-    "Errors of curve, colour, mosaic and quantise: the clean frame at 14 bits, DN, all else exact. Of normal: σ, "
-    "against the true quantile. Of shot: the largest difference of distribution functions, with read noise, as "
-    "maximum; on photographs, in σ of shot and read noise, as RMS. Of effects: the noisy frame at 14 bits "
-    "without shot noise, DN.",
-    "Tiers, end to end: tier, the clean frame at 14 bits with noise of two numbers; tier_noisy, its noisy frame in σ; "
-    "tier_electrons, the noisy frame of the physical profile in σ; tier_own, the clean frame of the settings as given.",
-    "Times of curve to mosaic run from the codes to the end of that stage, since the compiled form folds them into "
-    "one; those of shot and effects are what they add to a pair. The last column is a median of ratios within a "
-    "round. A dash: not measured by itself.",
+    "Errors of the stages curve, colour, mosaic and quantise: clean frame at 14 bits, in DN, with all other stages "
+    "exact. Error of normal: in σ, against the exact quantile. Error of shot: the maximum is the largest difference of "
+    "the distribution functions of shot plus read noise; the RMS is measured on photographs, in σ of shot and read "
+    "noise. Error of effects: noisy frame at 14 bits without shot noise, in DN.",
+    "End-to-end rows of the tiers: tier is the clean frame at 14 bits with two-parameter noise, tier_noisy its noisy "
+    "frame in σ, tier_electrons the noisy frame of the physical profile in σ, and tier_own the clean frame of the "
+    "given settings.",
+    "Times of curve, colour and mosaic run from the codes to the end of the stage, because the kernels fuse these "
+    "stages. Times of effects are the differences they make to a pair. The last column is the median of the ratios "
+    "within a round. A dash means that the value was not measured separately.",
 )
 
 
 def benchmark_page(report: BenchmarkReport, picture: bytes) -> str:
-    """Return ``accuracy.html``: one file without a script, the figure in it."""
+    """Return ``accuracy.html``, one file that contains the figure."""
     stages = [None, *(row.stage for row in report.rows)]
-    first = [at for at, row in enumerate(report.rows) if row.stage != stages[at]]
-    return markup.page(
-        "What accuracy costs",
-        element("h1", "What accuracy costs"),
-        element("p", markup.image(picture, "error against time of every method, by stage")),
-        element(
-            "p",
-            "Filled: nothing else is both faster and nearer. Grey: their front. "
-            "Errors of 0 stand on a line of their own.",
-        ),
-        markup.table(HEADINGS, map(cells, report.rows), RIGHT, first),
-        *(element("p", note) for note in NOTES),
-        element("h2", "How it was measured"),
-        markup.facts(report.facts),
+    groups = [index for index, row in enumerate(report.rows) if row.stage != stages[index]]
+    return render_page(
+        "benchmark.html",
+        title="Cost of accuracy",
+        figure=data_uri(picture),
+        measurements=PageTable(HEADINGS, list(map(cells, report.rows)), RIGHT, groups),
+        notes=NOTES,
+        conditions=report.facts,
     )

@@ -1,0 +1,66 @@
+"""Render the HTML pages of reports from the Jinja2 templates in ``templates/``.
+
+A page is one file without scripts that opens offline, on phones, in light and dark mode. Autoescaping is on for every
+template, and characters that are invisible or reverse the text around them are shown as escapes, so a file name can
+never become markup.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Collection, Iterable, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+INVISIBLE = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
+)
+"""Control characters, changes of text direction, and lone surrogates."""
+
+
+class PageTable(NamedTuple):
+    """A table of a page.
+
+    ``numeric`` holds the indices of columns aligned right, ``groups`` those of lines that begin a new group.
+    """
+
+    headings: Sequence[str]
+    lines: Iterable[Sequence[str]]
+    numeric: Collection[int] = ()
+    groups: Collection[int] = ()
+
+
+def render_page(template: str, **values: Any) -> str:
+    """Return a page rendered from a template of ``templates/``; a missing value raises `jinja2.UndefinedError`."""
+    return _environment().get_template(template).render(values)
+
+
+def data_uri(content: bytes, kind: str = "png") -> str:
+    """Return the ``data:`` address of an encoded image, which makes it part of the page."""
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def visible(value: Any) -> Any:
+    r"""Return text with invisible characters as escapes such as ``\x1b``; markup and other types are unchanged."""
+    if not isinstance(value, str) or hasattr(value, "__html__"):
+        return value
+    return INVISIBLE.sub(lambda match: match[0].encode("unicode_escape").decode(), value)
+
+
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # optional library, extra "figures"
+
+    return Environment(
+        loader=PackageLoader("unprocess_gen.reports"),
+        autoescape=True,
+        finalize=visible,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
