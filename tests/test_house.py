@@ -22,7 +22,7 @@ ONLY_IN = {
         *("simulation.reference.isp", "pipeline.generate"),
     },
     "PIL": {"sources.image.decode"},
-    "av": {"sources.video.decode"},
+    "av": {"sources.video.colours", "sources.video.decode"},
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng"},
 }

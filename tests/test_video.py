@@ -29,7 +29,8 @@ from unprocess_gen.sources import loader as photographs
 from unprocess_gen.sources.loader import list_photographs, load_source
 
 av = pytest.importorskip("av")
-from unprocess_gen.sources.video.decode import CODECS, FORMATS, Video  # noqa: E402
+from unprocess_gen.sources.video.colours import PIXEL_FORMATS  # noqa: E402
+from unprocess_gen.sources.video.decode import CODECS, Video  # noqa: E402
 
 Planes = Sequence[np.ndarray]
 
@@ -155,14 +156,14 @@ def formula(y: np.ndarray, u: np.ndarray, v: np.ndarray, matrix: int, full: bool
 
 
 def noise_planes(pix_fmt: str, width: int = 33, height: int = 17) -> list[np.ndarray]:
-    form = FORMATS[pix_fmt]
+    form = PIXEL_FORMATS[pix_fmt]
     rng = np.random.default_rng(5)
     dtype = np.uint16 if form.bits > 8 else np.uint8
     small = -(-height >> form.shift_y), -(-width >> form.shift_x)
     return [rng.integers(0, 1 << form.bits, shape, dtype) for shape in ((height, width), small, small)]
 
 
-YUV = [name for name in FORMATS if name.startswith("yuv") and name not in YUVJ]
+YUV = [name for name in PIXEL_FORMATS if name.startswith("yuv") and name not in YUVJ]
 
 
 @pytest.mark.parametrize("pix_fmt", YUV)
@@ -173,8 +174,8 @@ def test_colours_are_the_formulas_to_half_a_code(pix_fmt: str, matrix: int, full
     tags = {"colorspace": matrix, "color_range": 2 if full else 1}
     path = film(tmp_path / "a.mkv", "ffv1", pix_fmt, [raw_frame(pix_fmt, planes)], **tags)
     found = rgb(opened(path), 0)
-    wanted = formula(*planes, matrix, full, FORMATS[pix_fmt].bits)
-    assert found.dtype == (np.uint16 if FORMATS[pix_fmt].bits > 8 else np.uint8)
+    wanted = formula(*planes, matrix, full, PIXEL_FORMATS[pix_fmt].bits)
+    assert found.dtype == (np.uint16 if PIXEL_FORMATS[pix_fmt].bits > 8 else np.uint8)
     assert found.shape == wanted.shape == (17, 33, 3)
     assert np.abs(found - wanted).max() <= 0.5 + 1e-6
 
@@ -290,7 +291,7 @@ def test_rotation_is_applied_like_exif_orientation(orientation: int, tmp_path: P
 
 def test_a_turn_by_no_multiple_of_90_degrees_is_refused(tmp_path: Path) -> None:
     path = film(tmp_path / "a.mp4", "libx264", "yuv420p", scene(1), {"x264-params": "log-level=none"})
-    with pytest.raises(SourceError, match=r"^unsupported: the video is to be shown turned"):
+    with pytest.raises(SourceError, match=r"^unsupported: the video is rotated by an angle that is not"):
         rgb(opened(turned(path, (1, 1, -1, 1), 46341)), 0)
 
 
@@ -744,11 +745,11 @@ def test_a_video_that_changes_under_the_run_stops_it(films: Path, tmp_path: Path
 
 
 def test_the_file_is_opened_and_hashed_once(films: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    photographs._opened_film.cache_clear()
+    photographs._open_video.cache_clear()
     config = settings_of(films, include=["none"], video=["*.mp4"])
     for source in list_photographs(config).sources:
         load_source(config, source)
-    assert photographs._opened_film.cache_info().misses == 1
+    assert photographs._open_video.cache_info().misses == 1
 
 
 def test_a_limit_counts_frames(films: Path) -> None:
@@ -788,7 +789,7 @@ def test_without_pyav_a_video_is_refused_with_the_way_out(
     monkeypatch.setattr(photographs, "is_installed", lambda: False)
     done = door(f"source.root={films}", "source.clips=true")
     assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "h264.mp4 is a video, which needs PyAV: pip install 'unprocess_gen[video]'" in done.err
+    assert "h264.mp4 is a video, which needs PyAV; install it with pip install 'unprocess_gen[video]'" in done.err
     assert not (tmp_path / "ds").exists()
     assert door(f"source.root={films}", "source.clips=true", "source.video=[]", "n_jobs=1").code == 0
 
