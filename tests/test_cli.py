@@ -61,7 +61,7 @@ REFUSED = [
     (["--config-dir", "/no/such"], r".*'/no/such' not found"),
     (["--config-name", "other"], r".*'other'"),
     (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs nine numbers"),
-    (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a law"),
+    (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a distribution"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
     (["gains.red=0"], r"gains.red=0: a gain must be above 0"),
     (["out="], r"out='': expected the name of a folder"),

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from unprocess_gen.cli import hydra_app as compose
 from unprocess_gen.config import distributions as draws
 from unprocess_gen.config.distributions import DISTRIBUTION_NUMBERS, parse_distribution
+from unprocess_gen.config.noise_validation import PROFILE_RANGES
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import (
     NOT_DATA,
@@ -26,7 +27,7 @@ from unprocess_gen.config.serialization import (
     read_dataset_yaml,
     source_kind,
 )
-from unprocess_gen.config.validation import HIGHLIGHTS, RATES, validate_config
+from unprocess_gen.config.validation import HIGHLIGHTS, validate_config
 from unprocess_gen.core import lookup_tables as tables
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Distribution
@@ -47,7 +48,7 @@ NEEDS = {
 }
 NOISE_KEYS = {"name", "units", "black", "bits", "black_level_dn", "white_level_dn"}
 TWO_NUMBERS = {"a", "b", "negative_variance"}
-PHYSICAL = {"branches", "assumed", *(key for key, _, _ in RATES)}
+PHYSICAL = {"branches", "assumed", *(key for key, _, _ in PROFILE_RANGES)}
 CHOSEN = {"iso", "law", "levels", "draws"}
 """What a user says of a profile; no profile says it of itself."""
 SHA256 = "0" * 64
@@ -244,26 +245,29 @@ REFUSED = [
     ("gains.red=0", r"gains.red=0: a gain must be above 0"),
     ("gains.red=1e-310", r"gains.red=1e-310: a gain must be above 0, from 0.001 to 1000"),
     ("gains.blue=[uniform,1,1e9]", r"gains.blue=.*: a gain must be above 0, from 0.001 to 1000"),
-    ("camera=custom;camera.name=sony_a7r;camera.xyz2cam=[1,0,0,0,1,0,0,0,1]", r"camera.name=sony_a7r: is taken"),
+    (
+        "camera=custom;camera.name=sony_a7r;camera.xyz2cam=[1,0,0,0,1,0,0,0,1]",
+        r"camera.name=sony_a7r: is the name of",
+    ),
     ("gains.blue=-1.5", r"gains.blue=-1.5: a gain must be above 0"),
     ("gains.inverse_rgb=0.0", r"gains.inverse_rgb=0.0: a gain must be above 0"),
-    ("gains.red=nan", r"gains.red=nan: expected a finite number or a law: \[uniform, lowest, highest\]"),
-    ("gains.red=inf", r"gains.red=inf: expected a finite number or a law"),
-    ("gains.red=null", r"gains.red=null: expected a finite number or a law"),
-    ("gains.red=true", r"gains.red=True: expected a finite number or a law"),
-    ("gains.red=two", r"gains.red=two: expected a finite number or a law"),
-    ("gains.red=[]", r"gains.red=\[\]: expected a finite number or a law"),
-    ("gains.red=[normal,2,1]", r"gains.red=\[normal, 2, 1\]: expected a finite number or a law: \[uniform"),
+    ("gains.red=nan", r"gains.red=nan: expected a finite number or a distribution: \[uniform, lowest, highest\]"),
+    ("gains.red=inf", r"gains.red=inf: expected a finite number or a distribution"),
+    ("gains.red=null", r"gains.red=null: expected a finite number or a distribution"),
+    ("gains.red=true", r"gains.red=True: expected a finite number or a distribution"),
+    ("gains.red=two", r"gains.red=two: expected a finite number or a distribution"),
+    ("gains.red=[]", r"gains.red=\[\]: expected a finite number or a distribution"),
+    ("gains.red=[normal,2,1]", r"gains.red=\[normal, 2, 1\]: expected a finite number or a distribution: \[uniform"),
     ("gains.red=[uniform,2]", r"gains.red=\[uniform, 2\]: expected finite numbers: \[uniform, lowest, highest\]"),
     ("gains.red=[uniform,1,nan]", r"gains.red=\[uniform, 1, nan\]: expected finite numbers"),
-    ("gains.red=[uniform,2,1]", r"gains.red=\[uniform, 2, 1\]: the lowest value must lie below the highest"),
+    ("gains.red=[uniform,2,1]", r"gains.red=\[uniform, 2, 1\]: the lowest value must be below the highest"),
     ("gains.red=[uniform,0,2]", r"gains.red=\[uniform, 0, 2\]: a gain must be above 0"),
-    ("gains.red=[uniform,2,2]", r"gains.red=\[uniform, 2, 2\]: the lowest value must lie below the highest"),
+    ("gains.red=[uniform,2,2]", r"gains.red=\[uniform, 2, 2\]: the lowest value must be below the highest"),
     ("gains.blue=[truncated_normal,1,0,0.5,2]", r"gains.blue=.*: the standard deviation must be above 0"),
-    ("gains.blue=[truncated_normal,1,0.1,0.5,1.7]", r"gains.blue=.*: the limits must lie within six standard dev"),
+    ("gains.blue=[truncated_normal,1,0.1,0.5,1.7]", r"gains.blue=.*: the limits must be within six standard dev"),
     ("gains.inverse_rgb=[truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: a gain must be above 0"),
     ("gains.inverse_rgb=[inverse_truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: a gain must be above 0"),
-    ("gains.red=[inverse_truncated_normal,1,1,0.5,2]", r"gains.red=.*: expected a finite number or a law"),
+    ("gains.red=[inverse_truncated_normal,1,1,0.5,2]", r"gains.red=.*: expected a finite number or a distribution"),
     ("gains.highlight=clip", r"gains.highlight=clip: expected one of per_channel, gray_mean, none"),
     ("gains.threshold=1", r"gains.threshold=1.0: expected 0 up to, but not including, 1"),
     ("gains.threshold=-0.1", r"gains.threshold=-0.1: expected 0 up to"),
@@ -281,36 +285,36 @@ REFUSED = [
     ("sensor.white_level_dn=100", r"sensor.white_level_dn=100: expected 241 to 4095"),
     ("sensor.white_level_dn=4096", r"sensor.white_level_dn=4096: expected 241 to 4095"),
     ("sensor.pattern=RGBW", r"sensor.pattern=RGBW: expected one of RGGB, BGGR, GRBG, GBRG"),
-    ("sensor.clip=none", r"sensor.clip=none: output.dtype=uint16 holds nothing beyond .*; say output.dtype=float32"),
+    ("sensor.clip=none", r"sensor.clip=none: output.dtype=uint16 holds no values beyond .*; set output.dtype=float32"),
     ("sensor.clip=white", r"sensor.clip=white: expected one of sensor, black, none"),
     ("noise.units=null", r"noise.units=null: expected one of dn, normalized"),
     ("noise.units=electrons", r"noise.units=electrons: expected one of dn, normalized"),
     ("noise.black=null", r"noise.black=null: expected one of subtracted, included"),
     ("noise.negative_variance=abs", r"noise.negative_variance=abs: expected one of refuse, clip"),
-    ("noise.bits=null", r"noise.units=dn: imx385_iso3200 must say the bits, .* got null, 240, 4095"),
-    ("noise.black_level_dn=null", r"noise.units=dn: imx385_iso3200 must say the bits, .* got 12, null, 4095"),
-    ("noise.white_level_dn=null", r"noise.units=dn: imx385_iso3200 must say the bits, .* got 12, 240, null"),
+    ("noise.bits=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got null, 240, 4095"),
+    ("noise.black_level_dn=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got 12, null, 4095"),
+    ("noise.white_level_dn=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got 12, 240, null"),
     ("noise.white_level_dn=240", r"noise.white_level_dn=240: expected 241 to 4095"),
     ("noise.white_level_dn=5000", r"noise.white_level_dn=5000: expected 241 to 4095"),
     ("noise.black_level_dn=-1", r"noise.black_level_dn=-1: expected 0 to 4094"),
-    ("noise.a=null", r"noise.a=null: expected a finite number or a law: \[uniform, .*\]; \[log_uniform, .*\]"),
+    ("noise.a=null", r"noise.a=null: expected a finite number or a distribution: \[uniform, .*\]; \[log_uniform, .*\]"),
     ("noise.a=nan", r"noise.a=nan: expected a finite number"),
     ("noise.a=inf", r"noise.a=inf: expected a finite number"),
     ("noise.b=nan", r"noise.b=nan: expected a finite number"),
     ("noise.b=-inf", r"noise.b=-inf: expected a finite number"),
-    ("noise.a=-1", r"noise.a=-1: the variance's slope must be 0 or more"),
-    ("noise.a=[uniform,-1,1]", r"noise.a=\[uniform, -1, 1\]: the variance's slope must be 0 or more"),
+    ("noise.a=-1", r"noise.a=-1: expected a slope of the variance of 0 or more"),
+    ("noise.a=[uniform,-1,1]", r"noise.a=\[uniform, -1, 1\]: expected a slope of the variance of 0 or more"),
     ("noise.a=[log_uniform,0,1]", r"noise.a=\[log_uniform, 0, 1\]: the lowest value must be above 0"),
-    ("noise=brooks2019;noise.a=0", r"noise.a=0: noise.b depends on its logarithm, so it must be above 0"),
+    ("noise=brooks2019;noise.a=0", r"noise.a=0: expected more than 0, because noise.b depends on ln a"),
     ("noise=brooks2019;noise.b=[log_linear_in_a,2,1,-1]", r"noise.b=.*: expected a slope of -10 to 10"),
     ("noise=brooks2019;noise.black=included", r"noise.black=included: normalized units have black at 0"),
-    ("noise.b=-1", r"noise.b=-1: the variance at black is -1, below 0; say noise.negative_variance=clip"),
-    ("noise.b=[uniform,-1,1]", r"noise.b=\[uniform, -1, 1\]: the variance at black is -1, below 0"),
-    ("noise=brooks2019;noise.b=-0.1", r"noise.b=-0.1: the variance at black is -0.1, below 0"),
-    ("noise=imx385_iso3200_rvdd;noise.negative_variance=refuse", r"noise.b=-2043.51144: the variance at black is -122"),
+    ("noise.b=-1", r"noise.b=-1: variance at black is -1; expected 0 or more; set noise.negative_variance=clip"),
+    ("noise.b=[uniform,-1,1]", r"noise.b=\[uniform, -1, 1\]: variance at black is -1; expected 0 or more"),
+    ("noise=brooks2019;noise.b=-0.1", r"noise.b=-0.1: variance at black is -0.1; expected 0 or more"),
+    ("noise=imx385_iso3200_rvdd;noise.negative_variance=refuse", r"noise.b=-2043.51144: variance at black is -122"),
     ("output.layout=zip", r"output.layout=zip: expected one of mosaic, packed"),
     ("output.dtype=float64", r"output.dtype=float64: expected one of uint16, float32"),
-    ("output.dtype=float32;effects.quantise=on", r"effects.quantise=on: output.dtype=float32 is not rounded; say "),
+    ("output.dtype=float32;effects.quantise=on", r"effects.quantise=on: output.dtype=float32 is not rounded; set "),
     ("output.pairs_per_shard=0", r"output.pairs_per_shard=0: expected 1 to 1000000"),
     ("output.pairs_per_shard=1000001", r"output.pairs_per_shard=1000001: expected 1 to 1000000"),
     ("noise=imx385", r"scene.iso=100: noise=imx385 is calibrated for ISO 1600, 3200, .* give noise.iso="),
@@ -335,7 +339,7 @@ REFUSED = [
     ("noise=sony_a7s2;effects.column=on", r"effects.column=on: noise=sony_a7s2 gives no column_std_dn"),
     ("scene.exposure_ratio=0", r"scene.exposure_ratio=0: expected 0.001 to 1e\+06"),
     ("scene.exposure_s=[uniform,1,1e6]", r"scene.exposure_s=\[uniform, 1, 1000000.0\]: expected 1e-07 to 100000"),
-    ("scene.temperature_c=[choice]", r"scene.temperature_c=\[choice\]: expected a value at least"),
+    ("scene.temperature_c=[choice]", r"scene.temperature_c=\[choice\]: expected at least one value"),
 ]
 
 

@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 import update_reference
 
 from unprocess_gen.cli.main import HELP, VERBS
+from unprocess_gen.config.noise_validation import PROFILE_RANGES
 from unprocess_gen.config.schema import BranchConfig, Config
-from unprocess_gen.config.validation import RATES
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.planning.noise_profile import FORMS
 
@@ -59,7 +59,7 @@ KEYS = [
     for field in dataclasses.fields(getattr(Config(), group.name))
     if (group.name, field.name) != ("scene", "name")
 ]
-KEYS += [("noise", key) for key, _, _ in RATES] + [
+KEYS += [("noise", key) for key, _, _ in PROFILE_RANGES] + [
     ("noise", field.name) for field in dataclasses.fields(BranchConfig) if field.name != "iso"
 ]
 

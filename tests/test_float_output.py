@@ -442,7 +442,10 @@ def test_the_noise_in_the_arrays_is_the_rows(overrides: tuple[str, ...], make: M
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("sensor.clip=none",), "output.dtype=uint16 holds nothing beyond the sensor's ends; say output.dtype=float32"),
+        (
+            ("sensor.clip=none",),
+            "output.dtype=uint16 holds no values beyond the sensor's range; set output.dtype=float32",
+        ),
         (("output.dtype=float32", "effects.quantise=on"), "effects.quantise=on: output.dtype=float32 is not rounded"),
     ],
 )

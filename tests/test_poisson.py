@@ -28,7 +28,7 @@ SIGN = 2**31
 
 SMALL = (1e-12, 1e-9, 1e-6, 1e-3, 0.00999999, 0.01, 0.0400001, 0.3, 1.0, 3.7, 12.5, 30.25, 50.0, 63.99)
 BIG = (100.0, 1e3, 12345.678, 1e5, 1e6, 1e7, 1e9)
-RATES = (*SMALL, math.nextafter(LIMIT, 0), LIMIT, math.nextafter(LIMIT, 99), *BIG)
+PROFILE_RANGES = (*SMALL, math.nextafter(LIMIT, 0), LIMIT, math.nextafter(LIMIT, 99), *BIG)
 
 Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -116,7 +116,7 @@ LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
 """Whole words cannot follow the law nearer than half a word; 1e-11 of computing is another twentieth."""
 
 
-@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("rate", PROFILE_RANGES)
 def test_the_share_of_all_words_up_to_every_count_is_the_law_to_one_word(rate: float) -> None:
     """The promise is one word in 2**32; what is kept is little more than half of one, the least there can be."""
     assert np.abs(error_in_words(rate)).max() <= LEAST_ERROR + COMPUTED_ERROR
@@ -175,7 +175,7 @@ def test_a_wrong_entry_of_the_tables_breaks_the_law(n: int, monkeypatch: pytest.
 # Order and coupling ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("rate", PROFILE_RANGES)
 def test_counts_rise_with_the_normal_of_the_word(rate: float) -> None:
     """Around the words where the count changes, in both tails, and at random."""
     counts, _ = law(rate)
@@ -229,7 +229,7 @@ def test_the_fast_form_gives_what_the_reference_gives_at_the_edges() -> None:
     rates = [
         *NO_RATES,
         *TINY_RATES,
-        *RATES,
+        *PROFILE_RANGES,
         *(math.nextafter((c / 10) ** 2, s) for c in range(82) for s in (0, 99)),
     ]
     words, every = pairs(EDGE_WORDS, rates)

@@ -1,7 +1,7 @@
-"""The laws that a parameter can be drawn from, each a function of one uniform.
+"""Parse the distributions of parameters and draw from them.
 
-What needs an exponential, a logarithm or a quantile is computed in `decimal` and rounded once, since no libm gives the
-same last bit everywhere; that costs up to a millisecond a draw.
+Each draw is a function of one uniform in (0, 1). Exponentials, logarithms and quantiles are computed in `decimal` and
+rounded once, because the last bit of libm's results differs between machines. A draw takes up to one millisecond.
 """
 
 from __future__ import annotations
@@ -17,9 +17,24 @@ from unprocess_gen.core.lookup_tables import DIGITS, normal_cdf, normal_quantile
 from unprocess_gen.core.types import Distribution
 
 
-def draw_parameter(law: Distribution, uniform: float, a: float = 0.0) -> float:
-    """Return the value of a law at a uniform in (0, 1); ``a`` is what ``log_linear_in_a`` depends on."""
-    return DISTRIBUTIONS[law.kind](uniform, a, *law.numbers)
+def draw_parameter(distribution: Distribution, uniform: float, a: float = 0.0) -> float:
+    """Return the value of a distribution at a uniform.
+
+    Parameters
+    ----------
+    distribution : Distribution
+        As `parse_distribution` returns it.
+    uniform : float
+        Number in the open interval (0, 1).
+    a : float
+        Slope of the noise variance, for ``log_linear_in_a``.
+
+    Returns
+    -------
+    float
+        The correctly rounded value; within three roundings for ``uniform``.
+    """
+    return DISTRIBUTIONS[distribution.kind](uniform, a, *distribution.numbers)
 
 
 def _constant(u: float, a: float, value: float) -> float:
@@ -37,7 +52,7 @@ def _log_uniform(u: float, a: float, low: float, high: float) -> float:
 
 
 def _truncated(u: float, mean: float, std: float, low: float, high: float) -> Decimal:
-    """A normal draw that lies in [low, high]: the quantile of a uniform between their probabilities."""
+    """Draw from a normal distribution truncated to [low, high], by its inverse CDF."""
     bottom, top = (normal_cdf((Decimal(limit) - Decimal(mean)) / Decimal(std)) for limit in (low, high))
     value = Decimal(mean) + Decimal(std) * normal_quantile(bottom + Decimal(u) * (top - bottom))
     return min(max(value, Decimal(low)), Decimal(high))
@@ -54,14 +69,17 @@ def _inverse_truncated_normal(u: float, a: float, mean: float, std: float, low: 
 
 
 def _log_linear_in_a(u: float, a: float, slope: float, intercept: float, std: float) -> float:
-    """ln b = slope · ln a + intercept + std · n (Brooks et al. 2019, random_noise_levels(); natural logarithms)."""
+    """Compute b from ln b = slope · ln a + intercept + std · n, where n is a standard normal deviate.
+
+    Source: Brooks et al. 2019, random_noise_levels(); natural logarithms.
+    """
     with localcontext(prec=DIGITS):
         line = Decimal(slope) * Decimal(a).ln() + Decimal(intercept)
         return float((line + Decimal(std) * normal_quantile(Decimal(u))).exp())
 
 
 def _choice(u: float, a: float, *values: float) -> float:
-    """One of the values, each as likely."""
+    """Choose one of the values with equal probability."""
     return values[int(u * len(values))]
 
 
@@ -74,18 +92,18 @@ DISTRIBUTIONS: dict[str, Callable[..., float]] = {
     "inverse_truncated_normal": _inverse_truncated_normal,
     "log_linear_in_a": _log_linear_in_a,
 }
-"""What each law does with a uniform in (0, 1)."""
+"""Each distribution as a function of a uniform in (0, 1), the slope a, and its numbers."""
 
 
 def _check_increasing(low: float, high: float) -> str | None:
-    return None if low < high else "the lowest value must lie below the highest"
+    return None if low < high else "the lowest value must be below the highest"
 
 
 def _check_truncated(mean: float, std: float, low: float, high: float) -> str | None:
     if std <= 0:
         return "the standard deviation must be above 0"
     if abs(low - mean) > 6 * std or abs(high - mean) > 6 * std:
-        return "the limits must lie within six standard deviations of the mean"
+        return "the limits must be within six standard deviations of the mean"
     return _check_increasing(low, high)
 
 
@@ -106,43 +124,63 @@ DISTRIBUTION_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]
     "truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _check_truncated),
     "inverse_truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _check_truncated),
     "log_linear_in_a": (("slope", "intercept", "standard deviation"), _check_line),
-    "choice": (("value", "…"), lambda *values: None if values else "expected a value at least"),
+    "choice": (("value", "…"), lambda *values: None if values else "expected at least one value"),
 }
-"""The laws a parameter can be drawn from: their numbers, and what must hold between them (None: all is well)."""
+"""The names of each distribution's numbers, and a function that returns what is wrong with them, or None."""
 
 
 def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distribution:
-    """Read a number or a law ``[kind, number, …]``; ConfigError names ``key``, the value and the ``allowed`` kinds."""
+    """Parse a number or a distribution, ``[kind, number, …]``.
+
+    Parameters
+    ----------
+    key : str
+        Key of the value, for messages.
+    value : Any
+        The configuration value.
+    allowed : tuple of str
+        Allowed kinds; a finite number is always allowed.
+
+    Returns
+    -------
+    Distribution
+        Kind ``constant`` for a number.
+
+    Raises
+    ------
+    ConfigError
+        If the value is neither, its kind is not allowed, or its numbers do not fit the kind.
+    """
     forms = "; ".join(f"[{kind}, {', '.join(DISTRIBUTION_NUMBERS[kind][0])}]" for kind in allowed)
     if is_number(value):
         return Distribution("constant", (float(value),))
     if not isinstance(value, list) or not value or value[0] not in allowed:
-        raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a law: {forms}")
+        raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a distribution: {forms}")
     kind, numbers = str(value[0]), value[1:]
     names, rule = DISTRIBUTION_NUMBERS[kind]
     if (len(numbers) != len(names) and kind != "choice") or not all(is_number(number) for number in numbers):
         raise ConfigError(f"{key}={value_text(value)}: expected finite numbers: [{kind}, {', '.join(names)}]")
-    complaint = rule(*numbers)
-    if complaint:
-        raise ConfigError(f"{key}={value_text(value)}: {complaint}")
+    problem = rule(*numbers)
+    if problem:
+        raise ConfigError(f"{key}={value_text(value)}: {problem}")
     return Distribution(kind, tuple(float(number) for number in numbers))
 
 
-def lowest(drawn: Distribution) -> float:
-    """Return a value that no draw of the law lies below."""
-    if drawn.kind in ("constant", "choice"):
-        return min(drawn.numbers)
-    if drawn.kind == "truncated_normal":
-        return drawn.numbers[2]
-    if drawn.kind == "inverse_truncated_normal":
-        return 1 / drawn.numbers[3] if drawn.numbers[2] > 0 else -math.inf
-    return drawn.numbers[0] if drawn.kind in ("uniform", "log_uniform") else 0.0
+def lowest(distribution: Distribution) -> float:
+    """Return a lower limit of all draws from a distribution."""
+    if distribution.kind in ("constant", "choice"):
+        return min(distribution.numbers)
+    if distribution.kind == "truncated_normal":
+        return distribution.numbers[2]
+    if distribution.kind == "inverse_truncated_normal":
+        return 1 / distribution.numbers[3] if distribution.numbers[2] > 0 else -math.inf
+    return distribution.numbers[0] if distribution.kind in ("uniform", "log_uniform") else 0.0
 
 
-def highest(drawn: Distribution) -> float:
-    """Return a value that no draw of the law lies above."""
-    if drawn.kind == "choice":
-        return max(drawn.numbers)
-    if drawn.kind == "inverse_truncated_normal":
-        return 1 / drawn.numbers[2] if drawn.numbers[2] > 0 else math.inf
-    return math.inf if drawn.kind == "log_linear_in_a" else drawn.numbers[-1]
+def highest(distribution: Distribution) -> float:
+    """Return an upper limit of all draws from a distribution."""
+    if distribution.kind == "choice":
+        return max(distribution.numbers)
+    if distribution.kind == "inverse_truncated_normal":
+        return 1 / distribution.numbers[2] if distribution.numbers[2] > 0 else math.inf
+    return math.inf if distribution.kind == "log_linear_in_a" else distribution.numbers[-1]

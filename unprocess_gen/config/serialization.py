@@ -8,7 +8,7 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import yaml
 
-from unprocess_gen.config.interpretation import patch_setting
+from unprocess_gen.config.interpretation import canonical_patch
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
@@ -46,7 +46,7 @@ def dataset_yaml(config: Config) -> str:
     settings["source"] = {"kind": source_kind(config)} | {
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
-    settings["source"]["patch"] = patch_setting(config.source)
+    settings["source"]["patch"] = canonical_patch(config.source)
     for group, keys in NUMBERS_OR_LAWS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)

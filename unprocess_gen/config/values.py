@@ -1,4 +1,4 @@
-"""Check single configuration values."""
+"""Check single configuration values and format them for messages."""
 
 from __future__ import annotations
 
@@ -9,42 +9,63 @@ from typing import Any
 from unprocess_gen.core.errors import ConfigError
 
 NAME = re.compile(r"[\w.+-]{1,100}", re.ASCII)
-"""What a camera or a noise profile may be called: it stands in every row."""
+"""Allowed names of cameras, noise profiles, scenes and accuracy tiers. Every row of a manifest contains them."""
 
 
 def check_name(key: str, name: str) -> None:
-    """Raise ConfigError unless a name may be written to every row of a manifest."""
+    """Raise ConfigError unless a name consists of 1 to 100 characters that `NAME` allows."""
     if not NAME.fullmatch(name):
         raise ConfigError(f"{key}={name[:40]!r}: expected up to 100 letters, digits, and . _ + -")
 
 
 def one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
-    """Raise ConfigError unless the value is one of those allowed."""
+    """Raise ConfigError unless the value is one of the allowed strings."""
     if value not in allowed:
         raise ConfigError(f"{key}={value_text(value)}: expected one of {', '.join(allowed)}")
 
 
 def in_range(key: str, value: int, low: int, high: int, remark: str = "") -> None:
-    """Raise ConfigError unless ``low <= value <= high``."""
+    """Raise ConfigError unless ``low <= value <= high``; the message ends with ``remark``."""
     if not low <= value <= high:
-        raise ConfigError(f"{key}={value}: expected {low} to {high}{remark}")
+        raise ConfigError(f"{key}={value_text(value)}: expected {low} to {high}{remark}")
 
 
 def is_integer(value: Any) -> bool:
-    """Return whether a value is an integer; a bool is not."""
+    """Return whether a value is an integer other than a bool."""
     return isinstance(value, int) and not isinstance(value, bool)
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a finite number; a bool is not."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Return whether a value is a finite float, or an integer other than a bool that a float can hold."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer of more than 1024 bits
+        return False
 
 
 def value_text(value: Any) -> str:
-    """Return a value as messages and ``config.yaml`` write it."""
+    """Format a value for a message.
+
+    Parameters
+    ----------
+    value : Any
+        A configuration value.
+
+    Returns
+    -------
+    str
+        The value as YAML writes it: None as ``null``, lists in brackets.
+    """
     if isinstance(value, list):
         return "[" + ", ".join(value_text(item) for item in value) + "]"
+    if is_integer(value) and value.bit_length() > MAX_PRINTED_BITS:
+        return f"an integer of {value.bit_length()} bits"  # Python refuses to convert the longest to text
     return "null" if value is None else str(value)
+
+
+MAX_PRINTED_BITS = 1024
 
 
 def error_in_one_line(error: BaseException) -> str:

@@ -1,0 +1,252 @@
+"""Check noise profiles: those with two numbers, and physical profiles with branches by ISO."""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal
+from typing import Any
+
+from unprocess_gen.config.distributions import highest, lowest, parse_distribution
+from unprocess_gen.config.interpretation import (
+    A_DISTRIBUTIONS,
+    SCENE_DISTRIBUTIONS,
+    branch_of,
+    is_physical,
+    noise_distributions,
+)
+from unprocess_gen.config.schema import BranchConfig, NoiseConfig, SceneConfig
+from unprocess_gen.config.values import in_range, is_number, one_of, value_text
+from unprocess_gen.core.errors import ConfigError
+
+PROFILE_RANGES = (
+    ("prnu_std", 0.0, 0.5),
+    ("dark_e_per_s", 0.0, 1e6),
+    ("dark_reference_c", -273.0, 200.0),
+    ("dark_doubling_c", 0.1, 100.0),
+    ("hot_pixel_share", 0.0, 1.0),
+    ("hot_pixel_e_per_s", 0.0, 1e6),
+    ("dead_pixel_share", 0.0, 1.0),
+    ("full_well_e", 1.0, 1e9),
+)
+"""Range of the numbers of a physical profile that do not depend on ISO (chosen, far beyond sensors)."""
+
+FORM_LENGTHS = {"per_iso": (1, 2), "root": (1, 3), "line": (3, 3), "scale_line": (3, 3)}
+"""Fewest and most numbers of each form in `planning.noise_profile.FORMS`."""
+
+MAX_BRANCH_NUMBER = 1e9
+"""Largest number in a branch of a physical profile, and largest standard deviation in DN that a line gives."""
+
+MAX_ISO = 1e7
+
+MAX_ELECTRONS = 1e9
+"""Largest mean of an exact Poisson count (`simulation.reference.poisson`); no pixel holds as many electrons."""
+
+
+FARTHEST_NORMAL = 6.4
+"""No normal deviate of a 32-bit uniform is farther from 0."""
+
+
+def check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
+    """Raise ConfigError unless a noise profile can be simulated at the ISO, exposure and temperature of a scene."""
+    if is_physical(noise):
+        _check_physical(noise, scene)
+    else:
+        _check_two_numbers(noise)
+
+
+def _check_two_numbers(noise: NoiseConfig) -> None:
+    if noise.iso is not None:
+        raise ConfigError(
+            f"noise.iso={value_text(noise.iso)}: noise={noise.name} holds for one ISO; choose a physical profile"
+        )
+    _, b = noise_distributions(noise)
+    if noise.law == "poisson" and (noise.black == "included" or lowest(b) < 0):
+        raise ConfigError("noise.law=poisson: needs the black level subtracted and b of 0 or more")
+    if noise.units == "normalized":
+        if noise.black == "included":
+            raise ConfigError("noise.black=included: normalized units have black at 0, so it must be subtracted")
+        offset = 0.0
+    else:
+        _check_calibration(noise)
+        offset = _black_variance(noise)
+    if noise.law == "poisson":
+        _check_countable(noise)
+    if lowest(b) + offset < 0 and noise.negative_variance == "refuse":
+        raise ConfigError(
+            f"noise.b={value_text(noise.b)}: variance at black is {lowest(b) + offset:.6g}; expected 0 or more; "
+            "set noise.negative_variance=clip to use max(0, variance)"
+        )
+
+
+def _check_calibration(noise: NoiseConfig) -> None:
+    levels = (noise.bits, noise.black_level_dn, noise.white_level_dn)
+    if any(level is None for level in levels):
+        raise ConfigError(
+            f"noise.units=dn: {noise.name} needs bits, black_level_dn and white_level_dn of its calibration, "
+            f"got {', '.join(value_text(level) for level in levels)}"
+        )
+    assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
+    in_range("noise.bits", noise.bits, 1, 32)
+    in_range("noise.black_level_dn", noise.black_level_dn, 0, 2**noise.bits - 2)
+    in_range("noise.white_level_dn", noise.white_level_dn, noise.black_level_dn + 1, 2**noise.bits - 1)
+
+
+def _black_variance(noise: NoiseConfig) -> float:
+    """Return the least that an included black level adds to the variance at black, DN² of the profile."""
+    if noise.black != "included" or noise.black_level_dn is None:
+        return 0.0
+    return lowest(parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS)) * noise.black_level_dn
+
+
+def _check_countable(noise: NoiseConfig) -> None:
+    """Raise ConfigError if white is more than `MAX_ELECTRONS`; a = 0 means no shot noise, so nothing is counted."""
+    span = 1 if noise.units == "normalized" else (noise.white_level_dn or 0) - (noise.black_level_dn or 0)
+    a = parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS)
+    if a.numbers != (0.0,) and lowest(a) * MAX_ELECTRONS < span:
+        raise ConfigError(
+            f"noise.a={value_text(noise.a)}: noise.law=poisson counts up to {MAX_ELECTRONS:g} electrons, so a must be "
+            f"0, or at least {span / MAX_ELECTRONS:g}"
+        )
+
+
+# ------------------------------------------------------------------------------------------ physical noise profiles
+
+
+def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
+    if noise.law != "gaussian":
+        raise ConfigError(f"noise.law={noise.law}: needs a profile with two numbers; noise={noise.name} is physical")
+    for key in ("a", "b"):
+        if getattr(noise, key) is not None:
+            raise ConfigError(
+                f"noise.{key}={value_text(getattr(noise, key))}: noise={noise.name} is a physical profile; set iso"
+            )
+    if noise.units != "dn" or noise.black != "subtracted":
+        raise ConfigError(f"noise.units={noise.units}: a physical profile is in dn, with the black level subtracted")
+    _check_calibration(noise)
+    for number, branch in enumerate(noise.branches):
+        _check_branch(f"noise.branches[{number}]", noise, branch)
+    for key, low, high in PROFILE_RANGES:
+        value = getattr(noise, key)
+        if value is not None and not (math.isfinite(value) and low <= value <= high):
+            raise ConfigError(f"noise.{key}={value}: expected {low:g} to {high:g}")
+    for name in noise.assumed:
+        one_of("noise.assumed", name, tuple(key for key, _, _ in PROFILE_RANGES))
+    _check_iso(noise, scene)
+    _check_electrons(noise, scene)
+
+
+def _check_branch(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
+    if len(branch.iso) != 2 or not 0 < branch.iso[0] <= branch.iso[1] <= MAX_ISO:
+        raise ConfigError(f"{key}.iso={value_text(branch.iso)}: expected the lowest and the highest ISO, [100, 6400]")
+    one_of(f"{key}.read_law", branch.read_law, ("gaussian", "tukey"))
+    _check_form(f"{key}.dn_per_e", branch.dn_per_e, ("per_iso",))
+    gains = _gains_at_ends(branch)
+    _check_gain(f"{key}.dn_per_e", noise, branch, gains[0])
+    _check_form(f"{key}.read_std_dn", branch.read_std_dn, ("root", "line", "scale_line"), gains)
+    for name in ("row_std_dn", "column_std_dn"):
+        if getattr(branch, name) is not None:
+            _check_form(f"{key}.{name}", getattr(branch, name), ("root", "line"), gains)
+    shape = parse_distribution(f"{key}.read_shape", branch.read_shape, ("choice",))
+    if not (lowest(shape) > -0.5 and highest(shape) < 10):
+        raise ConfigError(
+            f"{key}.read_shape={value_text(branch.read_shape)}: expected more than -0.5, where the Tukey-lambda "
+            "distribution has a variance, and less than 10"
+        )
+    _check_black_error(f"{key}.black_error_dn", branch.black_error_dn)
+
+
+def _gains_at_ends(branch: BranchConfig) -> tuple[float, float]:
+    """Return the system gain at the lowest and the highest ISO of a branch, DN per electron."""
+    gain = branch.dn_per_e
+    if not isinstance(gain, list):
+        return float(gain), float(gain)
+    slope, intercept = gain[1], gain[2] if len(gain) > 2 else 0.0
+    return slope * branch.iso[0] + intercept, slope * branch.iso[1] + intercept
+
+
+def _check_gain(key: str, noise: NoiseConfig, branch: BranchConfig, lowest_gain: float) -> None:
+    """Raise ConfigError if a gain is 0, or so small that white is more than `MAX_ELECTRONS`."""
+    assert noise.white_level_dn is not None and noise.black_level_dn is not None
+    if not lowest_gain * MAX_ELECTRONS >= noise.white_level_dn - noise.black_level_dn:
+        raise ConfigError(
+            f"{key}={value_text(branch.dn_per_e)}: expected a gain above 0, with at most {MAX_ELECTRONS:g} electrons "
+            "at white"
+        )
+
+
+def _check_form(key: str, value: Any, allowed: tuple[str, ...], gains: tuple[float, ...] = ()) -> None:
+    """Raise ConfigError unless a value is a number or an allowed form; ``gains`` are those at which lines are used."""
+    if is_number(value) and 0 <= value <= MAX_BRANCH_NUMBER:
+        return
+    form, numbers = (value[0], value[1:]) if isinstance(value, list) and value else (None, [])
+    if form not in allowed:
+        raise ConfigError(
+            f"{key}={value_text(value)}: expected a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: "
+            f"{', '.join(allowed)}"
+        )
+    fewest, most = FORM_LENGTHS[form]
+    if not (
+        fewest <= len(numbers) <= most
+        and all(is_number(number) and abs(number) <= MAX_BRANCH_NUMBER for number in numbers)
+    ):
+        count = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+        raise ConfigError(
+            f"{key}={value_text(value)}: {form} takes {count} finite numbers of at most {MAX_BRANCH_NUMBER:g}"
+        )
+    if form in ("per_iso", "root"):
+        if min(numbers) < 0:
+            raise ConfigError(f"{key}={value_text(value)}: expected numbers of 0 or more")
+        return
+    slope, intercept, scatter = numbers
+    largest = max(slope * math.log(gain) for gain in gains) + intercept + FARTHEST_NORMAL * abs(scatter)
+    if largest > math.log(MAX_BRANCH_NUMBER):
+        raise ConfigError(
+            f"{key}={value_text(value)}: exceeds {MAX_BRANCH_NUMBER:g} DN within the ISO range; expected slope, "
+            "intercept and scatter of ln(standard deviation) against ln(gain)"
+        )
+
+
+def _check_black_error(key: str, value: Any) -> None:
+    if value is None or _is_black_error(value):
+        return
+    by_iso = isinstance(value, list) and bool(value) and value[0] == "by_log_iso"
+    rows = value[1:] if by_iso else [value]
+    if not rows or not all(isinstance(row, list) and len(row) == 4 and all(map(_is_black_error, row)) for row in rows):
+        raise ConfigError(
+            f"{key}={value_text(value)[:60]}: expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"
+        )
+
+
+def _is_black_error(value: Any) -> bool:
+    return is_number(value) and abs(value) <= MAX_BRANCH_NUMBER
+
+
+def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
+    """Raise ConfigError if an ISO could be drawn for which the profile was not calibrated."""
+    key, value = ("scene.iso", scene.iso) if noise.iso is None else ("noise.iso", noise.iso)
+    drawn = parse_distribution(key, value, SCENE_DISTRIBUTIONS)
+    ends = drawn.numbers
+    inside = all(branch_of(noise, iso) is not None for iso in ends)
+    if inside and drawn.kind not in ("constant", "choice"):
+        inside = any(branch.iso[0] <= min(ends) and max(ends) <= branch.iso[1] for branch in noise.branches)
+    if not inside:
+        ranges = ", ".join(
+            f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in (b.iso for b in noise.branches)
+        )
+        advice = "" if noise.iso is not None else f" (the ISO of scene={scene.name}); give noise.iso=…"
+        raise ConfigError(f"{key}={value_text(value)}: noise={noise.name} is calibrated for ISO {ranges}{advice}")
+
+
+def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
+    """Raise ConfigError if the dark current could exceed `MAX_ELECTRONS`."""
+    seconds = highest(parse_distribution("scene.exposure_s", scene.exposure_s, SCENE_DISTRIBUTIONS))
+    celsius = highest(parse_distribution("scene.temperature_c", scene.temperature_c, SCENE_DISTRIBUTIONS))
+    for key in ("dark_e_per_s", "hot_pixel_e_per_s"):
+        rate = Decimal((getattr(noise, key) or 0.0) * seconds)
+        doublings = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)
+        most = (Decimal(MAX_ELECTRONS) / 8).ln()  # a hot pixel has up to 8 times the mean
+        if rate > 0 and rate.ln() + doublings * Decimal(2).ln() > most:
+            raise ConfigError(
+                f"noise.{key}={getattr(noise, key)}: more than {MAX_ELECTRONS:g} electrons in {seconds:g} s at "
+                f"{celsius:g} degrees Celsius"
+            )
