@@ -72,7 +72,24 @@ class Text(NamedTuple):
         return self.description
 
 
-Allowed = Range | Words | Text
+class RelativePath(NamedTuple):
+    """Allow the percent-encoded path of a file below the source folder, so that nothing outside it is looked up."""
+
+    max_characters: int = 2**15
+
+    def __contains__(self, value: object) -> bool:
+        if not isinstance(value, str) or value not in ANY_TEXT or not 0 < len(value) <= self.max_characters:
+            return False
+        path = _PERCENT.sub(lambda match: chr(int(match[1], 16)), value)
+        return not path.startswith("/") and ".." not in path.split("/") and "\0" not in path
+
+    def __str__(self) -> str:
+        return "a path below the source folder, relative and without .. segments"
+
+
+_PERCENT = re.compile("%([0-9A-F]{2})")
+
+Allowed = Range | Words | Text | RelativePath
 Record = type[Plan] | type[Physics] | type[Patch] | type[Counts] | type[Source]
 
 
@@ -119,7 +136,7 @@ SIDE = Range(1, 2**32)
 MATRIX_ENTRY = Range(-1e10, 1e10)
 GAIN = Range(1e-4, 1e4)
 ELECTRONS = Range(0, 1e9)
-ANY_TEXT = Text(re.compile(r"[^\x00-\x1f\x7f]*"), "text without control characters")
+ANY_TEXT = Text(re.compile("[^\x00-\x1f\x7f\ud800-\udfff]*"), "text without control characters")
 KEY_TEXT = Text(re.compile(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?"), "eight digits, then -pNNNN and -lNNdNN if present")
 HEX_64 = Text(re.compile(r"([0-9a-f]{16})?|none"), "16 hexadecimal digits")
 HEX_128 = Text(re.compile(r"([0-9a-f]{32})?"), "32 hexadecimal digits")
@@ -138,7 +155,7 @@ class Column:
         Converts a cell's text to its value: `int`, `float`, `str` or `number_or_text`.
     meaning : str
         Description for users.
-    allowed : Range, Words or Text
+    allowed : Range, Words, Text or RelativePath
         Values other than the empty cell.
     of : type, optional
         Dataclass whose field the column holds.
@@ -210,7 +227,7 @@ COLUMNS = (
     Column(
         "key", str, "source index as eight digits; then patch, and level and draw, where there are several", KEY_TEXT
     ),
-    Column("source", str, "path below the source folder, percent-encoded where unsafe", ANY_TEXT, Source, "name"),
+    Column("source", str, "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name"),
     Column("source_sha256", str, "SHA-256 of the source's bytes", HEX_256),
     Column("source_bytes", int, "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes"),
     Column("status", str, "ok or failed", Words(("ok", "failed"))),

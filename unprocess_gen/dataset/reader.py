@@ -1,12 +1,15 @@
-"""A finished dataset, read back: `RawPairs`."""
+"""Read the pairs of a finished dataset, or of all datasets of a sweep, without copying or unpacking."""
 
 from __future__ import annotations
 
+import csv
+import operator
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.types import PACKED, UINT16, Float, Frame, Row
@@ -16,21 +19,55 @@ from unprocess_gen.dataset.shards import CLEAN, Form, Member, form_of, map_array
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
 
+SWEEP_TABLE = "sweep.csv"
+FINISHED = ("0", "3")
+"""Exit codes of jobs that left a dataset: complete, and complete with failed sources."""
 
-class Sample(NamedTuple):
-    """One pair of a dataset, and its manifest row (column → value).
 
-    Arrays are of the row's ``dtype`` and ``layout``: uint16 in DN, or float32 with 0 at black and 1 at white; mosaics
-    ``[H, W]``, or packed planes ``[4, H / 2, W / 2]`` in the order of `bayer.PLANES`.
-    """
-
+class _Frames(NamedTuple):
     clean: Frame
     noisy: Frame
     row: dict[str, Any]
 
 
+class Sample(_Frames):
+    """One pair of a dataset: ``clean, noisy, row = sample``.
+
+    Attributes
+    ----------
+    clean, noisy : ndarray
+        Frames in the ``dtype`` and ``layout`` of the row: uint16 in DN, or float32 with 0 at black and 1 at white;
+        mosaics [H, W], or packed planes [4, H / 2, W / 2] in the order of `cfa.PLANES`.
+    row : dict
+        Manifest row: value by column.
+    dataset : str
+        Name of the dataset's folder; for a sweep as in ``sweep.csv``.
+    """
+
+    dataset: str
+
+    def __new__(cls, clean: Frame, noisy: Frame, row: dict[str, Any], dataset: str = "") -> Sample:
+        """Return a tuple of three items with one more attribute."""
+        sample = super().__new__(cls, clean, noisy, row)
+        sample.dataset = dataset
+        return sample
+
+
 def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
-    """Return a frame of any dtype and layout as a mosaic ``[H, W]`` in DN: uint16 as it is, float32 as float64."""
+    """Return a frame as a mosaic in DN.
+
+    Parameters
+    ----------
+    frame : ndarray of uint16 or float32
+        Clean or noisy frame of a pair, mosaic or packed planes.
+    row : Row
+        Manifest row of the pair.
+
+    Returns
+    -------
+    ndarray of uint16 or float64, [H, W]
+        uint16 values unchanged; float32 values scaled from 0 at black and 1 at white to DN.
+    """
     mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
     if row["dtype"] == UINT16:
         return mosaic
@@ -38,45 +75,142 @@ def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
 
 
 class RawPairs:
-    """The pairs of a dataset, by number: a map-style dataset, for PyTorch's DataLoader as it is.
+    """Read the pairs of a dataset by number: a map-style dataset, for example for PyTorch's DataLoader.
 
-    ``pairs[i]`` is a `Sample` with ``clean``, ``noisy`` and ``row``, in the order of the manifest, failed photographs
-    left out. Arrays are mapped from the shard (no copy, no unpacking); they are yours to write to, the file does not
-    change. Holds no open file and of each row only its place (8 bytes), so it can be pickled, forked and shared between
-    threads, and a million pairs cost 8 MB.
+    ``pairs[i]`` is a `Sample`; negative numbers count from the end, and a slice is a `RawPairs` of those pairs. Pairs
+    are in the order of the manifest, without failed sources. Arrays are mapped from the shard. They can be written to;
+    the file does not change.
 
-    Raises DamageError where the dataset is not whole, IndexError for a number out of range.
+    No file stays open and only the position of each row is kept (12 bytes), so an instance can be pickled, forked and
+    shared between threads. Needs neither Numba nor OpenCV nor Hydra.
 
-    >>> pairs = RawPairs("ds")                                      # doctest: +SKIP
-    >>> clean, noisy, row = pairs[0]                                # doctest: +SKIP
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a finished dataset, or of a sweep. A sweep's datasets follow each other as in its ``sweep.csv``; jobs
+        that left no dataset are omitted.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+
+    Raises
+    ------
+    DamageError
+        If a manifest, a shard or ``sweep.csv`` is missing or damaged; for shards when a pair is read.
+    IndexError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> pairs = RawPairs("ds")  # doctest: +SKIP
+    >>> clean, noisy, row = pairs[0]  # doctest: +SKIP
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._manifest = self.path / "manifest.csv"
-        places = (at for at, row in rows_with_offsets(self._manifest) if row["status"] == "ok")
-        self._places = np.fromiter(places, dtype=np.int64)
-        self._indexes: dict[int, dict[str, Member]] = {}
+        self._datasets = [_Dataset(folder) for folder in _dataset_folders(self.path)]
+        offsets = [dataset.offsets() for dataset in self._datasets]
+        self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
+        self._dataset_of: NDArray[np.int32] = np.repeat(
+            np.arange(len(offsets), dtype=np.int32), [len(some) for some in offsets]
+        )
+
+    @property
+    def dataset(self) -> tuple[str, ...]:
+        """Return the folder name of each pair's dataset."""
+        return tuple(self._datasets[number].name for number in self._dataset_of)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._offsets)
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[number] for number in range(len(self)))
 
-    def __getitem__(self, number: int) -> Sample:
-        row = dict(read_row(self._manifest, int(self._places[number])))
+    @overload
+    def __getitem__(self, number: SupportsIndex) -> Sample: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> RawPairs: ...
+
+    def __getitem__(self, number: SupportsIndex | slice) -> Sample | RawPairs:
+        if isinstance(number, slice):
+            part = RawPairs.__new__(RawPairs)
+            part.path, part._datasets = self.path, self._datasets
+            part._offsets, part._dataset_of = self._offsets[number], self._dataset_of[number]
+            return part
+        place = operator.index(number)
+        dataset: _Dataset = self._datasets[int(self._dataset_of[place])]
+        return dataset.read(int(self._offsets[place]))
+
+
+class _Dataset:
+    """Read pairs of one dataset by the byte offsets of their rows."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.name = path.name or path.resolve().name
+        self._manifest = path / "manifest.csv"
+        self._indexes: dict[int, dict[str, Member]] = {}
+
+    def offsets(self) -> NDArray[np.int64]:
+        """Return the offsets of the rows of all pairs."""
+        rows = rows_with_offsets(self._manifest)
+        return np.fromiter((at for at, row in rows if row["status"] == "ok"), dtype=np.int64)
+
+    def read(self, offset: int) -> Sample:
+        """Return the pair whose row begins at a byte."""
+        row = dict(read_row(self._manifest, offset))
         shard = int(row["shard"] or 0)
         form = form_of(str(row["dtype"]), str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0))
+        members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
+        clean, noisy = (self._array(shard, f"{sample_key(row)}.{member}", form) for member in members)
+        return Sample(clean, noisy, row, self.name)
+
+    def _array(self, shard: int, name: str, form: Form) -> Frame:
         path = self.path / "shards" / shard_name(shard)
         if shard not in self._indexes:
             self._indexes[shard] = read_index(path)
-        members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
-        clean, noisy = (self._array(path, shard, f"{sample_key(row)}.{member}", form) for member in members)
-        return Sample(clean, noisy, row)
-
-    def _array(self, path: Path, shard: int, name: str, form: Form) -> Frame:
         member = self._indexes[shard].get(name)
         if member is None:
             raise DamageError(f"{path}: member {name} is missing")
         return map_array(path, member, form)
+
+
+def _dataset_folders(path: Path) -> list[Path]:
+    """Return the folder of a dataset, or those of the finished datasets of a sweep."""
+    table = path / SWEEP_TABLE
+    if (path / "manifest.csv").exists() or not table.exists():
+        return [path]
+    return [path / folder for folder in sweep_folders(table)]
+
+
+def sweep_folders(table: Path) -> list[str]:
+    """Return the folders of the finished datasets of a sweep.
+
+    Parameters
+    ----------
+    table : Path
+        The ``sweep.csv``, of this or an older version.
+
+    Returns
+    -------
+    list of str
+        Names below the folder of ``table``, in its order.
+
+    Raises
+    ------
+    DamageError
+        If the file cannot be read, lacks the columns ``folder`` and ``exit``, or names a folder elsewhere.
+    """
+    try:
+        with table.open(encoding="utf-8", newline="") as stream:
+            rows = list(csv.DictReader(stream, strict=True))
+        folders = [row["folder"] for row in rows if row["exit"] in FINISHED]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise DamageError(f"{table}: not the table of a sweep ({error})") from error
+    for folder in folders:
+        if folder in ("", ".", "..") or "/" in folder or "\0" in folder:
+            raise DamageError(f"{table}: folder={folder[:60]!r}: expected the name of a folder next to the table")
+    return folders

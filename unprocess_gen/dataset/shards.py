@@ -211,9 +211,11 @@ def read_index(path: Path) -> dict[str, Member]:
         with path.open("rb") as stream:
             while (header := stream.read(RECORD)) != END[:RECORD]:
                 info = tarfile.TarInfo.frombuf(header, "utf-8", "strict")
+                if info.size < 0:
+                    raise ValueError(f"member {info.name} has {info.size} bytes")
                 index[info.name] = Member(stream.tell(), info.size)
                 stream.seek(info.size + _padding(info.size), io.SEEK_CUR)
-    except (tarfile.HeaderError, FileNotFoundError) as error:
+    except (tarfile.HeaderError, OSError, ValueError, OverflowError) as error:
         raise DamageError(f"{path}: not a whole shard ({error})") from error
     return index
 

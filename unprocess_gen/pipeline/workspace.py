@@ -38,6 +38,7 @@ from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
 from unprocess_gen.core.files import RESUME, commit_file, machine_error
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.dataset.dataset_json import MAX_BYTES, check_dataset_json
 from unprocess_gen.dataset.manifest import read_rows, row_of_values, write_rows
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.tasks import ShardResult
@@ -347,10 +348,14 @@ def read_dataset(path: Path) -> dict[str, Any]:
         If the file cannot be read or any byte of it was changed.
     """
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES} bytes")
         text = path.read_bytes().decode("ascii")
         facts = json.loads(text)
         facts.pop("dataset_sha256")
         intact = dataset_text(facts) == text
+        if intact:
+            check_dataset_json(facts)
     except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
     if not intact:
