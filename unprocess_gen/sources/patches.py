@@ -1,11 +1,11 @@
-"""Patches: squares cut out of a full frame where its Bayer phase is kept.
+"""Cut full frames into square patches that keep the CFA phase.
 
-Every corner lies on an even row and column, so the sensor's pattern is that of each patch. A patch is the cut-out of
-its full frame's pair, bit for bit: noise goes by the coordinates of the full frame, and all that was drawn or decided
-for an image holds for each of its patches. Where patches overlap they share their noise.
+Every corner is at an even row and column, so a patch has the sensor's CFA pattern. A patch is the crop of its full
+frame's pair, bit for bit: noise depends on coordinates of the full frame, and everything drawn or decided for an image
+holds for its patches. Overlapping patches share their noise.
 
-Random corners are whole numbers made from whole numbers: a word times the number of even places, divided by 2**32, so
-of n places none is likelier than another by more than n / 2**32.
+Random corners are computed with integers: a random word times the number of even positions, divided by 2**32. Of n
+positions none is more likely than another by more than n / 2**32.
 """
 
 from __future__ import annotations
@@ -20,39 +20,77 @@ from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
 
 
 def list_patches(
-    law: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC
+    rule: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC
 ) -> tuple[Patch, ...]:
-    """Return the patches of an image, in order; without a law the whole image is one.
+    """List the patches of an image in order.
 
-    Of an odd side packed planes leave out the last row or column, which has no whole 2x2 tiles. Grids go row by row
-    from the top-left corner. Random places come from the image's own streams, so no other image, and no patch after
-    them, moves them.
+    Parameters
+    ----------
+    rule : PatchRule or None
+        How patches are placed; None makes the complete image one patch.
+    stream_key : int
+        Key of the image's random streams; random corners depend on it and on their number only.
+    height, width : int
+        Size of the image in pixels.
+    layout : {"mosaic", "packed"}
+        Packed planes omit the last row or column of an odd side, which has no complete 2 x 2 tile.
+
+    Returns
+    -------
+    tuple of Patch
+        A grid row by row from the top-left corner, or random patches in the order they were drawn.
     """
-    if law is None:
+    if rule is None:
         side = 2 if layout == PACKED else 1
         return (Patch(0, 0, 0, height // side * side, width // side * side),)
-    corners = _grid(law, height, width) if law.kind == "grid" else _random(law, stream_key, height, width)
-    return tuple(Patch(number, y, x, law.side, law.side) for number, (y, x) in enumerate(corners))
+    corners = _grid(rule, height, width) if rule.kind == "grid" else _random(rule, stream_key, height, width)
+    return tuple(Patch(number, y, x, rule.side, rule.side) for number, (y, x) in enumerate(corners))
 
 
-def _grid(law: PatchRule, height: int, width: int) -> Iterator[tuple[int, int]]:
-    rows, columns = (range(0, length - law.side + 1, law.stride) for length in (height, width))
+def _grid(rule: PatchRule, height: int, width: int) -> Iterator[tuple[int, int]]:
+    rows, columns = (range(0, length - rule.side + 1, rule.stride) for length in (height, width))
     return itertools.product(rows, columns)
 
 
-def _random(law: PatchRule, stream_key: int, height: int, width: int) -> Iterator[tuple[int, int]]:
-    rows, columns = ((length - law.side) // 2 + 1 for length in (height, width))
-    for first, second in patch_words(stream_key, law.count):
+def _random(rule: PatchRule, stream_key: int, height: int, width: int) -> Iterator[tuple[int, int]]:
+    rows, columns = ((length - rule.side) // 2 + 1 for length in (height, width))
+    for first, second in patch_words(stream_key, rule.count):
         yield 2 * (first * rows >> 32), 2 * (second * columns >> 32)
 
 
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
-    """Return the pixels of a patch."""
+    """Return the pixels of a patch.
+
+    Parameters
+    ----------
+    srgb : ndarray, [H, W, 3]
+        The full frame.
+    patch : Patch
+        Position and size.
+
+    Returns
+    -------
+    ndarray, [patch.height, patch.width, 3]
+        A view of ``srgb``.
+    """
     return srgb[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width]
 
 
 def pixels_in_none(cuts: tuple[Patch, ...], height: int, width: int) -> int:
-    """Return how many pixels of an image lie in no patch."""
+    """Return the number of pixels of an image that are in no patch.
+
+    Parameters
+    ----------
+    cuts : tuple of Patch
+        Patches of the image.
+    height, width : int
+        Size of the image in pixels.
+
+    Returns
+    -------
+    int
+        Number of pixels.
+    """
     left = np.ones((height, width), dtype=bool)
     for patch in cuts:
         left[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width] = False

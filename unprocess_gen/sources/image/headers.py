@@ -1,13 +1,12 @@
-"""What a file says of itself before a pixel is decoded: JPEG, PNG, TIFF, WebP and BMP, told by their first bytes.
+"""Read the headers of JPEG, PNG, TIFF, WebP and BMP files without decoding pixels.
 
-In few lines for each format, and OpenCV's shape is held against them later. Pillow was tried for it: its PNG plugin
-decodes all pixels to get at an ``eXIf`` chunk behind the image data, its WebP plugin starts a decoder, it refuses TIFFs
-before we can say why, and the walks that prove a file whole meet every header field on their way anyway. A header takes
-5 to 60 microseconds, whatever size it claims, plus the search through a JPEG for its last marker, at about 1 GB/s.
+A header takes 5 to 60 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
+shape of the decoded array is compared with the header later (`decode`). Pillow is not used: its PNG plugin decodes
+all pixels to reach an ``eXIf`` chunk behind them, its WebP plugin starts a decoder, and it refuses some TIFFs without a
+usable reason.
 
-OpenCV (4.12, 5.0) refuses every prefix of a file itself, but older ones, and ``imread`` of any version, hand out a
-half-gray JPEG. So a whole file is one that holds its end-of-image marker, IEND, or the last strip; bytes after the end
-(motion photos) are fine. What a file lost from its middle shows when it is decoded (`decode`).
+A file is complete if it contains its end-of-image marker, IEND, or its last strip; bytes after the end (motion photos)
+are accepted. Data missing from the middle are found when the file is decoded.
 """
 
 from __future__ import annotations
@@ -25,20 +24,39 @@ from unprocess_gen.core.errors import SourceError
 ORIENTATIONS = range(1, 9)
 
 _MOST_PIECES = 2**18
-"""Segments or chunks of a file; 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. A file of nothing else takes 0.5 s."""
+"""Largest number of segments or chunks: 2^26 pixels of 16-bit RGBA in pieces of 2 KiB. Walking them takes 0.5 s."""
 
 _MAX_PROFILE_BYTES = 2**22
-# What reading a header field raises where the file ends before it; offsets of 64 bits overflow first.
+# Raised when a header field lies past the end of the file; 64-bit offsets overflow first.
 _PAST_THE_END = (struct.error, OverflowError)
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What a file says of itself.
+    """Hold what a file declares about itself.
 
-    ``width`` and ``height`` are as stored, before the orientation; ``bits`` (8 or 16) are those of the decoded array.
-    ``mode`` is ``gray``, ``white_is_zero``, ``rgb``, ``palette`` or ``cmyk``. ``frames`` counts the full pages of a
-    TIFF; an animation counts as 2. ``missing`` says what a cut took away, and is empty for a whole file.
+    Attributes
+    ----------
+    format : str
+        ``jpeg``, ``png``, ``tiff``, ``webp`` or ``bmp``.
+    width, height : int
+        Size as stored, before the orientation is applied, in pixels.
+    mode : str
+        ``gray``, ``white_is_zero``, ``rgb``, ``palette`` or ``cmyk``.
+    bits : int
+        Bits of the decoded array, 8 or 16.
+    has_alpha : bool
+        Whether the file has an alpha channel or a transparent colour.
+    orientation : int
+        EXIF orientation, 1 to 8.
+    frames : int
+        Full pages of a TIFF; 2 for an animation.
+    icc : bytes or None
+        Embedded ICC profile.
+    cicp : tuple of int or None
+        Primaries, transfer, matrix and full-range flag of a PNG (ITU-T H.273).
+    missing : str
+        What the file lacks if it was cut; empty for a complete file.
     """
 
     format: str
@@ -55,21 +73,31 @@ class Header:
 
 
 def probe(data: bytes) -> Header:
-    """Reads the header of a JPEG, PNG, TIFF, WebP or BMP file, told by its first bytes, and no pixel.
+    """Read the header of an image file; its first bytes decide the format.
+
+    Parameters
+    ----------
+    data : bytes
+        The complete file.
+
+    Returns
+    -------
+    Header
+        Declared properties; no pixel is decoded.
 
     Raises
     ------
     SourceError
-        ``empty``, ``unsupported``, ``truncated`` (the cut went through the header itself) or ``corrupt``.
+        ``empty``, ``unsupported``, ``truncated`` (within the header itself) or ``corrupt``.
     """
     header = _header(data)
     if header.width < 1 or header.height < 1:
-        raise SourceError("corrupt", f"the {header.format} header says {header.width} x {header.height} pixels")
+        raise SourceError("corrupt", f"the {header.format} header declares {header.width} x {header.height} pixels")
     return header
 
 
 def max_side(name: str) -> int:
-    """Return the longest side, in pixels, that the library behind OpenCV takes for a format."""
+    """Return the longest side, in pixels, that OpenCV's codec of a format accepts."""
     return _FORMATS[name].max_side
 
 
@@ -77,7 +105,7 @@ _Piece = TypeVar("_Piece")
 
 
 def _bounded(pieces: Iterable[_Piece]) -> Iterator[_Piece]:
-    """Yields the pieces of a file, and refuses one that is made of so many that walking them takes long."""
+    """Yield the pieces of a file; raise SourceError if there are so many that walking them takes long."""
     for count, piece in enumerate(pieces):
         if count == _MOST_PIECES:
             raise SourceError("corrupt", f"the file has more than {_MOST_PIECES} segments or chunks")
@@ -86,20 +114,20 @@ def _bounded(pieces: Iterable[_Piece]) -> Iterator[_Piece]:
 
 # JPEG -----------------------------------------------------------------------------------------------------------------
 
-# Within a scan, FF is followed by 00, a restart marker or more FF: anything else begins the next segment.
+# Within a scan, FF is followed by 00, a restart marker or FF; anything else begins the next segment.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
 _JPEG_END, _JPEG_SCAN, _JPEG_EXIF, _JPEG_ICC = 0xD9, 0xDA, 0xE1, 0xE2
 _JPEG_HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)
 _JPEG_OTHER_FRAMES = (0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)
 _JPEG_MODES = {1: "gray", 3: "rgb", 4: "cmyk"}
 _JPEG_MOST_SCANS = 100
-"""Encoders write 1 to 20. An empty one takes 100 bytes, and 7 ms or more where the header claims 2^26 pixels."""
+"""Encoders write 1 to 20 scans. An empty scan has 100 bytes but takes 7 ms or more for declared 2^26 pixels."""
 _EXIF_PREFIX = b"Exif\0\0"
 _ICC_PREFIX = b"ICC_PROFILE\0"
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yields (marker, payload) up to the end-of-image marker, or to where the file ends before it."""
+    """Yield (marker, payload) up to the end-of-image marker, or to the end of a file without one."""
     match = _JPEG_MARKER.search(data, 2)
     while match is not None:
         marker = data[match.start() + 1]
@@ -139,7 +167,7 @@ def _jpeg(data: bytes) -> Header:
 def _jpeg_frame(marker: int, payload: bytes) -> Header:
     depth, height, width, components = struct.unpack_from(">BHHB", payload)
     if marker not in _JPEG_HUFFMAN_FRAMES or depth != 8 or components not in _JPEG_MODES:
-        raise _unsupported(f"a JPEG of kind SOF{marker - 0xC0} with {components} components of {depth} bits")
+        raise _unsupported(f"a JPEG of type SOF{marker - 0xC0} with {components} components of {depth} bits")
     return Header("jpeg", width, height, _JPEG_MODES[components])
 
 
@@ -157,7 +185,7 @@ _PNG_HEAD = 8
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yields (kind, start, end) of each whole chunk up to IEND."""
+    """Yield (kind, start, end) of each complete chunk up to IEND."""
     return _bounded(_png_walk(data))
 
 
@@ -178,7 +206,7 @@ def _png(data: bytes) -> Header:
     kinds = {kind for kind, _, _ in _png_chunks(data)}
     first, width, height, bits, colour = struct.unpack_from(">4sIIBB", data, _PNG_HEAD + 4)
     if first != b"IHDR" or colour not in _PNG_MODES:
-        raise SourceError("corrupt", f"the PNG file begins with {first!r} and says colour type {colour}")
+        raise SourceError("corrupt", f"the PNG file begins with {first!r} and has colour type {colour}")
     return Header(
         "png",
         width,
@@ -195,7 +223,7 @@ def _png(data: bytes) -> Header:
 
 
 def _png_profile(chunk: bytes | None) -> bytes | None:
-    """Unpacks iCCP: a name, a zero, the method, deflated bytes. A broken one is b"", which no policy takes for sRGB."""
+    """Decompress iCCP (name, zero, method, deflated bytes); a broken one gives no bytes, which never count as sRGB."""
     if chunk is None:
         return None
     try:
@@ -214,7 +242,7 @@ def _png_cicp(chunk: bytes | None) -> tuple[int, int, int, int] | None:
 
 
 def png_transparent_gray(data: bytes) -> int:
-    """The gray that tRNS declares transparent, as the decoded array spells it."""
+    """Return the gray value that tRNS declares transparent, as it appears in the decoded array."""
     bits = data[_PNG_HEAD + 16]
     key = int.from_bytes((_png_chunk(data, b"tRNS") or b"")[:2], "big")
     return key if bits == 16 else (key & (2**bits - 1)) * (255 // (2**bits - 1))
@@ -232,7 +260,7 @@ _CHUNKY, _SEPARATE = 1, 2
 _UNCOMPRESSED = 1
 _TIFF_COMPRESSIONS = {_UNCOMPRESSED: "none", 5: "LZW", 7: "JPEG", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
 _TIFF_CMYK, _TIFF_SUBSAMPLED = 5, 6
-# (photometric, bits, samples) -> mode; what is not here, OpenCV reads wrongly or not at all
+# (photometric, bits, samples) -> mode; OpenCV reads other kinds wrongly or not at all
 _TIFF_KINDS = {
     (0, 1, 1): "white_is_zero",
     (0, 8, 1): "white_is_zero",
@@ -250,19 +278,19 @@ _TIFF_KINDS = {
     (6, 8, 3): "rgb",
 }
 _MOST_ENTRIES = 4096
-"""Tags of a directory: libtiff takes no more. They are walked for up to `_MAX_PAGES` directories, which may overlap."""
+"""Tags of a directory that libtiff accepts, in each of up to `_MAX_PAGES` directories, which may overlap."""
 _MOST_PLACES, _MOST_VALUES = 2**22, 2**16
-"""Values of a tag that lists strips (of one row and one channel, in the longest picture there is) and of any other."""
+"""Largest number of values of a tag that lists strips (one row and channel each), and of any other tag."""
 _MOST_READ = 16
-"""How many times its size a compressed file may list in strips: some share their bytes, and each is copied."""
+"""Largest ratio of listed strip bytes to file size in a compressed file: strips may share bytes, each is copied."""
 _SMALLEST_TILE = 32
 _LARGEST_TILE = 2**24
 _MAX_PAGES = 64
-"""Enough to know that there are too many; a chain of overlapping directories could take hours to count."""
+"""Pages that are counted; a chain of overlapping directories could take hours."""
 
 
 class _Entry(NamedTuple):
-    """One tag of a TIFF directory: ``at`` is the place of the entry, ``value_at`` that of its first value."""
+    """Hold one tag of a TIFF directory: offsets of the entry (``at``) and of its first value (``value_at``)."""
 
     at: int
     kind: int
@@ -271,7 +299,7 @@ class _Entry(NamedTuple):
 
 
 class _Tiff(NamedTuple):
-    """How a TIFF file spells numbers, and where its first directory lies."""
+    """Hold the byte order of a TIFF file, whether it is a BigTIFF, and the offset of its first directory."""
 
     order: str
     big: bool
@@ -289,7 +317,7 @@ def _tiff_start(data: bytes) -> _Tiff:
 
 
 def _tiff_pages(data: bytes, tiff: _Tiff) -> Iterator[_Page]:
-    """Yields the directories of the chain; struct.error where one lies outside the file."""
+    """Yield the directories of the chain; struct.error if one lies outside the file."""
     at, seen = tiff.first, {0}
     while at not in seen:
         seen.add(at)
@@ -350,7 +378,7 @@ _Read = Callable[[int, int], tuple[int, ...]]
 
 
 def _reader(data: bytes, order: str, page: _Page) -> _Read:
-    """A look-up of tags: ``read(tag, default)`` is a tuple of at least one value."""
+    """Return a function ``read(tag, default)`` that returns a tuple of at least one value."""
 
     def read(tag: int, default: int) -> tuple[int, ...]:
         most = _MOST_PLACES if tag in _STRIP_TAGS + _TILE_TAGS else _MOST_VALUES
@@ -376,7 +404,7 @@ def _tiff_mode(read: _Read) -> str:
 
 
 def _check_tiff_layout(read: _Read, bits: int, samples: int) -> None:
-    """Refuses what OpenCV cannot read, or reads as something else."""
+    """Raise SourceError for layouts that OpenCV cannot read or reads wrongly."""
     compression = read(_COMPRESSION, _UNCOMPRESSED)[0]
     if compression not in _TIFF_COMPRESSIONS:
         raise _unsupported(f"a TIFF of compression {compression}")
@@ -393,10 +421,10 @@ _TILE_TAGS = (_TILE_OFFSETS, _TILE_BYTES)
 
 
 def _tiff_missing(read: _Read, size_bytes: int) -> str:
-    """What the file lacks of the strips or tiles that its first page lists."""
+    """Return what the file lacks of the strips or tiles that its first page lists; empty if it is complete."""
     offsets, lengths = (read(tag, 0) for tag in (_TILE_TAGS if _is_tiled(read) else _STRIP_TAGS))
     if 0 in offsets or 0 in lengths or len(offsets) != len(lengths):
-        raise SourceError("corrupt", "the TIFF page does not say where its pixels are")
+        raise SourceError("corrupt", "the TIFF page does not list its strips")
     if len(offsets) < _tiff_pieces(read):
         raise SourceError("corrupt", f"the TIFF page lists {len(offsets)} pieces of {_tiff_pieces(read)}")
     if sum(lengths) < _tiff_smallest(read):
@@ -414,25 +442,25 @@ def _is_tiled(read: _Read) -> bool:
 
 
 def _tiff_pieces(read: _Read) -> int:
-    """How many strips or tiles the first page needs."""
+    """Return the number of strips or tiles that the first page needs."""
     width, height = read(_WIDTH, 0)[0], read(_HEIGHT, 0)[0]
     across = read(_TILE_WIDTH, 0)[0] if _is_tiled(read) else width
     down = read(_TILE_HEIGHT, 0)[0] if _is_tiled(read) else read(_STRIP_ROWS, height)[0]
     if not across or not down:
-        raise SourceError("corrupt", "the TIFF page has strips or tiles of no size")
+        raise SourceError("corrupt", "the TIFF page has strips or tiles of size 0")
     planes = read(_SAMPLES, 1)[0] if read(_PLANES, _CHUNKY)[0] == _SEPARATE else 1
     return -(-width // across) * -(-height // down) * planes
 
 
 def _tiff_smallest(read: _Read) -> int:
-    """How many bytes the pixels take at least: of compressed or subsampled ones we know nothing."""
+    """Return the least number of bytes of the pixels; 1 for compressed or subsampled ones, which give no bound."""
     if read(_COMPRESSION, _UNCOMPRESSED)[0] != _UNCOMPRESSED or read(_PHOTOMETRIC, 1)[0] == _TIFF_SUBSAMPLED:
         return 1
     return (read(_WIDTH, 0)[0] * read(_BITS, 1)[0] * read(_SAMPLES, 1)[0] + 7) // 8 * read(_HEIGHT, 0)[0]
 
 
 def tiff_without_orientation(data: bytes) -> bytes | bytearray:
-    """The TIFF file with tag 274 set to 1, so that no decoder turns the picture; untouched where it says so already."""
+    """Return the TIFF file with tag 274 set to 1, so that no decoder rotates it; the same bytes if it is 1 already."""
     tiff = _tiff_start(data)
     entry = next(_tiff_pages(data, tiff)).get(_ORIENTATION)
     if entry is None or _values(data, tiff.order, entry) == (1,):
@@ -443,7 +471,7 @@ def tiff_without_orientation(data: bytes) -> bytes | bytearray:
 
 
 def _exif_orientation(block: bytes) -> int:
-    """The orientation in an EXIF block; 1 where there is none or it is broken, which is no reason to refuse pixels."""
+    """Return the orientation in an EXIF block; 1 if it is missing or broken, since the pixels are still usable."""
     tiff = block.removeprefix(_EXIF_PREFIX)
     if not _FORMATS["tiff"].magic.match(tiff):
         return 1
@@ -467,7 +495,7 @@ _WEBP_ALPHA, _WEBP_ANIMATION = 0x10, 0x02
 
 
 def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yields (kind, start, end) of each chunk; the last may reach past the end of the file."""
+    """Yield (kind, start, end) of each chunk; the last may extend past the end of the file."""
     at = _WEBP_HEAD
     while at + 8 <= len(data):
         kind, length = struct.unpack_from("<4sI", data, at)
@@ -497,24 +525,24 @@ def _webp(data: bytes) -> Header:
 
 
 def _webp_canvas(data: bytes, at: int) -> tuple[int, int, int]:
-    """(width, height, flags) of an extended file: 24-bit sizes less one."""
+    """Return (width, height, flags) of an extended file: 24-bit sizes minus one."""
     flags, width, height = struct.unpack_from("<B3x3s3s", data, at)
     return 1 + int.from_bytes(width, "little"), 1 + int.from_bytes(height, "little"), flags
 
 
 def _webp_lossy(data: bytes, at: int) -> tuple[int, int, int]:
-    """(width, height, flags) of a VP8 key frame: 14-bit sizes, the upper two bits ask for scaling."""
+    """Return (width, height, flags) of a VP8 key frame: 14-bit sizes; the upper two bits request scaling."""
     width, height = struct.unpack_from("<HH", data, at + 6)
     return width & 0x3FFF, height & 0x3FFF, 0
 
 
 def _webp_lossless(data: bytes, at: int) -> tuple[int, int, int]:
-    """(width, height, flags) of a VP8L stream: two 14-bit sizes less one, then the alpha bit."""
+    """Return (width, height, flags) of a VP8L stream: two 14-bit sizes minus one, then the alpha bit."""
     (packed,) = struct.unpack_from("<I", data, at + 1)
     return 1 + (packed & 0x3FFF), 1 + (packed >> 14 & 0x3FFF), _WEBP_ALPHA * (packed >> 28 & 1)
 
 
-# The extended header comes first: it speaks for the whole canvas.
+# The extended header comes first, since it gives the size of the complete canvas.
 _WEBP_SIZES = {b"VP8X": _webp_canvas, b"VP8 ": _webp_lossy, b"VP8L": _webp_lossless}
 
 
@@ -548,10 +576,10 @@ def _bmp(data: bytes) -> Header:
 
 def _bmp_has_alpha(data: bytes, header_size: int) -> bool:
     red, green, blue = struct.unpack_from("<III", data, 54)
-    # Below a header of 56 bytes OpenCV takes the usual masks for granted.
+    # For headers below 56 bytes OpenCV assumes the usual masks.
     unusual = header_size < _BMP_ALPHA_HEADER and (red, green, blue) != _BMP_USUAL_MASKS
     if unusual or not {red, green, blue} < _BMP_BYTE_MASKS or len({red, green, blue}) < 3:
-        raise _unsupported(f"a BMP whose colours lie under the masks {red:#x}, {green:#x}, {blue:#x}")
+        raise _unsupported(f"a BMP whose colours have the masks {red:#x}, {green:#x}, {blue:#x}")
     return header_size >= _BMP_ALPHA_HEADER and struct.unpack_from("<I", data, 66)[0] != 0
 
 
@@ -559,7 +587,7 @@ def _bmp_has_alpha(data: bytes, header_size: int) -> bool:
 
 
 class _Format(NamedTuple):
-    """``max_side`` is the longest side, in pixels, that the library behind OpenCV takes."""
+    """Hold a format's first bytes, its header reader, and the longest side in pixels that OpenCV's codec accepts."""
 
     magic: re.Pattern[bytes]
     read: Callable[[bytes], Header]
@@ -588,4 +616,4 @@ def _header(data: bytes) -> Header:
 
 
 def _unsupported(what: str) -> SourceError:
-    return SourceError("unsupported", f"{what}; we read {', '.join(_FORMATS)} in 8 bits, PNG and TIFF also in 16")
+    return SourceError("unsupported", f"{what}; expected {', '.join(_FORMATS)} of 8 bits, or PNG or TIFF of 16 bits")
