@@ -28,7 +28,7 @@ from unprocess_gen.config.serialization import (
     source_kind,
 )
 from unprocess_gen.config.validation import HIGHLIGHTS, validate_config
-from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core import tone_curves
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Distribution
 from unprocess_gen.planning.plan import plan_image
@@ -507,7 +507,7 @@ def test_what_is_not_a_datasets_config_yaml_is_refused_in_one_line(content: byte
 
 def test_choices_are_those_of_the_rooms_that_serve_them() -> None:
     assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
-    assert set(unprocess.TONES) == set(tables.TONES) == {"smoothstep", "none"}
+    assert set(unprocess.TONES) == set(tone_curves.TONES) == {"smoothstep", "none"}
     assert set(DISTRIBUTION_NUMBERS) == set(draws.DISTRIBUTIONS)
 
 

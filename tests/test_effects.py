@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from moments import REACH, SAMPLER_ERROR, bernstein
 
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core import exact_distributions
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
@@ -36,7 +36,7 @@ def normal(index: int) -> float:
 
 
 def exact(index: int) -> float:
-    return -float(tables.normal_quantile(Decimal(2 * index + 1) / 2**33))
+    return -float(exact_distributions.normal_quantile(Decimal(2 * index + 1) / 2**33))
 
 
 # One word -------------------------------------------------------------------------------------------------------------

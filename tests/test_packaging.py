@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
+CURVES = "unprocess_gen/core/data/curves_16bit.npz"
 OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
 
 
@@ -60,7 +61,7 @@ def test_the_sdist_holds_options_tests_and_readme(built: Path) -> None:
     with tarfile.open(archive) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}
 
-    assert {*OPTIONS, "README.md", "pyproject.toml", "tests/test_packaging.py"} <= names
+    assert {*OPTIONS, "README.md", "pyproject.toml", "tests/test_packaging.py", CURVES} <= names
 
 
 def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
@@ -68,6 +69,7 @@ def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
 
     assert {f"unprocess_gen/{option}" for option in OPTIONS} <= set(names)
+    assert CURVES in names
     assert not any(name.startswith(("conf/", "tests/")) for name in names)
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL, is_steep, method
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import IN_FLOAT32, Pair, Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.kernels import gaussian_float32 as single

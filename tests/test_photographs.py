@@ -14,7 +14,7 @@ from PIL import Image
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.planning.plan import plan_image

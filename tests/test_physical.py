@@ -28,7 +28,8 @@ from moments import REACH, SAMPLER_ERROR, bernstein
 from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, exponential_levels, tukey_std, tukey_table
+from unprocess_gen.core.exact_distributions import tukey_std
+from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, exponential_levels, tukey_table
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Patch, Physics, Plan, Source, Srgb
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row, read_rows, write_rows

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.planning.effect_selection import Light, Prediction, decide, facts_of, light_of

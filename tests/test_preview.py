@@ -16,7 +16,7 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.reports import contact_sheet, panels, sheet_pairs, stages_sheet
 from unprocess_gen.simulation.reference import isp as process

@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from conftest import Door
 
-from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core import lookup_tables, tone_curves
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
@@ -106,18 +107,20 @@ def last_bit(table: np.ndarray) -> np.ndarray:
     return changed
 
 
-@pytest.mark.parametrize("build", ["_build", "_quadratic"])
-def test_a_table_off_by_a_unit_in_the_last_place_is_found(build: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    true: Callable[..., object] = getattr(tables, build)
-    monkeypatch.setattr(tables, build, lambda *given: last_bit(np.array(true(*given)) * (1 + 2**-20)))
-    tables._linear_table.cache_clear()
-    tables._normal_table.cache_clear()
+@pytest.mark.parametrize(("module", "build"), [(tone_curves, "compute_curve"), (lookup_tables, "_normal_row")])
+def test_a_table_off_by_a_unit_in_the_last_place_is_found(
+    module: ModuleType, build: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true: Callable[..., object] = getattr(module, build)
+    monkeypatch.setattr(module, build, lambda *given: last_bit(np.array(true(*given)) * (1 + 2**-20)))
+    tone_curves._linear_table.cache_clear()
+    lookup_tables.normal_table.cache_clear()
     try:
-        with pytest.raises(MachineError, match=r"the self-test failed: a table came out as [0-9a-f]{64}, expected"):
+        with pytest.raises(MachineError, match=r"the self-test failed: a table has SHA-256 [0-9a-f]{64}; expected"):
             selftest.check("one_normal")
     finally:
-        tables._linear_table.cache_clear()
-        tables._normal_table.cache_clear()
+        tone_curves._linear_table.cache_clear()
+        lookup_tables.normal_table.cache_clear()
 
 
 def test_a_philox_with_another_constant_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

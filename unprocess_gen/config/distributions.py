@@ -13,7 +13,7 @@ from typing import Any
 
 from unprocess_gen.config.values import is_number, value_text
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.lookup_tables import DIGITS, normal_cdf, normal_quantile
+from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
 from unprocess_gen.core.types import Distribution
 
 

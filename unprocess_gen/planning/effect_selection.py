@@ -30,7 +30,7 @@ from unprocess_gen.config.interpretation import (
     missing_number,
 )
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics, Srgb
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.noise import EFFECTS

@@ -15,7 +15,7 @@ from typing import Any
 from unprocess_gen.config.distributions import draw_parameter, parse_distribution
 from unprocess_gen.config.interpretation import SCENE_DISTRIBUTIONS, branch_of
 from unprocess_gen.config.schema import BranchConfig, Config, NoiseConfig
-from unprocess_gen.core.lookup_tables import DIGITS, normal_quantile, tukey_std
+from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile, tukey_std
 from unprocess_gen.core.random_streams import body_key
 from unprocess_gen.core.types import Physics
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row
 from unprocess_gen.reports.panels import (

@@ -12,7 +12,7 @@ from dataclasses import astuple, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.lookup_tables import linear_table
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import PACKED, Counts, Float, Frame, Normalised, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.kernels import gaussian as fused

@@ -19,8 +19,9 @@ import numpy as np
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.jit import is_cached, kernel
-from unprocess_gen.core.lookup_tables import linear_table, normal_table
+from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import philox4x32
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import FLOAT32, IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
 from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.kernels import gaussian as fused

@@ -55,9 +55,10 @@ from unprocess_gen.config.schema import AccuracyConfig, CleanConfig, Config, Eff
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.jit import kernel
-from unprocess_gen.core.lookup_tables import linear_table, normal_table
+from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import BLOCK, Words
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import MOSAIC, Float, Frame, Pair, Plan, Raw, Srgb
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image

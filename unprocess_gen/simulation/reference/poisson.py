@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.lookup_tables import DIGITS, SEGMENTS, normal_cdf, normal_density, normal_table, sha256
+from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density
+from unprocess_gen.core.lookup_tables import SEGMENTS, normal_table, sha256
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
 

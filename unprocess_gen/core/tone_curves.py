@@ -1,0 +1,143 @@
+"""Tables that convert codes to linear light: exact inverse tone curve and gamma expansion.
+
+Curves are computed in `decimal` with 40 digits and rounded once to float64, because powers in NumPy and libm differ
+between machines. Each entry is correctly rounded. A curve of 256 codes takes 30 ms. A curve of 65,536 codes takes 7 s
+or more, so the curves of the options in ``conf/isp`` are package data. For another ``isp.gamma``, each process that
+decodes 16-bit sources computes the curve once. The SHA-256 of the package data and of the default curves is checked.
+
+``python -m unprocess_gen.core.tone_curves`` regenerates the package data (30 s).
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import math
+from collections.abc import Callable
+from decimal import Decimal, localcontext
+from pathlib import Path
+
+import numpy as np
+
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.exact_distributions import DIGITS
+from unprocess_gen.core.lookup_tables import freeze
+from unprocess_gen.core.types import Float, gamma_text
+
+PUBLISHED_SHA256 = {
+    ("smoothstep", "2.2", 256): "d358dd03d38f763306ef83a982403114f2ff8e5397025f2c68dbe50e85503bfa",
+    ("none", "2.2", 256): "d88862390e829fe50b30dad857e46bd483eba84df9360b31afd364070f23c73e",
+    ("none", "srgb", 256): "50108edde31f5f4cb0697f42d7366a51efd4f0070109b257bf9132bf7293e2b4",
+    ("none", "1", 256): "9eb7f1f01b639e68e5f9e5442b3512c457995d4a9a0f7911e541cd839b4ba055",
+    ("smoothstep", "2.2", 65536): "0b4e6586b50ad74765f96580bfab938e3a533bc9483241cc642157054464c4af",
+    ("none", "2.2", 65536): "9d8cd64fbd28b487e83708a1bf998cb59dcca50b531d72fb42987f2a1d2e2697",
+    ("none", "srgb", 65536): "16e1d9575cec5ce1ebb97a0fe9866cf5d2c434696708e32ffa0364d683e116ed",
+    ("none", "1", 65536): "71a3e67f3353f4a46ab0945c29cfcc7a0755e61bdee98cde71aa2a85f4681341",
+}
+"""SHA-256 of the float64 values of each curve that ``conf/isp`` offers, by tone, gamma and number of codes."""
+
+STORED_CURVES = Path(__file__).parent / "data" / "curves_16bit.npz"
+"""The curves of 65,536 codes in `PUBLISHED_SHA256`, as differences of order `DIFFERENCES` of the float64 bits."""
+
+DIFFERENCES = 4
+"""Order of the stored differences. Neighbouring entries differ smoothly, so 512 kB per curve become 40 kB."""
+
+
+def linear_table(tone: str, gamma: float | str, codes: int) -> Float:
+    """Return the curve from code to linear light.
+
+    Parameters
+    ----------
+    tone : str
+        Tone curve to invert: ``"smoothstep"`` (3x² - 2x³) or ``"none"``.
+    gamma : float or str
+        Exponent of the expansion, or ``"srgb"`` for the piecewise curve of IEC 61966-2-1.
+    codes : int
+        Number of codes: 256 or 65,536.
+
+    Returns
+    -------
+    ndarray of float64, [codes]
+        Entry k is the linear light of code k, correctly rounded; from 0 to 1, ascending, read-only.
+
+    Raises
+    ------
+    ValueError
+        If ``tone`` is unknown.
+    MachineError
+        If a published curve has another SHA-256 or the package data is missing.
+    """
+    if tone not in TONES:
+        raise ValueError(f"tone={tone}: unknown tone curve; expected one of {', '.join(TONES)}")
+    return _linear_table(tone, gamma_text(gamma), codes)
+
+
+@functools.lru_cache(maxsize=8)
+def _linear_table(tone: str, gamma: str, codes: int) -> Float:
+    published = PUBLISHED_SHA256.get((tone, gamma, codes))
+    is_stored = published is not None and codes == 65536
+    table = _read_stored(tone, gamma) if is_stored else compute_curve(tone, gamma, codes)
+    return freeze(table, published)
+
+
+def smoothstep_inverse(x: Decimal) -> Decimal:
+    """Return the y in [0, 1] with 3y² - 2y³ = x, for x in [0, 1], by Newton's method."""
+    if x > Decimal("0.5"):
+        return 1 - smoothstep_inverse(1 - x)
+    if x == 0:
+        return x
+    y = Decimal(2 * math.sin(math.asin(math.sqrt(x)) / 3) * math.cos(math.pi / 6 - math.asin(math.sqrt(x)) / 3))
+    for _ in range(3):
+        y -= (y * y * (3 - 2 * y) - x) / (6 * y * (1 - y))
+    return y
+
+
+def srgb_expand(v: Decimal) -> Decimal:
+    """Return the linear light of an sRGB value in [0, 1] (IEC 61966-2-1)."""
+    if v <= Decimal("0.04045"):
+        return v / Decimal("12.92")
+    return Decimal(((v + Decimal("0.055")) / Decimal("1.055")) ** Decimal("2.4"))
+
+
+TONES: dict[str, Callable[[Decimal], Decimal]] = {"smoothstep": smoothstep_inverse, "none": lambda x: x}
+
+
+def exact_curve(tone: str, gamma: str, code: int, codes: int) -> Decimal:
+    """Return the linear light of one code to `DIGITS` digits; ``gamma`` is spelled as by `types.gamma_text`."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        v = TONES[tone](Decimal(code) / (codes - 1))
+        if gamma == "srgb":
+            return srgb_expand(v)
+        return v ** Decimal(gamma) if v else v
+
+
+def compute_curve(tone: str, gamma: str, codes: int) -> Float:
+    """Compute a curve in `decimal`, float64 [codes]."""
+    return np.array([float(exact_curve(tone, gamma, code, codes)) for code in range(codes)])
+
+
+def _read_stored(tone: str, gamma: str) -> Float:
+    """Read a curve of 65,536 codes from the package data, float64 [65536]."""
+    try:
+        with np.load(io.BytesIO(STORED_CURVES.read_bytes()), allow_pickle=False) as stored:
+            bits = stored[f"{tone}-{gamma}"]
+    except Exception as error:  # a damaged archive raises various types
+        raise MachineError(f"{STORED_CURVES}: cannot be read ({error}); reinstall unprocess_gen") from error
+    for _ in range(DIFFERENCES):
+        bits = np.cumsum(bits, dtype=np.int64)
+    return np.asarray(bits.view(np.float64))
+
+
+def store_curves(path: Path) -> None:
+    """Compute all published curves of 65,536 codes and write them to ``path``."""
+    stored = {}
+    for (tone, gamma, codes), published in PUBLISHED_SHA256.items():
+        if codes == 65536:
+            bits = freeze(compute_curve(tone, gamma, codes), published).view(np.int64)
+            stored[f"{tone}-{gamma}"] = np.diff(bits, n=DIFFERENCES, prepend=np.zeros(DIFFERENCES, dtype=np.int64))
+    np.savez_compressed(path, allow_pickle=False, **stored)
+
+
+if __name__ == "__main__":
+    store_curves(STORED_CURVES)
