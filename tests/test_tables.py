@@ -125,7 +125,7 @@ def test_a_table_cannot_be_written_to() -> None:
 
 
 def test_an_unknown_tone_is_named_with_those_that_exist() -> None:
-    with pytest.raises(ValueError, match="tone=filmic: .*expected one of smoothstep, none"):
+    with pytest.raises(ValueError, match=r"tone=filmic: .*expected one of smoothstep, none"):
         tone_curves.linear_table("filmic", 2.2, 256)
 
 
