@@ -350,7 +350,7 @@ def test_the_clean_frame_has_no_noise_profile(ds: Path) -> None:
 def test_frames_without_a_noise_profile_are_counted(folder: Path, make: Make, door: Door, tmp_path: Path) -> None:
     make(folder, tmp_path / "ds", "noise=imx385_iso3200_rvdd", "source.limit=3")
     done = door("dng", "ds", "--keys", "00000000,00000002", "--to", "to")
-    assert "2 noisy ones without NoiseProfile, which their noise law does not fit" in done.out
+    assert "2 noisy ones without NoiseProfile, which their noise distribution does not fit" in done.out
 
 
 # -------------------------------------------------------------------------------------------------------------- tags
@@ -463,9 +463,9 @@ REFUSED = [
     ([], "dng: expected the folder of a dataset"),
     (["--keys", "00000000"], "dng: expected the folder of a dataset"),
     (["DS", "--to", "to"], r"dng: missing --keys K,…: the rows to write"),
-    (["DS", "--keys=", "--to", "to"], r"dng: missing --keys K,…"),
+    (["DS", "--keys=", "--to", "to"], r"dng: --keys: a value is missing"),
     (["DS", "--keys", "00000000"], "dng: missing --to FOLDER"),
-    (["DS", "--keys", "00000000", "--to", "to", "--both"], "dng: --both: expected --keys, --to"),
+    (["DS", "--keys", "00000000", "--to", "to", "--both"], "dng: --both: no such flag; expected --keys, --to"),
     (["DS", "--keys", "00000000,00000009", "--to", "to"], "--keys 00000009: .*has no such key"),
     (["DS", "--keys", "00000000,00000001", "--to", "to"], r"--keys 00000001: failed \(\w+\), so it has no frames"),
     (["DS", "--keys", "00000000,00000004", "--to", "to"], "--keys 00000004: is 21 x 40; LibRaw.* under 22 pixels"),

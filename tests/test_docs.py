@@ -12,12 +12,15 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 import update_reference
 
-from unprocess_gen.cli.main import HELP, VERBS
+from unprocess_gen.cli.help import global_help
+from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.noise_validation import PROFILE_RANGES
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.planning.noise_profile import FORMS
 
+HELP = global_help(VERBS, conf_dir())
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 README = PAGES[0].read_text(encoding="utf-8")

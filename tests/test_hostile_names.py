@@ -275,7 +275,7 @@ def test_replay_keeps_arrays_under_keys_alone(made: Made, door: Door, tmp_path: 
 def test_verify_makes_every_pair_again(made: Made, door: Door) -> None:
     count = len(made.contents)
     done = door("verify", made.out, "--regenerate", count)
-    assert (done.code, done.out) == (0, f"{made.out} is whole; {count} pairs were made again, bit for bit\n")
+    assert (done.code, done.out) == (0, f"{made.out} is intact; {count} pairs regenerated, bit for bit\n")
 
 
 def test_raw_pairs_gives_every_name(made: Made) -> None:

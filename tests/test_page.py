@@ -418,7 +418,7 @@ def test_report_does_not_replace_a_file_of_the_dataset(to: str, copy: Path, door
     [
         ((), "report: expected the folder of a dataset"),
         (("--to", "x"), "report: expected the folder of a dataset"),
-        (("ds", "--too", "x"), "report: --too: expected --to"),
+        (("ds", "--too", "x"), "report: --too: no such flag; expected --to, "),
         (("ds", "--to", "."), "--to .: expected the name of a file"),
         (("ds", "--to", "no/such.html"), "--to no/such.html: expected the name of a file in a folder that exists"),
     ],

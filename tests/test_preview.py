@@ -419,12 +419,12 @@ def test_other_content_of_the_same_size_is_detected(few: Path, make: Make, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--keys", "77"), "--keys 77: no such key; "),
-        (("--keys", "00000000,"), "--keys : no such key; "),
+        (("--keys", "77"), "--keys 77: "),
+        (("--keys", "00000000,"), "--keys 00000000,: '' is no key; "),
         (("--keys", "00000002"), "--keys 00000002: none.png failed (unsupported) and has no pair"),
         (("--source", "nowhere"), "--source nowhere: is not a folder"),
         (("--to", "file"), "--to file: is a file; expected a folder"),
-        (("--draw", "1"), "preview: --draw: expected --keys, --to, --source"),
+        (("--draw", "1"), "preview: --draw: no such flag; expected --keys, --to, --source"),
     ],
 )
 def test_wrong_argument_gives_one_line_and_writes_nothing(
@@ -453,7 +453,7 @@ def test_dataset_argument_is_required(door: Door, arguments: tuple[str, ...]) ->
 
 
 def test_folder_argument_is_required(few: Path, door: Door) -> None:
-    assert door("preview", few).err == "gen-dataset: preview: --to is missing: the folder to draw the sheets in\n"
+    assert door("preview", few).err == "gen-dataset: preview: missing --to FOLDER: where to write the files\n"
 
 
 @pytest.mark.parametrize("inside", ["", "shards"])

@@ -234,7 +234,7 @@ def test_a_dataset_that_a_run_holds_is_left_alone(copy: Path, door: Door) -> Non
 
 def test_a_whole_dataset_is_not_touched(whole: Path, copy: Path, door: Door) -> None:
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*")}
-    assert door("verify", copy, "--repair").out == f"{copy} is whole\n"
+    assert door("verify", copy, "--repair").out == f"{copy} is intact\n"
     assert {path: path.stat().st_mtime_ns for path in copy.rglob("*")} == before
 
 

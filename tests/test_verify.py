@@ -182,7 +182,7 @@ def test_the_command_ends_with_4_and_a_line_for_each_damage(copy: Path, door: Do
 
 
 def test_the_command_says_that_a_dataset_is_whole(copy: Path, door: Door) -> None:
-    assert door("verify", copy) == (0, f"{copy} is whole\n", "")
+    assert door("verify", copy) == (0, f"{copy} is intact\n", "")
 
 
 # Replay ---------------------------------------------------------------------------------------------------------------
@@ -249,7 +249,7 @@ def test_a_row_of_a_file_needs_a_folder(whole: Path) -> None:
 
 def test_verify_makes_pairs_again_on_request(whole: Path, door: Door) -> None:
     done = door("verify", whole, "--regenerate", "2")
-    assert (done.code, done.out) == (0, f"{whole} is whole; 2 pairs were made again, bit for bit\n")
+    assert (done.code, done.out) == (0, f"{whole} is intact; 2 pairs regenerated, bit for bit\n")
 
 
 def test_verify_names_a_source_that_changed(whole: Path, door: Door, tmp_path: Path) -> None:

@@ -1,0 +1,220 @@
+"""Complete command lines in bash and zsh: verbs, flags, settings and options.
+
+``gen-dataset completion bash`` prints a script. Its function calls ``gen-dataset completion query LINE`` for the line
+up to the cursor, and gets a kind of completion (``words``, ``folders``, ``files``) and the candidates.
+
+Design: ``docs/design/command_line.md``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shlex
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Argument, Call, Verb
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.suggestions import did_you_mean
+
+SHELLS = ("bash", "zsh")
+QUERY = "query"
+"""Word of the completion scripts; not for users."""
+
+WORDS, FOLDERS, FILES = "words", "folders", "files"
+
+BASH = r"""
+_gen_dataset() {
+    local IFS=$'\n' lines word=${COMP_WORDS[COMP_CWORD]}
+    lines=($("$1" completion query "${COMP_LINE:0:COMP_POINT}" 2>/dev/null)) || return
+    [[ $word == "=" ]] && word=
+    case ${lines[0]} in
+        folders) compopt -o filenames; COMPREPLY=($(compgen -d -- "$word")) ;;
+        files) compopt -o filenames; COMPREPLY=($(compgen -f -- "$word")) ;;
+        words)
+            COMPREPLY=("${lines[@]:1}")
+            if [[ $COMP_WORDBREAKS == *=* ]]; then  # bash replaces only what follows the last "="
+                local typed=${COMP_LINE:0:COMP_POINT}
+                typed=${typed##*[[:space:]]}
+                if [[ $typed == *=* ]]; then COMPREPLY=("${COMPREPLY[@]#"${typed%=*}="}"); fi
+            fi
+            [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *[.=] ]] && compopt -o nospace ;;
+    esac
+    return 0
+}
+complete -F _gen_dataset gen-dataset
+"""
+
+ZSH = r"""
+_gen_dataset() {
+    local -a lines
+    lines=("${(@f)$("${words[1]}" completion query "${(j: :)words[1,CURRENT-1]} $PREFIX" 2>/dev/null)}")
+    case ${lines[1]} in
+        folders) compset -P '*='; _files -/ ;;
+        files) compset -P '*='; _files ;;
+        words)
+            compadd -- ${(M)lines[2,-1]:#*[^.=]}
+            compadd -S '' -- ${(M)lines[2,-1]:#*[.=]} ;;
+    esac
+}
+(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }
+compdef _gen_dataset gen-dataset
+"""
+
+SWITCHED = ("auto", "on", "off")
+"""Values of each effect."""
+
+
+def print_completion(call: Call, verbs: Mapping[str, Verb]) -> int:
+    """Print the script of a shell, or the candidates for its query.
+
+    Parameters
+    ----------
+    call : Call
+        Parsed command line: the name of a shell, or ``query`` and the line up to the cursor.
+    verbs : mapping of str to Verb
+        The verbs by name.
+
+    Returns
+    -------
+    int
+        Exit code.
+
+    Raises
+    ------
+    ConfigError
+        If the shell is unknown.
+    """
+    words = call.words
+    if words[:1] == [QUERY] and len(words) == 2:
+        kind, candidates = complete(words[1], verbs)
+        print("\n".join([kind, *candidates]))
+        return 0
+    scripts = dict(zip(SHELLS, (BASH, ZSH), strict=True))
+    if len(words) != 1 or words[0] not in scripts:
+        word = " ".join(words)
+        raise ConfigError(f"completion: {word or 'no shell'}: expected bash or zsh{did_you_mean(word, SHELLS)}")
+    print(scripts[words[0]].lstrip("\n"), end="")
+    return 0
+
+
+def complete(line: str, verbs: Mapping[str, Verb]) -> tuple[str, list[str]]:
+    """Return how the last word of a command line can be completed.
+
+    Parameters
+    ----------
+    line : str
+        The command line up to the cursor.
+    verbs : mapping of str to Verb
+        The verbs by name.
+
+    Returns
+    -------
+    kind : str
+        ``folders`` or ``files`` if the shell shall complete a name; else ``words``.
+    candidates : list of str
+        Complete words that begin with the last word of the line; for ``words`` only.
+    """
+    *before, current = _split(line)
+    name = next(iter(before[1:2]), "")
+    verb = verbs.get(name, verbs["generate"])
+    arguments = (*verb.arguments, *STANDARD)
+    last = before[-1] if len(before) > 1 else ""
+    for argument in arguments:
+        if argument.metavar and last in argument.flags:
+            return argument.completes or WORDS, []
+    for spellings, (values, _) in HYDRA_FLAGS.items() if verb.composes else ():
+        if last in spellings and values:
+            return (WORDS, _starting(current, values)) if values != ANY_VALUE else (FILES, [])
+    if current.startswith("-"):
+        return WORDS, _starting(current, _flags(verb, arguments, first=len(before) == 1))
+    key, equals, _ = current.partition("=")
+    for argument in arguments:
+        if equals and key in argument.settings:
+            return argument.completes or WORDS, []
+    if equals and verb.composes:
+        return _values(key, current, _option_folders(before))
+    candidates = [f"{key}=" for argument in arguments for key in argument.settings]
+    if len(before) == 1 and re.fullmatch("[a-z]*", current):
+        candidates += verbs
+    if verb.composes:
+        candidates += _settings(current, _option_folders(before))
+    candidates += verb.words
+    found = _starting(current, candidates)
+    if verb.place is not None and not found:
+        return verb.place.completes, []
+    if verb.place is not None and not current:
+        return verb.place.completes, []
+    return WORDS, found
+
+
+def _split(line: str) -> list[str]:
+    """Split a line into words, the last of them up to the cursor; an open quotation mark ends with the line."""
+    for closing in ("", "'", '"'):
+        try:
+            words = shlex.split(line + closing)
+        except ValueError:
+            continue
+        return [*words, ""] if not closing and line[-1:].isspace() else words or [""]
+    return ["", ""]
+
+
+def _starting(prefix: str, candidates: Iterable[str]) -> list[str]:
+    return sorted({candidate for candidate in candidates if candidate.startswith(prefix)})
+
+
+def _flags(verb: Verb, arguments: Iterable[Argument], first: bool) -> list[str]:
+    flags = [flag for argument in arguments for flag in argument.flags]
+    hydra = [flag for spellings in HYDRA_FLAGS for flag in spellings] if verb.composes else []
+    return [*flags, *hydra, "-h", "--help", *(["--version"] if first else [])]
+
+
+def _option_folders(words: list[str]) -> list[Path]:
+    """Return the folders of options: the built-in one, and those of ``--config-dir`` on the line."""
+    named = [word.partition("=")[2] for word in words if re.match("(--config-dir|-cd)=", word)]
+    named += [value for flag, value in itertools.pairwise(words) if flag in ("--config-dir", "-cd")]
+    return [conf_dir(), *(Path(folder).expanduser() for folder in named)]
+
+
+def _settings(current: str, folders: list[Path]) -> list[str]:
+    """Return keys as far as they are typed: ``camera=``, ``camera.``, and the keys of ``camera.`` once it is typed."""
+    from unprocess_gen.config.schema import Config
+
+    added = {path.name for folder in folders for path in folder.glob("*/")}
+    keys: list[str] = []
+    for field in fields(Config):
+        keys.append(f"{field.name}.") if is_dataclass(_default(field)) else keys.append(f"{field.name}=")
+        if is_dataclass(_default(field)):
+            if len(group_options(field.name, *folders)) > 1:
+                keys.append(f"{field.name}=")
+            if current.startswith(f"{field.name}."):
+                keys += [f"{field.name}.{key.name}=" for key in fields(_default(field))]
+    typed = current.endswith(".") or "." in current
+    plus = sorted(added - {field.name for field in fields(Config)})
+    return [key for key in keys if not (typed and key.endswith("."))] + [f"+{group}=" for group in plus]
+
+
+def _default(field: Any) -> Any:
+    return field.default_factory() if callable(field.default_factory) else field.default
+
+
+def _values(key: str, current: str, folders: list[Path]) -> tuple[str, list[str]]:
+    """Return the values of a key: options of a group, true and false, the states of an effect, folders."""
+    from unprocess_gen.config.schema import Config
+
+    if key == "out":
+        return FOLDERS, []
+    if key == "source.root":
+        return FILES, []
+    group, _, name = key.lstrip("+").partition(".")
+    values: Iterable[str] = () if name else group_options(group, *folders)
+    default = getattr(getattr(Config(), group, None), name, None) if name else getattr(Config(), group, None)
+    if isinstance(default, bool):
+        values = ("true", "false")
+    elif group == "effects" and name and name != "tolerance":
+        values = SWITCHED
+    return WORDS, _starting(current, (f"{key}={value}" for value in values))

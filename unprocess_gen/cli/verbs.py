@@ -1,0 +1,527 @@
+"""The verbs of ``gen-dataset``: one function each, and `VERBS`, which describes them.
+
+A function takes the parsed command line and returns the exit code. It imports what it needs, because importing the
+kernels or Hydra takes longer than ``--help`` may take.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import shlex
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from unprocess_gen.cli.arguments import SOURCE, Argument, Call, Place, Verb
+from unprocess_gen.cli.completion import SHELLS, print_completion
+from unprocess_gen.cli.messages import print_result, report, report_error
+from unprocess_gen.cli.sweep import worst
+from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
+
+if TYPE_CHECKING:
+    from unprocess_gen.config.schema import AccuracyConfig, Config
+    from unprocess_gen.core.types import Row
+    from unprocess_gen.pipeline.generate import Summary
+    from unprocess_gen.pipeline.replay import ReplayResult
+    from unprocess_gen.pipeline.verify import Damage
+
+# ------------------------------------------------------------------------------------------- verbs that take settings
+
+
+def run_generate(call: Call) -> int:
+    """Generate a dataset, or one for each combination of a sweep."""
+    from unprocess_gen.cli.hydra_app import compose
+
+    return compose(call.overrides, generate_dataset, sweep_csv=True)
+
+
+def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary]:
+    """Generate one dataset and print its summary.
+
+    Parameters
+    ----------
+    config : Config
+        Validated config.
+    label : str
+        Name of the job and its place in a sweep.
+
+    Returns
+    -------
+    tuple of int and Summary
+        Exit code: 3 if more sources failed than ``source.max_failed`` allows; and what was generated.
+    """
+    from unprocess_gen.pipeline.generate import generate
+
+    summary = generate(config)
+    print_result(_summary_line(summary))
+    if summary.made and summary.sites["all"]:
+        print_result(_clipping_line(summary.sites))
+    too_many = sum(summary.failed.values()) > config.source.max_failed
+    return 3 if too_many else 0, summary
+
+
+def _summary_line(summary: Summary) -> str:
+    failed = ", ".join(f"{count} {reason}" for reason, count in summary.failed.items())
+    facts = f"{summary.pairs} pairs in {summary.shards} shards, {summary.bytes / 1e6:,.1f} MB, " + (
+        f"{sum(summary.failed.values())} failed ({failed}; see {summary.out}/manifest.csv)" if failed else "0 failed"
+    )
+    if not summary.made:
+        return f"{summary.out} is complete: {facts}; nothing to do"
+    return f"{summary.out}: {facts}; {summary.made} of {summary.rows} made now, {summary.seconds:.1f} s"
+
+
+def _clipping_line(sites: dict[str, int]) -> str:
+    """Return the shares of clipped and saturated sites, so that clipping does not go unnoticed in training data."""
+    share = {name: f"{count / sites['all']:.3%}" for name, count in sites.items()}
+    return (
+        f"of {sites['all']:,} sites, clean: {share['clean_clipped_low']} were clipped at black, "
+        f"{share['clean_clipped_high']} at white, {share['saturated']} are saturated; "
+        f"noisy: {share['noisy_clipped_low']} were clipped low, {share['noisy_clipped_high']} high; "
+        f"{share['zero_variance']} have no noise variance"
+    )
+
+
+def run_plan(call: Call) -> int:
+    """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
+    from unprocess_gen.cli.hydra_app import compose
+
+    return compose(call.overrides, partial(_plan, read_all="all" in call.values))
+
+
+def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, None]:
+    from unprocess_gen.pipeline.executors.local import effective_jobs
+    from unprocess_gen.reports.estimate import estimate_run, format_estimate
+
+    estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
+    print_result(f"out       {config.out}")
+    print_result(format_estimate(config, estimate))
+    return 0, None
+
+
+def run_accuracy(call: Call) -> int:
+    """Measure error and time of every method and tier, and write a report."""
+    from unprocess_gen.cli.hydra_app import compose
+
+    overrides = _with_out(call.overrides, "accuracy")
+    return compose(overrides, partial(_accuracy, command=shlex.join(["gen-dataset", "accuracy", *overrides])))
+
+
+def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None]:
+    from unprocess_gen.config.schema import NoiseConfig, SensorConfig
+    from unprocess_gen.config.serialization import read_option
+    from unprocess_gen.reports import report_files
+    from unprocess_gen.reports.benchmark import measure
+    from unprocess_gen.reports.benchmark import report as benchmark_report
+
+    out = Path(config.out)
+    report_files.check_report_folder(out, "accuracy")
+    noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
+    profiles = measure.BenchmarkProfiles(
+        _tiers(),
+        read_option(noise / "imx385_iso3200.yaml", NoiseConfig),
+        read_option(noise / "sony_a7s2.yaml", NoiseConfig),
+        read_option(sensor / "generic_14bit.yaml", SensorConfig),
+    )
+    benchmark = measure.measure_accuracy(config, profiles, command=command)
+    benchmark_report.write_benchmark(benchmark, out)
+    print_result(benchmark_report.text_table(benchmark.rows))
+    print_result(f"{out}: {', '.join(benchmark_report.FILES)}")
+    return 0, None
+
+
+def _tiers() -> dict[str, AccuracyConfig]:
+    """Return every tier of ``conf/accuracy``, the reference first."""
+    from unprocess_gen.config.schema import AccuracyConfig
+    from unprocess_gen.config.serialization import read_option
+
+    files = sorted((conf_dir() / "accuracy").glob("*.yaml"), key=lambda path: (path.stem != "reference", path.stem))
+    return {path.stem: read_option(path, AccuracyConfig) for path in files}
+
+
+FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
+"""Settings that ``figures`` accepts; the article determines the others."""
+
+
+def run_figures(call: Call) -> int:
+    """Draw the article's figures for one photograph."""
+    from unprocess_gen.cli.hydra_app import compose
+
+    for override in call.overrides:
+        if "=" in override and not override.startswith("-") and re.split(r"[.=]", override)[0] not in FIGURE_KEYS:
+            raise ConfigError(f"figures: {override}: the article sets it; expected {', '.join(FIGURE_KEYS)}")
+    overrides = _with_out(call.overrides, "figures")
+    return compose(overrides, partial(_figures, command=shlex.join(["gen-dataset", "figures", *overrides])))
+
+
+def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None]:
+    from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+    from unprocess_gen.config.serialization import read_option
+    from unprocess_gen.reports import paper_figures, report_files
+
+    out = Path(config.out)
+    report_files.check_report_folder(out, "figures")
+    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_figures.GAINS}
+    authors = read_option(conf_dir() / "noise" / f"{paper_figures.AUTHORS_NOISE}.yaml", NoiseConfig)
+    drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
+    print_result(f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}")
+    return 0, None
+
+
+def _with_out(overrides: list[str], out: str) -> list[str]:
+    """Add a verb's own default of ``out``, so that a report never goes into a dataset's folder."""
+    return overrides if any(override.startswith("out=") for override in overrides) else [*overrides, f"out={out}"]
+
+
+# ------------------------------------------------------------------------------------------ verbs that take a dataset
+
+
+def run_again(call: Call) -> int:
+    """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
+    from unprocess_gen.config.serialization import read_dataset_yaml
+    from unprocess_gen.config.validation import validate_config
+    from unprocess_gen.pipeline.replay import source_root
+    from unprocess_gen.pipeline.verify import have_same_rows
+
+    folder = _dataset("again", call)
+    config, kind = read_dataset_yaml(folder / "config.yaml")
+    if "out" not in call.values:
+        raise ConfigError("again: out=… is missing; expected the folder for the new dataset")
+    root = call.values.get("source")
+    if kind != "folder" and root is not None:
+        raise ConfigError(
+            f"again: source.root={root}: {folder} was made from a source of kind {kind}; leave source.root out"
+        )
+    if kind == "folder":
+        root = source_root(folder / "manifest.csv", root)
+        if root is None:
+            raise ConfigError(
+                f"again: {folder} was made from a source of kind folder and does not record which; give source.root=…"
+            )
+    config.out, config.source.root = call.values["out"], root
+    config.n_jobs = call.values.get("n_jobs", config.n_jobs)
+    config.source.max_failed = call.values.get("max_failed", config.source.max_failed)
+    validate_config(config)
+    code, _ = generate_dataset(config)
+    old, new = folder / "manifest.csv", Path(config.out) / "manifest.csv"
+    if not old.exists():
+        print_result(f"{folder} has no manifest.csv to compare with")
+    elif not have_same_rows(old, new):
+        raise DamageError(f"{new}: differs from that of {folder}; check that the sources are the same")
+    else:
+        print_result(f"the same as {folder}, bit for bit")
+    return code
+
+
+def run_verify(call: Call) -> int:
+    """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
+    from unprocess_gen.pipeline.verify import is_sweep, verify, verify_sweep
+
+    folder = call.path
+    assert folder is not None
+    if not is_sweep(folder):
+        return _finish_verification(folder, verify(folder), call)
+    codes = []
+    for result in verify_sweep(folder):
+        try:
+            codes.append(_finish_verification(folder / result.folder, result.damages, call))
+        except UnprocessGenError as error:  # the other datasets are verified nevertheless
+            codes.append(report_error(error))
+    intact = codes.count(0)
+    print_result(f"{folder}: {intact} of {len(codes)} datasets are intact")
+    return worst(codes)
+
+
+def _finish_verification(folder: Path, found: Iterable[Damage], call: Call) -> int:
+    """Report the damage of a dataset; repair, regenerate and fit the noise as the flags ask; return the exit code."""
+    from unprocess_gen.pipeline.repair import repair
+    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
+    from unprocess_gen.pipeline.verify import verify
+
+    manifest, root = folder / "manifest.csv", call.values.get("source")
+    codes: list[int] = []
+    damages = _reported(folder, found)
+    if damages and "repair" in call.values:
+        for step in repair(folder, source_root(manifest, root)):
+            if step.repaired:
+                print_result(step)
+            else:
+                report(str(step), logging.ERROR)
+            codes.append(step.exit_code)
+        damages = _reported(folder, verify(folder))
+    count, regenerated = call.values.get("regenerate", 0), 0
+    if count and not damages:
+        replayed = list(replay(evenly_spaced_rows(manifest, count), source_root(manifest, root)))
+        regenerated, codes = len(replayed), [result.exit_code for result in replayed]
+        damages += _reported(folder, (_complaint(result) for result in replayed if result.complaint))
+    if "noise" in call.values and not damages:
+        damages += _check_noise(folder, call.values.get("to"))
+    if damages:
+        return worst(codes) or DamageError.exit_code
+    print_result(f"{folder} is intact" + (f"; {regenerated} pairs regenerated, bit for bit" if regenerated else ""))
+    return 0
+
+
+def _complaint(result: ReplayResult) -> str:
+    return f"{result.key} ({result.source}): {result.complaint}"
+
+
+def _check_noise(folder: Path, to: str | None) -> list[str]:
+    """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
+    from unprocess_gen.reports import photon_transfer
+
+    fits = photon_transfer.fit_dataset(folder)
+    if fits.worst is None:
+        print_result(f"{folder}: no pair has enough sites to fit its noise")
+        return []
+    print_result(
+        f"noise of {fits.count} pairs fitted (a, b with 95 % intervals); the farthest from its row: {fits.worst}"
+    )
+    if to is not None:
+        photon_transfer.draw_fits(fits.first, Path(to))
+        print_result(f"drawn in {to}")
+    return _reported(folder, (f"noise of {fit}" for fit in fits.wrong))
+
+
+def _reported(folder: Path, damages: Iterable[object]) -> list[str]:
+    """Report damages on stderr; return them as text."""
+    texts = [str(damage) for damage in damages]
+    for text in texts:
+        report(f"{folder}: {text}", logging.ERROR)
+    return texts
+
+
+def run_replay(call: Call) -> int:
+    """Regenerate rows of a manifest, and compare or write their arrays."""
+    from unprocess_gen.dataset.selection import select_rows
+    from unprocess_gen.pipeline.replay import replay, source_root
+
+    manifest = _dataset("replay", call)
+    manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
+    to = Path(call.values["to"]) if "to" in call.values else None
+    skipped: list[Row] = []
+    rows = select_rows(manifest, call.values.get("rows"), call.values.get("keys"), skipped)
+    codes = []
+    for result in replay(rows, source_root(manifest, call.values.get("source")), to):
+        codes.append(result.exit_code)
+        if result.complaint:
+            report(_complaint(result), logging.ERROR)
+    same = codes.count(0)
+    print_result(
+        f"{same} pairs are the same, bit for bit; {len(codes) - same} are not"
+        + (f"; arrays in {to}" if to else "")
+        + _skipped(len(skipped))
+    )
+    return worst(codes)
+
+
+def _skipped(failed: int) -> str:
+    """Return the end of a verb's result that counts failed rows inside ranges of ``--keys``."""
+    return f"; {failed} failed rows skipped" if failed else ""
+
+
+def run_report(call: Call) -> int:
+    """Write the HTML page of a dataset."""
+    from unprocess_gen.reports.dataset_report import write_dataset_report
+
+    folder = _dataset("report", call)
+    to, root = call.values.get("to"), call.values.get("source")
+    print_result(write_dataset_report(folder, None if to is None else Path(to), None if root is None else Path(root)))
+    return 0
+
+
+def run_preview(call: Call) -> int:
+    """Draw contact sheets of pairs."""
+    from unprocess_gen.dataset.selection import select_pairs
+    from unprocess_gen.reports.contact_sheet import write_sheets
+
+    folder = _dataset("preview", call)
+    to, root, with_stages = _folder_to("preview", call), call.values.get("source"), "stages" in call.values
+    keys: list[str] = []
+    failed = files = 0
+    if "keys" in call.values:
+        selected = select_pairs(folder / "manifest.csv", call.values["keys"])
+        keys, failed = [str(row["key"]) for row in selected.rows.values()], selected.failed
+    for sheet in write_sheets(folder, to, keys, None if root is None else Path(root), with_stages):
+        files += len(sheet.files)
+        if sheet.missing_source:
+            omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
+            report(f"{sheet.key} ({sheet.source}): {omitted} left out: {sheet.missing_source}")
+    print_result(f"{files} pictures in {to}{_skipped(failed)}")
+    return 0
+
+
+def run_dng(call: Call) -> int:
+    """Write frames as DNG files."""
+    from unprocess_gen.dataset.dng import FRAMES, export
+    from unprocess_gen.dataset.selection import select_pairs
+
+    folder = _dataset("dng", call)
+    if "keys" not in call.values:
+        raise ConfigError("dng: missing --keys K,…: the rows to write")
+    to = _folder_to("dng", call)
+    frames = [frame for frame in FRAMES if frame in call.values] or FRAMES
+    exported = export(folder, call.values["keys"], frames, to)
+    counts = (
+        (exported.written, "DNG files written"),
+        (exported.present, "were there already, the same"),
+        (exported.without_profile, "noisy ones without NoiseProfile, which their noise distribution does not fit"),
+        (select_pairs(folder / "manifest.csv", call.values["keys"]).failed, "failed rows skipped"),
+    )
+    print_result(f"{to}: " + "; ".join(f"{count} {what}" for count, what in counts if count))
+    return 0
+
+
+def _folder_to(verb: str, call: Call) -> Path:
+    if "to" not in call.values:
+        raise ConfigError(f"{verb}: missing --to FOLDER: where to write the files")
+    return Path(call.values["to"])
+
+
+def _dataset(verb: str, call: Call) -> Path:
+    """Return the verb's dataset; refuse the folder of a sweep with the name of one of its datasets."""
+    path = call.path
+    assert path is not None
+    if (path / "sweep.csv").is_file() and not (path / "dataset.json").exists():
+        datasets = sorted(file.parent for file in path.glob("*/dataset.json"))
+        example = f", such as {datasets[0]}" if datasets else ""
+        raise ConfigError(f"{verb}: {path}: is the folder of a sweep; expected one of its datasets{example}")
+    return path
+
+
+# ------------------------------------------------------------------------------------------------------- the table
+
+DATASET = Place("DIR", "the folder of a dataset")
+KEYS = Argument(
+    ("--keys",), "rows: source indices and ranges, full keys, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
+)
+
+
+def _count(text: str) -> int:
+    if (number := int(text)) < 0:
+        raise ValueError
+    return number
+
+
+def _whole_number(names: tuple[str, ...], text: str, metavar: str = "N") -> Argument:
+    return Argument(names, text, metavar, int, "an integer")
+
+
+SETTINGS_SOURCE = Argument(
+    ("--source",), "folder of the photographs, or one photograph: source.root=ROOT", "ROOT", completes="files"
+)
+
+VERBS: dict[str, Verb] = {
+    verb.name: verb
+    for verb in (
+        Verb(
+            "generate",
+            "generate a dataset; the default verb",
+            run_generate,
+            (SETTINGS_SOURCE,),
+            composes=True,
+            resumes=True,
+        ),
+        Verb(
+            "plan",
+            "estimate pairs, bytes and time, and explain the effects; write nothing",
+            run_plan,
+            (Argument(("--all",), "read every photograph, for exact sizes"), SETTINGS_SOURCE),
+            composes=True,
+        ),
+        Verb(
+            "accuracy",
+            "measure what accuracy costs in time, and report it in out (accuracy)",
+            run_accuracy,
+            (SETTINGS_SOURCE,),
+            composes=True,
+        ),
+        Verb(
+            "figures",
+            "draw the article's figures on the first photograph, in out (figures)",
+            run_figures,
+            (SETTINGS_SOURCE,),
+            composes=True,
+        ),
+        Verb(
+            "verify",
+            "check every byte of a dataset or sweep; repair, regenerate, fit the noise",
+            run_verify,
+            (
+                SOURCE,
+                Argument(
+                    ("--regenerate",), "regenerate N pairs and compare them", "N", _count, "an integer of 0 or more"
+                ),
+                Argument(("--to",), "with --noise: draw the fits in FILE (PNG)", "FILE", completes="files"),
+                Argument(("--repair",), "restore damaged files to the same bytes"),
+                Argument(("--noise",), "fit the noise in the arrays and compare it with the manifest"),
+            ),
+            Place("DIR", "the folder of a dataset or of a sweep"),
+        ),
+        Verb(
+            "replay",
+            "regenerate rows and compare them, or write their arrays",
+            run_replay,
+            (
+                SOURCE,
+                Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
+                KEYS,
+                Argument(("--to",), "write the arrays to FOLDER", "FOLDER", completes="folders"),
+            ),
+            Place("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
+        ),
+        Verb(
+            "report",
+            "write an HTML page about a dataset",
+            run_report,
+            (Argument(("--to",), "write FILE instead of DIR/report.html", "FILE", completes="files"), SOURCE),
+            DATASET,
+        ),
+        Verb(
+            "preview",
+            "draw contact sheets of pairs, and of each processing step",
+            run_preview,
+            (
+                KEYS,
+                Argument(("--to",), "write the pictures to FOLDER", "FOLDER", completes="folders"),
+                SOURCE,
+                Argument(("--stages",), "draw each processing step too"),
+            ),
+            DATASET,
+        ),
+        Verb(
+            "dng",
+            "write frames as DNG files, for raw converters",
+            run_dng,
+            (
+                KEYS,
+                Argument(("--to",), "write the files to FOLDER", "FOLDER", completes="folders"),
+                Argument(("--noisy",), "only noisy frames"),
+                Argument(("--clean",), "only clean frames"),
+            ),
+            DATASET,
+        ),
+        Verb(
+            "again",
+            "regenerate a dataset from its config.yaml in another folder, and compare",
+            run_again,
+            (
+                SOURCE,
+                Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders"),
+                _whole_number(("n_jobs",), "worker processes; -1: all cores"),
+                _whole_number(("source.max_failed",), "failed images before the exit code is 3"),
+            ),
+            DATASET,
+            resumes=True,
+        ),
+        Verb(
+            "completion",
+            'print a completion script: eval "$(gen-dataset completion bash)"',
+            lambda call: print_completion(call, VERBS),
+            words=SHELLS,
+        ),
+    )
+}
+"""The verbs by name, in the order of the help."""
