@@ -421,7 +421,7 @@ def test_other_content_of_the_same_size_is_detected(few: Path, make: Make, tmp_p
     [
         (("--keys", "77"), "--keys 77: "),
         (("--keys", "00000000,"), "--keys 00000000,: '' is no key; "),
-        (("--keys", "00000002"), "--keys 00000002: none.png failed (unsupported) and has no pair"),
+        (("--keys", "00000002"), "--keys 00000002: failed (unsupported), so it has no frames"),
         (("--source", "nowhere"), "--source nowhere: is not a folder"),
         (("--to", "file"), "--to file: is a file; expected a folder"),
         (("--draw", "1"), "preview: --draw: no such flag; expected --keys, --to, --source"),
