@@ -101,7 +101,7 @@ def test_a_method_is_measured_under_a_budget_that_takes_it(method: Any) -> None:
 def test_a_method_is_measured_with_no_other_form_than_its_own() -> None:
     exact = set(choose_methods(accuracy_budget(TIERS[EXACT]), counts_electrons=True))
     for method in METHODS:
-        if method.form == "float64":
+        if method.implementation == "float64":
             chosen = set(choose_methods(accuracy_budget(accuracy.alone(method, TIERS)), counts_electrons=True))
             assert len(chosen - exact) <= 1
 

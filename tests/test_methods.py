@@ -11,7 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.accuracy import FORMS, METHODS, STAGES, Budget, choose_methods, method, methods_of_stage
+from unprocess_gen.config.accuracy import (
+    IMPLEMENTATIONS,
+    METHODS,
+    STAGES,
+    Budget,
+    choose_methods,
+    method,
+    methods_of_stage,
+)
 from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
@@ -63,12 +71,12 @@ def test_counts_are_taken_for_normals_where_the_budget_allows() -> None:
 def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
     some = Budget("some", False, dn, share, normal, distance)
     chosen = [method(*spelled.split(":")) for spelled in choose_methods(some, counts_electrons=False)]
-    cheaper = FORMS[: FORMS.index(chosen[0].form)]
+    cheaper = IMPLEMENTATIONS[: IMPLEMENTATIONS.index(chosen[0].implementation)]
 
-    assert len({one.form for one in chosen}) == 1
+    assert len({one.implementation for one in chosen}) == 1
     assert all(one.fits(some) for one in chosen)
     for form in cheaper:
-        assert not all(one.fits(some) for one in METHODS if one.form == form)
+        assert not all(one.fits(some) for one in METHODS if one.implementation == form)
 
 
 def test_the_exact_tier_gives_no_dn_away() -> None:
@@ -99,7 +107,10 @@ def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("accuracy.normal_error=1e-9", "accuracy.normal_error=1e-09: the best that can be had is 1.5e-07 (normal:"),
+        (
+            "accuracy.normal_error=1e-9",
+            "accuracy.normal_error=1e-09: no method is that accurate; expected at least 1.5e-07",
+        ),
         ("accuracy.clean_dn=-1", "accuracy.clean_dn=-1.0: expected a number of 0 or more"),
         ("accuracy.law_distance=nan", "accuracy.law_distance=nan: expected a number of 0 or more"),
         ("accuracy.name='a b'", "accuracy.name='a b': expected up to 100 letters"),
@@ -197,9 +208,9 @@ def test_the_distance_is_the_greatest_difference_of_the_two_distribution_functio
 def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
     """Cheapest first; the readable form last, and there is one."""
     for stage in STAGES:
-        forms = [FORMS.index(one.form) for one in methods_of_stage(stage)]
+        forms = [IMPLEMENTATIONS.index(one.implementation) for one in methods_of_stage(stage)]
         assert forms == sorted(forms)
-        assert forms[-1] == FORMS.index("numpy")
+        assert forms[-1] == IMPLEMENTATIONS.index("numpy")
 
 
 def test_a_method_is_named_once() -> None:

@@ -1,12 +1,14 @@
-"""How each stage can be computed, what each way is off by, and the first that a budget of accuracy can afford.
+"""Declare the methods of each stage with their errors, and choose the first that a budget of errors allows.
 
-A method states its worst error against the reference; the tests prove the statements, exhaustively where the domain is
-finite. Within a stage the methods stand in a fixed order, cheapest first, as measured once: a choice by what a machine
-measures would make the data depend on the machine. `gen-dataset accuracy` measures what the order is worth.
+Each `Method` states its largest error against the reference. Tests prove the statements, exhaustively if the domain is
+finite. Methods are tried in a fixed order of cost, never in a measured one: the data must not depend on the machine.
+``gen-dataset accuracy`` measures what each method costs and errs.
 
-Errors of the clean frame are those of the whole frame with every stage in that precision, since one kernel serves them
-all; those of normals are against the true quantile of their word, in standard deviations, so that the reference has one
-too (the quadratics of `tables.normal_table`).
+Errors of the clean frame are those of a frame whose stages all have the method's precision, because one kernel computes
+them all. Errors of normal deviates are against the true quantile, in standard deviations; so the reference has one too
+(the quadratics of `core.lookup_tables.normal_table`).
+
+How the error statements were obtained: ``docs/design/accuracy.md``.
 """
 
 from __future__ import annotations
@@ -20,11 +22,23 @@ from unprocess_gen.core.types import Plan
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What may be given up for speed.
+    """Limit the errors accepted for speed.
 
-    ``readable``: only forms that one can read will do. ``clean_dn``: largest error of a DN of the clean frame, and
-    ``clean_changed_share`` the share of them that may be off at all, at 14 bits. ``normal_error``: of a normal, in
-    standard deviations. ``law_distance``: of the law of shot and read noise together, in total variation.
+    Attributes
+    ----------
+    name : str
+        Name of the tier, recorded in each row.
+    readable : bool
+        Allow only the NumPy reference.
+    clean_dn : float
+        Largest error of a clean value, DN.
+    clean_changed_share : float
+        Largest fraction of clean values that differ, at 14 bits.
+    normal_error : float
+        Largest error of a normal deviate, in standard deviations.
+    law_distance : float
+        Largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead, by
+        the first Edgeworth term (`simulation.reference.poisson.gaussian_distance`).
     """
 
     name: str
@@ -37,14 +51,25 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One way to compute a stage; its errors are zero where they are not stated.
+    """Describe one way to compute a stage. Errors that are not stated are zero.
 
-    ``form``: which of `FORMS` it belongs to.
+    Attributes
+    ----------
+    stage, name : str
+        Identify the method in rows, as ``stage:name``.
+    implementation : str
+        One of `IMPLEMENTATIONS`.
+    meaning : str
+        Description for the accuracy report.
+    clean_dn, clean_changed_share, normal_error : float
+        Largest errors; units as in `Budget`.
+    approximates_law : bool
+        Whether a normal distribution replaces the Poisson distribution within ``Budget.law_distance``.
     """
 
     stage: str
     name: str
-    form: str
+    implementation: str
     meaning: str
     clean_dn: float = 0.0
     clean_changed_share: float = 0.0
@@ -53,16 +78,16 @@ class Method:
 
     @property
     def spelled(self) -> str:
-        """How a row names it."""
+        """Return ``stage:name``, the name in rows."""
         return f"{self.stage}:{self.name}"
 
     @property
     def readable(self) -> bool:
-        """Whether it is a form that one can read."""
-        return self.form == "numpy"
+        """Return whether the method belongs to the NumPy reference."""
+        return self.implementation == "numpy"
 
     def fits(self, budget: Budget) -> bool:
-        """Whether a budget can afford it."""
+        """Return whether all errors of the method are within a budget."""
         return (
             (self.readable or not budget.readable)
             and self.clean_dn <= budget.clean_dn
@@ -72,11 +97,14 @@ class Method:
         )
 
 
-FORMS = ("float32", "float64", "numpy")
-"""Forms of a whole pair, cheapest first: the stages of one kernel are computed in its precision, all or none."""
+IMPLEMENTATIONS = ("float32", "float64", "numpy")
+"""Implementations of a pair, cheapest first. One kernel computes several stages, so all stages use the same one."""
 
 FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE = 1.0, 5e-4
+"""Errors of the clean frame in float32: largest, DN, and fraction of values that differ, at 14 bits."""
+
 QUADRATIC_NORMAL, POLYNOMIAL_NORMAL = 1.5e-7, 5.8e-4
+"""Errors of normal deviates by 1024 quadratics and by a polynomial, in standard deviations."""
 
 
 def _clean32(stage: str, name: str, meaning: str) -> Method:
@@ -84,15 +112,20 @@ def _clean32(stage: str, name: str, meaning: str) -> Method:
 
 
 METHODS = (
-    _clean32("curve", "float32_table", "the exact table, rounded to float32 with the matrix"),
+    _clean32("curve", "float32_table", "the exact table and the matrix, rounded to float32"),
     Method("curve", "exact_table", "float64", "tone and gamma of every code, correctly rounded to float64"),
-    Method("curve", "numpy_table", "numpy", "the same table, NumPy"),
-    _clean32("colour", "fused_float32", "matrix and gains of the one channel of a site, float32"),
-    Method("colour", "fused_float64", "float64", "the same in float64, in the reference's order of operations"),
+    Method("curve", "numpy_table", "numpy", "tone and gamma of every code, with NumPy"),
+    _clean32("colour", "fused_float32", "matrix and gains of the channel recorded at each site, float32"),
+    Method(
+        "colour",
+        "fused_float64",
+        "float64",
+        "matrix and gains of the channel recorded at each site, in the reference's order",
+    ),
     Method("colour", "numpy_float64", "numpy", "matrix and gains of all three channels, NumPy"),
-    Method("mosaic", "at_site_float32", "float32", "no other channel than the site's is computed"),
-    Method("mosaic", "at_site", "float64", "the same"),
-    Method("mosaic", "after_colour", "numpy", "the site's channel is taken from the three"),
+    Method("mosaic", "at_site_float32", "float32", "only the channel recorded at each site is computed, float32"),
+    Method("mosaic", "at_site", "float64", "only the channel recorded at each site is computed"),
+    Method("mosaic", "after_colour", "numpy", "all three channels are computed, one is selected"),
     Method(
         "normal",
         "polynomial_float32",
@@ -104,46 +137,62 @@ METHODS = (
         "normal",
         "quadratic_float64",
         "float64",
-        "inverse CDF by 1024 quadratics, or whatever gives the same DN",
+        "inverse CDF by 1024 quadratics, or a method that gives the same DN",
         normal_error=QUADRATIC_NORMAL,
     ),
-    Method("normal", "numpy_float64", "numpy", "the same, NumPy", normal_error=QUADRATIC_NORMAL),
     Method(
-        "shot", "gaussian_where_near", "float64", "a normal where that law is near, else counts", approximates_law=True
+        "normal", "numpy_float64", "numpy", "inverse CDF by 1024 quadratics, with NumPy", normal_error=QUADRATIC_NORMAL
     ),
-    Method("shot", "inversion", "float64", "Poisson counts by inversion, right to 2^-32"),
-    Method("shot", "numpy_inversion", "numpy", "the same, NumPy"),
+    Method(
+        "shot",
+        "gaussian_where_near",
+        "float64",
+        "normal distribution if its CDF is near, otherwise counts",
+        approximates_law=True,
+    ),
+    Method("shot", "inversion", "float64", "Poisson counts by inversion of the CDF, correct to 2^-32"),
+    Method("shot", "numpy_inversion", "numpy", "Poisson counts by inversion of the CDF, with NumPy"),
     Method("effects", "fused_float64", "float64", "effects in order, row by row"),
     Method("effects", "numpy_float64", "numpy", "effects in order, NumPy"),
-    _clean32("quantise", "fused_float32", "half to even above black, clipped, float32"),
-    Method("quantise", "fused_float64", "float64", "half to even, clipped"),
-    Method("quantise", "numpy_float64", "numpy", "the same, NumPy"),
+    _clean32("quantise", "fused_float32", "rounded half to even, clipped, float32"),
+    Method("quantise", "fused_float64", "float64", "rounded half to even, clipped"),
+    Method("quantise", "numpy_float64", "numpy", "rounded half to even, clipped, with NumPy"),
 )
 """Every method, by stage, cheapest first."""
 
 STAGES = tuple(dict.fromkeys(method.stage for method in METHODS))
 
-OF_COUNTS = frozenset({"shot", "effects"})
-"""Stages that only noise made of counts has."""
-OF_INTEGERS = frozenset({"quantise"})
-"""Stages that only frames of whole DN have."""
+COUNT_STAGES = frozenset({"shot", "effects"})
+"""Stages that exist only for noise with Poisson counts."""
 
+INTEGER_STAGES = frozenset({"quantise"})
+"""Stages that exist only for integer frames."""
 
-MOST_GROWTH, MOST_GROWTH_OF_HIGHLIGHTS = 8.0, 64.0
-"""What rounding takes of a look-up may grow to on its way to the clean frame, for the errors of float32 to hold: 3 and
-20 with known cameras, the gains of `conf/` and the default threshold."""
+MAX_ERROR_GAIN, MAX_HIGHLIGHT_ERROR_GAIN = 8.0, 64.0
+"""Largest factors by which the rounding error of a table entry may grow in a clean value for the errors of float32 to
+hold. The cameras and gains of ``conf/`` reach 3, and 20 in highlights at the default threshold."""
 
 
 def is_steep(plan: Plan) -> bool:
-    """Whether a plan's matrix, gains, darkening or highlight term make more than that of it.
+    """Return whether a plan amplifies rounding errors too much for float32.
 
-    The light of a channel is i · (gain + headroom · m²), where m = (i - threshold) / (1 - threshold), and i a sum of
-    look-ups times the row of the matrix.
+    The light of a channel is i · (gain + headroom · m²) with m = (i - threshold) / (1 - threshold). Here i is the sum
+    of table entries times one row of the matrix.
+
+    Parameters
+    ----------
+    plan : Plan
+        Matrix, gains, exposure and highlights of the pair.
+
+    Returns
+    -------
+    bool
+        True if the factor exceeds `MAX_ERROR_GAIN`, or `MAX_HIGHLIGHT_ERROR_GAIN` in highlights.
     """
     rows = [sum(abs(entry) for entry in plan.rgb2cam[at : at + 3]) * plan.exposure for at in (0, 3, 6)]
     highlights = 0.0 if plan.highlight == "none" else 1 + 2 / (1 - plan.highlight_threshold)
     return any(
-        row * gain > MOST_GROWTH or row * (gain + max(1 - gain, 0.0) * highlights) > MOST_GROWTH_OF_HIGHLIGHTS
+        row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN
         for row, gain in zip(rows, plan.inverse_gains, strict=True)
     )
 
@@ -151,53 +200,81 @@ def is_steep(plan: Plan) -> bool:
 def choose_methods(
     budget: Budget, counts_electrons: bool, normalised: bool = False, steep: bool = False
 ) -> tuple[str, ...]:
-    """Return the methods of the first form that fits, as a row names them; ConfigError where none does.
+    """Choose a method for each stage: the cheapest implementation whose errors are within the budget.
 
-    Noise made of counts has no form in float32, nor has what is ``steep`` (`is_steep`). Frames that are ``normalised``,
-    and so not rounded, are exact under any budget: beside the readable form they have one alone (`floats`), whose
-    effects are the readable ones.
+    Parameters
+    ----------
+    budget : Budget
+        Limits on the errors.
+    counts_electrons : bool
+        Whether the noise has Poisson counts, which have no float32 implementation.
+    normalised : bool
+        Whether frames are normalised floats. They are not rounded and are exact under every budget: float64 or NumPy,
+        with the effects in NumPy.
+    steep : bool
+        Whether `is_steep` excludes float32.
+
+    Returns
+    -------
+    tuple of str
+        ``stage:name`` of each method, in the order of `STAGES`.
+
+    Raises
+    ------
+    ConfigError
+        If no implementation is within the budget; the message has the smallest error possible.
     """
-    stages = [stage for stage in STAGES if counts_electrons or stage not in OF_COUNTS]
-    forms: Sequence[str] = FORMS
+    stages = [stage for stage in STAGES if counts_electrons or stage not in COUNT_STAGES]
     if normalised:
-        stages = [stage for stage in stages if stage not in OF_INTEGERS]
-        forms, budget = FORMS[1:], replace(budget, law_distance=0.0)
-    for form in FORMS[1:] if steep else forms:
-        chosen = [_first(stage, "numpy" if normalised and stage == "effects" else form, budget) for stage in stages]
+        stages = [stage for stage in stages if stage not in INTEGER_STAGES]
+        budget = replace(budget, law_distance=0.0)
+    for implementation in IMPLEMENTATIONS[1:] if steep or normalised else IMPLEMENTATIONS:
+        chosen = [
+            _first(stage, "numpy" if normalised and stage == "effects" else implementation, budget) for stage in stages
+        ]
         if None not in chosen:
             return tuple(method.spelled for method in chosen if method is not None)
-    raise ConfigError(_best(stages, budget))
+    raise ConfigError(_smallest_error(stages, budget))
 
 
 def methods_of_stage(stage: str) -> tuple[Method, ...]:
-    """Return the methods of a stage, cheapest first."""
+    """Return the methods of a stage.
+
+    Parameters
+    ----------
+    stage : str
+        One of `STAGES`.
+
+    Returns
+    -------
+    tuple of Method
+        Cheapest first.
+    """
     return tuple(method for method in METHODS if method.stage == stage)
 
 
 def method(stage: str, name: str) -> Method:
-    """Return a method by stage and name; KeyError where there is none."""
-    for one in methods_of_stage(stage):
-        if one.name == name:
-            return one
+    """Return the method with a stage and a name; raise KeyError if there is none."""
+    for candidate in methods_of_stage(stage):
+        if candidate.name == name:
+            return candidate
     raise KeyError(f"{stage} has no method {name}")
 
 
-def _first(stage: str, form: str, budget: Budget) -> Method | None:
-    fitting = (one for one in methods_of_stage(stage) if one.form == form and one.fits(budget))
-    return next(fitting, None)
+def _first(stage: str, implementation: str, budget: Budget) -> Method | None:
+    """Return the cheapest method of a stage and implementation within a budget."""
+    candidates = (each for each in methods_of_stage(stage) if each.implementation == implementation)
+    return next((each for each in candidates if each.fits(budget)), None)
 
 
-def _best(stages: Sequence[str], budget: Budget) -> str:
-    """Say what is the best that can be had, of the first number that is asked too much of."""
+def _smallest_error(stages: Sequence[str], budget: Budget) -> str:
+    """Return a message about the first limit that no method keeps, with the smallest error possible."""
     for key in ("clean_dn", "clean_changed_share", "normal_error"):
         for stage in stages:
-            best = min(methods_of_stage(stage), key=lambda one: float(getattr(one, key)))
+            best = min(methods_of_stage(stage), key=lambda each: float(getattr(each, key)))
             if getattr(best, key) > getattr(budget, key):
                 return (
-                    f"accuracy.{key}={getattr(budget, key):g}: the best that can be had is {getattr(best, key):g} "
-                    f"({best.spelled})"
+                    f"accuracy.{key}={getattr(budget, key):g}: no method is that accurate; expected at least "
+                    f"{getattr(best, key):g} ({best.spelled})"
                 )
-    raise AssertionError(f"no form fits {budget}")
-
-
-# ---------------------------------------------------------------------------------------------- Gauss for Poisson
+    raise AssertionError(f"no implementation fits {budget}")

@@ -415,7 +415,9 @@ def alone(method: Method, tiers: dict[str, AccuracyConfig]) -> AccuracyConfig:
         return exact
     if method.readable:
         return tiers[REFERENCE]
-    together = [one for one in METHODS if one.form == method.form and one.form != "float64"] or [method]
+    together = [
+        one for one in METHODS if one.implementation == method.implementation and one.implementation != "float64"
+    ] or [method]
     return replace(
         exact,
         clean_dn=max(exact.clean_dn, *(one.clean_dn for one in together)),
