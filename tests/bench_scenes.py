@@ -114,7 +114,7 @@ def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[
 
 def nanoseconds(srgb: Srgb, plan: Plan) -> float:
     """One pair of a body that was not seen before, nanoseconds of processor time a pixel."""
-    electrons.body_response.cache_clear()
+    electrons.prnu_response.cache_clear()
     started = time.thread_time()
     make_pair(srgb, plan)
     return (time.thread_time() - started) * 1e9 / (srgb.shape[0] * srgb.shape[1])

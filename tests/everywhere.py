@@ -48,13 +48,19 @@ from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.kernels import float_draws as floats
-from unprocess_gen.simulation.kernels import gaussian as fused
-from unprocess_gen.simulation.kernels import gaussian_float32 as single
-from unprocess_gen.simulation.kernels import physical as electrons
-from unprocess_gen.simulation.kernels import poisson
-from unprocess_gen.simulation.kernels.normal import fill_coarse_normals, fill_fine_normals, normal_quantiles
-from unprocess_gen.simulation.kernels.simd import bare, load
+from unprocess_gen.simulation.kernels import (
+    clean,
+    float_draws,
+    gaussian,
+    gaussian_float32,
+    philox,
+    physical,
+    poisson,
+    readout,
+    segments,
+)
+from unprocess_gen.simulation.kernels.normal import fill_coarse_normals, fill_fine_normals, normal_quantile_tables
+from unprocess_gen.simulation.kernels.simd import load, pointer_to
 from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.simulation.reference.poisson import poisson_tables
 
@@ -105,7 +111,7 @@ def facts(given: str) -> dict[str, Any]:
 
 def listen() -> Any:
     """Have whatever the outer kernel is given from now on hashed, to the last bit; what it fills comes last."""
-    kernel, heard = fused._pairs, hashlib.sha256()
+    kernel, heard = gaussian._fill_pairs, hashlib.sha256()
 
     def told(*arguments: Any) -> None:
         for argument in arguments[:-3]:
@@ -113,7 +119,7 @@ def listen() -> Any:
                 heard.update(np.asarray(one).tobytes())
         kernel(*arguments)
 
-    fused._pairs = told
+    gaussian._fill_pairs = told
     return heard
 
 
@@ -150,38 +156,38 @@ def kernels() -> dict[str, Any]:
 
 @kernel
 def _draw(words: Any, rates: Any, normal: Any, tables: Any, room: Any, out: Any) -> None:
-    poisson.draw(words, rates, normal, tables, room, out)
+    poisson.fill_counts(words, rates, normal, tables, room, out)
 
 
 @kernel
 def _digitise(counts: Any, words: Any, body: Any, room: Any, out: Any) -> None:
-    electrons._digitise(counts, words, body, (0, 0), 64.0, room, out)
+    physical._convert_to_dn(counts, words, body, (0, 0), 64.0, room, out)
 
 
 @kernel
 def _light(
-    codes: Any, scene: Any, room: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean: Any,
+    codes: Any, scene: Any, room: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean_dn: Any,
     tally: Any,
 ) -> None:  # fmt: skip
-    count, of_photograph, run = clean.shape[0], fused.bare_scene(scene), fused.bare_room(room)
-    gains, headroom = load(bare(scene.site_gains, 0), 0), load(bare(scene.site_headroom, 0), 0)
-    fused.fill_signal(bare(codes, 0), True, 0, count, of_photograph, bare(camera, 0))
-    fused._fill_light_by_gray(bare(codes, 0), 0, count, of_photograph, bare(gray, 0))
-    fused.fill_dim(count // BLOCK, gains, of_photograph, run, run.clean)
-    fused.copy(count, run.unrounded, dim)
-    fused.fill_bright(count // BLOCK, gains, headroom, of_photograph, run, run.clean)
-    fused.fill_light(room.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
-    fused.fill_clean_of_light(lit, scene, unrounded, clean, tally)
+    count, of_photograph, run = clean_dn.shape[0], clean.parameter_pointers(scene), segments.buffer_pointers(room)
+    gains, headroom = load(pointer_to(scene.site_gains, 0), 0), load(pointer_to(scene.site_headroom, 0), 0)
+    clean.fill_signal(pointer_to(codes, 0), True, 0, count, of_photograph, pointer_to(camera, 0))
+    clean._fill_gray_mean_signal(pointer_to(codes, 0), 0, count, of_photograph, pointer_to(gray, 0))
+    clean.fill_linear(count // BLOCK, gains, of_photograph, run, run.clean)
+    segments.copy_values(count, run.unrounded_dn, dim)
+    clean.recompute_bright(count // BLOCK, gains, headroom, of_photograph, run, run.clean)
+    clean.fill_scene_light(room.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
+    clean.fill_clean_from_light(lit, scene, unrounded, clean_dn, tally)
 
 
 @kernel
 def _draws(key: Any, words: Any) -> None:
-    fused.fill_words(key, (3, 0), np.uint64(4), words.shape[0], words)
+    philox.fill_segment_words(key, (3, 0), np.uint64(4), words.shape[0], words)
 
 
 @kernel
 def _round(dn: Any, noisy: Any, tally: Any) -> None:
-    fused.digitise(dn, (0.0, 4095.0), noisy, tally)
+    readout.round_and_clip(dn, (0.0, 4095.0), noisy, tally)
 
 
 def doubles() -> str:
@@ -190,32 +196,32 @@ def doubles() -> str:
     A frame would show it once in 10^12 sites. The noisy frame is not seen before it is rounded, so it gets signals that
     make it end half-way between two DN.
     """
-    count = fused.CHUNK
+    count = segments.LONG_SEGMENT
     n = np.arange(count)
     tally = np.zeros(6, dtype=np.int64)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
     camera, gray, lit, unrounded, counts, digitised, dim = (np.empty(count) for _ in range(7))
     words = np.empty(count, dtype=np.uint32)
-    clean, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
+    clean_dn, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
-    room, of_counts = fused.make_room(count), poisson.room_for(count)
+    room, of_counts = segments.allocate_buffers(count), poisson.allocate_count_buffers(count)
     room.signal[:count] = n / 999.0
     plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
-    scene = fused.scene_of(plan, np.arange(256) / 255.0, (1, count), (0, 0))
-    _light(codes, scene, room, camera, gray, dim, lit, unrounded, clean, tally)
-    key = fused.key_words(2**33 + 1, 5, 6, 7)
+    scene = clean.pair_parameters(plan, np.arange(256) / 255.0, (1, count), (0, 0))
+    _light(codes, scene, room, camera, gray, dim, lit, unrounded, clean_dn, tally)
+    key = philox.philox_key(2**33 + 1, 5, 6, 7)
     _draws(key, words)
-    normals = floats.by_inverse_cdf(words[None], normal_table())[0]
-    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantiles(), poisson_tables(), of_counts, counts)
-    body = electrons._body(plan, (1, count), (0, 0))
+    normals = float_draws.by_inverse_cdf(words[None], normal_table())[0]
+    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantile_tables(), poisson_tables(), of_counts, counts)
+    body = physical._sensor_parameters(plan, (1, count), (0, 0))
     _digitise(counts, words, body, of_counts, digitised)
     _round(n % 9 + 0.5, noisy, tally)
     deep, fine, coarse = np.empty((3, count), dtype=np.float32)
     fill_fine_normals(words, deep, fine)
     fill_coarse_normals(words, deep, coarse)
     return digest(
-        camera, gray, lit, unrounded, clean, normals, counts, digitised, body.response, dim, words, fine, coarse, noisy,
-        tally, room.unrounded[:count], room.lit[:count],
+        camera, gray, lit, unrounded, clean_dn, normals, counts, digitised, body.response, dim, words, fine, coarse,
+        noisy, tally, room.unrounded_dn[:count], room.bright_light[:count],
     )  # fmt: skip
 
 
@@ -253,10 +259,15 @@ def code() -> dict[str, Any]:
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for what they are called with; call none."""
     black = np.zeros((2, 2, 3), dtype=np.uint8)
-    outer = ((fused, "_pairs"), (fused, "_unprocess"), (single, "_pairs32"))
-    of_counts = ("_physical_pair", "_plain_pair", "_physical_noisy", "_responses")
-    of_floats = ("_words", "_by_inverse_cdf", "_poisson")
-    for room, name in (*outer, *((electrons, name) for name in of_counts), *((floats, name) for name in of_floats)):
+    outer = ((gaussian, "_fill_pairs"), (clean, "_fill_clean_frame"), (gaussian_float32, "_fill_pairs32"))
+    of_counts = (
+        "_fill_physical_pair",
+        "_fill_shot_read_pair",
+        "_fill_physical_noisy",
+        "_fill_prnu_response",
+    )
+    of_floats = ("_fill_words", "_fill_by_inverse_cdf", "_fill_poisson")
+    for room, name in (*outer, *((physical, name) for name in of_counts), *((float_draws, name) for name in of_floats)):
         setattr(room, name, compiler(getattr(room, name)))
     for plan in selftest.GOLDEN_PLANS.values():
         make_pair(black, plan)
@@ -269,7 +280,7 @@ def compile_kernels() -> None:
     three = (numba.float64[::1],) * 3
     selftest._product_and_sum.compile(three)
     words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)
-    given = words, doubles, normal_quantiles(), poisson_tables(), poisson.room_for(8), doubles
+    given = words, doubles, normal_quantile_tables(), poisson_tables(), poisson.allocate_count_buffers(8), doubles
     _draw.compile(tuple(map(numba.typeof, given)))
 
 

@@ -161,8 +161,8 @@ def test_noise_that_is_not_clipped_has_mean_zero_in_black() -> None:
 def test_bands_and_pieces_leave_no_trace(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     plan, picture = normalised(PLANS[name]), selftest.golden_picture()
     whole = make_pair(picture, plan, ORIGIN)
-    monkeypatch.setattr(floats, "BAND", 5 * picture.shape[1])
-    monkeypatch.setattr(floats, "PIECE", 2 * picture.shape[1])
+    monkeypatch.setattr(floats, "BAND_SITES", 5 * picture.shape[1])
+    monkeypatch.setattr(floats, "PIECE_SITES", 2 * picture.shape[1])
     pieces = make_pair(picture, plan, ORIGIN)
     assert pieces.clean.tobytes() == whole.clean.tobytes()
     assert pieces.noisy.tobytes() == whole.noisy.tobytes()

@@ -53,12 +53,10 @@ def test_libraries_are_imported_in_listed_modules_only(library: str) -> None:
 
 
 def test_no_fast_math_on_the_way_to_the_output() -> None:
-    from unprocess_gen.simulation.kernels import gaussian as fused
-    from unprocess_gen.simulation.kernels import normal as normals
-    from unprocess_gen.simulation.kernels import physical as electrons
-    from unprocess_gen.simulation.kernels import poisson
+    from unprocess_gen.simulation.kernels import clean, gaussian, normal, philox, physical, poisson, readout
 
-    kernels = [value for room in (electrons, fused, normals, poisson) for value in vars(room).values()]
+    modules = (philox, clean, normal, poisson, gaussian, physical, readout)
+    kernels = [value for module in modules for value in vars(module).values()]
     kernels = [value for value in kernels if hasattr(value, "targetoptions")]
 
     assert len(kernels) >= 20

@@ -10,21 +10,21 @@ import pytest
 
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.simulation.kernels.simd import (
-    WIDE,
-    bare,
-    below,
-    bits_of,
-    float_of,
-    four_bytes,
-    greatest,
-    least,
+    VECTOR_WIDTH,
+    from_bits,
+    less_than,
     load,
-    mask_of,
-    nothing,
-    root,
+    load_four_bytes,
+    maximum,
+    minimum,
+    movemask,
+    pointer_to,
+    square_root,
     store,
+    to_bits,
     to_float32,
     to_uint32,
+    uint32_zeros,
 )
 
 SINGLES = np.array([-np.inf, -1.5, -0.0, 0.0, 1e-40, 2.5, 7.25, np.inf], dtype=np.float32)
@@ -36,55 +36,55 @@ SHIFT, MASK = np.uint32(9), np.uint32(0x7FFFFFFF)
 
 @kernel
 def _arithmetic(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, made = load(bare(x, 0), 0), load(bare(y, 0), 0), bare(out, 0)
+    a, b, made = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
     store(made, 0, a + b)
     store(made, 8, a - b)
     store(made, 16, a * b)
     store(made, 24, NUMBER * b + a * TWO)
-    store(made, 32, greatest(a, b))
-    store(made, 40, least(a, NUMBER))
-    store(made, 48, root(greatest(a, ZERO)))
-    store(made, 56, a / greatest(b, NUMBER))
+    store(made, 32, maximum(a, b))
+    store(made, 40, minimum(a, NUMBER))
+    store(made, 48, square_root(maximum(a, ZERO)))
+    store(made, 56, a / maximum(b, NUMBER))
 
 
 @kernel
 def _bits(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, made = load(bare(x, 0), 0), load(bare(y, 0), 0), bare(out, 0)
-    store(made, 0, (b & MASK) ^ bits_of(a))
+    a, b, made = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
+    store(made, 0, (b & MASK) ^ to_bits(a))
     store(made, 8, (b >> SHIFT) | (b << SHIFT))
-    store(made, 16, below(a, NUMBER))
-    store(made, 24, bits_of(to_float32(b & MASK)))
+    store(made, 16, less_than(a, NUMBER))
+    store(made, 24, to_bits(to_float32(b & MASK)))
     store(made, 32, to_uint32(to_float32(b & MASK) * NUMBER))
-    store(made, 40, bits_of(float_of(b ^ b)) + nothing() + b)
+    store(made, 40, to_bits(from_bits(b ^ b)) + uint32_zeros() + b)
 
 
 @kernel
 def _doubles(x: np.ndarray, out: np.ndarray) -> None:
-    a, made = load(bare(x, 0), 0), bare(out, 0)
+    a, made = load(pointer_to(x, 0), 0), pointer_to(out, 0)
     store(made, 0, to_float32(a))
     store(made, 8, to_float32((a * 1e10 + 6755399441055744.0) - 6755399441055744.0))
 
 
 @kernel
 def _masks(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, made = load(bare(x, 0), 0), load(bare(y, 0), 0), bare(out, 0)
-    made[0] = mask_of(b)
-    made[1] = mask_of(below(a, a * TWO))
-    made[2] = mask_of(below(ZERO, a))
+    a, b, made = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
+    made[0] = movemask(b)
+    made[1] = movemask(less_than(a, a * TWO))
+    made[2] = movemask(less_than(ZERO, a))
 
 
 @kernel
 def _halves(x: np.ndarray, out: np.ndarray) -> None:
-    store(bare(out, 3), 0, load(bare(x, 0), 0))
+    store(pointer_to(out, 3), 0, load(pointer_to(x, 0), 0))
 
 
 @kernel
 def _one_by_one(codes: np.ndarray, wide: np.ndarray, out: np.ndarray) -> None:
-    from_second, made = bare(codes, 3), bare(out, 0)
-    made[0] = four_bytes(from_second, np.uint64(2))
+    from_second, made = pointer_to(codes, 3), pointer_to(out, 0)
+    made[0] = load_four_bytes(from_second, np.uint64(2))
     for at in range(3):
         made[1 + at] = from_second[at]
-    numbers = bare(bare(wide, 1), 1)
+    numbers = pointer_to(pointer_to(wide, 1), 1)
     made[4] = numbers[np.uint16(40000)]
 
 
@@ -125,7 +125,7 @@ def test_a_mask_has_the_first_lane_lowest() -> None:
     out = np.zeros(3, dtype=np.uint32)
     _masks(OTHERS, WORDS, out)
     assert out.tolist() == [0b00011000, 0b10110001, 0b10110001]
-    assert WIDE == 8
+    assert VECTOR_WIDTH == 8
 
 
 def test_low_halves_are_stored_among_numbers_of_16_bits_and_nothing_beside_them() -> None:

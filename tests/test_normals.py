@@ -11,14 +11,14 @@ from unprocess_gen.core.lookup_tables import normal_table, tukey_table
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.normal import (
     FINE_ERROR,
-    PIECES,
-    Quantiles,
-    exact_normal,
+    LINES_PER_OCTAVE,
+    QuantileTables,
+    build_quantile_tables,
+    exact_value,
+    fill_approximate_values,
     fill_coarse_normals,
     fill_fine_normals,
-    normal_quantiles,
-    quantiles,
-    quick_normals,
+    normal_quantile_tables,
 )
 from unprocess_gen.simulation.reference import noise as effects
 
@@ -27,22 +27,22 @@ SIGN = 2**31
 
 @kernel
 def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
-    quick_normals(words, lines, pairs, out)
+    fill_approximate_values(words, lines, pairs, out)
 
 
 @kernel
 def _exact(words: np.ndarray, quadratics: tuple[Float, Float, Float], out: np.ndarray) -> None:
     for n in range(out.shape[0]):
-        out[n] = exact_normal(words[n], quadratics)
+        out[n] = exact_value(words[n], quadratics)
 
 
-def quick(words: np.ndarray, law: Quantiles) -> np.ndarray:
+def quick(words: np.ndarray, law: QuantileTables) -> np.ndarray:
     out = np.empty(words.shape, dtype=np.float32)
     _quick(words, law.lines, np.empty(words.shape, dtype=np.uint64), out)
     return out.astype(np.float64)
 
 
-def exact(words: np.ndarray, law: Quantiles) -> np.ndarray:
+def exact(words: np.ndarray, law: QuantileTables) -> np.ndarray:
     out = np.empty(words.shape)
     _exact(words, law.quadratics, out)
     return out
@@ -50,7 +50,11 @@ def exact(words: np.ndarray, law: Quantiles) -> np.ndarray:
 
 def telling_words() -> np.ndarray:
     """The words beside every end of every line, those that single precision rounds up there, and some at random."""
-    ends = (2.0 ** np.arange(-1, 31)[:, None] * (1 + np.arange(PIECES) / PIECES)).ravel().astype(np.int64)
+    ends = (
+        (2.0 ** np.arange(-1, 31)[:, None] * (1 + np.arange(LINES_PER_OCTAVE) / LINES_PER_OCTAVE))
+        .ravel()
+        .astype(np.int64)
+    )
     spread = np.concatenate([ends[:, None] + np.arange(-3, 4), ends[:, None] - 2 ** np.arange(8)], axis=1).ravel()
     random = np.random.default_rng(1).integers(0, SIGN, 2**21)
     tails = (2 ** (31 * np.random.default_rng(2).random(2**20))).astype(np.int64)
@@ -65,7 +69,7 @@ LAWS = {"normal": normal_table(), **{f"tukey {shape}": tukey_table(shape) for sh
 @pytest.mark.parametrize("law", LAWS)
 def test_quick_values_are_within_the_error_that_is_claimed(law: str) -> None:
     table, words = LAWS[law], telling_words()
-    form = quantiles(table)
+    form = build_quantile_tables(table)
     off = np.abs(quick(words, form) - effects.by_inverse_cdf(words, table))
     assert off.max() <= form.error
     assert off.max() > form.error / 20  # nor is the claim far too wide
@@ -74,16 +78,16 @@ def test_quick_values_are_within_the_error_that_is_claimed(law: str) -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_the_exact_value_of_a_word_is_the_reference_s(law: str) -> None:
     words = telling_words()
-    assert (exact(words, quantiles(LAWS[law])) == effects.by_inverse_cdf(words, LAWS[law])).all()
+    assert (exact(words, build_quantile_tables(LAWS[law])) == effects.by_inverse_cdf(words, LAWS[law])).all()
 
 
 def test_normals_are_known_to_a_hundred_thousandth() -> None:
-    assert normal_quantiles().error < 1e-5
+    assert normal_quantile_tables().error < 1e-5
 
 
 @pytest.mark.slow
 def test_quick_normals_are_within_their_error_for_every_word() -> None:
-    form = normal_quantiles()
+    form = normal_quantile_tables()
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
         assert np.abs(quick(words, form) - exact(words, form)).max() <= form.error
@@ -122,7 +126,7 @@ def test_normals_by_polynomials_have_their_word_s_sign(which: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("which", POLYNOMIALS)
 def test_normals_by_polynomials_are_as_near_as_they_say_for_every_word(which: str) -> None:
-    form, worst = normal_quantiles(), 0.0
+    form, worst = normal_quantile_tables(), 0.0
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
         worst = max(worst, float(np.abs(by_polynomial(words, which) - exact(words, form)).max()))

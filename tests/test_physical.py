@@ -300,7 +300,7 @@ def test_a_clean_frame_cut_out_of_another_gets_noise_of_its_own_sites(everything
 
 def test_a_clean_frame_that_depends_on_the_level_has_no_noisy_frame_alone(everything: Plan) -> None:
     for plan in (everything, replace(averaged(everything), effects=WITHOUT_WELL)):
-        with pytest.raises(ValueError, match="another at every noise level"):
+        with pytest.raises(ValueError, match="clean frame depends on the noise level"):
             electrons.make_noisy(np.zeros((2, 2)), plan, (0.0, 4095.0))
 
 

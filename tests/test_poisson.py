@@ -17,8 +17,8 @@ from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.simulation.kernels import poisson as kernels
-from unprocess_gen.simulation.kernels.normal import Quantiles, normal_quantiles, quick_normals
-from unprocess_gen.simulation.kernels.poisson import Counting, draw, room_for
+from unprocess_gen.simulation.kernels.normal import QuantileTables, fill_approximate_values, normal_quantile_tables
+from unprocess_gen.simulation.kernels.poisson import CountBuffers, allocate_count_buffers, fill_counts
 from unprocess_gen.simulation.reference import poisson as poissons
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.reference.poisson import LIMIT, Tables, poisson, poisson_tables
@@ -36,16 +36,16 @@ Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
 def fast(words: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """The compiled form, called as `poisson` is."""
     out = np.full(words.shape, np.nan)
-    room = room_for((len(words) + 7) // 8 * 8)
-    _draw(words.astype(np.uint32), rates, normal_quantiles(), poisson_tables(), room, out)
+    room = allocate_count_buffers((len(words) + 7) // 8 * 8)
+    _draw(words.astype(np.uint32), rates, normal_quantile_tables(), poisson_tables(), room, out)
     return out
 
 
 @kernel
 def _draw(
-    words: np.ndarray, rates: np.ndarray, normal: Quantiles, tables: Tables, room: Counting, out: np.ndarray
+    words: np.ndarray, rates: np.ndarray, normal: QuantileTables, tables: Tables, room: CountBuffers, out: np.ndarray
 ) -> None:
-    draw(words, rates, normal, tables, room, out)
+    fill_counts(words, rates, normal, tables, room, out)
 
 
 def word(rank: np.ndarray) -> np.ndarray:
@@ -266,7 +266,7 @@ def test_the_guess_leaves_two_counts_in_every_cell() -> None:
 def short(words: np.ndarray, rate: float) -> np.ndarray:
     """The short form of x as it is compiled: quick normals, single precision, the whole part of the rate kept out."""
     quick = np.empty(words.shape, dtype=np.float32)
-    _quick(words, normal_quantiles().lines, np.empty(words.shape, dtype=np.uint64), quick)
+    _quick(words, normal_quantile_tables().lines, np.empty(words.shape, dtype=np.uint64), quick)
     a, b = (np.array(one, dtype=np.float32) for one in (poissons.A, poissons.B))
     root = np.sqrt(np.float32(rate))
     s = quick * (np.float32(1) / root)
@@ -280,7 +280,7 @@ def short(words: np.ndarray, rate: float) -> np.ndarray:
 
 @kernel
 def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
-    quick_normals(words, lines, pairs, out)
+    fill_approximate_values(words, lines, pairs, out)
 
 
 def real_quantile(rate: float, w: float) -> float:
@@ -393,7 +393,7 @@ def test_the_sharpened_normal_is_the_quantile_to_1e_12_of_the_distribution() -> 
     tails = poisson_tables().tails
     for index in indices:
         tail = (int(index) + 0.5) / WORDS
-        w = kernels._sharpened.py_func(tail, float(normals(np.array([index], dtype=np.uint32))[0]), tails)
+        w = kernels._refine_normal.py_func(tail, float(normals(np.array([index], dtype=np.uint32))[0]), tails)
         with mpmath.workdps(30):
             assert abs(mpmath.erfc(mpmath.mpf(w) / mpmath.sqrt(2)) / 2 - tail) < 1e-12
 
@@ -501,7 +501,7 @@ def test_the_table_of_distribution_functions_is_right_at_both_ends_of_every_cell
             counts, cdf = law(rate)
             k = np.arange(max(found.least[cell], counts[0]), min(found.most[cell], counts[-1]) + 1)
             offset = rate - found.middle[cell]
-            tabulated = [kernels._at_most.py_func(found.cdf, found.first[cell] + n, offset) for n in k]
+            tabulated = [kernels._cdf_at.py_func(found.cdf, found.first[cell] + n, offset) for n in k]
             assert np.abs(tabulated - cdf[k - counts[0]]).max() < 1e-11
 
 

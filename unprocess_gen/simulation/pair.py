@@ -18,6 +18,7 @@ from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.kernels import gaussian as fused
 from unprocess_gen.simulation.kernels import gaussian_float32 as single
 from unprocess_gen.simulation.kernels import physical as electrons
+from unprocess_gen.simulation.kernels.clean import make_clean
 from unprocess_gen.simulation.reference import noise as effects
 from unprocess_gen.simulation.reference.cfa import pack
 from unprocess_gen.simulation.reference.sensor import noisy_limits, normalise, quantise, to_dn
@@ -81,7 +82,7 @@ def _pairs_of_one_normal(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, i
 
 def _pairs_of_one_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
     first = plans[0]
-    unrounded, rounded, of_clean = fused.unprocess(srgb, first, _curve(srgb, first), origin)
+    unrounded, rounded, of_clean = make_clean(srgb, first, _curve(srgb, first), origin)
     if first.normalised:
         del rounded
         clean = _float_frame(unrounded.shape, first)
@@ -176,13 +177,13 @@ def _float_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Pair:
     clean, noisy = (_float_frame(srgb.shape, plan) for _ in range(2))
     counts = np.zeros(len(fields(Counts)), dtype=np.int64)
     curve = _curve(srgb, plan)
-    for rows in floats.bands(srgb.shape, floats.BAND):
+    for rows in floats.row_bands(srgb.shape, floats.BAND_SITES):
         at = origin[0] + rows.start, origin[1]
         if plan.averaged:
-            light = _light(srgb[rows], plan, at, curve, floats.COMPILED_DRAWS)
+            light = _light(srgb[rows], plan, at, curve, floats.KERNEL_DRAWS)
             clean_dn, of_clean = _clean_dn(light, plan), np.array(_beyond(light, plan))
         else:
-            clean_dn, _, of_clean = fused.unprocess(srgb[rows], plan, curve, at)
+            clean_dn, _, of_clean = make_clean(srgb[rows], plan, curve, at)
         counts += _fill_floats(clean_dn, of_clean, plan, at, _of_rows(clean, rows), _of_rows(noisy, rows))
     return Pair(clean, noisy, Counts(*counts.tolist()))
 
@@ -201,9 +202,9 @@ def _fill_floats(
     """
     counts = np.zeros(len(fields(Counts)), dtype=np.int64)
     counts[:2] = of_clean[:2]
-    for rows in floats.bands(clean_dn.shape, floats.PIECE):
+    for rows in floats.row_bands(clean_dn.shape, floats.PIECE_SITES):
         at = origin[0] + rows.start, origin[1]
-        piece = _read_out(clean_dn[rows], (0, 0), plan, at, floats.COMPILED_DRAWS)
+        piece = _read_out(clean_dn[rows], (0, 0), plan, at, floats.KERNEL_DRAWS)
         if clean is not None:
             _of_rows(clean, rows)[:] = _laid_out(piece.clean, plan, at)
         _of_rows(noisy, rows)[:] = _laid_out(piece.noisy, plan, at)

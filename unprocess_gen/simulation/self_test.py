@@ -23,6 +23,7 @@ from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import FLOAT32, IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
+from unprocess_gen.simulation.kernels import clean
 from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.kernels import gaussian as fused
 from unprocess_gen.simulation.kernels import gaussian_float32 as single
@@ -145,13 +146,13 @@ PROVED_BY = {
 """Which golden pairs prove which kernels: those that a plan does not need would take seconds to compile."""
 
 OUTER = {
-    "one_normal": (fused._pairs,),
-    "float32": (single._pairs32,),
-    "plain": (electrons._plain_pair,),
-    "physical": (electrons._physical_pair, electrons._responses),
+    "one_normal": (fused._fill_pairs,),
+    "float32": (single._fill_pairs32,),
+    "plain": (electrons._fill_shot_read_pair,),
+    "physical": (electrons._fill_physical_pair, electrons._fill_prnu_response),
     "readable": (),
-    "normalised": (fused._unprocess, *floats.OF_NORMALS),
-    "normalised_counts": (fused._unprocess, *floats.OF_NORMALS, *floats.OF_COUNTS),
+    "normalised": (clean._fill_clean_frame, *floats.NORMAL_KERNELS),
+    "normalised_counts": (clean._fill_clean_frame, *floats.NORMAL_KERNELS, *floats.COUNT_KERNELS),
 }
 """The kernels that bring all others of their kind with them."""
 
@@ -168,7 +169,7 @@ def kernels(plan: Plan) -> str:
     if plan.normalised:
         return "normalised_counts" if plan.counts_electrons else "normalised"
     if plan.counts_electrons:
-        return "plain" if electrons.is_plain(plan) else "physical"
+        return "plain" if electrons.has_only_shot_and_read(plan) else "physical"
     return "float32" if plan.in_float32 else "one_normal"
 
 

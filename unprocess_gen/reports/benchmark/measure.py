@@ -65,26 +65,33 @@ from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.kernels import float_draws as floats
 from unprocess_gen.simulation.kernels import gaussian_float32 as single
 from unprocess_gen.simulation.kernels import physical as electrons
-from unprocess_gen.simulation.kernels.gaussian import (
-    CHUNK,
-    RUN,
-    Room,
-    Scene,
-    Single,
-    bare_room,
-    bare_scene,
-    digitise,
+from unprocess_gen.simulation.kernels.clean import (
+    PairParameters,
     fill_clean,
     fill_signal,
-    look_up,
-    make_room,
-    products_of,
+    parameter_pointers,
+    row_products,
+    sum_products,
 )
-from unprocess_gen.simulation.kernels.gaussian import scene_of as fused_scene
-from unprocess_gen.simulation.kernels.normal import Quantiles, fill_coarse_normals, fill_fine_normals, normal_quantiles
-from unprocess_gen.simulation.kernels.poisson import Counting, room_for
-from unprocess_gen.simulation.kernels.poisson import draw as draw_counts
-from unprocess_gen.simulation.kernels.simd import bare
+from unprocess_gen.simulation.kernels.clean import pair_parameters as fused_scene
+from unprocess_gen.simulation.kernels.normal import (
+    QuantileTables,
+    fill_coarse_normals,
+    fill_fine_normals,
+    normal_quantile_tables,
+)
+from unprocess_gen.simulation.kernels.poisson import CountBuffers, allocate_count_buffers
+from unprocess_gen.simulation.kernels.poisson import fill_counts as draw_counts
+from unprocess_gen.simulation.kernels.readout import round_and_clip
+from unprocess_gen.simulation.kernels.segments import (
+    LONG_SEGMENT,
+    SEGMENT,
+    Float32,
+    SegmentBuffers,
+    allocate_buffers,
+    buffer_pointers,
+)
+from unprocess_gen.simulation.kernels.simd import pointer_to
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference import noise as effects
@@ -523,7 +530,7 @@ def quadratic_normals(words: Words) -> Float:
 
 def polynomial_normals(words: Words) -> Float:
     """Return the float32 form's normals of uint32 words ``[n]``."""
-    whole = np.resize(words, -(-words.size // CHUNK) * CHUNK)
+    whole = np.resize(words, -(-words.size // LONG_SEGMENT) * LONG_SEGMENT)
     depths, out = np.empty((2, whole.size), dtype=np.float32)
     fill_coarse_normals(whole, depths, out)
     return out[: words.size].astype(np.float64)
@@ -549,7 +556,7 @@ def _pair_ns(
     readable = accuracy.readable
     srgb = subject.readable if readable else subject.compiled
     plan = lab.plan(setting, accuracy, subject, srgb, edit)
-    electrons.body_response.cache_clear()
+    electrons.prnu_response.cache_clear()
     return clocked(lambda: make_pair(srgb, plan), srgb.shape[0] * srgb.shape[1])
 
 
@@ -569,10 +576,10 @@ def _counts_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -
     physics = lab.plan("electrons", lab.tiers[EXACT], subject, subject.readable).physics
     assert physics is not None
     span_dn = plan.white_level_dn - plan.black_level_dn
-    rates = np.resize(np.clip(light, 0, 1) * plan.exposure * span_dn / physics.dn_per_e, (BUFFERS, CHUNK))
+    rates = np.resize(np.clip(light, 0, 1) * plan.exposure * span_dn / physics.dn_per_e, (BUFFERS, LONG_SEGMENT))
     words = _some_words(rates.size).reshape(rates.shape)
     turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // rates.size)
-    given = normal_quantiles(), poisson_tables(), room_for(CHUNK), np.empty(CHUNK)
+    given = normal_quantile_tables(), poisson_tables(), allocate_count_buffers(LONG_SEGMENT), np.empty(LONG_SEGMENT)
     return clocked(lambda: _counts(rates, turns, words, *given), turns * rates.size)
 
 
@@ -594,7 +601,7 @@ def _clean_plan(lab: BenchmarkSession, srgb: Srgb, subject: BenchmarkImage) -> t
     return plan, linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
 
 
-def _scene(lab: BenchmarkSession, subject: BenchmarkImage) -> tuple[Srgb, Scene]:
+def _scene(lab: BenchmarkSession, subject: BenchmarkImage) -> tuple[Srgb, PairParameters]:
     srgb = subject.compiled
     plan, curve = _clean_plan(lab, srgb, subject)
     return srgb, fused_scene(plan, curve, srgb.shape, (0, 0))
@@ -602,26 +609,26 @@ def _scene(lab: BenchmarkSession, subject: BenchmarkImage) -> tuple[Srgb, Scene]
 
 def _look_up_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
-    out = np.empty(CHUNK)
+    out = np.empty(LONG_SEGMENT)
     return clocked(lambda: _signals(srgb, scene, out), srgb.shape[0] * srgb.shape[1])
 
 
 def _look_up32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
-    products, out = scene.products.astype(np.float32), np.empty(CHUNK, dtype=np.float32)
-    return clocked(lambda: _signals32(srgb, products, scene.sites, out), srgb.shape[0] * srgb.shape[1])
+    products, out = scene.products.astype(np.float32), np.empty(LONG_SEGMENT, dtype=np.float32)
+    return clocked(lambda: _signals32(srgb, products, scene.site_channels, out), srgb.shape[0] * srgb.shape[1])
 
 
 def _clean_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
     counts = np.zeros(6, dtype=np.int64)
-    return clocked(lambda: _cleans(srgb, scene, make_room(), counts), srgb.shape[0] * srgb.shape[1])
+    return clocked(lambda: _cleans(srgb, scene, allocate_buffers(), counts), srgb.shape[0] * srgb.shape[1])
 
 
 def _clean32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     srgb, scene = _scene(lab, subject)
-    of_scene = single.products32_of(scene), single.sites_of(scene), single.light_of(scene)
-    return clocked(lambda: _cleans32(srgb, *of_scene, single.make_room()), srgb.shape[0] * srgb.shape[1])
+    of_scene = single.dn_products32(scene), single.site_parameters32(scene), single.clean_parameters32(scene)
+    return clocked(lambda: _cleans32(srgb, *of_scene, single.allocate_buffers32()), srgb.shape[0] * srgb.shape[1])
 
 
 def _numpy_curve_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
@@ -656,22 +663,22 @@ LIMITS_DN = (0.0, 16383.0)
 
 def _round_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     chunks, turns = _chunks_of_dn(lab, subject)
-    buffers = np.empty(CHUNK, dtype=np.uint16), np.zeros(6, dtype=np.int64)
+    buffers = np.empty(LONG_SEGMENT, dtype=np.uint16), np.zeros(6, dtype=np.int64)
     return clocked(lambda: _digits(chunks, turns, LIMITS_DN, *buffers), turns * chunks.size)
 
 
 def _round32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage) -> float:
     plan, _ = _clean_plan(lab, subject.compiled, subject)
     doubles, turns = _chunks_of_dn(lab, subject)
-    chunks, law = doubles.astype(np.float32), single.law_of(plan, LIMITS_DN)
-    black, noisy = np.uint32(plan.black_level_dn), np.empty(CHUNK, dtype=np.uint16)
+    chunks, law = doubles.astype(np.float32), single.noise_parameters32(plan, LIMITS_DN)
+    black, noisy = np.uint32(plan.black_level_dn), np.empty(LONG_SEGMENT, dtype=np.uint16)
     return clocked(lambda: _digits32(chunks, turns, law, black, noisy), turns * chunks.size)
 
 
 def _chunks_of_dn(lab: BenchmarkSession, subject: BenchmarkImage) -> tuple[Float, int]:
     """Return chunks of a photograph's DN before rounding, and how often they go round for as many as it has pixels."""
     plan, light = _light_of(lab, subject, subject.readable)
-    chunks = np.resize(to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest), (BUFFERS, CHUNK))
+    chunks = np.resize(to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest), (BUFFERS, LONG_SEGMENT))
     return chunks, -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
 
 
@@ -696,9 +703,9 @@ def _normals32_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkImage
 
 
 def _clocked_normals(kernel: Callable[..., None], subject: BenchmarkImage) -> float:
-    chunks = _some_words(BUFFERS * CHUNK).reshape(BUFFERS, CHUNK)
+    chunks = _some_words(BUFFERS * LONG_SEGMENT).reshape(BUFFERS, LONG_SEGMENT)
     turns = -(-subject.compiled.shape[0] * subject.compiled.shape[1] // chunks.size)
-    depths, out = np.empty((2, CHUNK), dtype=np.float32)
+    depths, out = np.empty((2, LONG_SEGMENT), dtype=np.float32)
     return clocked(lambda: kernel(chunks, turns, depths, out), turns * chunks.size)
 
 
@@ -708,54 +715,56 @@ def _numpy_normals_ns(lab: BenchmarkSession, method: Method, subject: BenchmarkI
 
 
 @kernel
-def _signals(srgb: Srgb, scene: Scene, out: Float) -> None:
+def _signals(srgb: Srgb, scene: PairParameters, out: Float) -> None:
     """Look up the codes, the matrix folded into the curve."""
     height, width = srgb.shape[:2]
-    bared = bare_scene(scene)
+    bared = parameter_pointers(scene)
     for y in range(height):
-        for start in range(0, width, CHUNK):
-            n = min(CHUNK, width - start)
-            fill_signal(bare(srgb, 3 * (y * width + start)), srgb.itemsize == 1, y, n, bared, bare(out, 0))
+        for start in range(0, width, LONG_SEGMENT):
+            n = min(LONG_SEGMENT, width - start)
+            fill_signal(pointer_to(srgb, 3 * (y * width + start)), srgb.itemsize == 1, y, n, bared, pointer_to(out, 0))
 
 
 @kernel
-def _signals32(srgb: Srgb, products: Single, sites: NDArray[np.int64], out: Single) -> None:
+def _signals32(srgb: Srgb, products: Float32, sites: NDArray[np.int64], out: Float32) -> None:
     """As `_signals`, in float32."""
     height, width = srgb.shape[:2]
     for y in range(height):
-        even, odd = products_of(bare(products, 0), products.shape[2], bare(sites, 0), y)
-        for start in range(0, width, CHUNK):
-            n, codes = min(CHUNK, width - start), bare(srgb, 3 * (y * width + start))
-            look_up(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, bare(out, 0))
+        even, odd = row_products(pointer_to(products, 0), products.shape[2], pointer_to(sites, 0), y)
+        for start in range(0, width, LONG_SEGMENT):
+            n, codes = min(LONG_SEGMENT, width - start), pointer_to(srgb, 3 * (y * width + start))
+            sum_products(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, pointer_to(out, 0))
 
 
 @kernel
-def _cleans(srgb: Srgb, scene: Scene, room: Room, counts: NDArray[np.int64]) -> None:
+def _cleans(srgb: Srgb, scene: PairParameters, room: SegmentBuffers, counts: NDArray[np.int64]) -> None:
     """Go from codes to the clean frame."""
-    run, bared, tally = bare_room(room), bare_scene(scene), bare(counts, 0)
+    run, bared, tally = buffer_pointers(room), parameter_pointers(scene), pointer_to(counts, 0)
     height, width = srgb.shape[:2]
     for y in range(height):
-        for start in range(0, width, RUN):
-            n, codes = min(RUN, width - start), bare(srgb, 3 * (y * width + start))
+        for start in range(0, width, SEGMENT):
+            n, codes = min(SEGMENT, width - start), pointer_to(srgb, 3 * (y * width + start))
             fill_clean(codes, srgb.itemsize == 1, y, 0, n, bared, run, run.clean, tally)
 
 
 @kernel
-def _cleans32(srgb: Srgb, products: Single, sites: Single, light: single.Light, room: single.Room32) -> None:
+def _cleans32(
+    srgb: Srgb, products: Float32, sites: Float32, light: single.CleanParameters32, room: single.SegmentBuffers32
+) -> None:
     """As `_cleans`, in float32."""
     height, width = srgb.shape[:2]
-    run = single.bare_room(room)
+    run = single.buffer_pointers32(room)
     for y in range(height):
-        even, odd = products_of(bare(products, 0), products.shape[2], bare(light.channels, 0), y)
-        of_sites = single.bright_sites(sites, y & 1, 0)
-        for start in range(0, width, RUN):
-            n = min(RUN, width - start)
-            codes = bare(srgb, 3 * (y * width + start))
-            look_up(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, run.signal)
+        even, odd = row_products(pointer_to(products, 0), products.shape[2], pointer_to(light.site_channels, 0), y)
+        of_sites = single.load_site_parameters(sites, y & 1, 0)
+        for start in range(0, width, SEGMENT):
+            n = min(SEGMENT, width - start)
+            codes = pointer_to(srgb, 3 * (y * width + start))
+            sum_products(codes, even, odd, products.shape[2], n, srgb.itemsize == 1, run.signal)
             blocks = -(-n // BLOCK)
-            some_bright = single.fill_clean(blocks, of_sites[0], light, run, run.clean)[1]
+            some_bright = single.fill_linear32(blocks, of_sites[0], light, run, run.clean)[1]
             if some_bright:
-                single.fill_bright(blocks, of_sites, light, run, run.clean)
+                single.recompute_bright32(blocks, of_sites, light, run, run.clean)
 
 
 @kernel
@@ -763,19 +772,21 @@ def _digits(chunks: Float, turns: int, limits_dn: tuple[float, float], noisy: Ra
     """Round chunks of DN in turns."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
-            digitise(chunks[chunk], limits_dn, noisy, counts)
+            round_and_clip(chunks[chunk], limits_dn, noisy, counts)
 
 
 @kernel
-def _digits32(chunks: Single, turns: int, law: single.Law32, black: np.uint32, noisy: Raw) -> None:
+def _digits32(chunks: Float32, turns: int, law: single.NoiseParameters32, black: np.uint32, noisy: Raw) -> None:
     """As `_digits`, in float32."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
-            single.digitise(chunks.shape[1], law, black, bare(chunks, chunk * chunks.shape[1]), bare(noisy, 0))
+            single.round_and_clip32(
+                chunks.shape[1], law, black, pointer_to(chunks, chunk * chunks.shape[1]), pointer_to(noisy, 0)
+            )
 
 
 @kernel
-def _normals(chunks: Words, turns: int, depths: Single, out: Single) -> None:
+def _normals(chunks: Words, turns: int, depths: Float32, out: Float32) -> None:
     """Make normals of chunks of words in turns."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):
@@ -784,7 +795,13 @@ def _normals(chunks: Words, turns: int, depths: Single, out: Single) -> None:
 
 @kernel
 def _counts(
-    rates: Float, turns: int, words: Words, normal: Quantiles, tables: PoissonTables, room: Counting, out: Float
+    rates: Float,
+    turns: int,
+    words: Words,
+    normal: QuantileTables,
+    tables: PoissonTables,
+    room: CountBuffers,
+    out: Float,
 ) -> None:
     """Draw counts of chunks of rates in turns."""
     for _ in range(turns):
@@ -793,7 +810,7 @@ def _counts(
 
 
 @kernel
-def _normals32(chunks: Words, turns: int, depths: Single, out: Single) -> None:
+def _normals32(chunks: Words, turns: int, depths: Float32, out: Float32) -> None:
     """As `_normals`, for the form in float32."""
     for _ in range(turns):
         for chunk in range(chunks.shape[0]):

@@ -1,11 +1,13 @@
-"""The form in float32 of a pair whose noise is one normal a site: `fused`'s, where a budget allows errors.
+"""Simulate pairs with two-parameter Gaussian noise in float32, for accuracy budgets that allow errors.
 
-Three quarters of its time. The errors are stated in `methods` and proved by the tests; every machine makes the same
-ones. Beside the precision three things are given up: the matrix's products are made with the gains and the span of the
-sensor in them, so that sums of them are DN at once; the normals' polynomials are shorter; and no site is made again.
+Takes three quarters of the time of `gaussian`. `config.accuracy` states the errors, tests prove them, and every CPU
+makes the same ones. Besides precision, three things differ from `gaussian`:
 
-Nanoseconds a pixel, AVX2 (Zen 3): look-ups 0.65, the clean frame 0.15, Philox 0.65, depths of the draws 0.4, noise and
-read-out 0.65. Tried: straight lines in place of polynomials for the normals, which take one look-up each: 0.8 more.
+* The tabulated products include gains, exposure and span, so sums of them are DN above the black level.
+* The polynomials of the normal deviates have lower degrees (`normal.coarse_normal`).
+* No site is recomputed exactly.
+
+All DN in this module count from the black level, which is added after rounding. Timings: ``docs/design/kernels.md``.
 """
 
 from __future__ import annotations
@@ -19,50 +21,48 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import inner, kernel
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.types import Float, Pair, Plan, Raw, Srgb
-from unprocess_gen.simulation.kernels.gaussian import (
-    HETEROSCEDASTIC,
-    ROUND32,
-    RUN,
-    ZERO32,
-    Indices,
-    Scene,
-    Single,
-    blocks_of,
-    copy,
-    count_below,
-    count_still,
-    empty_frames,
-    fill_blocks,
-    key_of,
-    keys_of,
-    look_up,
-    pairs_of,
-    pinned_dn,
-    products_of,
-    scene_of,
+from unprocess_gen.simulation.kernels.clean import (
+    PairParameters,
+    count_negative,
+    pair_parameters,
+    pinned_level_dn,
+    row_products,
+    sum_products,
 )
-from unprocess_gen.simulation.kernels.normal import coarse_normal, fill_coarse_depths, signed
+from unprocess_gen.simulation.kernels.gaussian import HETEROSCEDASTIC
+from unprocess_gen.simulation.kernels.normal import apply_signs, coarse_normal, fill_coarse_depths
+from unprocess_gen.simulation.kernels.philox import fill_word_blocks, load_key, philox_keys
+from unprocess_gen.simulation.kernels.readout import count_zero_variance
+from unprocess_gen.simulation.kernels.rounding import ROUND32
+from unprocess_gen.simulation.kernels.segments import (
+    SEGMENT,
+    Float32,
+    Indices,
+    allocate_frames,
+    copy_values,
+    frames_to_pairs,
+    locate_blocks,
+)
 from unprocess_gen.simulation.kernels.simd import (
-    WIDE,
-    Numbers,
+    VECTOR_WIDTH,
+    Pointer,
     Vector,
-    bare,
-    below,
-    bits_of,
-    greatest,
-    least,
+    less_than,
     load,
-    mask_of,
-    root,
+    maximum,
+    minimum,
+    movemask,
+    pointer_to,
+    square_root,
     store,
+    to_bits,
 )
 
 _0, _8 = np.uint64(0), np.uint64(8)
-_1F, _INFINITY = np.float32(1), np.float32(np.inf)
+_ZERO32, _ONE32, _INFINITY = np.float32(0), np.float32(1), np.float32(np.inf)
 
-ROUNDINGS = 2.0**-18
-"""What white is off by in float32, at most, as a share of it: a quarter DN of 16 bits. Light that is above white by no
-more is not counted as clipped."""
+FLOAT32_MARGIN = 2.0**-18
+"""Largest relative error of white in float32, a quarter DN at 16 bits; light above white by less is not clipped."""
 
 
 def make_pairs(
@@ -72,306 +72,373 @@ def make_pairs(
     limits_dn: Sequence[tuple[float, float]],
     origin: tuple[int, int] = (0, 0),
 ) -> list[Pair]:
-    """Make the pairs of `fused.make_pairs`, of which all is the same but the precision."""
-    frames = empty_frames(srgb, len(plans))
-    scene = scene_of(plans[0], curve, srgb.shape, origin)
-    laws = np.array([law_of(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
-    of_scene = products32_of(scene), sites_of(scene), light_of(scene)
-    _pairs32(np.ascontiguousarray(srgb), *of_scene, laws, keys_of(plans), origin, make_room(), *frames)
-    return pairs_of(*frames)
+    """Simulate pairs that share the clean frame and differ in their Gaussian noise, in float32.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes.
+    plans : sequence of Plan
+        Plans of two-parameter profiles that differ only in noise, level, draw and frame.
+    curve : ndarray of float64, [codes]
+        Linear value of each code.
+    limits_dn : sequence of (float, float)
+        Lowest and highest DN of each plan's noisy frame.
+    origin : (int, int)
+        Row and column of ``srgb[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    list of Pair
+        One pair per plan, uint16 ``[H, W]``; all share the clean array.
+    """
+    frames = allocate_frames(srgb, len(plans))
+    parameters = pair_parameters(plans[0], curve, srgb.shape, origin)
+    noise = np.array([noise_parameters32(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
+    of_clean = dn_products32(parameters), site_parameters32(parameters), clean_parameters32(parameters)
+    _fill_pairs32(
+        np.ascontiguousarray(srgb), *of_clean, noise, philox_keys(plans), origin, allocate_buffers32(), *frames
+    )
+    return frames_to_pairs(*frames)
 
 
-class Light(NamedTuple):
-    """What of a `fused.Scene` the loops need; DN count from black on, which is put on when they are whole."""
+class CleanParameters32(NamedTuple):
+    """Hold the parameters of the clean frame in float32."""
 
-    by_gray: bool
-    channels: NDArray[np.int64]  # [2, 2]: of each site
-    gains: Single  # of the channels
-    scale: np.float32  # from light to DN
+    gray_mean: bool
+    site_channels: NDArray[np.int64]  # [2, 2]
+    inverse_gains: Float32  # [3]
+    dn_per_signal: np.float32  # without gains
     threshold: np.float32
     steepness: np.float32  # of the highlight term: 1 / (1 - threshold)
     exposure: np.float32
-    limit: np.float32
+    limit: np.float32  # of light before the exposure is applied
     brightest: np.float32
-    clipped: np.float32  # light above it counts as clipped: that of white is 1 but for the roundings
-    span: np.float32
+    clipped: np.float32  # light above it counts as clipped; includes FLOAT32_MARGIN
+    span_dn: np.float32
     black: np.uint32
 
 
-def light_of(scene: Scene) -> Light:
-    """Return what the loops need of a scene."""
-    black, span, _ = scene.levels_dn
+def clean_parameters32(parameters: PairParameters) -> CleanParameters32:
+    """Convert the parameters of a clean frame to float32."""
+    black, span, _ = parameters.levels_dn
     f = np.float32
-    return Light(
-        scene.by_gray, scene.sites, scene.gains.astype(f), f(scene.exposure * span),
-        f(scene.threshold), f(1 / (1 - scene.threshold)), f(scene.exposure), f(np.inf if scene.exposure == 1 else 1),
-        f(scene.brightest), f(scene.brightest * (1 + ROUNDINGS)), f(span), np.uint32(black),
-    )  # fmt: skip
+    return CleanParameters32(
+        gray_mean=parameters.gray_mean,
+        site_channels=parameters.site_channels,
+        inverse_gains=parameters.inverse_gains.astype(f),
+        dn_per_signal=f(parameters.exposure * span),
+        threshold=f(parameters.highlight_threshold),
+        steepness=f(1 / (1 - parameters.highlight_threshold)),
+        exposure=f(parameters.exposure),
+        limit=f(np.inf if parameters.exposure == 1 else 1),
+        brightest=f(parameters.brightest),
+        clipped=f(parameters.brightest * (1 + FLOAT32_MARGIN)),
+        span_dn=f(span),
+        black=np.uint32(black),
+    )
 
 
-class Law32(NamedTuple):
-    """The variance line and the limits of a noisy frame; DN count from black on."""
+def dn_products32(parameters: PairParameters) -> Float32:
+    """Return the products ``[3, 3, codes]`` scaled to DN; unscaled with ``gray_mean``, which compares channels."""
+    scale = np.ones(3) if parameters.gray_mean else _dn_per_signal(parameters)
+    return (parameters.products * scale[:, None, None]).astype(np.float32)
+
+
+def site_parameters32(parameters: PairParameters) -> Float32:
+    """Return linear limit in DN, signal per DN, gain and headroom by site, ``[4, 2, VECTOR_WIDTH + 2]``.
+
+    The second axis is for even and odd rows.
+    """
+    gains = np.ones(3) if parameters.gray_mean else parameters.inverse_gains
+    dn_per_signal = _dn_per_signal(parameters)
+    of_channels = parameters.linear_limit * dn_per_signal, 1 / dn_per_signal, gains, parameters.headroom
+    rows = np.stack([values[parameters.site_channels] for values in of_channels]).astype(np.float32)
+    return np.ascontiguousarray(np.tile(rows, (1, 1, VECTOR_WIDTH // 2 + 1)))
+
+
+def _dn_per_signal(parameters: PairParameters) -> Float:
+    """Return the DN per unit of linear signal of each channel; with ``gray_mean`` gains are inverted earlier."""
+    gains = np.ones(3) if parameters.gray_mean else parameters.inverse_gains
+    return gains * parameters.exposure * parameters.levels_dn[1]
+
+
+class NoiseParameters32(NamedTuple):
+    """Hold the variance line and the limits of one noisy frame in float32."""
 
     a: np.float32
     b: np.float32
     pinned_dn: np.float32
-    saturated_dn: np.float32  # from which on a site is pinned: white is `pinned_dn` but for the roundings
+    saturated_dn: np.float32  # clean values from here on are pinned; FLOAT32_MARGIN below pinned_dn
     low: np.float32
     high: np.float32
 
 
-def law_of(plan: Plan, limits_dn: tuple[float, float]) -> Law32:
-    """Return the law of a plan's noise."""
-    black, pinned = plan.black_level_dn, pinned_dn(plan)
+def noise_parameters32(plan: Plan, limits_dn: tuple[float, float]) -> NoiseParameters32:
+    """Return the noise parameters of a plan; ``limits_dn`` are the lowest and highest DN of its noisy frame."""
+    black, pinned_dn = plan.black_level_dn, pinned_level_dn(plan)
     f = np.float32
-    with np.errstate(over="ignore"):  # a variance beyond float32 is infinite, and its site clipped
-        a, b = (f(one) for one in plan.variance_line)
-    pinned_at = f(pinned - black), f((pinned - black) * (1 - ROUNDINGS))
-    return Law32(a, b, *pinned_at, f(limits_dn[0] - black), f(limits_dn[1] - black))
+    with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
+        a, b = (f(coefficient) for coefficient in plan.variance_line)
+    pinned = f(pinned_dn - black), f((pinned_dn - black) * (1 - FLOAT32_MARGIN))
+    return NoiseParameters32(a, b, *pinned, f(limits_dn[0] - black), f(limits_dn[1] - black))
 
 
 @inner
-def _law(laws: Single, plan: int) -> Law32:
-    """Return one of several plans'."""
-    return Law32(laws[plan, 0], laws[plan, 1], laws[plan, 2], laws[plan, 3], laws[plan, 4], laws[plan, 5])
+def _load_noise_parameters32(noise: Float32, plan: int) -> NoiseParameters32:
+    """Return row ``plan`` of an array of noise parameters."""
+    return NoiseParameters32(
+        noise[plan, 0], noise[plan, 1], noise[plan, 2], noise[plan, 3], noise[plan, 4], noise[plan, 5]
+    )
 
 
-def _dn_of_signal(scene: Scene) -> Float:
-    """Return what makes DN of the channels' signals, where they are dim; by gray the gains are inverted already."""
-    gains = np.ones(3) if scene.by_gray else scene.gains
-    return gains * scene.exposure * scene.levels_dn[1]
+class SegmentBuffers32(NamedTuple):
+    """Hold the scratch arrays for one segment of a row, padded to complete blocks of 64 pixels.
 
-
-def products32_of(scene: Scene) -> Single:
-    """Return the products as DN above black; by gray, where the three channels are compared, as they are."""
-    scale = np.ones(3) if scene.by_gray else _dn_of_signal(scene)
-    return (scene.products * scale[:, None, None]).astype(np.float32)
-
-
-def sites_of(scene: Scene) -> Single:
-    """Return ``[4, 2, WIDE + 2]``: for pixels of an even and of an odd row dim DN, signal per DN, gain, headroom."""
-    gains = np.ones(3) if scene.by_gray else scene.gains
-    of_channels = scene.dim * _dn_of_signal(scene), 1 / _dn_of_signal(scene), gains, scene.headroom
-    rows = np.stack([one[scene.sites] for one in of_channels]).astype(np.float32)
-    return np.ascontiguousarray(np.tile(rows, (1, 1, WIDE // 2 + 1)))
-
-
-class Room32(NamedTuple):
-    """As `fused.Room`; DN count from black on.
-
-    Not of that name: Numba tells tuples apart by it when it is called, and is slow where two share one.
+    Its name differs from `segments.SegmentBuffers` because Numba dispatches by class name, and slowly if two share one.
     """
 
-    signal: Single  # DN already
-    clean_dn: Single
-    lit: Single  # light of what is bright
+    signal: Float32  # linear signal times gains, exposure and span: DN
+    clean_dn: Float32
+    bright_light: Float32  # normalised light of bright vectors, 0 elsewhere
     words: Indices
-    depths: Single
-    noisy_dn: Single  # neither rounded nor clipped
+    depths: Float32  # see `normal.fill_coarse_depths`
+    noisy_dn: Float32  # neither rounded nor clipped
     clean: Raw
     noisy: Raw
 
 
-def make_room() -> Room32:
-    """Return room for a run."""
-    size = RUN + BLOCK
+def allocate_buffers32() -> SegmentBuffers32:
+    """Allocate zeroed buffers for a segment."""
+    size = SEGMENT + BLOCK
     singles, raw = np.zeros((5, size), dtype=np.float32), np.zeros((2, size), dtype=np.uint16)
-    signal, clean_dn, lit, depths, noisy_dn = singles
+    signal, clean_dn, bright_light, depths, noisy_dn = singles
     words = np.zeros(size, dtype=np.uint32)
-    return Room32(signal, clean_dn, lit, words, depths, noisy_dn, raw[0], raw[1])
+    return SegmentBuffers32(signal, clean_dn, bright_light, words, depths, noisy_dn, raw[0], raw[1])
 
 
 @inner
-def bare_room(room: Room32) -> Room32:
-    """Return the same, bare."""
-    return Room32(
-        bare(room.signal, _0), bare(room.clean_dn, _0), bare(room.lit, _0), bare(room.words, _0),
-        bare(room.depths, _0), bare(room.noisy_dn, _0), bare(room.clean, _0), bare(room.noisy, _0),
-    )  # fmt: skip
+def buffer_pointers32(buffers: SegmentBuffers32) -> SegmentBuffers32:
+    """Return the buffers as raw pointers."""
+    return SegmentBuffers32(
+        pointer_to(buffers.signal, _0),
+        pointer_to(buffers.clean_dn, _0),
+        pointer_to(buffers.bright_light, _0),
+        pointer_to(buffers.words, _0),
+        pointer_to(buffers.depths, _0),
+        pointer_to(buffers.noisy_dn, _0),
+        pointer_to(buffers.clean, _0),
+        pointer_to(buffers.noisy, _0),
+    )
 
 
 @kernel
-def _pairs32(
+def _fill_pairs32(
     srgb: Srgb,
-    products: Single,
-    sites: Single,
-    light: Light,
-    laws: Single,
+    products: Float32,
+    sites: Float32,
+    clean_parameters: CleanParameters32,
+    noise: Float32,
     keys: NDArray[np.uint64],
     origin: tuple[int, int],
-    room: Room32,
+    buffers: SegmentBuffers32,
     clean: Raw,
     noisy: Raw,
     counts: NDArray[np.int64],
 ) -> None:
-    """`fused._pairs` in float32."""
+    """Fill the frames and counts of all pairs, segment by segment."""
     height, width = clean.shape
-    codes, of_bytes = products.shape[2], srgb.itemsize == 1
-    run, tally = bare_room(room), bare(counts, _0)
+    code_count, is_uint8 = products.shape[2], srgb.itemsize == 1
+    segment, of_clean = buffer_pointers32(buffers), pointer_to(counts, _0)
+    channels = pointer_to(clean_parameters.site_channels, _0)
     for y in range(height):
-        even, odd = products_of(bare(products, _0), codes, bare(light.channels, _0), y)
-        for start in range(0, width, RUN):
-            length = min(RUN, width - start)
-            first, after, block, blocks = blocks_of(origin[1] + start, length)
-            at, is_whole = y * width + start, length == blocks * BLOCK
-            if light.by_gray:
-                _fill_light_by_gray(srgb[y, start : start + length], products, y, light, room.signal[first:after])
+        even, odd = row_products(pointer_to(products, _0), code_count, channels, y)
+        for start in range(0, width, SEGMENT):
+            length = min(SEGMENT, width - start)
+            first, after, block, blocks = locate_blocks(origin[1] + start, length)
+            at, fills_blocks = y * width + start, length == blocks * BLOCK
+            if clean_parameters.gray_mean:
+                row, signal = srgb[y, start : start + length], buffers.signal[first:after]
+                _fill_gray_mean_dn(row, products, y, clean_parameters, signal)
             else:
-                look_up(bare(srgb, 3 * at), even, odd, codes, length, of_bytes, bare(run.signal, first))
-            of_sites = bright_sites(sites, y & 1, first)
-            frame = bare(clean, at) if is_whole else run.clean
-            some_below, some_bright = fill_clean(blocks, of_sites[0], light, run, frame)
-            if some_below:
-                tally[0] += count_below(first, after, run.signal)
-            if some_bright:
-                fill_bright(blocks, of_sites, light, run, frame)
-                _count_bright((first, after), light, run, tally)
-            if not is_whole:
-                copy(length, bare(run.clean, first), bare(clean, at))
+                signals = pointer_to(segment.signal, first)
+                sum_products(pointer_to(srgb, 3 * at), even, odd, code_count, length, is_uint8, signals)
+            of_sites = load_site_parameters(sites, y & 1, first)
+            target = pointer_to(clean, at) if fills_blocks else segment.clean
+            has_negative, has_bright = fill_linear32(blocks, of_sites[0], clean_parameters, segment, target)
+            if has_negative:
+                of_clean[0] += count_negative(first, after, segment.signal)
+            if has_bright:
+                recompute_bright32(blocks, of_sites, clean_parameters, segment, target)
+                _count_bright32((first, after), clean_parameters, segment, of_clean)
+            if not fills_blocks:
+                copy_values(length, pointer_to(segment.clean, first), pointer_to(clean, at))
             for plan in range(noisy.shape[0]):
-                key, law = key_of(keys, plan), _law(laws, plan)
-                fill_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, run.words)
+                key, of_plan = load_key(keys, plan), _load_noise_parameters32(noise, plan)
+                fill_word_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, segment.words)
                 to = plan * height * width + at
-                frame = bare(noisy, to) if is_whole else run.noisy
-                _fill_noisy(blocks * BLOCK, (first, after), law, light.black, run, frame, bare(counts, 6 * plan))
-                if not is_whole:
-                    copy(length, bare(run.noisy, first), bare(noisy, to))
+                target = pointer_to(noisy, to) if fills_blocks else segment.noisy
+                count, black, of_noisy = blocks * BLOCK, clean_parameters.black, pointer_to(counts, 6 * plan)
+                _fill_noisy32(count, (first, after), of_plan, black, segment, target, of_noisy)
+                if not fills_blocks:
+                    copy_values(length, pointer_to(segment.noisy, first), pointer_to(noisy, to))
 
 
 @inner
-def _fill_light_by_gray(row: Srgb, products: Single, y: int, light: Light, out: Single) -> None:
-    """`fused._fill_light_by_gray`, to DN."""
+def _fill_gray_mean_dn(row: Srgb, products: Float32, y: int, parameters: CleanParameters32, out: Float32) -> None:
+    """Linearise, apply the matrix, invert the gains with highlights preserved by the mean of the channels; to DN."""
+    gains = parameters.inverse_gains
     for x in range(row.shape[0]):
         r, g, b = row[x, 0], row[x, 1], row[x, 2]
         red = (products[0, 0, r] + products[0, 1, g]) + products[0, 2, b]
         green = (products[1, 0, r] + products[1, 1, g]) + products[1, 2, b]
         blue = (products[2, 0, r] + products[2, 1, g]) + products[2, 2, b]
-        m = max(((red + green) + blue) / np.float32(3) - light.threshold, ZERO32) * light.steepness
+        m = max(((red + green) + blue) / np.float32(3) - parameters.threshold, _ZERO32) * parameters.steepness
         mask = m * m
-        c = light.channels[y & 1, x & 1]
+        c = parameters.site_channels[y & 1, x & 1]
         i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * max(mask + (_1F - mask) * light.gains[c], light.gains[c]) * light.scale
+        out[x] = i * max(mask + (_ONE32 - mask) * gains[c], gains[c]) * parameters.dn_per_signal
 
 
 @inner
-def fill_clean(blocks: int, dims: Vector, light: Light, run: Room32, clean: Numbers) -> tuple[bool, bool]:
-    """`fused.fill_dim` of signals that are DN; return whether one is below black, and whether one is bright."""
-    lowest = highest = load(run.signal, _0)
-    for n in range(blocks * (BLOCK // WIDE)):
-        x = np.uint64(n) * _8
-        signal = load(run.signal, x)
-        lowest, highest = least(lowest, signal), greatest(highest, signal)
-        dn = greatest(signal, ZERO32)
-        store(run.clean_dn, x, dn)
-        store(clean, x, bits_of(dn + ROUND32) + light.black)
-    return mask_of(below(lowest, ZERO32)) != 0, mask_of(below(dims, highest)) != 0
-
-
-@inner
-def bright_sites(sites: Single, row: int, first: int) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return what `fill_bright` takes of `sites_of`: dim DN, signal per DN, gain and headroom of eights of a row."""
+def load_site_parameters(sites: Float32, row: int, first: int) -> tuple[Vector, Vector, Vector, Vector]:
+    """Load a vector of each parameter of `site_parameters32` for an even or odd row (0, 1), from column ``first``."""
     width = sites.shape[2]
     at = row * width + (first & 1)
     return (
-        load(bare(sites, at), _0),
-        load(bare(sites, 2 * width + at), _0),
-        load(bare(sites, 4 * width + at), _0),
-        load(bare(sites, 6 * width + at), _0),
+        load(pointer_to(sites, at), _0),
+        load(pointer_to(sites, 2 * width + at), _0),
+        load(pointer_to(sites, 4 * width + at), _0),
+        load(pointer_to(sites, 6 * width + at), _0),
     )
 
 
 @inner
-def fill_bright(
+def fill_linear32(
+    blocks: int, limits_dn: Vector, parameters: CleanParameters32, segment: SegmentBuffers32, clean: Pointer
+) -> tuple[bool, bool]:
+    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
+    lowest = highest = load(segment.signal, _0)
+    for n in range(blocks * (BLOCK // VECTOR_WIDTH)):
+        x = np.uint64(n) * _8
+        signal = load(segment.signal, x)
+        lowest, highest = minimum(lowest, signal), maximum(highest, signal)
+        dn = maximum(signal, _ZERO32)
+        store(segment.clean_dn, x, dn)
+        store(clean, x, to_bits(dn + ROUND32) + parameters.black)
+    return movemask(less_than(lowest, _ZERO32)) != 0, movemask(less_than(limits_dn, highest)) != 0
+
+
+@inner
+def recompute_bright32(
     blocks: int,
     sites: tuple[Vector, Vector, Vector, Vector],
-    light: Light,
-    run: Room32,
-    clean: Numbers,
+    parameters: CleanParameters32,
+    segment: SegmentBuffers32,
+    clean: Pointer,
 ) -> None:
-    """`fused.fill_bright` of a run's eights that have something bright in them; light goes to ``run.lit``, else 0."""
-    dims, per_dn, gains, headroom = sites
-    for n in range(blocks * (BLOCK // WIDE)):
+    """Recompute vectors that contain a bright signal; their light goes to ``segment.bright_light``, elsewhere 0."""
+    limits_dn, signal_per_dn, gains, headroom = sites
+    for n in range(blocks * (BLOCK // VECTOR_WIDTH)):
         x = np.uint64(n) * _8
-        signal = load(run.signal, x)
-        if mask_of(below(dims, signal)) == 0:
-            store(run.lit, x, signal * ZERO32)
+        signal = load(segment.signal, x)
+        if movemask(less_than(limits_dn, signal)) == 0:
+            store(segment.bright_light, x, signal * _ZERO32)
             continue
-        i = signal * per_dn
-        m = greatest(i - light.threshold, ZERO32) * light.steepness
-        lit = least(i * gains + i * (m * m) * headroom, light.limit) * light.exposure
-        dn = least(greatest(lit, ZERO32), light.brightest) * light.span
-        store(run.lit, x, lit)
-        store(run.clean_dn, x, dn)
-        store(clean, x, bits_of(dn + ROUND32) + light.black)
+        i = signal * signal_per_dn
+        m = maximum(i - parameters.threshold, _ZERO32) * parameters.steepness
+        light = minimum(i * gains + i * (m * m) * headroom, parameters.limit) * parameters.exposure
+        dn = minimum(maximum(light, _ZERO32), parameters.brightest) * parameters.span_dn
+        store(segment.bright_light, x, light)
+        store(segment.clean_dn, x, dn)
+        store(clean, x, to_bits(dn + ROUND32) + parameters.black)
 
 
 @inner
-def _count_bright(valid: tuple[int, int], light: Light, run: Room32, tally: Numbers) -> None:
-    above = saturated = 0
-    last = light.span + ROUND32
-    for x in range(valid[0], valid[1]):
-        above += run.lit[x] > light.clipped
-        saturated += run.clean_dn[x] + ROUND32 == last
-    tally[1] += above
-    tally[4] += saturated
-
-
-@inner
-def _low16(rounded: np.float32, black: np.uint32) -> np.uint16:
-    return np.uint16((np.float32(rounded).view(np.uint32) + black) & np.uint32(0xFFFF))
-
-
-@inner
-def _fill_noisy(
-    count: int, valid: tuple[int, int], law: Law32, black: np.uint32, run: Room32, noisy: Numbers, tally: Numbers
+def _count_bright32(
+    valid: tuple[int, int], parameters: CleanParameters32, segment: SegmentBuffers32, counts: Pointer
 ) -> None:
-    """`fused._fill_noisy` in float32."""
-    fill_coarse_depths(count, run.words, run.depths)
-    _fill_noise(count, law, run)
-    some_clipped = digitise(count, law, black, run.noisy_dn, noisy)
-    if law.pinned_dn < _INFINITY:
-        _pin(valid, law, black, run, noisy)
-    if some_clipped:
-        _count_clipped(valid, law, run, tally)
-    tally[5] += count_still(valid, (law.a, law.b, ZERO32), run.clean_dn)
+    """Count sites above the brightest light, and saturated ones."""
+    above = saturated = 0
+    last = parameters.span_dn + ROUND32
+    for x in range(valid[0], valid[1]):
+        above += segment.bright_light[x] > parameters.clipped
+        saturated += segment.clean_dn[x] + ROUND32 == last
+    counts[1] += above
+    counts[4] += saturated
 
 
 @inner
-def _fill_noise(count: int, law: Law32, run: Room32) -> None:
-    for n in range(count // WIDE):
+def _fill_noisy32(
+    count: int,
+    valid: tuple[int, int],
+    noise: NoiseParameters32,
+    black: np.uint32,
+    segment: SegmentBuffers32,
+    noisy: Pointer,
+    counts: Pointer,
+) -> None:
+    """Fill one segment of a noisy frame and update its counts."""
+    fill_coarse_depths(count, segment.words, segment.depths)
+    _fill_noise32(count, noise, segment)
+    has_clipped = round_and_clip32(count, noise, black, segment.noisy_dn, noisy)
+    if noise.pinned_dn < _INFINITY:
+        _pin_saturated32(valid, noise, black, segment, noisy)
+    if has_clipped:
+        _count_clipped32(valid, noise, segment, counts)
+    counts[5] += count_zero_variance(valid, (noise.a, noise.b, _ZERO32), segment.clean_dn)
+
+
+@inner
+def _fill_noise32(count: int, noise: NoiseParameters32, segment: SegmentBuffers32) -> None:
+    """Add noise to the clean DN."""
+    for n in range(count // VECTOR_WIDTH):
         x = np.uint64(n) * _8
-        clean_dn = load(run.clean_dn, x)
-        std = root(greatest(clean_dn * law.a + law.b, ZERO32))
-        store(run.noisy_dn, x, clean_dn + signed(std * coarse_normal(load(run.depths, x)), load(run.words, x)))
+        clean_dn = load(segment.clean_dn, x)
+        std = square_root(maximum(clean_dn * noise.a + noise.b, _ZERO32))
+        normal = coarse_normal(load(segment.depths, x))
+        store(segment.noisy_dn, x, clean_dn + apply_signs(std * normal, load(segment.words, x)))
 
 
 @inner
-def digitise(count: int, law: Law32, black: np.uint32, noisy_dn: Numbers, noisy: Numbers) -> bool:
-    """Clip, round half to even, cast; return whether anything was clipped."""
+def round_and_clip32(count: int, noise: NoiseParameters32, black: np.uint32, noisy_dn: Pointer, noisy: Pointer) -> bool:
+    """Clip, round half to even, cast to uint16; return whether any of the ``count`` sites was clipped."""
     lowest = highest = load(noisy_dn, _0)
-    for n in range(count // WIDE):
+    for n in range(count // VECTOR_WIDTH):
         x = np.uint64(n) * _8
         dn = load(noisy_dn, x)
-        lowest, highest = least(lowest, dn), greatest(highest, dn)
-        store(noisy, x, bits_of(least(greatest(dn, law.low), law.high) + ROUND32) + black)
-    return bool(mask_of(below(lowest, law.low) | below(law.high, highest)) != 0)
+        lowest, highest = minimum(lowest, dn), maximum(highest, dn)
+        store(noisy, x, to_bits(minimum(maximum(dn, noise.low), noise.high) + ROUND32) + black)
+    return bool(movemask(less_than(lowest, noise.low) | less_than(noise.high, highest)) != 0)
 
 
 @inner
-def _pin(valid: tuple[int, int], law: Law32, black: np.uint32, run: Room32, noisy: Numbers) -> None:
+def _pin_saturated32(
+    valid: tuple[int, int], noise: NoiseParameters32, black: np.uint32, segment: SegmentBuffers32, noisy: Pointer
+) -> None:
+    """Replace the noisy values of saturated sites with the pinned level."""
     for x in range(valid[0], valid[1]):
-        if run.clean_dn[x] >= law.saturated_dn:
-            run.noisy_dn[x] = law.pinned_dn
-            noisy[x] = _low16(min(max(law.pinned_dn, law.low), law.high) + ROUND32, black)
+        if segment.clean_dn[x] >= noise.saturated_dn:
+            segment.noisy_dn[x] = noise.pinned_dn
+            noisy[x] = _low_16_bits32(min(max(noise.pinned_dn, noise.low), noise.high) + ROUND32, black)
 
 
 @inner
-def _count_clipped(valid: tuple[int, int], law: Law32, run: Room32, tally: Numbers) -> None:
-    low, high = law.low, law.high
-    below_low, above_high = 0, 0
+def _low_16_bits32(shifted: np.float32, black: np.uint32) -> np.uint16:
+    """Return ``black`` plus the integer that a float32 holds after the addition of `ROUND32`."""
+    return np.uint16((np.float32(shifted).view(np.uint32) + black) & np.uint32(0xFFFF))
+
+
+@inner
+def _count_clipped32(
+    valid: tuple[int, int], noise: NoiseParameters32, segment: SegmentBuffers32, counts: Pointer
+) -> None:
+    """Count noisy values that round to below and above the limits."""
+    low, high = noise.low, noise.high
+    below, above = 0, 0
     for x in range(valid[0], valid[1]):
-        rounded = (min(max(run.noisy_dn[x], low - _1F), high + _1F) + ROUND32) - ROUND32
-        below_low += rounded < low
-        above_high += rounded > high
-    tally[2] += below_low
-    tally[3] += above_high
+        rounded = (min(max(segment.noisy_dn[x], low - _ONE32), high + _ONE32) + ROUND32) - ROUND32
+        below += rounded < low
+        above += rounded > high
+    counts[2] += below
+    counts[3] += above

@@ -1,12 +1,12 @@
-"""Eight neighbours at a time, as kernels write them where a loop over single numbers would not become vector code.
+"""Write SIMD code in kernels: vectors of eight numbers, and raw pointers.
 
-A value of eight lanes is what a kernel loads, computes with and stores: ``+ - * / & | ^ >> <<`` lane by lane, with
-numbers of one lane beside it, and the functions below. Compiled it is a vector of LLVM, which lays it out on whatever
-registers a processor has: two of four lanes, one of eight, half of one of sixteen. Where nothing is compiled it is a
-NumPy array of eight, so that a kernel reads, and computes, the same either way.
+For loops that LLVM does not vectorise by itself. Kernels load vectors, compute with them and store them. Vectors
+support ``+ - * / & | ^ >> <<`` per lane, also with a scalar operand, and the functions of this module. Every operation
+rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused.
 
-Every operation rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused. Bytes and bits
-are counted from the low end, as on every machine that Numba serves.
+Each function has two implementations: on NumPy arrays of eight elements, used when kernels run uncompiled (tests
+compare both), and as LLVM instructions on ``<8 x type>``, which LLVM maps to the registers of the processor. Bytes and
+bits are numbered from the low end, as on every platform that Numba supports.
 """
 
 from __future__ import annotations
@@ -23,285 +23,286 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import lower_builtin, models, register_model, type_callable
 from numpy.typing import NDArray
 
-WIDE = 8
-"""Lanes to a vector."""
+VECTOR_WIDTH = 8
+"""Lanes of a vector."""
 
 Vector = NDArray[Any]
-"""Eight lanes, as Python sees them."""
-Numbers = NDArray[Any]
-"""What `bare` returns, as Python sees it."""
+"""Eight lanes; in uncompiled code an array."""
+Pointer = NDArray[Any]
+"""A raw pointer to array data; in uncompiled code an array."""
 Index = int | np.integer[Any]
 
 
-def bare(array: NDArray[Any], at: Index) -> Numbers:
-    """Return the numbers of an array in one piece, from the flat index ``at`` on.
+def pointer_to(array: NDArray[Any], at: Index) -> Pointer:
+    """Return a pointer to the data of a C-contiguous array, from the flat index ``at`` on.
 
-    Compiled it is their place in memory and no more: nobody checks an index, and nobody counts that the array is in
-    use, which costs a locked instruction each time that one is handed on. So the array must live until the last use: an
-    argument of the kernel that Python calls does, and what the same function uses again below.
+    Compiled code checks no index and counts no reference: the count costs a locked instruction per call. So the array
+    must outlive the pointer, as arguments of the outer kernel do.
     """
     return array.reshape(-1)[at:]
 
 
-def load(numbers: Numbers, at: Index) -> Vector:
-    """Return numbers ``at`` to ``at + 7``."""
-    return numbers[at : at + WIDE].copy()
+def load(pointer: Pointer, at: Index) -> Vector:
+    """Load the vector of elements ``at`` to ``at + 7``."""
+    return pointer[at : at + VECTOR_WIDTH].copy()
 
 
-def store(numbers: Numbers, at: Index, lanes: Vector) -> None:
-    """Put eight lanes where `load` would take them from; uint32 lanes go among uint16 by their low halves."""
-    numbers[at : at + WIDE] = lanes.astype(numbers.dtype)
+def store(pointer: Pointer, at: Index, lanes: Vector) -> None:
+    """Store a vector as elements ``at`` to ``at + 7``; uint32 lanes are truncated to uint16 elements."""
+    pointer[at : at + VECTOR_WIDTH] = lanes.astype(pointer.dtype)
 
 
-def four_bytes(numbers: Numbers, at: Index) -> np.uint32:
-    """Return bytes ``at`` to ``at + 3`` as one number, the first in its lowest bits: one load where it is compiled."""
-    return np.uint32(int.from_bytes(numbers[at : at + 4].tobytes(), "little"))
+def load_four_bytes(pointer: Pointer, at: Index) -> np.uint32:
+    """Load bytes ``at`` to ``at + 3`` as one little-endian number, in a single instruction."""
+    return np.uint32(int.from_bytes(pointer[at : at + 4].tobytes(), "little"))
 
 
-def greatest(x: Vector, y: Any) -> Vector:
-    """Return ``x`` where it is above ``y``, else ``y``."""
+def maximum(x: Vector, y: Any) -> Vector:
+    """Return ``x`` where x > y, else ``y``, per lane; ``y`` if either is NaN."""
     return np.asarray(np.where(x > y, x, y), dtype=x.dtype)
 
 
-def least(x: Vector, y: Any) -> Vector:
-    """Return ``x`` where it is below ``y``, else ``y``."""
+def minimum(x: Vector, y: Any) -> Vector:
+    """Return ``x`` where x < y, else ``y``, per lane; ``y`` if either is NaN."""
     return np.asarray(np.where(x < y, x, y), dtype=x.dtype)
 
 
-def below(x: Any, y: Any) -> Vector:
-    """Return all bits set where ``x`` is below ``y``, none elsewhere: unsigned lanes as wide as theirs."""
+def less_than(x: Any, y: Any) -> Vector:
+    """Return a mask per lane: all bits set where x < y, else 0; unsigned lanes of the same width."""
     lanes = np.asarray(x if np.ndim(x) else y)
     every_bit = 2 ** (8 * lanes.itemsize) - 1
-    return np.asarray(np.where(x < y, every_bit, 0), dtype=_unsigned(lanes))
+    return np.asarray(np.where(x < y, every_bit, 0), dtype=_unsigned_dtype(lanes))
 
 
-def root(x: Vector) -> Vector:
-    """Return the square roots."""
+def square_root(x: Vector) -> Vector:
+    """Return the square root of each lane."""
     return np.asarray(np.sqrt(x))
 
 
-def bits_of(x: Vector) -> Vector:
-    """Return the bits of floats, as unsigned lanes as wide."""
-    return x.view(_unsigned(x))
+def to_bits(x: Vector) -> Vector:
+    """Return the bits of float lanes as unsigned integers of the same width."""
+    return x.view(_unsigned_dtype(x))
 
 
-def float_of(bits: Vector) -> Vector:
-    """Return the float32 that have these bits."""
+def from_bits(bits: Vector) -> Vector:
+    """Return the float32 lanes that have these bits."""
     return bits.view(np.float32)
 
 
 def to_float32(x: Vector) -> Vector:
-    """Return float64, or uint32 below 2**31, as the nearest float32."""
+    """Convert float64, or uint32 below 2**31, to the nearest float32."""
     return x.astype(np.float32)
 
 
 def to_uint32(x: Vector) -> Vector:
-    """Return whole float32, at least 0 and below 2**31."""
+    """Convert float32 lanes with integer values from 0 to below 2**31 to uint32."""
     return x.astype(np.uint32)
 
 
-def nothing() -> Vector:
-    """Return uint32 lanes of 0."""
-    return np.zeros(WIDE, dtype=np.uint32)
+def uint32_zeros() -> Vector:
+    """Return a uint32 vector of zeros."""
+    return np.zeros(VECTOR_WIDTH, dtype=np.uint32)
 
 
-def mask_of(x: Vector) -> np.uint32:
-    """Return the top bits of unsigned lanes as the bits of one number, the first lane's lowest."""
+def movemask(x: Vector) -> np.uint32:
+    """Return the top bits of unsigned lanes as the low bits of one number, the first lane lowest."""
     top = np.uint64(8 * x.itemsize - 1)
     return np.uint32(sum(int(lane >> x.dtype.type(top)) << n for n, lane in enumerate(x)))
 
 
-def _unsigned(lanes: Vector) -> np.dtype[Any]:
+def _unsigned_dtype(lanes: Vector) -> np.dtype[Any]:
     return np.dtype(f"uint{8 * lanes.itemsize}")
 
 
-# ------------------------------------------------------------------------------------------------------ as compiled
+# ------------------------------------------------------------------------------------------------- Numba types and code
 
 
-class Lanes(types.Type):
-    """The type of eight lanes of a number."""
+class VectorType(types.Type):
+    """Describe a vector of eight numbers to Numba."""
 
-    def __init__(self, of: types.Number) -> None:
-        self.of = of
-        super().__init__(name=f"lanes({of})")
+    def __init__(self, element: types.Number) -> None:
+        self.element = element
+        super().__init__(name=f"vector({element})")
 
 
-_ELEMENTS: dict[types.Number, ir.Type] = {
+_LLVM_TYPES: dict[types.Number, ir.Type] = {
     types.float32: ir.FloatType(),
     types.float64: ir.DoubleType(),
     types.uint32: ir.IntType(32),
     types.uint64: ir.IntType(64),
 }
-_OF_BITS: dict[types.Number, types.Number] = {types.float32: types.uint32, types.float64: types.uint64}
-_HALF = ir.IntType(16)
+_UNSIGNED: dict[types.Number, types.Number] = {types.float32: types.uint32, types.float64: types.uint64}
+_INT16 = ir.IntType(16)
 
 
-def _vector(kind: Lanes) -> ir.VectorType:
-    return ir.VectorType(_ELEMENTS[kind.of], WIDE)
+def _llvm_vector(vector_type: VectorType) -> ir.VectorType:
+    return ir.VectorType(_LLVM_TYPES[vector_type.element], VECTOR_WIDTH)
 
 
-@register_model(Lanes)
-class _Model(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Lanes) -> None:
-        super().__init__(manager, kind, _vector(kind))
+@register_model(VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, vector_type: VectorType) -> None:
+        super().__init__(manager, vector_type, _llvm_vector(vector_type))
 
 
-def _define(
+def _register(
     function: Callable[..., Any],
     typer: Callable[..., Any],
     build: Callable[..., Any],
     signature: tuple[Any, ...] = (types.VarArg(types.Any),),
 ) -> None:
-    """Say what a function on lanes returns, by the types it is given, and which instructions it becomes."""
+    """Register the result type and the LLVM code of a function on vectors."""
     type_callable(function)(lambda context: typer)
     lower_builtin(function, *signature)(build)
 
 
-def _kind(*operands: Any) -> Lanes | None:
-    """Return the one kind of lanes among some operands; None, so that Numba looks further, where there is none."""
-    kinds = {operand for operand in operands if isinstance(operand, Lanes)}
-    others = [operand for operand in operands if not isinstance(operand, (Lanes, types.Number))]
-    return kinds.pop() if len(kinds) == 1 and not others else None
+def _common_type(*operands: Any) -> VectorType | None:
+    """Return the only vector type among operands; None, so that Numba tries other overloads, if there is none."""
+    vector_types = {operand for operand in operands if isinstance(operand, VectorType)}
+    others = [operand for operand in operands if not isinstance(operand, (VectorType, types.Number))]
+    return vector_types.pop() if len(vector_types) == 1 and not others else None
 
 
-def _spread(context: Any, builder: Any, signature: Any, arguments: Any) -> tuple[Lanes, list[Any]]:
-    """Return the kind of lanes, and all operands as such; a single number is put into every lane."""
-    kind = _kind(*signature.args)
-    assert kind is not None
-    return kind, [
-        one if of == kind else _in_every_lane(builder, context.cast(builder, one, of, kind.of), kind)
-        for of, one in zip(signature.args, arguments, strict=True)
+def _broadcast(context: Any, builder: Any, signature: Any, arguments: Any) -> tuple[VectorType, list[Any]]:
+    """Return the vector type and the operands converted to it; scalars are copied into every lane."""
+    vector_type = _common_type(*signature.args)
+    assert vector_type is not None
+    return vector_type, [
+        operand
+        if given == vector_type
+        else _splat(builder, context.cast(builder, operand, given, vector_type.element), vector_type)
+        for given, operand in zip(signature.args, arguments, strict=True)
     ]
 
 
-def _in_every_lane(builder: Any, number: Any, kind: Lanes) -> Any:
-    empty, first = ir.Constant(_vector(kind), ir.Undefined), ir.Constant(ir.IntType(32), 0)
-    of_first = ir.Constant(ir.VectorType(ir.IntType(32), WIDE), [0] * WIDE)
-    return builder.shuffle_vector(builder.insert_element(empty, number, first), empty, of_first)
+def _splat(builder: Any, number: Any, vector_type: VectorType) -> Any:
+    empty, first = ir.Constant(_llvm_vector(vector_type), ir.Undefined), ir.Constant(ir.IntType(32), 0)
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), VECTOR_WIDTH), [0] * VECTOR_WIDTH)
+    return builder.shuffle_vector(builder.insert_element(empty, number, first), empty, zeros)
 
 
-def _instruction(of_floats: str, of_integers: str) -> Callable[..., Any]:
+def _build_operation(float_name: str, integer_name: str) -> Callable[..., Any]:
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kind, operands = _spread(context, builder, signature, arguments)
-        return getattr(builder, of_floats if kind.of in _OF_BITS else of_integers)(*operands)
+        vector_type, operands = _broadcast(context, builder, signature, arguments)
+        return getattr(builder, float_name if vector_type.element in _UNSIGNED else integer_name)(*operands)
 
     return build
 
 
-def _choice(sign: str) -> Callable[..., Any]:
+def _build_select(comparison: str) -> Callable[..., Any]:
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        _, (x, y) = _spread(context, builder, signature, arguments)
-        return builder.select(builder.fcmp_ordered(sign, x, y), x, y)
+        _, (x, y) = _broadcast(context, builder, signature, arguments)
+        return builder.select(builder.fcmp_ordered(comparison, x, y), x, y)
 
     return build
 
 
-def _kind_of_two(x: Any, y: Any) -> Lanes | None:
-    return _kind(x, y)
+def _operation_type(x: Any, y: Any) -> VectorType | None:
+    return _common_type(x, y)
 
 
-def _mask_kind(x: Any, y: Any) -> Lanes | None:
-    kind = _kind(x, y)
-    return None if kind is None else Lanes(_OF_BITS[kind.of])
+def _comparison_type(x: Any, y: Any) -> VectorType | None:
+    vector_type = _common_type(x, y)
+    return None if vector_type is None else VectorType(_UNSIGNED[vector_type.element])
 
 
-def _below(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    _, (x, y) = _spread(context, builder, signature, arguments)
-    return builder.sext(builder.fcmp_ordered("<", x, y), _vector(signature.return_type))
+def _build_less_than(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    _, (x, y) = _broadcast(context, builder, signature, arguments)
+    return builder.sext(builder.fcmp_ordered("<", x, y), _llvm_vector(signature.return_type))
 
 
-def _root(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    vector = _vector(signature.args[0])
-    name = f"llvm.sqrt.v{WIDE}f{signature.args[0].of.bitwidth}"
+def _build_square_root(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    vector = _llvm_vector(signature.args[0])
+    name = f"llvm.sqrt.v{VECTOR_WIDTH}f{signature.args[0].element.bitwidth}"
     return builder.call(
         cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector]), name), arguments
     )
 
 
-def _reinterpreted(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.bitcast(arguments[0], _vector(signature.return_type))
+def _build_bitcast(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.bitcast(arguments[0], _llvm_vector(signature.return_type))
 
 
-def _to_float32(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    convert = builder.fptrunc if signature.args[0].of in _OF_BITS else builder.sitofp
-    return convert(arguments[0], _vector(signature.return_type))
+def _build_to_float32(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    convert = builder.fptrunc if signature.args[0].element in _UNSIGNED else builder.sitofp
+    return convert(arguments[0], _llvm_vector(signature.return_type))
 
 
-def _to_uint32(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.fptosi(arguments[0], _vector(signature.return_type))
+def _build_to_uint32(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.fptosi(arguments[0], _llvm_vector(signature.return_type))
 
 
-def _nothing(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return ir.Constant(_vector(signature.return_type), None)
+def _build_zeros(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return ir.Constant(_llvm_vector(signature.return_type), None)
 
 
-def _mask_of(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    set_ = builder.icmp_signed("<", arguments[0], ir.Constant(_vector(signature.args[0]), None))
-    return builder.zext(builder.bitcast(set_, ir.IntType(WIDE)), ir.IntType(32))
+def _build_movemask(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    is_set = builder.icmp_signed("<", arguments[0], ir.Constant(_llvm_vector(signature.args[0]), None))
+    return builder.zext(builder.bitcast(is_set, ir.IntType(VECTOR_WIDTH)), ir.IntType(32))
 
 
-class Bare(types.Type):
-    """The type of what `bare` returns."""
+class PointerType(types.Type):
+    """Describe a raw pointer to numbers to Numba."""
 
-    def __init__(self, of: types.Number) -> None:
-        self.of = of
-        super().__init__(name=f"bare({of})")
-
-
-@register_model(Bare)
-class _Place(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Bare) -> None:
-        super().__init__(manager, kind, manager.lookup(kind.of).get_data_type().as_pointer())
+    def __init__(self, element: types.Number) -> None:
+        self.element = element
+        super().__init__(name=f"pointer({element})")
 
 
-def _bare(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+@register_model(PointerType)
+class _PointerModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, pointer_type: PointerType) -> None:
+        super().__init__(manager, pointer_type, manager.lookup(pointer_type.element).get_data_type().as_pointer())
+
+
+def _build_pointer(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     array, at = arguments
-    of_array = isinstance(signature.args[0], types.Array)
-    place = context.make_array(signature.args[0])(context, builder, array).data if of_array else array
-    return builder.gep(place, [at])
+    is_array = isinstance(signature.args[0], types.Array)
+    pointer = context.make_array(signature.args[0])(context, builder, array).data if is_array else array
+    return builder.gep(pointer, [at])
 
 
-def _at(builder: Any, place: Any, at: Any, pointee: ir.Type) -> Any:
-    return builder.bitcast(builder.gep(place, [at]), pointee.as_pointer())
+def _address(builder: Any, pointer: Any, at: Any, pointee: ir.Type) -> Any:
+    return builder.bitcast(builder.gep(pointer, [at]), pointee.as_pointer())
 
 
-def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    place, at = arguments
-    lanes = _at(builder, place, at, _vector(signature.return_type))
-    return builder.load(lanes, align=signature.args[0].of.bitwidth // 8)
+def _build_load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    pointer, at = arguments
+    lanes = _address(builder, pointer, at, _llvm_vector(signature.return_type))
+    return builder.load(lanes, align=signature.args[0].element.bitwidth // 8)
 
 
-def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    numbers, _, kind = signature.args
-    place, at, lanes = arguments
-    vector = _vector(kind)
-    if numbers.of == types.uint16:
-        vector = ir.VectorType(_HALF, WIDE)
+def _build_store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    pointer_type, _, vector_type = signature.args
+    pointer, at, lanes = arguments
+    vector = _llvm_vector(vector_type)
+    if pointer_type.element == types.uint16:
+        vector = ir.VectorType(_INT16, VECTOR_WIDTH)
         lanes = builder.trunc(lanes, vector)
-    builder.store(lanes, _at(builder, place, at, vector), align=numbers.of.bitwidth // 8)
+    builder.store(lanes, _address(builder, pointer, at, vector), align=pointer_type.element.bitwidth // 8)
     return context.get_dummy_value()
 
 
-def _four_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    place, at = arguments
-    return builder.load(_at(builder, place, at, ir.IntType(32)), align=1)
+def _build_load_four_bytes(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    pointer, at = arguments
+    return builder.load(_address(builder, pointer, at, ir.IntType(32)), align=1)
 
 
-def _one(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+def _element_address(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.gep(arguments[0], [context.cast(builder, arguments[1], signature.args[1], types.intp)])
 
 
-def _get(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.load(_one(context, builder, signature, arguments))
+def _build_getitem(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.load(_element_address(context, builder, signature, arguments))
 
 
-def _set(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    number = context.cast(builder, arguments[2], signature.args[2], signature.args[0].of)
-    builder.store(number, _one(context, builder, signature, arguments))
+def _build_setitem(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    number = context.cast(builder, arguments[2], signature.args[2], signature.args[0].element)
+    builder.store(number, _element_address(context, builder, signature, arguments))
     return context.get_dummy_value()
 
 
-for _sign, _of_floats, _of_integers in (
+for _operator, _float_name, _integer_name in (
     (operator.add, "fadd", "add"),
     (operator.sub, "fsub", "sub"),
     (operator.mul, "fmul", "mul"),
@@ -312,37 +313,39 @@ for _sign, _of_floats, _of_integers in (
     (operator.lshift, "", "shl"),
     (operator.rshift, "", "lshr"),
 ):
-    type_callable(_sign)(lambda context: _kind_of_two)
-    for _operands in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
-        lower_builtin(_sign, *_operands)(_instruction(_of_floats, _of_integers))
+    type_callable(_operator)(lambda context: _operation_type)
+    for _operands in ((VectorType, VectorType), (VectorType, types.Number), (types.Number, VectorType)):
+        lower_builtin(_operator, *_operands)(_build_operation(_float_name, _integer_name))
 
-_define(greatest, _kind_of_two, _choice(">"))
-_define(least, _kind_of_two, _choice("<"))
-_define(below, _mask_kind, _below)
-_define(root, lambda x: x, _root)
-_define(bits_of, lambda x: Lanes(_OF_BITS[x.of]), _reinterpreted)
-_define(float_of, lambda bits: Lanes(types.float32), _reinterpreted)
-_define(to_float32, lambda x: Lanes(types.float32), _to_float32)
-_define(to_uint32, lambda x: Lanes(types.uint32), _to_uint32)
-_define(nothing, lambda: Lanes(types.uint32), _nothing)
-_define(mask_of, lambda x: types.uint32, _mask_of)
-_define(bare, lambda array, at: Bare(array.dtype) if isinstance(array, types.Array) else array, _bare)
-_define(load, lambda numbers, at: Lanes(numbers.of), _load)
-_define(store, lambda numbers, at, lanes: types.none, _store)
-_define(four_bytes, lambda numbers, at: types.uint32, _four_bytes)
+_register(maximum, _operation_type, _build_select(">"))
+_register(minimum, _operation_type, _build_select("<"))
+_register(less_than, _comparison_type, _build_less_than)
+_register(square_root, lambda x: x, _build_square_root)
+_register(to_bits, lambda x: VectorType(_UNSIGNED[x.element]), _build_bitcast)
+_register(from_bits, lambda bits: VectorType(types.float32), _build_bitcast)
+_register(to_float32, lambda x: VectorType(types.float32), _build_to_float32)
+_register(to_uint32, lambda x: VectorType(types.uint32), _build_to_uint32)
+_register(uint32_zeros, lambda: VectorType(types.uint32), _build_zeros)
+_register(movemask, lambda x: types.uint32, _build_movemask)
+_register(
+    pointer_to, lambda array, at: PointerType(array.dtype) if isinstance(array, types.Array) else array, _build_pointer
+)
+_register(load, lambda pointer, at: VectorType(pointer.element), _build_load)
+_register(store, lambda pointer, at, lanes: types.none, _build_store)
+_register(load_four_bytes, lambda pointer, at: types.uint32, _build_load_four_bytes)
 
 
 @type_callable(operator.getitem)
-def _type_of_get(context: Any) -> Callable[..., Any]:
-    return lambda numbers, at: numbers.of if isinstance(numbers, Bare) else None
+def _type_getitem(context: Any) -> Callable[..., Any]:
+    return lambda pointer, at: pointer.element if isinstance(pointer, PointerType) else None
 
 
 @infer_global(operator.setitem)
-class _TypeOfSet(AbstractTemplate):
+class _SetitemTemplate(AbstractTemplate):
     def generic(self, arguments: Any, keywords: Any) -> Any:
-        numbers, at, number = arguments
-        return signature(types.none, numbers, at, number) if isinstance(numbers, Bare) else None
+        pointer, at, number = arguments
+        return signature(types.none, pointer, at, number) if isinstance(pointer, PointerType) else None
 
 
-lower_builtin(operator.getitem, Bare, types.Integer)(_get)
-lower_builtin(operator.setitem, Bare, types.Integer, types.Number)(_set)
+lower_builtin(operator.getitem, PointerType, types.Integer)(_build_getitem)
+lower_builtin(operator.setitem, PointerType, types.Integer, types.Number)(_build_setitem)

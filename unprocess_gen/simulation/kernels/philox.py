@@ -1,0 +1,94 @@
+"""Generate counter-based random words in kernels: Philox4x32-10 in the layout of `core.random_streams`.
+
+The values are those of `core.random_streams.words`; tests compare them with Random123's known answers. Each word
+depends only on its key and counter, so segments, workers and crops cannot change it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.jit import inner
+from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS
+from unprocess_gen.core.types import Plan
+from unprocess_gen.simulation.kernels.simd import Pointer
+
+LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+KEY_STEP0, KEY_STEP1 = (np.uint64(step) for step in KEY_STEPS)
+_M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
+
+PhiloxKey = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
+"""Two 32-bit words of the key, then two words that go into the counter: level and draw, and frame."""
+
+_CounterBlock = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
+
+
+def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> PhiloxKey:
+    """Return the key and counter words of a 64-bit stream key, as kernels take them."""
+    return np.uint64(key & 0xFFFFFFFF), np.uint64(key >> 32), np.uint64(level << 12 | draw), np.uint64(frame)
+
+
+def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
+    """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
+    return np.array([philox_key(plan.stream_key, plan.level, plan.draw, plan.frame) for plan in plans])
+
+
+@inner
+def load_key(keys: NDArray[np.uint64], plan: int) -> PhiloxKey:
+    """Return row ``plan`` of the array that `philox_keys` made."""
+    return keys[plan, 0], keys[plan, 1], keys[plan, 2], keys[plan, 3]
+
+
+@inner
+def philox_round(
+    c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
+) -> _CounterBlock:
+    """Compute one round of Philox4x32 on four words, each in the low half of a uint64; high halves are ignored.
+
+    Vector units multiply only the low halves, so masking before a product is free. Callers contain the loop over
+    rounds: LLVM neither inlines nor vectorises a function that contains it.
+    """
+    p0 = _M0 * (c0 & LOW32)
+    p1 = _M1 * (c2 & LOW32)
+    return (p1 >> _32) ^ (c1 ^ k0), p1, (p0 >> _32) ^ (c3 ^ k1), p0
+
+
+@inner
+def fill_word_blocks(
+    key: PhiloxKey, first_block: int, blocks: int, y: np.uint64, purpose_word: np.uint64, out: Pointer
+) -> None:
+    """Fill ``out`` (uint32) with one word per pixel, for ``blocks`` complete blocks of row ``y``."""
+    for block in range(blocks):
+        counter = np.uint64((first_block + block) * LANES)
+        at = block * BLOCK
+        for lane in range(LANES):
+            c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word | key[2], key[3]
+            k0, k1 = key[0], key[1]
+            for _ in range(ROUNDS):
+                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
+                k0, k1 = (k0 + KEY_STEP0) & LOW32, (k1 + KEY_STEP1) & LOW32
+            out[at + lane] = np.uint32(c0 & LOW32)
+            out[at + LANES + lane] = np.uint32(c1 & LOW32)
+            out[at + 2 * LANES + lane] = np.uint32(c2 & LOW32)
+            out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
+
+
+@inner
+def fill_segment_words(
+    key: PhiloxKey,
+    position: tuple[int, int],
+    purpose_word: np.uint64,
+    length: int,
+    words: NDArray[np.uint32],
+) -> int:
+    """Fill ``words`` with complete blocks that cover ``length`` pixels from ``position`` (row, column).
+
+    Return the index in ``words`` of the first pixel's word.
+    """
+    offset = position[1] % BLOCK
+    blocks = (offset + length + BLOCK - 1) // BLOCK
+    fill_word_blocks(key, position[1] // BLOCK, blocks, np.uint64(position[0]), purpose_word, words)
+    return int(offset)
