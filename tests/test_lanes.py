@@ -1,4 +1,4 @@
-"""Vectors: what is compiled computes as the arrays do that kernels see where nothing is compiled."""
+"""Test vectors and pointers: compiled functions give the same bytes as their NumPy implementations."""
 
 from __future__ import annotations
 
@@ -36,105 +36,105 @@ SHIFT, MASK = np.uint32(9), np.uint32(0x7FFFFFFF)
 
 @kernel
 def _arithmetic(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, made = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    store(made, 0, a + b)
-    store(made, 8, a - b)
-    store(made, 16, a * b)
-    store(made, 24, NUMBER * b + a * TWO)
-    store(made, 32, maximum(a, b))
-    store(made, 40, minimum(a, NUMBER))
-    store(made, 48, square_root(maximum(a, ZERO)))
-    store(made, 56, a / maximum(b, NUMBER))
+    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
+    store(target, 0, a + b)
+    store(target, 8, a - b)
+    store(target, 16, a * b)
+    store(target, 24, NUMBER * b + a * TWO)
+    store(target, 32, maximum(a, b))
+    store(target, 40, minimum(a, NUMBER))
+    store(target, 48, square_root(maximum(a, ZERO)))
+    store(target, 56, a / maximum(b, NUMBER))
 
 
 @kernel
 def _bits(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, made = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    store(made, 0, (b & MASK) ^ to_bits(a))
-    store(made, 8, (b >> SHIFT) | (b << SHIFT))
-    store(made, 16, less_than(a, NUMBER))
-    store(made, 24, to_bits(to_float32(b & MASK)))
-    store(made, 32, to_uint32(to_float32(b & MASK) * NUMBER))
-    store(made, 40, to_bits(from_bits(b ^ b)) + uint32_zeros() + b)
+    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
+    store(target, 0, (b & MASK) ^ to_bits(a))
+    store(target, 8, (b >> SHIFT) | (b << SHIFT))
+    store(target, 16, less_than(a, NUMBER))
+    store(target, 24, to_bits(to_float32(b & MASK)))
+    store(target, 32, to_uint32(to_float32(b & MASK) * NUMBER))
+    store(target, 40, to_bits(from_bits(b ^ b)) + uint32_zeros() + b)
 
 
 @kernel
-def _doubles(x: np.ndarray, out: np.ndarray) -> None:
-    a, made = load(pointer_to(x, 0), 0), pointer_to(out, 0)
-    store(made, 0, to_float32(a))
-    store(made, 8, to_float32((a * 1e10 + 6755399441055744.0) - 6755399441055744.0))
+def _float64(x: np.ndarray, out: np.ndarray) -> None:
+    a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
+    store(target, 0, to_float32(a))
+    store(target, 8, to_float32((a * 1e10 + 6755399441055744.0) - 6755399441055744.0))
 
 
 @kernel
 def _masks(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, made = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    made[0] = movemask(b)
-    made[1] = movemask(less_than(a, a * TWO))
-    made[2] = movemask(less_than(ZERO, a))
+    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
+    target[0] = movemask(b)
+    target[1] = movemask(less_than(a, a * TWO))
+    target[2] = movemask(less_than(ZERO, a))
 
 
 @kernel
-def _halves(x: np.ndarray, out: np.ndarray) -> None:
+def _uint16(x: np.ndarray, out: np.ndarray) -> None:
     store(pointer_to(out, 3), 0, load(pointer_to(x, 0), 0))
 
 
 @kernel
-def _one_by_one(codes: np.ndarray, wide: np.ndarray, out: np.ndarray) -> None:
-    from_second, made = pointer_to(codes, 3), pointer_to(out, 0)
-    made[0] = load_four_bytes(from_second, np.uint64(2))
+def _scalars(codes: np.ndarray, wide: np.ndarray, out: np.ndarray) -> None:
+    from_second, target = pointer_to(codes, 3), pointer_to(out, 0)
+    target[0] = load_four_bytes(from_second, np.uint64(2))
     for at in range(3):
-        made[1 + at] = from_second[at]
+        target[1 + at] = from_second[at]
     numbers = pointer_to(pointer_to(wide, 1), 1)
-    made[4] = numbers[np.uint16(40000)]
+    target[4] = numbers[np.uint16(40000)]
 
 
 DOUBLES = np.array([1.1, -2.5e-11, 2.5e-10, 3.5e-10, 1e300, -0.0, 12345.678901234, 0.5e-10])
 CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
     "arithmetic": (_arithmetic, (SINGLES, OTHERS), np.zeros(64, dtype=np.float32)),
     "bits": (_bits, (SINGLES, WORDS), np.zeros(48, dtype=np.uint32)),
-    "doubles": (_doubles, (DOUBLES,), np.zeros(16, dtype=np.float32)),
+    "float64": (_float64, (DOUBLES,), np.zeros(16, dtype=np.float32)),
     "masks": (_masks, (OTHERS, WORDS), np.zeros(3, dtype=np.uint32)),
-    "halves": (_halves, (WORDS,), np.zeros(12, dtype=np.uint16)),
-    "one by one": (
-        _one_by_one,
+    "uint16": (_uint16, (WORDS,), np.zeros(12, dtype=np.uint16)),
+    "scalars": (
+        _scalars,
         (np.arange(200, 212, dtype=np.uint8).reshape(2, 2, 3), np.arange(50000, dtype=np.uint32)),
         np.zeros(5, dtype=np.uint32),
     ),
 }
 
 
-def uncompiled(made_of: Any) -> Callable[..., None]:
-    return cast(Callable[..., None], getattr(made_of, "py_func", made_of))
+def uncompiled(kernel_function: Any) -> Callable[..., None]:
+    return cast(Callable[..., None], getattr(kernel_function, "py_func", kernel_function))
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.filterwarnings("ignore:overflow")
-def test_vectors_hold_what_arrays_hold(case: str) -> None:
-    made_of, given, room = CASES[case]
-    compiled, plain = room.copy(), room.copy()
+def test_compiled_vectors_equal_numpy_implementation(case: str) -> None:
+    kernel_function, arguments, empty = CASES[case]
+    compiled, expected = empty.copy(), empty.copy()
 
-    made_of(*given, compiled)
+    kernel_function(*arguments, compiled)
     with np.errstate(all="ignore"):
-        uncompiled(made_of)(*given, plain)
+        uncompiled(kernel_function)(*arguments, expected)
 
-    assert compiled.tobytes() == plain.tobytes()
-    assert compiled.tobytes() != room.tobytes()
+    assert compiled.tobytes() == expected.tobytes()
+    assert compiled.tobytes() != empty.tobytes()
 
 
-def test_a_mask_has_the_first_lane_lowest() -> None:
+def test_first_lane_is_lowest_bit_of_mask() -> None:
     out = np.zeros(3, dtype=np.uint32)
     _masks(OTHERS, WORDS, out)
     assert out.tolist() == [0b00011000, 0b10110001, 0b10110001]
     assert VECTOR_WIDTH == 8
 
 
-def test_low_halves_are_stored_among_numbers_of_16_bits_and_nothing_beside_them() -> None:
+def test_store_truncates_to_16_bits_and_writes_eight_values_only() -> None:
     out = np.full(12, 7, dtype=np.uint16)
-    _halves(WORDS, out)
+    _uint16(WORDS, out)
     assert out.tolist() == [7, 7, 7, *(int(word) % 2**16 for word in WORDS), 7]
 
 
-def test_an_index_of_16_bits_has_no_sign() -> None:
+def test_index_of_16_bits_is_unsigned() -> None:
     out = np.zeros(5, dtype=np.uint32)
-    _one_by_one(*CASES["one by one"][1], out)
+    _scalars(*CASES["scalars"][1], out)
     assert out.tolist() == [0xD0CFCECD, 203, 204, 205, 40002]
