@@ -1,10 +1,10 @@
-"""How fast a pair is made, as a ratio: two tiers of accuracy and a yardstick in turns, in one process, one thread.
+"""Measure the speed of a pair relative to a yardstick: two accuracy tiers, interleaved, one process, one thread.
 
     python tests/bench_pair.py PHOTO [PHOTO ...] [--yardstick naive.py] [--rounds 5]
 
-Prints, for each photograph, nanoseconds a pixel (medians), and how many times as fast a tier is (medians of the ratios
-round by round). The yardstick is `algorithm1` beside this file, or any module with the functions unprocess(rgb, dtype),
-add_noise(raw) and to_dn(raw).
+Prints nanoseconds per pixel for each photograph (medians), and the speed of each tier relative to the yardstick
+(medians of the ratios of each round). The yardstick is `algorithm1` in this folder, or any module with the functions
+unprocess(rgb, dtype), add_noise(raw) and to_dn(raw).
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ TIERS = ("exact", "fast")
 
 
 def fixed_plan(tier: str) -> Plan:
+    """Return the same plan for every photograph, with the accuracy budget of a tier."""
     noise = NoiseConfig("imx385_iso3200", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
     budget = OmegaConf.load(Path(__file__).parents[1] / "conf" / "accuracy" / f"{tier}.yaml")
     accuracy = OmegaConf.to_object(OmegaConf.merge(AccuracyConfig, budget))
@@ -43,6 +44,7 @@ def fixed_plan(tier: str) -> Plan:
 
 
 def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
+    """Return a function that simulates a pair by `algorithm1` with the parameters of a plan."""
     tiny = make_pair(np.zeros((1, 1, 3), np.uint8), plan)
     values = pair_row("", Source(0, "", "", 0), "", 1, 0, plan, tiny, ("", ""), Patch(0, 0, 0, 1, 1))
     row = {name: str(value) for name, value in values.items()}
@@ -56,6 +58,7 @@ def own_yardstick(plan: Plan) -> Callable[[np.ndarray], object]:
 
 
 def other_yardstick(path: str) -> Callable[[np.ndarray], object]:
+    """Return a function that simulates a pair by the module at ``path``."""
     spec = importlib.util.spec_from_file_location("yardstick", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -69,13 +72,14 @@ def other_yardstick(path: str) -> Callable[[np.ndarray], object]:
 
 
 def seconds(call: Callable[[], object]) -> float:
-    """Processor time of this thread, which waits for nobody on a shared machine."""
+    """Return the CPU time of a call in this thread, which other processes do not change."""
     started = time.thread_time()
     call()
     return time.thread_time() - started
 
 
 def main() -> None:
+    """Measure every photograph given on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", nargs="+")
     parser.add_argument("--yardstick")
@@ -96,7 +100,7 @@ def main() -> None:
         tiers = (
             f"{tier} {ns:.2f} ({ratio:.1f})" for tier, ns, ratio in zip(TIERS, times_ns[1:], found[-1], strict=True)
         )
-        print(f"{Path(photo).name}: yardstick {times_ns[0]:.0f} ns a pixel,", ", ".join(tiers))
+        print(f"{Path(photo).name}: yardstick {times_ns[0]:.0f} ns per pixel,", ", ".join(tiers))
     for tier, ratios in zip(TIERS, np.transpose(found), strict=True):
         print(f"{tier}: median ratio {np.median(ratios):.1f}, {ratios.min():.1f} to {ratios.max():.1f}")
 

@@ -1,14 +1,15 @@
-"""What scenes cost, and what leaving effects out saves and loses: one process, one thread, in turns.
+"""Measure the time of scenes, and what omitting effects saves and costs in accuracy: one thread, interleaved.
 
     python tests/bench_scenes.py PHOTO [PHOTO ...] [--profiles sony_a7s2,imx385] [--rounds 5] [--costs | --daylight]
 
-Prints a Markdown table, a line for each scene and physical profile: nanoseconds of processor time a pixel under
-``effects=auto`` and with everything on that has a number (assumed numbers count as sourced ones, so that auto decides
-about all), their ratio, the ratio of auto to the two-parameter profile imx385_iso3200, all as medians over photographs
-and rounds; and the error accepted: what auto left out, RMS over the noise that hides it, in the worst statistic
-(`omission`), measured on a cut-out of each photograph, all together, by the reference forms. With ``--costs``: what
-each effect adds, all others being on. With ``--daylight``: every profile as it stands, assumed numbers left out, beside
-the two-parameter model of the same tier.
+Prints a Markdown table with a row for each scene and physical profile. Times are nanoseconds of CPU time per pixel,
+medians over photographs and rounds: under ``effects=auto``, with all effects that have a parameter, their ratio, and
+the ratio of auto to the two-parameter profile imx385_iso3200. Assumed parameters count as sourced ones, so that auto
+decides about all effects. The last column is the accepted error: RMS of the omitted effects divided by the masking
+noise, in the worst statistic (`omission`), measured by the reference on a crop of each photograph.
+
+``--costs`` prints the time that each effect adds with all others on. ``--daylight`` compares every profile, without
+assumed parameters, with the two-parameter model of the same tier.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Float, Plan, Srgb
-from unprocess_gen.planning import effect_selection as planner
+from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.kernels import physical as electrons
+from unprocess_gen.simulation.kernels.physical import prnu_response
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import noise as effects
 from unprocess_gen.simulation.reference.noise import EFFECTS
@@ -44,16 +45,17 @@ from unprocess_gen.sources.image.decode import decode
 SCENES = ("daylight", "indoor", "low_light", "night", "video_night", "long_exposure")
 PROFILES = ("sony_a7s2", "nikon_d850", "imx385", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")
 COST_SCENES = ("daylight", "night")
-"""Many electrons a pixel, and few: counts below 64 are the dearer ones."""
+"""Scenes of many and of few electrons per pixel: counts below 64 are slower."""
 
 ISOS = ("noise.iso=1600", "noise.iso=3200", "noise.iso=6400")
-"""What is taken, in turn, where a profile was not calibrated at the scene's ISO."""
+"""Alternatives, in this order, if a profile was not calibrated at the ISO of the scene."""
 
-CUT = (384, 512)
-"""Of the reference forms, which take 3 microseconds a pixel."""
+CROP = (384, 512)
+"""Size of the crop for the reference, which takes 3 microseconds per pixel."""
 
 
 def settings(*overrides: str) -> Config:
+    """Return the validated config of these overrides."""
     ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         node = compose("config", overrides=list(overrides))
@@ -64,23 +66,24 @@ def settings(*overrides: str) -> Config:
     return config
 
 
-def physical(*said: str) -> Config:
-    """Settings of a scene and a profile, at the scene's ISO if the profile has it."""
-    if not are_taken(*said):
-        said = (*said, next(iso for iso in ISOS if are_taken(*said, iso)))
-    return settings(*said)
+def physical(*overrides: str) -> Config:
+    """Return the config of a scene and a profile, at the ISO of the scene if the profile has it."""
+    if not is_valid(*overrides):
+        overrides = (*overrides, next(iso for iso in ISOS if is_valid(*overrides, iso)))
+    return settings(*overrides)
 
 
-def are_taken(*said: str) -> bool:
+def is_valid(*overrides: str) -> bool:
+    """Return whether these overrides give a valid config."""
     try:
-        settings(*said)
+        settings(*overrides)
     except ConfigError:
         return False
     return True
 
 
 def unrounded(srgb: Srgb, plan: Plan) -> tuple[Float, Float]:
-    """The clean and the noisy frame in DN, before rounding."""
+    """Return the clean and the noisy frame in DN, before rounding."""
     light = unprocess(srgb, plan) * plan.exposure
     if plan.averaged:
         light = effects.respond(light, plan)
@@ -89,106 +92,110 @@ def unrounded(srgb: Srgb, plan: Plan) -> tuple[Float, Float]:
 
 
 def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[str, Float]:
-    """What ``auto`` leaves out of ``everything``, squared, over the variance that hides it, for each statistic.
+    """Return the squared omission of ``auto`` divided by the masking variance, for each statistic.
 
-    One value for each pixel, row, column and colour plane of the mean over the ``frames`` of a still clip. What hides
-    is the noise of ``auto`` at the local signal.
+    One value per pixel, row, column and colour plane of the mean over the ``frames`` of a still clip. The masking
+    variance is that of ``auto`` at the local signal.
     """
     clean_dn = unrounded(srgb, auto)[0]
     clips = ([unrounded(srgb, replace(plan, frame=n))[1] for n in range(frames)] for plan in (everything, auto))
     with_all, with_some = (np.mean(clip, axis=0) for clip in clips)
-    left_out = with_all - with_some
+    omitted = with_all - with_some
     variance = effects.noise_variance(clean_dn, auto) + 1 / 12
     if auto.physics is not None and "dark_current" in auto.effects:
         variance = variance + auto.physics.dn_per_e**2 * auto.physics.dark_e
     variance = variance / frames
-    height, width = left_out.shape
-    planes = [(left_out[y::2, x::2], variance[y::2, x::2]) for y in range(min(height, 2)) for x in range(min(width, 2))]
+    height, width = omitted.shape
+    planes = [(omitted[y::2, x::2], variance[y::2, x::2]) for y in range(min(height, 2)) for x in range(min(width, 2))]
     return {
-        "pixel": (left_out**2 / variance).ravel(),
-        "row mean": left_out.mean(1) ** 2 / (variance.mean(1) / width),
-        "column mean": left_out.mean(0) ** 2 / (variance.mean(0) / height),
+        "pixel": (omitted**2 / variance).ravel(),
+        "row mean": omitted.mean(1) ** 2 / (variance.mean(1) / width),
+        "column mean": omitted.mean(0) ** 2 / (variance.mean(0) / height),
         "plane mean": np.array([part.mean() ** 2 / (noise.mean() / part.size) for part, noise in planes]),
     }
 
 
 def nanoseconds(srgb: Srgb, plan: Plan) -> float:
-    """One pair of a body that was not seen before, nanoseconds of processor time a pixel."""
-    electrons.prnu_response.cache_clear()
+    """Return the CPU time of one pair without cached PRNU, nanoseconds per pixel."""
+    prnu_response.cache_clear()
     started = time.thread_time()
     make_pair(srgb, plan)
     return (time.thread_time() - started) * 1e9 / (srgb.shape[0] * srgb.shape[1])
 
 
 def planned(config: Config, srgb: Srgb, switch: str, number: int) -> Plan:
+    """Plan a photograph with ``effects.all`` set to ``switch``."""
     config.effects.all = switch
-    return plan_image(config, f"{number:064x}", 0, planner.facts_of(srgb))
+    return plan_image(config, f"{number:064x}", 0, facts_of(srgb))
 
 
-def cut(srgb: Srgb) -> Srgb:
-    top, left = ((side - most) // 2 if side > most else 0 for side, most in zip(srgb.shape[:2], CUT, strict=True))
-    return np.ascontiguousarray(srgb[top : top + CUT[0], left : left + CUT[1]])
+def crop(srgb: Srgb) -> Srgb:
+    """Return the crop of size `CROP` in the middle."""
+    top, left = ((side - most) // 2 if side > most else 0 for side, most in zip(srgb.shape[:2], CROP, strict=True))
+    return np.ascontiguousarray(srgb[top : top + CROP[0], left : left + CROP[1]])
 
 
-def in_turns(srgb: Srgb, plans: dict[str, Plan], rounds: int) -> dict[str, list[float]]:
+def interleaved(srgb: Srgb, plans: dict[str, Plan], rounds: int) -> dict[str, list[float]]:
+    """Return the times of each plan, nanoseconds per pixel, measured in turns."""
     for plan in plans.values():
         nanoseconds(srgb, plan)
-    taken: dict[str, list[float]] = {name: [] for name in plans}
+    times_ns: dict[str, list[float]] = {name: [] for name in plans}
     for _ in range(rounds):
         for name, plan in plans.items():
-            taken[name].append(nanoseconds(srgb, plan))
-    return taken
+            times_ns[name].append(nanoseconds(srgb, plan))
+    return times_ns
 
 
-def line(scene: str, noise: str, photos: list[Srgb], rounds: int) -> str:
+def table_row(scene: str, noise: str, photos: list[Srgb], rounds: int) -> str:
+    """Return the Markdown row of a scene and a profile."""
     config = physical(f"scene={scene}", f"noise={noise}", "noise.assumed=[]")
     two = settings("noise=imx385_iso3200")
-    ratios, times, left_out = [], {"two": [], "auto": [], "on": []}, set()
+    ratios, times, omitted = [], {"two": [], "auto": [], "on": []}, set()
     squares: dict[str, list[Float]] = {"": [np.zeros(1)]}
     for number, srgb in enumerate(photos):
         plans = {"two": plan_image(two, f"{number:064x}")}
         plans |= {switch: planned(config, srgb, switch, number) for switch in ("auto", "on")}
-        left_out |= set(plans["on"].effects) - set(plans["auto"].effects)
-        taken = in_turns(srgb, plans, rounds)
-        for name, seconds in taken.items():
+        omitted |= set(plans["on"].effects) - set(plans["auto"].effects)
+        times_ns = interleaved(srgb, plans, rounds)
+        for name, seconds in times_ns.items():
             times[name] += seconds
-        ratios += zip(taken["on"], taken["auto"], taken["two"], strict=True)
-        part = cut(srgb)
+        ratios += zip(times_ns["on"], times_ns["auto"], times_ns["two"], strict=True)
+        part = crop(srgb)
         part_plans = [planned(config, part, switch, number) for switch in ("on", "auto")]
-        left_out |= set(part_plans[0].effects) - set(part_plans[1].effects)
+        omitted |= set(part_plans[0].effects) - set(part_plans[1].effects)
         for statistic, values in omission(part, *part_plans).items():
             squares.setdefault(statistic, []).append(values)
     error = max(math.sqrt(np.concatenate(values).mean()) for values in squares.values())
     auto, on = (statistics.median(times[name]) for name in ("auto", "on"))
     saved = statistics.median(auto / on for on, auto, _ in ratios)
-    beside = statistics.median(auto / two for _, auto, two in ratios)
+    relative = statistics.median(auto / two for _, auto, two in ratios)
     iso = plans["on"].physics.iso if plans["on"].physics is not None else 0
-    names = ", ".join(effect for effect in EFFECTS if effect in left_out) or "nothing"
+    names = ", ".join(effect for effect in EFFECTS if effect in omitted) or "nothing"
     return (
-        f"| {scene} | {noise}, ISO {iso:g} | {auto:.1f} | {on:.1f} | {saved:.2f} | {beside:.1f} | {names} "
+        f"| {scene} | {noise}, ISO {iso:g} | {auto:.1f} | {on:.1f} | {saved:.2f} | {relative:.1f} | {names} "
         f"| {error:.3f} |"
     )
 
 
 def daylight(photos: list[Srgb], rounds: int) -> None:
-    """Print what the profiles' pairs take beside the two-parameter model's, median and most of the photographs'."""
+    """Print the time of each profile relative to the two-parameter model: median and maximum over photographs."""
     print("| profile | `exact` | `fast` |\n|---|--:|--:|")
     for noise in PROFILES:
-        told = []
+        cells = []
         for tier in ("exact", "fast"):
-            ours = physical("scene=daylight", f"noise={noise}", f"accuracy={tier}")
+            profile = physical("scene=daylight", f"noise={noise}", f"accuracy={tier}")
             two = settings("noise=imx385_iso3200", f"accuracy={tier}")
             ratios = []
             for number, srgb in enumerate(photos):
-                plans = {"ours": planned(ours, srgb, "auto", number), "two": plan_image(two, f"{number:064x}")}
-                taken = in_turns(srgb, plans, rounds)
-                ratios.append(min(taken["ours"]) / min(taken["two"]))
-            told.append(f"{statistics.median(ratios):.2f} ({max(ratios):.2f})")
-        print(f"| {noise} | {told[0]} | {told[1]} |", flush=True)
+                plans = {"auto": planned(profile, srgb, "auto", number), "two": plan_image(two, f"{number:064x}")}
+                times_ns = interleaved(srgb, plans, rounds)
+                ratios.append(min(times_ns["auto"]) / min(times_ns["two"]))
+            cells.append(f"{statistics.median(ratios):.2f} ({max(ratios):.2f})")
+        print(f"| {noise} | {cells[0]} | {cells[1]} |", flush=True)
 
 
 def costs(photo: Srgb, rounds: int) -> None:
-    """Print what each effect adds to a pair with all the others, on the photograph at 2880x2160: shortest times."""
+    """Print the time that each effect adds to all others on a photograph of 2880x2160: differences of minimum times."""
     srgb = cv2.resize(photo, (2880, 2160), interpolation=cv2.INTER_AREA)
     print("| effect | " + " | ".join(COST_SCENES) + " |\n|---|" + "--:|" * len(COST_SCENES))
     table: dict[str, list[float]] = {effect: [] for effect in EFFECTS}
@@ -200,9 +207,9 @@ def costs(photo: Srgb, rounds: int) -> None:
         plans = {"all": plan} | {
             effect: replace(plan, effects=tuple(other for other in EFFECTS if other != effect)) for effect in EFFECTS
         }
-        taken = in_turns(srgb, plans, rounds)
+        times_ns = interleaved(srgb, plans, rounds)
         for effect in EFFECTS:
-            table[effect].append(min(taken["all"]) - min(taken[effect]))
+            table[effect].append(min(times_ns["all"]) - min(times_ns[effect]))
     for effect, values in table.items():
         print(f"| {effect} | " + " | ".join(f"{value:.1f}" for value in values) + " |")
 
@@ -224,12 +231,12 @@ def main() -> None:
         daylight(photos, options.rounds)
         return
     print(
-        "| scene | profile | auto, ns/pixel | all on | auto / all | auto / two-parameter | left out | error accepted |"
+        "| scene | profile | auto, ns/pixel | all on | auto / all | auto / two-parameter | omitted | accepted error |"
     )
     print("|---|---|--:|--:|--:|--:|---|--:|")
     for scene in SCENES:
         for noise in options.profiles.split(","):
-            print(line(scene, noise, photos, options.rounds), flush=True)
+            print(table_row(scene, noise, photos, options.rounds), flush=True)
 
 
 if __name__ == "__main__":
