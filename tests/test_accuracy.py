@@ -319,7 +319,7 @@ def test_the_page_is_one_file_without_a_script_and_escapes_names() -> None:
     )
 
     assert "<script" not in page
-    assert "&lt;script&gt;alert(&#x27;&amp;&quot;)" in page
+    assert "&lt;script&gt;alert(&#39;&amp;&#34;)" in page
     assert 'src="data:image/png;base64,cG5n"' in page
     assert not re.search(r"(href|src)=\"(?!data:)", page)
 
@@ -416,7 +416,7 @@ def test_a_plan_tells_the_price_of_what_is_chosen_beside_the_tiers(settings: Set
     )
 
     assert re.fullmatch(
-        r"accuracy  exact: clean 0 DN, normals 1e-06 σ, exact laws; [\d.e+]+ ns a pixel here "
+        r"accuracy  exact: clean 0 DN, normals within 1e-06 σ, exact shot noise; [\d.e+]+ ns per pixel here "
         r"\(reference [\d.e+]+, fast [\d.e+]+\)",
         line,
     )
@@ -426,8 +426,8 @@ def test_a_plan_says_what_a_loose_budget_gives_away(settings: Settings, tmp_path
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "accuracy=fast")
 
     assert (
-        "accuracy  fast: clean within 1 DN at a share of 0.001, normals 0.001 σ, laws within 0.005; "
-        in format_estimate(config, estimate_run(config, 1, True))
+        "accuracy  fast: clean within 1 DN, a fraction of 0.001 changed, normals within 0.001 σ, "
+        "shot noise within 0.005 (CDF); " in format_estimate(config, estimate_run(config, 1, True))
     )
 
 
@@ -435,4 +435,4 @@ def test_a_plan_of_nothing_readable_has_no_price(settings: Settings, tmp_path: P
     (tmp_path / "a.png").write_bytes(b"")
     config = settings(f"source.root={tmp_path}")
 
-    assert "exact laws;" not in format_estimate(config, estimate_run(config, 1, True, TIERS))
+    assert "exact shot noise;" not in format_estimate(config, estimate_run(config, 1, True, TIERS))

@@ -1,4 +1,4 @@
-"""What a run would make, told before: which photographs are read, and when a number is exact."""
+"""The estimate of `plan`: which sources are read, when numbers are exact, and the text."""
 
 from __future__ import annotations
 
@@ -27,36 +27,41 @@ def listing(count: int) -> tuple[Source, ...]:
 
 
 @given(total=st.integers(1, 500), count=st.integers(1, 50))
-def test_a_spread_is_as_many_different_sources_in_order(total: int, count: int) -> None:
+def test_spaced_sources_are_different_and_in_order(total: int, count: int) -> None:
     indices = [source.index for source in evenly_spaced(listing(total), count)]
     assert len(indices) == min(total, count)
     assert indices == sorted(set(indices))
 
 
 @given(total=st.integers(1, 500), count=st.integers(1, 50))
-def test_a_spread_is_even(total: int, count: int) -> None:
+def test_spaced_sources_have_even_distances(total: int, count: int) -> None:
     indices = [source.index for source in evenly_spaced(listing(total), count)]
     gaps = [after - before for before, after in zip(indices, [*indices[1:], total], strict=True)]
     assert max(gaps) - min(gaps) <= 1
     assert indices[0] == 0
 
 
-def test_few_photographs_are_all_read_and_the_bytes_exact(settings: Settings, tmp_path: Path) -> None:
-    told = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE)}"), 1, read_all=False)
-    assert (told.exact, len(told.looks)) == (True, SAMPLE)
+def test_few_sources_are_all_read_and_bytes_are_exact(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE)}"), 1, read_all=False)
+    assert (estimate.exact, len(estimate.source_estimates)) == (True, SAMPLE)
 
 
-def test_of_many_photographs_a_sample_is_read(settings: Settings, tmp_path: Path) -> None:
-    told = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=False)
-    assert (told.exact, len(told.looks), told.sources, told.shards) == (False, SAMPLE, SAMPLE + 1, 3)
+def test_many_sources_are_sampled(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=False)
+    assert (estimate.exact, len(estimate.source_estimates), estimate.sources, estimate.shards) == (
+        False,
+        SAMPLE,
+        SAMPLE + 1,
+        3,
+    )
 
 
-def test_all_are_read_when_asked(settings: Settings, tmp_path: Path) -> None:
-    told = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=True)
-    assert (told.exact, len(told.looks)) == (True, SAMPLE + 1)
+def test_all_sources_are_read_on_request(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=True)
+    assert (estimate.exact, len(estimate.source_estimates)) == (True, SAMPLE + 1)
 
 
-def test_about_is_said_where_not_all_were_read(settings: Settings, tmp_path: Path) -> None:
+def test_sampled_estimate_says_about(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}")
     assert "about" in next(
         line
@@ -68,66 +73,98 @@ def test_about_is_said_where_not_all_were_read(settings: Settings, tmp_path: Pat
     )
 
 
-def test_time_is_divided_by_the_workers(settings: Settings, tmp_path: Path) -> None:
-    told = estimate_run(settings(f"source.root={fill(tmp_path / 'p', 3)}"), 4, read_all=True)
-    assert told.seconds == pytest.approx(sum(look.seconds for look in told.looks) / 4)
+def test_time_is_divided_by_the_number_of_workers(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', 3)}"), 4, read_all=True)
+    assert estimate.seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / 4)
 
 
-def test_a_photograph_that_fails_takes_no_bytes_and_keeps_its_reason(settings: Settings, tmp_path: Path) -> None:
+def test_failed_source_has_no_bytes_and_a_reason(settings: Settings, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
-    told = estimate_run(settings(f"source.root={tmp_path / 'p'}"), 1, read_all=True)
-    assert (told.bytes, told.looks[0].reason, told.looks[0].levels) == (0, "empty", ())
+    estimate = estimate_run(settings(f"source.root={tmp_path / 'p'}"), 1, read_all=True)
+    assert (estimate.bytes, estimate.source_estimates[0].reason, estimate.source_estimates[0].levels) == (
+        0,
+        "empty",
+        (),
+    )
 
 
-def test_free_bytes_are_those_of_the_nearest_folder_that_exists(settings: Settings, tmp_path: Path) -> None:
+def test_free_bytes_are_measured_at_the_nearest_existing_folder(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", f"out={tmp_path}/not/yet/there")
     assert estimate_run(config, 1, True).free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
 
 
-def test_a_forecast_of_nothing_but_failures_can_be_told(settings: Settings, tmp_path: Path) -> None:
+def test_estimate_without_readable_sources_has_a_text(settings: Settings, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
     config = settings(f"source.root={tmp_path / 'p'}")
     assert "fails     000.png: empty" in format_estimate(config, estimate_run(config, 1, True))
 
 
-def test_skipped_effects_are_told_with_their_reason(settings: Settings, tmp_path: Path) -> None:
+def test_skipped_effects_are_listed_with_their_reason(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=none")
     assert "skipped   heteroscedastic: noise=none has no variance" in format_estimate(
         config, estimate_run(config, 1, True)
     )
 
 
-def test_shadows_without_noise_are_told(settings: Settings, tmp_path: Path) -> None:
+def test_shadows_without_noise_are_reported(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=imx385_iso3200_rvdd")
     assert "no noise up to 15.33 DN above black" in format_estimate(config, estimate_run(config, 1, True))
 
 
-def test_every_noise_level_is_told(door: Door, tmp_path: Path) -> None:
+def test_every_noise_level_is_listed(door: Door, tmp_path: Path) -> None:
     levels = "noise.levels=[{a: 1, b: 2},{a: 30, b: 900}]"
-    told = door("plan", "source.limit=1", "noise=heteroscedastic", levels, f"out={tmp_path}/ds").out
-    assert "a=1, b=2; a=30, b=900 (" in told
-    assert "a_dn 1 to 30, b_dn2 2 to 900" in told
+    estimate = door("plan", "source.limit=1", "noise=heteroscedastic", levels, f"out={tmp_path}/ds").out
+    assert "a=1, b=2; a=30, b=900 (" in estimate
+    assert "a_dn 1 to 30, b_dn2 2 to 900" in estimate
 
-    told = door("plan", "source.limit=1", "noise=nikon_d850", "noise.levels=[100,6400]", f"out={tmp_path}/ds").out
-    assert "ISO 100 to 6400" in told
-    assert " of 2 " in told
+    estimate = door("plan", "source.limit=1", "noise=nikon_d850", "noise.levels=[100,6400]", f"out={tmp_path}/ds").out
+    assert "ISO 100 to 6400" in estimate
+    assert " of 2 " in estimate
 
 
-def test_an_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:
+def test_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no file matches source.include="):
         estimate_run(settings(f"source.root={tmp_path}"), 1, read_all=False)
 
 
-def test_a_negative_b_without_slope_can_be_told(settings: Settings, tmp_path: Path) -> None:
+def test_negative_b_without_slope_has_a_text(settings: Settings, tmp_path: Path) -> None:
     overrides = ("noise.a=0", "noise.b=-5", "noise.negative_variance=clip")
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", *overrides)
     assert "b_dn2 -5" in format_estimate(config, estimate_run(config, 1, True))
 
 
-def test_of_a_physical_profile_every_effect_is_told_with_its_reason(settings: Settings, tmp_path: Path) -> None:
+def test_every_effect_of_a_physical_profile_has_a_line_and_a_reason(settings: Settings, tmp_path: Path) -> None:
     config = settings("noise=sony_a7s2", "scene=night", f"source.root={fill(tmp_path / 'p', 2)}")
-    told = format_estimate(config, estimate_run(config, 1, True))
-    assert "scene     night: ISO 6400" in told
-    assert "noise     sony_a7s2: " in told
+    estimate = format_estimate(config, estimate_run(config, 1, True))
+    assert "scene     night: ISO 6400" in estimate
+    assert "noise     sony_a7s2: " in estimate
     for effect in EFFECTS:
-        assert re.search(rf"^{effect} .* [0-2] of 2 +[\d.]+ +\S", told, re.MULTILINE), effect
+        assert re.search(rf"^{effect} .* [0-2] of 2 +[\d.]+ +\S", estimate, re.MULTILINE), effect
+
+
+def test_unmatched_files_are_counted_by_suffix_with_advice(settings: Settings, tmp_path: Path) -> None:
+    folder = fill(tmp_path / "p", 1)
+    for name in ("a.heic", "b.heic", "c.txt"):
+        (folder / name).touch()
+    config = settings(f"source.root={folder}")
+    estimate = estimate_run(config, 1, True)
+
+    assert estimate.unmatched == {".heic": 2, ".txt": 1}
+    line = format_estimate(config, estimate).splitlines()[1]
+    assert "3 files are not matched by source.include (2 .heic, 1 .txt); convert " in line
+
+
+def test_failed_source_is_listed_with_its_explanation(settings: Settings, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"no picture")
+    config = settings(f"source.root={tmp_path / 'p'}")
+    estimate = estimate_run(config, 1, True)
+
+    detail = estimate.source_estimates[0].detail
+    assert detail
+    assert f"fails     000.png: unsupported\n          {detail}" in format_estimate(config, estimate)
+
+
+def test_pairs_are_extrapolated_from_the_sample(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 4)}", "noise.draws=2")
+    assert estimate_run(config, 1, False).pairs == 2 * (SAMPLE + 4)
+    assert estimate_run(config, 1, True).pairs == 2 * (SAMPLE + 4)

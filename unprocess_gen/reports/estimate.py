@@ -1,7 +1,7 @@
-"""What a run would make, told before it: pairs, shards, bytes, time, effects and why. Writes nothing.
+"""Estimate what a run would make: pairs, shards, bytes, time and effects. Nothing is written.
 
-Reads `SAMPLE` photographs spread over the listing, or all of them; the bytes of the shards are exact when all were
-read, since a pair's size depends on its width, height and name alone.
+Up to `SAMPLE` evenly spaced sources are read, or all of them on request. The bytes of the shards are exact if all were
+read, because the size of a pair depends only on its width, height and name.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,22 +26,39 @@ from unprocess_gen.dataset.manifest import json_size
 from unprocess_gen.dataset.shards import form_of, image_bytes, shard_bytes
 from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
-from unprocess_gen.reports.benchmark import measure as accuracy
+from unprocess_gen.reports.benchmark.measure import measure_tier_times
+from unprocess_gen.reports.formatting import value_range
 from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.sources.listing import unmatched_sentence
 from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches, pixels_in_none
 
 SAMPLE = 16
+"""Number of sources read unless all are asked for."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceEstimate:
-    """What one photograph would give: the bytes of its pairs (0 where it fails), the time, the plans of its
-    noise levels or the reason.
+    """Hold what one source would give, or why it fails.
 
-    ``predictions``: what was decided about each effect of a physical profile, and why. ``patches`` and ``pairs`` are
-    how many it gives, ``pixels`` and ``left_out`` how many it has and how many of them lie in no patch; ``complaint``
-    says more of the reason.
+    Attributes
+    ----------
+    source : Source
+        The source.
+    bytes : int
+        Bytes of its pairs in a shard; 0 if it fails.
+    seconds : float
+        Time it took to make them.
+    levels : tuple of Plan
+        The plan of each noise level; empty if it fails.
+    reason, detail : str or None, str
+        Reason class and explanation of the failure.
+    predictions : tuple of tuple of Prediction
+        For each noise level, the decision about each effect of a physical profile.
+    patches, pairs : int
+        Number of patches and of pairs.
+    pixels, unused_pixels : int
+        Number of pixels, and of those that are in no patch.
     """
 
     source: Source
@@ -53,16 +70,33 @@ class SourceEstimate:
     patches: int = 0
     pairs: int = 0
     pixels: int = 0
-    left_out: int = 0
-    complaint: str = ""
+    unused_pixels: int = 0
+    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class RunEstimate:
-    """What a run would make; ``exact`` where every photograph was read.
+    """Hold what a run would make.
 
-    ``prices``: what a pair costs under the chosen accuracy and every tier, nanoseconds a pixel, measured just now;
-    empty where no photograph could be read.
+    Attributes
+    ----------
+    sources, shards, bytes : int
+        Number of sources and shards, and bytes of all shards.
+    exact : bool
+        Whether every source was read.
+    seconds : float
+        Time with ``n_jobs`` workers, without writing to disk.
+    n_jobs : int
+        Number of workers.
+    free_bytes : int
+        Free bytes on the disk of ``out``.
+    source_estimates : tuple of SourceEstimate
+        The sources that were read.
+    tier_ns : dict of str to float
+        Time of a pair in ns per pixel under the chosen accuracy and each tier, measured now; empty if no source is
+        readable.
+    unmatched : dict of str to int
+        Number of files that no pattern of ``source.include`` matches, by suffix.
     """
 
     sources: int
@@ -72,20 +106,47 @@ class RunEstimate:
     seconds: float
     n_jobs: int
     free_bytes: int
-    looks: tuple[SourceEstimate, ...]
-    prices: dict[str, float]
+    source_estimates: tuple[SourceEstimate, ...]
+    tier_ns: dict[str, float]
+    unmatched: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs, extrapolated unless ``exact``."""
+        pairs = sum(source.pairs for source in self.source_estimates)
+        return pairs if self.exact else pairs * self.sources // len(self.source_estimates)
 
 
 def estimate_run(
     config: Config, n_jobs: int, read_all: bool, tiers: Mapping[str, AccuracyConfig] | None = None
 ) -> RunEstimate:
-    """Look at the photographs of a run; ``n_jobs`` is what the time is divided by, ``tiers`` what is priced beside it.
+    """Estimate a run by making the pairs of a sample of its sources.
 
-    Raises ConfigError as `photographs.list_photographs` does.
+    Parameters
+    ----------
+    config : Config
+        Validated config.
+    n_jobs : int
+        Number of workers, 1 or more; the time is divided by it.
+    read_all : bool
+        Whether to read every source, which makes the bytes exact.
+    tiers : mapping of str to AccuracyConfig, optional
+        Accuracy tiers whose time is measured for comparison.
+
+    Returns
+    -------
+    RunEstimate
+        The estimate.
+
+    Raises
+    ------
+    ConfigError
+        If the sources cannot be listed.
     """
-    sources = list_photographs(config.source).sources
+    listing = list_photographs(config.source)
+    sources = listing.sources
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
-    _warm_up(config)
+    _compile_kernels(config)
     looks = tuple(estimate_source(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
     per_shard = config.output.pairs_per_shard
@@ -97,20 +158,20 @@ def estimate_run(
         total = sum(one.bytes for one in looks) * len(sources) // len(looks) + shards * shard_bytes([0])
     seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
     free = shutil.disk_usage(_existing(Path(config.out))).free
-    prices = _prices(config, looks, tiers or {})
-    return RunEstimate(len(sources), shards, total, exact, seconds, n_jobs, free, looks, prices)
+    tier_ns = _tier_ns(config, looks, tiers or {})
+    return RunEstimate(len(sources), shards, total, exact, seconds, n_jobs, free, looks, tier_ns, listing.unmatched)
 
 
 def estimate_source(config: Config, source: Source) -> SourceEstimate:
-    """Make the pairs of one photograph, with the digests that its shard takes, and throw them away."""
+    """Make the pairs of one source, with the digests that a shard needs, and discard them."""
     started = time.perf_counter()
     try:
         sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
-        return SourceEstimate(source, 0, time.perf_counter() - started, (), error.reason, complaint=error.text)
+        return SourceEstimate(source, 0, time.perf_counter() - started, (), error.reason, detail=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
-    told = plan_levels(config, *identity, facts)
-    levels, predictions = tuple(plan for plan, _ in told), tuple(of_level for _, of_level in told)
+    planned = plan_levels(config, *identity, facts)
+    levels, predictions = tuple(plan for plan, _ in planned), tuple(of_level for _, of_level in planned)
     plans = with_draws(config, levels, source.frame)
     height, width = photograph.srgb.shape[:2]
     output = config.output
@@ -124,21 +185,32 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
     forms = (form_of(output.dtype, output.layout, patch.height, patch.width) for patch in cuts)
     size = sum(image_bytes(form, json_bytes, len(plans)) for form in forms)
     seconds = time.perf_counter() - started
-    pixels, left_out = width * height, pixels_in_none(cuts, height, width)
-    pairs = len(cuts) * len(plans)
-    return SourceEstimate(source, size, seconds, levels, None, predictions, len(cuts), pairs, pixels, left_out)
+    return SourceEstimate(
+        source,
+        size,
+        seconds,
+        levels,
+        None,
+        predictions,
+        patches=len(cuts),
+        pairs=len(cuts) * len(plans),
+        pixels=width * height,
+        unused_pixels=pixels_in_none(cuts, height, width),
+    )
 
 
-def _prices(config: Config, looks: tuple[SourceEstimate, ...], tiers: Mapping[str, AccuracyConfig]) -> dict[str, float]:
-    """Measure what accuracy costs on the first photograph that can be read."""
-    for one in looks:
-        if one.levels:
-            return accuracy.measure_tier_times(config, dict(tiers), load_source(config.source, one.source)[1].srgb)
+def _tier_ns(
+    config: Config, estimates: tuple[SourceEstimate, ...], tiers: Mapping[str, AccuracyConfig]
+) -> dict[str, float]:
+    """Measure the time of each tier on the first readable source."""
+    for estimate in estimates:
+        if estimate.levels:
+            return measure_tier_times(config, dict(tiers), load_source(config.source, estimate.source)[1].srgb)
     return {}
 
 
-def _warm_up(config: Config) -> None:
-    """Have the machine code ready, so that its compilation is not taken for the price of an image."""
+def _compile_kernels(config: Config) -> None:
+    """Make pairs of a tiny image, so that the time of the first source does not include compilation."""
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
     for _ in make_pairs(srgb, plan_pairs(config, "0" * 64, facts=facts_for(config, srgb))):
         pass
@@ -149,143 +221,155 @@ def _existing(path: Path) -> Path:
     return path if path.exists() else _existing(path.parent)
 
 
-# -------------------------------------------------------------------------------------------------------- for people
+# ------------------------------------------------------------------------------------------------------------- text
 
 
-def format_estimate(config: Config, told: RunEstimate) -> str:
-    """Return the forecast as lines for a terminal."""
-    about = "" if told.exact else "about "
+def format_estimate(config: Config, estimate: RunEstimate) -> str:
+    """Format an estimate for a terminal.
+
+    Parameters
+    ----------
+    config : Config
+        The config of the run.
+    estimate : RunEstimate
+        The estimate.
+
+    Returns
+    -------
+    str
+        Lines without a final newline.
+    """
+    about = "" if estimate.exact else "about "
+    sampled = len(estimate.source_estimates)
+    unmatched = unmatched_sentence(estimate.unmatched)
     lines = [
-        f"sources   {told.sources} ({config.source.root or 'built-in scenes'}), {len(told.looks)} of them read",
-        f"pairs     {_pairs(told)}, in {told.shards} shards of {config.output.pairs_per_shard}",
-        *_patches(config, told.looks),
-        f"bytes     {about}{told.bytes:,} in shards" + ("" if told.exact else " (--all reads every source: exact)"),
-        f"disk      {told.free_bytes:,} bytes free" + ("" if told.free_bytes > told.bytes else ": NOT ENOUGH"),
-        f"time      about {_duration(told.seconds)} with {told.n_jobs} worker{'s' if told.n_jobs > 1 else ''}, "
-        "and what the disk takes to write it",
-        *_failures(config, told),
-        *_accuracy(config.accuracy, told.prices),
-        *_noise(config, told.looks),
+        f"sources   {estimate.sources} ({config.source.root or 'built-in scenes'}), {sampled} of them read",
+        *([f"          {unmatched}"] if unmatched else []),
+        f"pairs     {about}{estimate.pairs}, in {estimate.shards} shards of {config.output.pairs_per_shard}",
+        *_patch_lines(config, estimate.source_estimates),
+        f"bytes     {about}{estimate.bytes:,} in shards"
+        + ("" if estimate.exact else " (--all reads every source: exact)"),
+        f"disk      {estimate.free_bytes:,} bytes free"
+        + ("" if estimate.free_bytes > estimate.bytes else ": NOT ENOUGH"),
+        f"time      about {format_duration(estimate.seconds)} with {estimate.n_jobs} "
+        f"worker{'s' if estimate.n_jobs > 1 else ''}, plus the time to write to disk",
+        *_failure_lines(config, estimate.source_estimates),
+        *_accuracy_lines(config.accuracy, estimate.tier_ns),
+        *_noise_lines(config, estimate.source_estimates),
     ]
     return "\n".join(lines)
 
 
-def _duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
+    """Return a duration in seconds, minutes or hours, whichever reads best."""
     if seconds < 90:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _pairs(told: RunEstimate) -> str:
-    pairs = sum(one.pairs for one in told.looks)
-    return str(pairs) if told.exact else f"about {pairs * told.sources // len(told.looks)}"
-
-
-def _patches(config: Config, looks: tuple[SourceEstimate, ...]) -> list[str]:
-    """Return what is cut out of an image and how much of it is in no patch; nothing where images stay whole."""
-    law, cut_up = patch_rule(config.source), [one for one in looks if one.patches]
-    odd = [one for one in cut_up if one.left_out]
-    if law is None and odd:
-        share = sum(one.left_out for one in odd) / sum(one.pixels for one in cut_up)
-        return [f"packed    {len(odd)} of {len(cut_up)} images have an odd side, whose last row or column is left out: "
-                f"{share:.2%} of the pixels"]  # fmt: skip
-    if law is None or not cut_up:
+def _patch_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[str]:
+    """Return what is cut from each image and the fraction of its pixels in no patch; nothing for complete images."""
+    rule, readable = patch_rule(config.source), [source for source in estimates if source.patches]
+    cropped = [source for source in readable if source.unused_pixels]
+    if rule is None and cropped:
+        fraction = sum(source.unused_pixels for source in cropped) / sum(source.pixels for source in readable)
+        return [
+            f"packed    {len(cropped)} of {len(readable)} images have an odd side, whose last row or column is left "
+            f"out: {fraction:.2%} of the pixels"
+        ]
+    if rule is None or not readable:
         return []
-    places = f"{law.count} at random places" if law.kind == "random" else f"a grid, {law.stride} apart"
-    left_out = sum(one.left_out for one in cut_up) / sum(one.pixels for one in cut_up)
-    counts = _span([one.patches for one in cut_up])
-    return [f"patches   {law.side} x {law.side}, {places}: {counts} an image; {left_out:.1%} of the pixels are in none"]
+    places = f"{rule.count} at random places" if rule.kind == "random" else f"a grid, {rule.stride} apart"
+    fraction = sum(source.unused_pixels for source in readable) / sum(source.pixels for source in readable)
+    counts = value_range([source.patches for source in readable])
+    return [f"patches   {rule.side} x {rule.side}, {places}: {counts} per image; {fraction:.1%} of the pixels unused"]
 
 
-def _accuracy(chosen: AccuracyConfig, prices: dict[str, float]) -> list[str]:
-    """Return what is asked for, and its price beside that of the tiers."""
+def _accuracy_lines(chosen: AccuracyConfig, tier_ns: dict[str, float]) -> list[str]:
+    """Return the chosen budget, and its time compared with that of the tiers."""
     clean = f"clean {chosen.clean_dn:g} DN"
     if chosen.clean_dn:
-        clean = f"clean within {chosen.clean_dn:g} DN at a share of {chosen.clean_changed_share:g}"
-    laws = f"laws within {chosen.law_distance:g}" if chosen.law_distance else "exact laws"
-    line = f"accuracy  {chosen.name}: {clean}, normals {chosen.normal_error:g} σ, {laws}"
-    if chosen.name not in prices:
+        clean = f"clean within {chosen.clean_dn:g} DN, a fraction of {chosen.clean_changed_share:g} changed"
+    shot = f"shot noise within {chosen.law_distance:g} (CDF)" if chosen.law_distance else "exact shot noise"
+    line = f"accuracy  {chosen.name}: {clean}, normals within {chosen.normal_error:g} σ, {shot}"
+    if chosen.name not in tier_ns:
         return [line]
-    others = ", ".join(f"{name} {ns:.3g}" for name, ns in prices.items() if name != chosen.name)
-    return [f"{line}; {prices[chosen.name]:.3g} ns a pixel here" + (f" ({others})" if others else "")]
+    others = ", ".join(f"{name} {ns:.3g}" for name, ns in tier_ns.items() if name != chosen.name)
+    return [f"{line}; {tier_ns[chosen.name]:.3g} ns per pixel here" + (f" ({others})" if others else "")]
 
 
-def _failures(config: Config, told: RunEstimate) -> list[str]:
-    failed = [one for one in told.looks if one.reason is not None]
-    lines = [f"fails     {one.source.name}: {one.reason}\n          {one.complaint}" for one in failed]
+def _failure_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[str]:
+    failed = [source for source in estimates if source.reason is not None]
+    lines = [f"fails     {source.source.name}: {source.reason}\n          {source.detail}" for source in failed]
     if len(failed) > config.source.max_failed:
-        lines.append(f"          more than source.max_failed={config.source.max_failed}: the run will end with 3")
+        lines.append(f"          more than source.max_failed={config.source.max_failed}: the run will exit with 3")
     return lines
 
 
-def _noise(config: Config, looks: tuple[SourceEstimate, ...]) -> list[str]:
-    plans = [plan for one in looks for plan in one.levels]
+def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[str]:
+    plans = [plan for source in estimates for plan in source.levels]
     if not plans:
         return []
     if is_physical(config.noise):
-        return [*_physical(config, plans), *_table([of_level for one in looks for of_level in one.predictions])]
+        predictions = [of_level for source in estimates for of_level in source.predictions]
+        return [*_physical_lines(config, plans), *_effect_table(predictions)]
     sensor, noise, first = config.sensor, config.noise, plans[0]
     profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
-    levels = noise_levels(noise)
-    numbers = "; ".join(dict.fromkeys(f"a={one.a}, b={one.b}" for one in levels))
+    numbers = "; ".join(dict.fromkeys(f"a={level.a}, b={level.b}" for level in noise_levels(noise)))
     lines = [
         f"noise     {noise.name}: {numbers} ({noise.units}, black {profile_levels[0]} "
         f"{noise.black}, white {profile_levels[1]})",
         f"          on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}): "
-        f"a_dn {_span([plan.a_dn for plan in plans])}, b_dn2 {_span([plan.b_dn2 for plan in plans])}",
+        f"a_dn {value_range([plan.a_dn for plan in plans])}, b_dn2 {value_range([plan.b_dn2 for plan in plans])}",
     ]
     zero = max(
         (-plan.b_dn2 / plan.a_dn for plan in plans if "heteroscedastic" in plan.effects and plan.a_dn), default=0
     )
     if zero > 0:
-        lines.append(f"          no noise up to {zero:.2f} DN above black, where the fitted variance is below 0")
+        lines.append(f"          no noise up to {zero:.2f} DN above black, where the fitted variance is negative")
     lines += [f"effect    {name}: {EFFECT_REASONS[name]}" for name in first.effects]
     lines += [f"skipped   {reason}" for reason in first.skipped]
     return lines
 
 
 EFFECT_REASONS = {
-    "heteroscedastic": "on; shot and read noise in one, variance = a_dn·(x - black) + b_dn2",
+    "heteroscedastic": "on; shot and read noise together, variance = a_dn·(x - black) + b_dn2",
     "quantise": "on; integer output is always rounded and clipped",
 }
 """Why each effect of a two-parameter profile is simulated."""
 
 
-def _span(values: list[float], digits: int = 6) -> str:
-    low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
-    return low if low == high else f"{low} to {high}"
-
-
-def _physical(config: Config, plans: list[Plan]) -> list[str]:
-    """Return what a physical profile and the scene say of the photographs read."""
+def _physical_lines(config: Config, plans: list[Plan]) -> list[str]:
+    """Return the scene and the numbers of a physical noise profile for the sources that were read."""
     sensor, noise = config.sensor, config.noise
     assert noise.white_level_dn is not None and noise.black_level_dn is not None
     physics = [plan.physics for plan in plans if plan.physics is not None]
-    laws = sorted({one.read_law if one.read_law == "gaussian" else "Tukey's law" for one in physics})
+    distributions = sorted({"Gaussian" if one.read_law == "gaussian" else "Tukey lambda" for one in physics})
     scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
     lines = [
-        f"scene     {plans[0].scene}: ISO {_span([one.iso for one in physics])}, "
-        f"{_span([one.exposure_s for one in physics])} s, {_span([one.temperature_c for one in physics])} °C, "
-        f"light divided by {_span([plan.exposure_ratio for plan in plans], 4)}",
+        f"scene     {plans[0].scene}: ISO {value_range([one.iso for one in physics])}, "
+        f"{value_range([one.exposure_s for one in physics])} s, "
+        f"{value_range([one.temperature_c for one in physics])} °C, "
+        f"light divided by {value_range([plan.exposure_ratio for plan in plans], 4)}",
         f"noise     {noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
         f"on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}) times {scale:.6g}",
-        f"          there K {_span([one.dn_per_e for one in physics], 4)} DN per electron, "
-        f"read noise of deviation {_span([one.read_std_dn for one in physics], 4)} DN ({', '.join(laws)})",
+        f"          system gain {value_range([one.dn_per_e for one in physics], 4)} DN per electron, read noise "
+        f"{value_range([one.read_std_dn for one in physics], 4)} DN standard deviation ({', '.join(distributions)})",
     ]
     if noise.assumed:
-        lines.append(f"          assumed, no source gives them: {', '.join(noise.assumed)}")
+        lines.append(f"          assumed, without a source: {', '.join(noise.assumed)}")
     return lines
 
 
-def _table(predictions: list[tuple[Prediction, ...]]) -> list[str]:
-    """Return a line for each effect: of the photograph where it shows best, and how often it is simulated."""
-    lines = ["effect         predicted DN  in the         hidden by DN  simulated  ns/pixel  why"]
+def _effect_table(predictions: list[tuple[Prediction, ...]]) -> list[str]:
+    """Return one line per effect: the source in which it is strongest, and how often it is simulated."""
+    lines = ["effect         predicted DN  statistic      masking DN    simulated  ns/pixel  why"]
     for of_effect in zip(*predictions, strict=True):
         best = max(of_effect, key=lambda one: (one.simulated, one.ratio, one.outliers))
         simulated = f"{sum(one.simulated for one in of_effect)} of {len(of_effect)}"
         cost = f"{COST_NS[best.effect]:.1f}"
         lines.append(
-            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:13}  {best.hidden_dn:12.3g}  "
+            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:13}  {best.hidden_dn:10.3g}    "
             f"{simulated:9}  {cost:>8}  {best.why}"
         )
     return lines

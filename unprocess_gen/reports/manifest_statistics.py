@@ -161,12 +161,12 @@ class ColumnStatistics:
 
     @property
     def is_logarithmic(self) -> bool:
-        """Whether the column is shown on a logarithmic scale."""
+        """True if the column is shown on a logarithmic scale."""
         return self.linear.least > 0 and self.linear.greatest >= self.LOGARITHMIC_RATIO * self.linear.least
 
     @property
     def is_constant(self) -> bool:
-        """Whether all values are equal."""
+        """True if all values are equal."""
         return self.linear.least == self.linear.greatest
 
 

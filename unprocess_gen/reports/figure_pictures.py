@@ -1,0 +1,113 @@
+"""Draw pictures and curves of paper figures with matplotlib."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.types import Frame, Srgb
+from unprocess_gen.simulation.reference.cfa import CHANNELS, tile
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, BLUE, ORANGE, GREEN, GREY = "#000000", "#0072B2", "#D55E00", "#009E73", "#999999"
+"""Colours of Okabe and Ito, which people with colour vision deficiency can distinguish."""
+
+MOST_PX = 720
+"""Longest side of a picture in a figure."""
+
+FloatImage = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PaperFigure:
+    """A figure of the article: file name, title, PNG, paragraphs of its caption, and a table (headings first)."""
+
+    file: str
+    title: str
+    png: bytes
+    caption: tuple[str, ...]
+    table: tuple[tuple[str, ...], ...] = ()
+
+
+def block_means(image: NDArray[Any], most: int = MOST_PX, is_mosaic: bool = False) -> FloatImage:
+    """Return means over square blocks, so that no side is longer than about ``most`` pixels.
+
+    Blocks of a mosaic have even sides, so that each contains the four CFA sites equally often; a mosaic that is small
+    enough is unchanged.
+    """
+    height, width = image.shape[:2]
+    side = min(-(-max(height, width) // most), height, width)
+    if is_mosaic and side > 1:
+        side = max(side + side % 2 if side < min(height, width) else side - side % 2, 1)
+    rows, columns = height // side, width // side
+    blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *image.shape[2:])
+    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64))
+
+
+def small_photograph(srgb: Srgb) -> FloatImage:
+    """Return a photograph at reduced size, ``[h, w, 3]`` in [0, 1]."""
+    return block_means(srgb) / float(np.iinfo(srgb.dtype).max)
+
+
+def channel_fractions(mask: NDArray[np.bool_], pattern: str, most: int = MOST_PX) -> FloatImage:
+    """Return the fraction of set sites of each channel at reduced size, ``[h, w, 3]`` in [0, 1]."""
+    channel = np.tile(np.array(tile(pattern)), tuple(-(-side // 2) for side in mask.shape))
+    channel = channel[: mask.shape[0], : mask.shape[1]]
+    planes = []
+    for number in range(len(CHANNELS)):
+        present = block_means(channel == number, most, is_mosaic=True)
+        chosen = block_means(mask & (channel == number), most, is_mosaic=True)
+        planes.append(np.divide(chosen, present, out=np.zeros_like(chosen), where=present > 0))
+    return np.stack(planes, axis=-1)
+
+
+def show_picture(axes: Axes, picture: FloatImage, title: str, low: float = 0.0, high: float = 1.0) -> None:
+    """Show a grey or RGB picture without ticks; grey values from ``low`` (black) to ``high`` (white)."""
+    axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest")
+    axes.set_title(title, loc="left")
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def show_stretched(axes: Axes, raw: Frame, title: str) -> None:
+    """Show a raw frame as the article does: its lowest DN black, its highest DN white."""
+    show_picture(axes, block_means(raw, is_mosaic=True), title, float(raw.min()), float(raw.max()))
+
+
+def panel_grid(rows: int, columns: int, width: float, aspect: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure ``width`` inches wide with equal panels whose heights are ``aspect`` times their widths."""
+    from matplotlib.figure import Figure
+
+    height = rows * (width / columns * aspect + 0.35)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False).ravel())
+
+
+def panel_aspect(srgb: Srgb) -> float:
+    """Return height over width of a photograph, limited to 0.5 … 1.5."""
+    height, width = (float(length) for length in srgb.shape[:2])
+    return min(max(height / width, 0.5), 1.5)
+
+
+def figure_png(draw: Callable[[], Figure]) -> bytes:
+    """Return the figure that a function draws, as the bytes of a PNG."""
+    from matplotlib import rc_context
+
+    style: dict[Any, Any] = {"font.size": 9, "axes.titlesize": 9.5, "axes.titleweight": "bold"}
+    with rc_context(style):
+        content = io.BytesIO()
+        draw().savefig(content, format="png", dpi=110)
+    return content.getvalue()
+
+
+def percent(part: int, total: int) -> str:
+    """Return a ratio as a percentage with three decimals."""
+    return f"{part / total:.3%}"
