@@ -20,7 +20,7 @@ from conftest import COMMAND, Cli, environment, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.cli.messages import log_to_stderr
+from unprocess_gen.cli.messages import logging_to
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError, MachineError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
@@ -237,8 +237,8 @@ def test_a_committed_shard_that_is_not_whole_is_made_again(
 
 
 def test_progress_begins_where_the_earlier_run_ended(begun: Path, make: Make, capfd: Any) -> None:
-    log_to_stderr()
-    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    with logging_to():
+        make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
     assert "gen-dataset: 6/6 images" in capfd.readouterr().err
 
 

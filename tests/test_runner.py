@@ -19,7 +19,7 @@ from conftest import PHOTOS, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.cli.messages import log_to_stderr
+from unprocess_gen.cli.messages import logging_to
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.files import array_xxh3
@@ -458,8 +458,8 @@ def test_minus_one_worker_stands_for_the_cores_this_process_may_use() -> None:
 def test_progress_is_plain_lines_where_there_is_no_terminal(
     make: Make, photos: Path, tmp_path: Path, capfd: Any
 ) -> None:
-    log_to_stderr()
-    make(photos, tmp_path / "ds")
+    with logging_to():
+        make(photos, tmp_path / "ds")
     out, err = capfd.readouterr()
     assert out == ""
     assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)

@@ -30,6 +30,7 @@ from unprocess_gen.core.types import Counts, Row, Source
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.progress import Progress
+from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
 from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.loader import list_photographs
@@ -105,7 +106,8 @@ def generate(config: Config, label: str = "") -> Summary:
     DamageError
         If ``out`` is a finished dataset and a file of it is missing or has another size.
     MachineError
-        If the disk is full or fails, ``out`` or a source was deleted, or memory runs out.
+        If the dataset will not fit the disk (unless ``check_disk=false``), the disk fails, ``out`` or a source was
+        deleted, or memory runs out.
     """
     started = time.monotonic()
     listing = list_photographs(config.source)
@@ -118,6 +120,8 @@ def generate(config: Config, label: str = "") -> Summary:
         tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
         done = set(workspace.committed(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
+        if config.check_disk:
+            check_free_space(config, todo, workspace.out)
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         context = RunContext(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < own_cores())
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)

@@ -7,8 +7,6 @@ read, because the size of a pair depends only on its width, height and name.
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,11 +17,11 @@ import numpy as np
 from unprocess_gen.config.interpretation import is_physical, noise_levels, patch_rule
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
-from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Plan, Source
-from unprocess_gen.dataset.manifest import json_size
-from unprocess_gen.dataset.shards import form_of, image_bytes, shard_bytes
+from unprocess_gen.dataset.shards import shard_bytes
+from unprocess_gen.pipeline.sizes import source_bytes
 from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark.measure import measure_tier_times
@@ -157,7 +155,7 @@ def estimate_run(
     else:
         total = sum(one.bytes for one in looks) * len(sources) // len(looks) + shards * shard_bytes([0])
     seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
-    free = shutil.disk_usage(_existing(Path(config.out))).free
+    free = free_bytes(Path(config.out))
     tier_ns = _tier_ns(config, looks, tiers or {})
     return RunEstimate(len(sources), shards, total, exact, seconds, n_jobs, free, looks, tier_ns, listing.unmatched)
 
@@ -181,9 +179,7 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
             for frame in (pair.clean, pair.noisy) if number == 0 else (pair.noisy,):
                 array_xxh3(frame)
                 hashlib.sha256(frame.data)
-    json_bytes = json_size(source.name, len(plans))
-    forms = (form_of(output.dtype, output.layout, patch.height, patch.width) for patch in cuts)
-    size = sum(image_bytes(form, json_bytes, len(plans)) for form in forms)
+    size = source_bytes(config, source.name, height, width)
     seconds = time.perf_counter() - started
     return SourceEstimate(
         source,
@@ -214,11 +210,6 @@ def _compile_kernels(config: Config) -> None:
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
     for _ in make_pairs(srgb, plan_pairs(config, "0" * 64, facts=facts_for(config, srgb))):
         pass
-
-
-def _existing(path: Path) -> Path:
-    path = Path(os.path.abspath(path))
-    return path if path.exists() else _existing(path.parent)
 
 
 # ------------------------------------------------------------------------------------------------------------- text
