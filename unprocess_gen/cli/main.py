@@ -24,6 +24,7 @@ from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, UnprocessGenError
+from unprocess_gen.core.limits import prepare_libraries
 from unprocess_gen.core.suggestions import did_you_mean
 
 OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
@@ -86,6 +87,7 @@ def run(arguments: Sequence[str]) -> int:
     if "--version" in flags:
         print(f"unprocess_gen {__version__}")
         return 0
+    prepare_libraries()
     call = parse(verb, rest)
     values = call.values
     with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):

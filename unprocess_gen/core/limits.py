@@ -7,7 +7,7 @@ import resource
 
 from unprocess_gen.core.errors import MachineError
 
-LEAST_ADDRESS_SPACE = 2**30
+LEAST_ADDRESS_SPACE = 3 * 2**28
 """Bytes of ``ulimit -v`` below which libraries crash instead of raising MemoryError.
 
 Without the check, numpy's OpenBLAS and LLVM end the process with a segmentation fault or a page of tracebacks."""
