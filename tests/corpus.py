@@ -2,7 +2,7 @@
 
 The test pictures of image libraries come from source packages: broken, cut, oversized and odd on purpose. To them are
 added derived ones: good pictures cut, flipped, zeroed, and with headers that lie. A picture whose name no default glob
-matches is renamed to ``.jpg`` or ``.png``: what a file is must be told by its bytes. Nothing of it is ours to pass on,
+matches is renamed to ``.jpg`` or ``.png``, so that only the bytes give the format. Nothing of it may be distributed,
 so nothing of it is kept in the repository.
 
     FOLDER/<package>/00012-name.png       as fetched
@@ -92,7 +92,7 @@ def download(to: Path, pip: list[str], package: str, command: list[str] | None =
     )
     found = sorted(path for path in to.iterdir() if re.search(r"\.(tar\.\w+|tgz|zip)$", path.name))
     if not found:
-        last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
+        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
         print(f"{package}: not fetched ({last[:120]})", file=sys.stderr)
     return found
 
@@ -182,7 +182,7 @@ def bases(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 def good_format(path: Path) -> str:
-    """The format of a picture that Pillow loads whole, or an empty text."""
+    """Return the format of a picture that Pillow loads completely, or an empty text."""
     ends = {"JPEG": b"\xff\xd9", "PNG": b"IEND\xaeB`\x82"}
     data = path.read_bytes()
     try:

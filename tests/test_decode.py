@@ -180,7 +180,7 @@ def test_gray_becomes_three_equal_channels(kind: str) -> None:
     ("bits", "row", "grays"),
     [(1, b"\x50", [0, 255, 0, 255]), (2, b"\x1b", [0, 85, 170, 255]), (4, b"\x05\xaf", [0, 85, 170, 255])],
 )
-def test_few_bits_of_gray_are_spread_over_the_whole_range(bits: int, row: bytes, grays: list[int]) -> None:
+def test_few_bits_of_gray_are_spread_over_all_codes(bits: int, row: bytes, grays: list[int]) -> None:
     assert pixels_of(png(4, bits, 0, row))[0, :, 0].tolist() == grays
 
 
@@ -303,7 +303,7 @@ def test_a_broken_thumbnail_directory_does_not_hide_the_orientation() -> None:
 
 
 def with_alpha(alpha: int, dtype: Any = np.uint8) -> np.ndarray:
-    """[5, 7, 4], opaque but for one pixel."""
+    """Return ``[5, 7, 4]``, opaque except for one pixel."""
     stored = np.dstack([noise(5, 7, dtype), np.full((5, 7), np.iinfo(dtype).max, dtype)])
     stored[3, 2, 3] = alpha
     return stored
@@ -339,7 +339,7 @@ def test_one_pixel_that_is_almost_opaque_is_refused(kind: str) -> None:
 
 
 @pytest.mark.parametrize("alpha", [255, 254], ids=["opaque", "not"])
-def test_alpha_beside_gray_in_a_png(alpha: int) -> None:
+def test_gray_png_with_alpha(alpha: int) -> None:
     data = png(2, 8, 4, bytes([5, 255, 170, alpha]))
     assert pixels_of(data)[0, :, 0].tolist() == [5, 170] if alpha == 255 else reason_of(data) == "alpha"
 
@@ -359,24 +359,24 @@ TRANSPARENT_KEYS = {
 
 
 @pytest.mark.parametrize("kind", TRANSPARENT_KEYS)
-def test_a_transparent_colour_in_a_png_is_refused_where_a_pixel_has_it(kind: str) -> None:
+def test_transparent_png_colour_that_a_pixel_has_is_refused(kind: str) -> None:
     colour, bits, row, _, met = TRANSPARENT_KEYS[kind]
     assert reason_of(png(4, bits, colour, row, PALETTE + chunk(b"tRNS", met))) == "alpha"
 
 
 @pytest.mark.parametrize("kind", [kind for kind, case in TRANSPARENT_KEYS.items() if case[3] is not None])
-def test_a_transparent_colour_in_a_png_that_no_pixel_has_is_dropped(kind: str) -> None:
+def test_transparent_png_colour_without_a_pixel_is_dropped(kind: str) -> None:
     colour, bits, row, unmet, _ = TRANSPARENT_KEYS[kind]
     before = PALETTE if colour == 3 else b""
     plain = pixels_of(png(4, bits, colour, row, before))
     np.testing.assert_array_equal(pixels_of(png(4, bits, colour, row, before + chunk(b"tRNS", unmet or b""))), plain)
 
 
-def test_alpha_beside_gray_in_a_tiff_is_refused_because_opencv_drops_it() -> None:
+def test_gray_tiff_with_alpha_is_refused() -> None:
     assert reason_of(tiff(noise(3, 4, channels=2), "minisblack", extrasamples=["unassalpha"])) == "alpha"
 
 
-def test_the_unused_byte_of_a_32_bit_bmp_is_no_alpha() -> None:
+def test_unused_byte_of_a_32_bit_bmp_is_ignored() -> None:
     assert pixels_of(bmp(1, 1, 32, b"\3\2\1\0")).tolist() == [[[1, 2, 3]]]
 
 
@@ -436,7 +436,7 @@ def test_more_than_one_picture_is_animated(kind: str) -> None:
     assert reason_of(pillow(smooth(), kind, save_all=True, append_images=more)) == "animated"
 
 
-def test_a_thumbnail_page_beside_a_full_one_is_fine() -> None:
+def test_thumbnail_page_next_to_a_full_one_is_accepted() -> None:
     file = io.BytesIO()
     with tifffile.TiffWriter(file) as writer:
         writer.write(noise(8, 9), photometric="rgb")
@@ -470,7 +470,7 @@ def test_a_header_that_claims_3600_megapixels_is_refused_at_once(kind: str) -> N
     assert reason == ("truncated" if kind == "bmp" else "too_large")
 
 
-def test_what_opencv_itself_refuses_for_its_size_is_too_large_whatever_the_setting() -> None:
+def test_sizes_that_opencv_refuses_are_too_large() -> None:
     assert reason_of(HUGE["png"], max_pixels=2**40) == "too_large"
     assert reason_of(png(1_000_001, 8, 0, b""), max_pixels=CV2_MAX_PIXELS) == "too_large"
 
@@ -484,7 +484,7 @@ def test_a_setting_that_does_not_exist_is_a_value_error() -> None:
 
 
 def swapped_primaries() -> bytes:
-    """A profile that is sRGB but for red and green changing places."""
+    """Return a profile that is sRGB with red and green swapped."""
     profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
     tags = {
         bytes(profile[at : at + 4]): at for at in range(132, 132 + 12 * int.from_bytes(profile[128:132], "big"), 12)
@@ -520,7 +520,7 @@ def test_a_profile_in_many_segments_is_put_together() -> None:
     assert probe(pillow(smooth(), "JPEG", icc_profile=profile)).icc == profile
 
 
-def test_a_png_profile_that_does_not_unpack_is_refused_when_asked() -> None:
+def test_broken_png_profile_is_refused_under_icc_refuse() -> None:
     data = png(1, 8, 2, b"abc", chunk(b"iCCP", b"name\0\0not deflated"))
     assert probe(data).icc == b""
     assert reason_of(data, icc="refuse") == "icc"
@@ -530,7 +530,7 @@ def test_a_png_profile_that_does_not_unpack_is_refused_when_asked() -> None:
 
 
 def thumbnail_exif() -> bytes:
-    """EXIF with a whole JPEG in it, which has an end-of-image marker of its own."""
+    """Return EXIF with a complete JPEG in it, which has an end-of-image marker."""
     block = exif(6)
     small = pillow(smooth(8, 8), "JPEG")
     link = struct.pack("<I", len(block) - 6)
@@ -622,7 +622,7 @@ def test_a_chain_of_tiff_pages_that_bites_its_tail_ends() -> None:
 
 
 @pytest.mark.parametrize("kind", CUTTABLE)
-def test_random_damage_ends_in_pixels_of_the_right_size_or_in_a_reason(kind: str) -> None:
+def test_random_damage_gives_pixels_or_a_reason(kind: str) -> None:
     generator = random.Random(kind)
     for _ in range(150):
         data = bytearray(CUTTABLE[kind])
@@ -670,7 +670,7 @@ def noisy_picture() -> Image.Image:
 
 
 @pytest.mark.parametrize("cut", range(300, 3300, 370))
-def test_a_jpeg_that_lost_its_middle_and_kept_its_end_is_corrupt(cut: int) -> None:
+def test_jpeg_without_its_middle_is_corrupt(cut: int) -> None:
     stream = io.BytesIO()
     noisy_picture().save(stream, "JPEG", quality=85)
     data = stream.getvalue()
@@ -689,7 +689,7 @@ def test_a_tiff_whose_compressed_data_are_broken_is_corrupt(compression: str) ->
 
 
 def test_a_refusal_leaves_stderr_clean(capfd: pytest.CaptureFixture[str]) -> None:
-    test_a_jpeg_that_lost_its_middle_and_kept_its_end_is_corrupt(1410)
+    test_jpeg_without_its_middle_is_corrupt(1410)
     assert capfd.readouterr().err == ""
 
 

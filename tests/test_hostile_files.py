@@ -1,7 +1,7 @@
 """Files made to break a decoder: whatever lies in the folder, the run ends, within bounds, with a row for each file.
 
-Quick: photographs of our own, damaged the ways `corpus` knows; headers that claim more than there is; deflated zeros;
-and what stands in a folder without being a file. Slow: the test pictures of image libraries, some eight thousand with
+Quick: generated photographs, damaged in the ways of `corpus`; headers that declare more than there is; deflated zeros;
+and folder entries that are not files. Slow: the test pictures of image libraries, some eight thousand with
 those derived from them, from the folder that ``CORPUS`` names, or fetched (minutes). What a file takes is measured in a
 process of its own, whose high-water mark of memory is set back before each.
 """
@@ -95,7 +95,7 @@ def undocumented(rows: Rows) -> dict[str, str]:
     return {path: row["reason"] for path, row in rows.items() if (row["status"], row["reason"]) not in allowed}
 
 
-# Damaged photographs of our own ---------------------------------------------------------------------------------------
+# Damaged generated photographs ----------------------------------------------------------------------------------------
 
 
 def encoded(kind: str, **options: Any) -> bytes:
@@ -121,7 +121,7 @@ KINDS = {"jpg": "jpeg", "png": "png", "tif": "tiff", "webp": "webp", "bmp": "bmp
 
 @pytest.fixture(scope="module")
 def damaged(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A run over `OURS`, whole and damaged in every way: ``good-8.png``, ``cut-0-8.png``, …, some 200 files."""
+    """Run over `OURS`, intact and damaged in every way: ``good-8.png``, ``cut-0-8.png``, …, some 200 files."""
     folder = tmp_path_factory.mktemp("hostile")
     (folder / "photos").mkdir()
     for name, data in OURS.items():
@@ -142,12 +142,12 @@ def test_every_damaged_photograph_has_a_row(damaged: Run) -> None:
     assert sorted(damaged.rows) == sorted(os.listdir(damaged.root))
 
 
-def test_every_damaged_photograph_is_a_pair_or_failed_for_a_documented_reason(damaged: Run) -> None:
+def test_damaged_photographs_are_pairs_or_have_a_reason(damaged: Run) -> None:
     assert undocumented(damaged.rows) == {}
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_whole_photographs_among_damaged_ones_are_pairs(name: str, damaged: Run) -> None:
+def test_intact_photographs_among_damaged_ones_are_pairs(name: str, damaged: Run) -> None:
     assert damaged.rows[f"good-{name}"]["status"] == "ok"
 
 
@@ -158,7 +158,7 @@ def test_every_cut_of_a_photograph_is_refused_as_broken(name: str, damaged: Run)
     assert set(reasons.values()) <= {"truncated", "corrupt"}, reasons
 
 
-def test_a_dataset_of_damaged_photographs_is_whole(damaged: Run) -> None:
+def test_dataset_of_damaged_photographs_is_intact(damaged: Run) -> None:
     verified = gen_dataset("verify", damaged.out)
     assert (verified.returncode, verified.stderr) == (0, "")
 
@@ -225,7 +225,7 @@ def no_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("no_decoder")
 @pytest.mark.parametrize("claim", CLAIMS)
-def test_a_claim_of_a_few_bytes_is_refused_from_the_header_within_50_ms(claim: str) -> None:
+def test_false_size_is_refused_from_the_header_within_50_ms(claim: str) -> None:
     data, reason = CLAIMS[claim]
     start = time.process_time()
     with pytest.raises(SourceError) as caught:
@@ -245,7 +245,7 @@ def test_refusing_a_claim_takes_no_memory_to_speak_of(claim: str) -> None:
     assert peak < 100_000
 
 
-# What stands in a folder and is no file -------------------------------------------------------------------------------
+# Folder entries that are not files ------------------------------------------------------------------------------------
 
 
 def bind_socket(path: Path) -> None:
@@ -280,7 +280,7 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run(folder / "photos", folder / "ds", timeout_s=60)
 
 
-def test_what_is_no_file_ends_the_run_with_3_and_no_traceback(odd: Run) -> None:
+def test_entries_other_than_files_exit_3_without_traceback(odd: Run) -> None:
     assert no_trouble(odd), odd.done.stderr
 
 
@@ -289,7 +289,7 @@ def test_what_is_no_file_has_a_row_with_its_reason(odd: Run) -> None:
     assert {path: row["reason"] for path, row in odd.rows.items()} == wanted
 
 
-def test_a_folder_that_links_to_itself_is_entered_once_and_counted(odd: Run) -> None:
+def test_folder_that_links_to_itself_is_listed_once(odd: Run) -> None:
     assert json.loads((odd.out / "dataset.json").read_text())["skipped_links"] == 1
 
 
@@ -325,7 +325,7 @@ def test_a_file_without_permission_to_read_is_unreadable(
 class Weight(NamedTuple):
     """What became of one file, and what it took from its first byte to its pair in a shard.
 
-    ``seconds`` are of the processors, of all threads; ``peak_bytes`` is the resident memory of the whole process.
+    ``seconds`` are of the processors, of all threads; ``peak_bytes`` is the resident memory of the process.
     """
 
     outcome: str
@@ -341,7 +341,7 @@ def peak_bytes() -> int:
 
 def weigh_all(door: Connection, config: Config, tmp: str) -> None:
     """Make a shard of each source that comes in, and send out what it took. Runs in a process of its own."""
-    for dtype in (np.uint8, np.uint16):  # what is compiled or read once is nobody's weight
+    for dtype in (np.uint8, np.uint16):  # compile and read once before measuring
         make_pair(np.zeros((4, 4, 3), dtype), plan_image(config, "0" * 64, 0))
     bench = RunContext(config, tmp, os.getpid())
     while True:
@@ -356,7 +356,7 @@ def weigh_all(door: Connection, config: Config, tmp: str) -> None:
 
 
 class Scales:
-    """Weighs files one by one; the process behind it is started anew where it dies or says nothing for a minute.
+    """Measure files one by one; its process is restarted if it dies or gives no answer for a minute.
 
     The source folder of ``config`` is the root of the file system.
     """
@@ -449,9 +449,7 @@ def weigh_bomb(make: Callable[[], bytes], path: Path, scales: Scales) -> Weight:
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_a_small_file_of_as_many_pixels_as_allowed_stays_within_bounds(
-    name: str, tmp_path: Path, scales: Scales
-) -> None:
+def test_small_file_of_maximum_pixels_stays_within_bounds(name: str, tmp_path: Path, scales: Scales) -> None:
     make, outcome = BOMBS[name]
     weight = weigh_bomb(make, tmp_path / name, scales)
     assert weight.outcome == outcome
@@ -461,7 +459,7 @@ def test_a_small_file_of_as_many_pixels_as_allowed_stays_within_bounds(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW_BOMBS)
-def test_as_many_pixels_as_allowed_stay_within_bounds_in_any_format(name: str, tmp_path: Path, scales: Scales) -> None:
+def test_maximum_pixels_stay_within_bounds_in_any_format(name: str, tmp_path: Path, scales: Scales) -> None:
     make, outcome = SLOW_BOMBS[name]
     weight = weigh_bomb(make, tmp_path / name, scales)
     print(name, weight)
@@ -510,18 +508,18 @@ def test_every_file_of_the_corpus_has_a_row(corpus: Path, corpus_run: Run) -> No
 
 
 @pytest.mark.slow
-def test_every_file_of_the_corpus_is_a_pair_or_failed_for_a_documented_reason(corpus_run: Run) -> None:
+def test_files_of_the_corpus_are_pairs_or_have_a_reason(corpus_run: Run) -> None:
     assert undocumented(corpus_run.rows) == {}
 
 
 @pytest.mark.slow
-def test_a_dataset_of_the_corpus_is_whole(corpus_run: Run) -> None:
+def test_dataset_of_the_corpus_is_intact(corpus_run: Run) -> None:
     verified = gen_dataset("verify", corpus_run.out, timeout_s=600)
     assert (verified.returncode, verified.stderr) == (0, "")
 
 
 @pytest.mark.slow
-def test_every_cut_jpeg_and_png_of_the_corpus_is_refused_as_truncated_or_corrupt(corpus: Path, corpus_run: Run) -> None:
+def test_cut_files_of_the_corpus_are_truncated_or_corrupt(corpus: Path, corpus_run: Run) -> None:
     def is_jpeg_or_png(path: str) -> bool:
         with (corpus / path).open("rb") as file:
             return file.read(4).startswith((b"\xff\xd8\xff", b"\x89PNG"))
@@ -533,7 +531,7 @@ def test_every_cut_jpeg_and_png_of_the_corpus_is_refused_as_truncated_or_corrupt
 
 
 @pytest.mark.slow
-def test_no_file_of_the_corpus_takes_more_than_10_s_or_1500_mb(corpus: Path, scales: Scales) -> None:
+def test_corpus_files_take_at_most_10_s_and_1500_mb(corpus: Path, scales: Scales) -> None:
     weights = {path: scales.weigh(corpus / path) for path in matched_files(corpus)}
     for measure in ("seconds", "peak_bytes"):
         print(
@@ -606,7 +604,7 @@ LABOURS: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.usefixtures("no_decoder")
 @pytest.mark.parametrize("labour", LABOURS)
-def test_a_file_made_to_cost_much_work_is_refused_as_corrupt_within_2_s(labour: str) -> None:
+def test_expensive_hostile_file_is_corrupt_within_2_s(labour: str) -> None:
     data = LABOURS[labour]()
     start = time.process_time()
     with pytest.raises(SourceError, match=r"^corrupt"):
@@ -614,7 +612,7 @@ def test_a_file_made_to_cost_much_work_is_refused_as_corrupt_within_2_s(labour: 
     assert time.process_time() - start < 2
 
 
-def test_a_list_of_more_strips_than_a_picture_can_have_is_not_read() -> None:
+def test_impossible_number_of_strips_is_not_read() -> None:
     data = strips(10, 10, 5 * 10**6, b"\1\2\3\4" * 10**7)
     tracemalloc.start()
     with pytest.raises(SourceError, match=r"^corrupt"):
@@ -624,19 +622,19 @@ def test_a_list_of_more_strips_than_a_picture_can_have_is_not_read() -> None:
     assert peak < 10**6
 
 
-def test_a_directory_of_too_many_entries_in_exif_is_a_broken_one() -> None:
+def test_exif_directory_of_too_many_entries_is_broken() -> None:
     block = struct.pack("<2sHIH", b"II", 42, 8, 5000) + bytes(12 * 5000 + 4)
     data = encoded("JPEG", exif=b"Exif\0\0" + block)
     assert decode(data, max_pixels=MAX_PIXELS, icc="ignore").orientation == 1
 
 
-def test_bytes_between_the_last_row_and_the_end_are_no_damage() -> None:
+def test_bytes_after_the_last_row_are_accepted() -> None:
     """As some cameras write them: libjpeg passes them over."""
     data = encoded("JPEG")
     assert decode(data[:-2] + b"\0\0" + data[-2:], max_pixels=MAX_PIXELS, icc="ignore").srgb.shape == (48, 64, 3)
 
 
-# Damage that the codec tells of in other words ------------------------------------------------------------------------
+# Damage reported by rare codec messages -------------------------------------------------------------------------------
 
 
 def cut_at_a_restart() -> bytes:
@@ -683,13 +681,13 @@ TOLD_OTHERWISE: dict[str, Callable[[], bytes]] = {
 
 
 @pytest.mark.parametrize("kind", TOLD_OTHERWISE)
-def test_damage_that_the_codec_tells_of_in_other_words_is_corrupt(kind: str) -> None:
+def test_damage_reported_by_rare_codec_messages_is_corrupt(kind: str) -> None:
     with pytest.raises(SourceError, match=r"^corrupt"):
         decode(TOLD_OTHERWISE[kind](), max_pixels=MAX_PIXELS, icc="ignore")
 
 
 @pytest.mark.parametrize("header_size", [40, 52])
-def test_a_bmp_of_unusual_masks_and_a_short_header_is_unsupported_because_opencv_ignores_them(header_size: int) -> None:
+def test_bmp_with_unusual_masks_and_short_header_is_unsupported(header_size: int) -> None:
     head = struct.pack("<IiiHHIIiiII", header_size, 1, 1, 1, 32, 3, 4, 0, 0, 0, 0)
     masks = struct.pack("<III", 0xFF, 0xFF00, 0xFF0000)
     data = struct.pack("<2sIHHI", b"BM", 70, 0, 0, 66) + head + masks + b"\1\2\3\0"
@@ -698,7 +696,7 @@ def test_a_bmp_of_unusual_masks_and_a_short_header_is_unsupported_because_opencv
 
 
 @pytest.mark.parametrize("header_size", [40, 52])
-def test_a_bmp_of_the_usual_masks_and_a_short_header_is_read(header_size: int) -> None:
+def test_bmp_with_usual_masks_and_short_header_is_read(header_size: int) -> None:
     head = struct.pack("<IiiHHIIiiII", header_size, 1, 1, 1, 32, 3, 4, 0, 0, 0, 0)
     masks = struct.pack("<III", 0xFF0000, 0xFF00, 0xFF)
     data = struct.pack("<2sIHHI", b"BM", 70, 0, 0, 66) + head + masks + b"\3\2\1\0"

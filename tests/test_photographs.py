@@ -1,4 +1,4 @@
-"""What is done to pixels before the pipeline: averaging in whole numbers, and the dither of 8-bit codes."""
+"""Pixels before the pipeline: averaging in integers, and the dither of 8-bit codes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from unprocess_gen.sources.loader import downscaled, list_photographs, load_sour
 
 
 @given(side=st.integers(1, 9), seed=st.integers(0, 99), deep=st.booleans())
-def test_a_downscaled_code_is_the_exact_mean_to_the_nearest_of_65536(side: int, seed: int, deep: bool) -> None:
+def test_downscaled_code_is_nearest_to_the_exact_mean(side: int, seed: int, deep: bool) -> None:
     srgb = pixels(seed, 19, 23, np.uint16 if deep else np.uint8)
     found = downscaled(srgb, side)
     assert found.shape == (19 // side, 23 // side, 3)
@@ -48,9 +48,7 @@ def test_a_photograph_too_small_to_be_downscaled_is_unsupported(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("override", ["source.downscale=2", "source.dequantize=dither"])
-def test_such_pairs_can_be_made_again_from_their_rows_alone(
-    override: str, photos: Path, make: Make, tmp_path: Path
-) -> None:
+def test_such_pairs_are_regenerated_from_their_rows(override: str, photos: Path, make: Make, tmp_path: Path) -> None:
     make(photos, tmp_path / "ds", override)
     replayed = list(replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(photos)))
     assert len(replayed) >= 12
@@ -65,7 +63,7 @@ def dithered(settings: Settings) -> object:
 CURVE = linear_table("smoothstep", 2.2, 256)
 
 
-def test_a_dithered_code_moves_by_up_to_half_a_code_evenly(dithered: object) -> None:
+def test_dither_moves_codes_uniformly_by_half_a_code(dithered: object) -> None:
     """Each of 257 offsets is as likely; 120,000 of them: six standard errors of mean and variance."""
     moved = dequantise(np.full((200, 200, 3), 100, dtype=np.uint8), dithered, CURVE).astype(int) - 25_700  # type: ignore[arg-type]
     assert (moved.min(), moved.max()) == (-128, 128)
@@ -84,7 +82,7 @@ def test_channels_are_moved_independently(dithered: object) -> None:
     assert np.abs(np.corrcoef(moved.T) - np.eye(3)).max() < 6 / 100
 
 
-def test_the_dither_of_a_cut_out_is_the_cut_out_of_the_dither(dithered: object) -> None:
+def test_dither_of_a_crop_is_the_crop_of_the_dither(dithered: object) -> None:
     srgb = pixels(3, 40, 90)
     whole = dequantise(srgb, dithered, CURVE)  # type: ignore[arg-type]
     np.testing.assert_array_equal(dequantise(srgb[7:, 65:], dithered, CURVE, (7, 65)), whole[7:, 65:])  # type: ignore[arg-type]

@@ -69,7 +69,7 @@ def test_globs_are_blind_to_case(tmp_path: Path) -> None:
     assert paths(listed(tmp_path, "*.jPg")) == ["a.JPG", "b.Jpg"]
 
 
-def test_a_glob_with_a_slash_is_held_against_the_relative_path(tmp_path: Path) -> None:
+def test_glob_with_a_slash_matches_the_relative_path(tmp_path: Path) -> None:
     fill(tmp_path, "in/a.jpg", "out/a.jpg", "a.jpg")
     assert paths(listed(tmp_path, "in/*")) == ["in/a.jpg"]
 
@@ -118,7 +118,7 @@ def test_path_outside_the_root_is_never_opened(tmp_path: Path, path: str, monkey
         read_bytes(f"{tmp_path}/root", Source(0, path, path, 10))
 
 
-def test_folder_of_videos_only_is_refused_with_the_setting_that_reads_them(tmp_path: Path) -> None:
+def test_folder_of_videos_only_is_refused_with_the_setting(tmp_path: Path) -> None:
     fill(tmp_path, "film.MP4", "notes.txt")
     with pytest.raises(ConfigError, match=r"set source\.clips=true to read videos as clips"):
         list_folder(str(tmp_path), ["*.jpg"], True, None, video=["*.mp4"])
@@ -202,7 +202,7 @@ def test_what_is_no_file_is_listed_with_its_reason(tmp_path: Path, kind: str) ->
 
 
 @pytest.mark.parametrize("kind", ODD_ENTRIES)
-def test_what_is_no_file_is_refused_on_reading_with_its_reason(tmp_path: Path, kind: str) -> None:
+def test_entries_other_than_files_are_refused_on_reading(tmp_path: Path, kind: str) -> None:
     make, reason = ODD_ENTRIES[kind]
     make(tmp_path / "z.jpg")
     with pytest.raises(SourceError) as caught:
@@ -334,7 +334,7 @@ def test_a_file_that_vanished_is_unreadable(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["pipe", "directory"])
-def test_what_took_the_place_of_a_listed_file_is_not_a_file(tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_pipe_that_replaced_a_listed_file_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
     fill(tmp_path, "a.jpg")
     source = only(tmp_path)
     (tmp_path / "a.jpg").unlink()
@@ -351,7 +351,7 @@ def test_a_file_of_another_size_than_listed_stops_the_run(tmp_path: Path) -> Non
         read_bytes(str(tmp_path), source)
 
 
-def test_a_file_that_grows_while_it_is_read_stops_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_that_grows_while_read_stops_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path, "a.jpg")
     source = only(tmp_path)
     fstat = os.fstat
@@ -424,7 +424,7 @@ def test_what_is_no_file_is_passed_through(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/cpuinfo").exists(), reason="no file here that is longer than it says")
-def test_a_file_that_says_it_is_empty_and_is_not_is_taken_at_its_word(tmp_path: Path) -> None:
+def test_file_of_declared_size_zero_with_content_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.png").symlink_to("/proc/cpuinfo")
     (source,) = sources.list_folder(str(tmp_path), ["*.png"], True, None).sources
     with pytest.raises(SourceError, match=r"^empty"):

@@ -46,7 +46,7 @@ def test_a_scene_is_a_contiguous_srgb_picture_of_its_own(name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_numbers_tell_scenes_of_a_kind_apart(kind: str) -> None:
+def test_scenes_of_a_kind_differ_by_number(kind: str) -> None:
     assert len({sha256(f"{kind}-{number}") for number in range(4)}) == 4
 
 

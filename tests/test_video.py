@@ -334,9 +334,7 @@ def test_frames_are_those_a_player_shows_in_its_order(kind: str, tmp_path: Path)
         assert np.abs(found - wanted)[inside].max() < 1
 
 
-def test_a_decoder_starts_at_each_closed_group_and_goes_on_within(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_decoder_starts_at_each_closed_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     starts: list[int] = []
     packets = Video._packets
     monkeypatch.setattr(Video, "_packets", lambda self, start: starts.append(start) or packets(self, start))
@@ -362,7 +360,7 @@ def test_a_video_of_one_frame_has_one(tmp_path: Path) -> None:
     assert rgb(video, 0).shape == (48, 64, 3)
 
 
-def test_what_the_codec_crops_is_gone(tmp_path: Path) -> None:
+def test_pixels_that_the_codec_crops_are_absent(tmp_path: Path) -> None:
     """H.264 codes squares of 16 pixels; 34 x 18 are cut out of 48 x 32."""
     path = film(tmp_path / "a.mp4", "libx264", "yuv420p", scene(3, 34, 18), {"x264-params": "qp=0:log-level=none"})
     found = rgb(opened(path), 2)
@@ -437,7 +435,7 @@ def jpeg(path: Path) -> None:
 
 
 def no_frames(path: Path) -> None:
-    """A film whose one packet says that it is not of the video's track."""
+    """Return a film with one packet that declares another track."""
     film(path, "ffv1", "bgr0", scene(1))
     content = bytearray(path.read_bytes())
     at = content.index(b"\xa3", content.index(b"\x1fC\xb6u"))
@@ -474,7 +472,7 @@ UNUSABLE: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "unsupported",
     ),
     "alpha": ("a.mkv", lambda path: film(path, "ffv1", "bgra", scene(2)), "alpha"),
-    "alpha beside": ("a.webm", lambda path: film(path, "libvpx-vp9", "yuva420p", scene(2)), "alpha"),
+    "separate alpha": ("a.webm", lambda path: film(path, "libvpx-vp9", "yuva420p", scene(2)), "alpha"),
     "12 bits": ("a.mkv", lambda path: film(path, "ffv1", "yuv420p12le", scene(2)), "unsupported"),
     "PQ": ("a.mkv", lambda path: film(path, "ffv1", "yuv420p10le", scene(2), color_trc=16), "unsupported"),
     "HLG": ("a.mkv", lambda path: film(path, "ffv1", "yuv420p10le", scene(2), color_trc=18), "unsupported"),
@@ -534,7 +532,7 @@ def reason_of(video: Video, number: int) -> str:
     return ""
 
 
-def test_damage_costs_its_frame_and_those_that_may_refer_to_it(tmp_path: Path) -> None:
+def test_damage_affects_its_frame_and_dependent_ones(tmp_path: Path) -> None:
     whole, broken = map(opened, damaged(tmp_path))
     wanted = [""] * 7 + ["corrupt"] * 3 + [""] * 10
     assert [reason_of(broken, number) for number in range(20)] == wanted
@@ -548,7 +546,7 @@ def test_damage_costs_its_frame_and_those_that_may_refer_to_it(tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", [kind for kind in ENCODED if kind != "av1"])
 def test_damage_shows_alike_however_it_was_reached(kind: str, tmp_path: Path) -> None:
-    """Whether a decoder finds it or not: what comes before it is whole, what comes after it is the same each time."""
+    """Frames before the damage are intact; later ones are the same each time, whether the decoder finds it or not."""
     path = encode(tmp_path, kind)
     video = opened(path)
     whole = [outcome(video, number) for number in range(30)]
@@ -620,7 +618,7 @@ def test_every_frame_is_a_row_with_its_clip_and_number(filmed: Path, films: Path
     assert [row["key"] for row in rows(filmed)] == [f"{index:08d}" for index in range(38)]
 
 
-def test_all_frames_of_a_video_have_its_files_digest_and_size(filmed: Path, films: Path) -> None:
+def test_frames_of_a_video_have_its_digest_and_size(filmed: Path, films: Path) -> None:
     import hashlib
 
     content = (films / "h264.mp4").read_bytes()
@@ -688,14 +686,14 @@ def test_another_video_moves_nothing(films: Path, filmed: Path, make: Make, tmp_
     assert {key(row) for row in rows(tmp_path / "ds")} == kept
 
 
-def test_a_frame_can_be_made_again_from_its_row_alone(filmed: Path, films: Path) -> None:
+def test_frame_is_regenerated_from_its_row(filmed: Path, films: Path) -> None:
     assert verify(filmed) == []
     replayed = list(replay(read_rows(filmed / "manifest.csv"), str(films)))
     assert len(replayed) == 38
     assert [one for one in replayed if one.complaint] == []
 
 
-def test_a_damaged_frame_is_made_again(films: Path, filmed: Path, door: Door, tmp_path: Path) -> None:
+def test_damaged_frame_is_repaired(films: Path, filmed: Path, door: Door, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(filmed, tmp_path / "ds"))
     path = copy / "shards" / "shard-00001.tar"
     content = bytearray(path.read_bytes())
@@ -706,7 +704,7 @@ def test_a_damaged_frame_is_made_again(films: Path, filmed: Path, door: Door, tm
     assert path.read_bytes() == (filmed / "shards" / "shard-00001.tar").read_bytes()
 
 
-def test_a_lost_shard_and_manifest_are_made_again_from_the_videos(
+def test_lost_shard_and_manifest_are_regenerated_from_videos(
     films: Path, filmed: Path, door: Door, tmp_path: Path
 ) -> None:
     copy = Path(shutil.copytree(filmed, tmp_path / "ds"))
@@ -761,9 +759,7 @@ def test_a_limit_counts_frames(films: Path) -> None:
 
 
 @pytest.mark.parametrize("override", ["source.downscale=2", "source.dequantize=dither"])
-def test_what_is_done_to_pixels_beforehand_is_done_to_frames(
-    override: str, films: Path, make: Make, tmp_path: Path
-) -> None:
+def test_downscale_and_dither_apply_to_frames(override: str, films: Path, make: Make, tmp_path: Path) -> None:
     make(films, tmp_path / "ds", "source.clips=true", override)
     assert {row["status"] for row in rows(tmp_path / "ds")} == {"ok"}
     assert [one for one in replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(films)) if one.complaint] == []
@@ -776,7 +772,7 @@ def test_without_clips_videos_are_left_out_and_counted(films: Path) -> None:
 
 
 def test_a_photograph_with_a_videos_name_is_one_without_clips(make: Make, tmp_path: Path) -> None:
-    """And its row says so: a replay does not look at the name."""
+    """Its row records this: a replay does not look at the name."""
     (tmp_path / "in").mkdir()
     jpeg(tmp_path / "in" / "a.mp4")
     make(tmp_path / "in", tmp_path / "ds", "source.include=['*.mp4']")

@@ -279,7 +279,7 @@ def _stamp(file: BinaryIO) -> Stamp:
 
 
 def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
-    """Number files of equal content 0, 1, … in listing order (``occurrence``).
+    """Assign files of equal content the numbers 0, 1, … in listing order (``occurrence``).
 
     Only files that share a size are read; their ``sha256`` is kept. A file that cannot be read keeps number 0, since
     it has no pixels to distinguish.

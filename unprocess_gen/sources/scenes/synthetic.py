@@ -1,16 +1,16 @@
-"""Built-in pictures: what the tool photographs when nobody gave it a folder.
+"""Generate the built-in scenes, which are the source if ``source.root`` is null.
 
-A scene has a name, ``<kind>-<number>``, and is drawn from that name alone: blake2b of the name keys a Philox stream,
-and a painter turns the stream into linear light. There are no assets to ship and none to go stale.
+A scene has a name, ``<kind>-<number>``, and depends on it only: blake2b of the name keys a Philox stream, and a painter
+turns the stream into linear light. No picture files are shipped.
 
-The same name is the same bytes on every machine, so that a dataset made from scenes can be pinned by its hashes. This
-is why only exact operations appear here: integers, comparisons, table look-ups, and ``+ - * / sqrt floor`` on float64,
-each as one elementwise ufunc, which IEEE 754 rounds in one way only. Sines, powers, sums, matrix products and image
-libraries are absent: their last bit depends on the CPU, the build and the version. Angles are hence rational points
-of the unit circle, falloffs are rational functions, and the transfer curve is a square root.
+A name gives the same bytes on every machine, so that datasets of scenes can be pinned by their hashes. Therefore only
+exact operations are used: integers, comparisons, look-ups, and ``+ - * / sqrt floor`` on float64, each as one
+elementwise ufunc, which IEEE 754 rounds in one way. Sines, powers, sums, matrix products and image libraries are not:
+their last bit depends on CPU, build and version. Angles are therefore rational points of the unit circle, falloffs are
+rational functions, and the transfer curve is a square root.
 
-A painter works on ``[3, H, W]`` float64, where 0 is black and 1 is the white that a display can show; what is brighter
-clips. The cost is about 100 ms and 30 MB for each scene, on one core.
+A painter returns ``[3, H, W]`` float64, where 0 is black and 1 is display white; brighter values clip. A scene takes
+about 100 ms and 30 MB on one core.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DEFAULT_COUNT = 10
 
 
 def listing(limit: int | None) -> tuple[str, ...]:
-    """The names of the first ``limit`` scenes (None: ten), kinds taking turns; a shorter listing begins a longer."""
+    """Return the names of the first ``limit`` scenes (None: ten); kinds alternate."""
     count = DEFAULT_COUNT if limit is None else limit
     if count < 0:
         raise ValueError(f"limit of synthetic scenes {limit!r}: expected None or an integer of 0 or more")
@@ -48,7 +48,7 @@ SIZES = {
     "gradients-1": (427, 639),
     "night_lamps-1": (767, 511),
 }
-"""Heights and widths that differ from the default: real folders hold odd sides and upright pictures too."""
+"""Heights and widths that differ from the default, with odd sides and a portrait, as real folders have them."""
 
 
 def scene(name: str) -> NDArray[np.uint8]:
@@ -60,7 +60,7 @@ def scene(name: str) -> NDArray[np.uint8]:
 
 
 def _kind(name: str) -> str:
-    """The kind that ``name`` asks for. A number has one spelling only, so that one picture has one name."""
+    """Return the kind in a name; a number has one spelling only, so that a picture has one name."""
     match = re.fullmatch(r"(.*)-(?:0|[1-9][0-9]*)", name)
     if match is None or match[1] not in KINDS:
         raise ValueError(
@@ -71,7 +71,7 @@ def _kind(name: str) -> str:
 
 
 class _Draws:
-    """The random numbers of one scene. Raw Philox words only: NumPy may change its distributions, never these."""
+    """Hold the random stream of one scene; it uses raw Philox words, since NumPy may change its distributions."""
 
     def __init__(self, name: str) -> None:
         digest = hashlib.blake2b(name.encode("utf-8"), digest_size=16).digest()
@@ -81,37 +81,37 @@ class _Draws:
         return self._philox.random_raw(count)
 
     def below(self, bound: int, count: int) -> NDArray[np.int64]:
-        """``count`` integers of 0 .. ``bound`` - 1."""
+        """Return ``count`` integers from 0 to ``bound`` - 1."""
         return (((self._raw(count) >> np.uint64(32)) * np.uint64(bound)) >> np.uint64(32)).astype(np.int64)
 
     def between(self, low: float, high: float, count: int) -> Float:
-        """``count`` float64 of [``low``, ``high``)."""
+        """Return ``count`` float64 in [``low``, ``high``)."""
         unit = (self._raw(count) >> np.uint64(11)).astype(np.float64) / float(1 << 53)
         return low + (high - low) * unit
 
     def one(self, low: float, high: float) -> float:
-        """One float of [``low``, ``high``)."""
+        """Return one float in [``low``, ``high``)."""
         return float(self.between(low, high, 1)[0])
 
     def pick(self, bound: int) -> int:
-        """One integer of 0 .. ``bound`` - 1."""
+        """Return one integer from 0 to ``bound`` - 1."""
         return int(self.below(bound, 1)[0])
 
     def order(self, count: int) -> list[int]:
-        """A shuffle of 0 .. ``count`` - 1."""
+        """Return a permutation of 0 to ``count`` - 1."""
         return [int(i) for i in np.argsort(self._raw(count), kind="stable")]
 
     def octets(self, shape: tuple[int, ...]) -> Float:
-        """Float64 of ``shape``, multiples of 1/256 in [0, 1): eight to a word, and cheap enough for every pixel."""
+        """Return float64 multiples of 1/256 in [0, 1); eight per random word, cheap enough for every pixel."""
         size = int(np.prod(shape))
         words = self._raw(-(-size // 8)).astype("<u8")
         return words.view(np.uint8)[:size].reshape(shape) / 256.0
 
 
 def _encode(light: Float, draws: _Draws) -> NDArray[np.uint8]:
-    """Linear light ``[3, H, W]`` to codes ``[H, W, 3]``; smaller than a code step is dithered, so nothing bands.
+    """Convert linear light ``[3, H, W]`` to codes ``[H, W, 3]``, with dither below one code step against banding.
 
-    A value that is a code exactly stays that code: flat patches stay flat, black stays 0 and white 255.
+    A value that equals a code keeps it: flat patches stay flat, black stays 0 and white 255.
     """
     codes = np.minimum(np.maximum(light, 0.0), 1.0)
     np.sqrt(codes, out=codes)
@@ -121,13 +121,13 @@ def _encode(light: Float, draws: _Draws) -> NDArray[np.uint8]:
 
 
 def _light(codes: tuple[Codes, ...]) -> Float:
-    """A table of display codes as linear light ``[N, 3]``: the inverse of the curve in ``_encode``."""
+    """Return display codes as linear light ``[N, 3]``; inverse of the curve in `_encode`."""
     shown = np.array(codes, dtype=np.float64) / 255.0
     return shown * shown
 
 
 def _grid(height: int, width: int) -> tuple[Float, Float]:
-    """Pixel coordinates ``[H, 1]`` and ``[1, W]``, which broadcast where they meet."""
+    """Return pixel coordinates ``[H, 1]`` and ``[1, W]``, which broadcast."""
     return np.arange(height, dtype=np.float64)[:, None], np.arange(width, dtype=np.float64)[None, :]
 
 
@@ -136,7 +136,7 @@ def _unit(value: Float) -> Float:
 
 
 def _smooth(value: Float) -> Float:
-    """The cubic from 0 to 1 that is level at both ends."""
+    """Return the cubic from 0 to 1 with zero slope at both ends."""
     t = _unit(value)
     return t * t * (3.0 - 2.0 * t)
 
@@ -151,14 +151,14 @@ def _planes(colour: Float) -> Float:
 
 
 def _box(y: Float, x: Float, top: float, left: float, bottom: float, right: float) -> Float:
-    """How much of each pixel an upright rectangle covers, 0 .. 1."""
+    """Return the fraction of each pixel that an axis-aligned rectangle covers."""
     rows = _unit(np.minimum(y - top, bottom - y) + 0.5)
     columns = _unit(np.minimum(x - left, right - x) + 0.5)
     return rows * columns
 
 
 def _noise(draws: _Draws, height: int, width: int, cell: tuple[int, int]) -> Float:
-    """Value noise ``[H, W]`` in -1 .. 1, whose lattice has ``cell`` = (rows, columns) pixels between its points."""
+    """Return value noise ``[H, W]`` in [-1, 1] on a lattice of ``cell`` = (rows, columns) pixels."""
     rows, columns = height // cell[0] + 2, width // cell[1] + 2
     lattice = draws.between(-1.0, 1.0, rows * columns).reshape(rows, columns)
     return _stretch(_stretch(lattice, height, cell[0]).T, width, cell[1]).T
@@ -172,7 +172,7 @@ def _stretch(lattice: Float, length: int, cell: int) -> Float:
     return lattice[low] + (lattice[low + 1] - lattice[low]) * weight
 
 
-# Dead leaves: opaque shapes of power-law sizes that hide one another, the classic model of natural images.
+# Dead leaves: opaque shapes with power-law sizes that occlude one another, the classic model of natural images.
 
 LEAF_PALETTES: tuple[tuple[Codes, ...], ...] = (
     (
@@ -195,11 +195,11 @@ LEAF_SHAPES: tuple[Callable[[Float, Float], Float], ...] = (
     lambda p, q: p * p + np.abs(q),
     lambda p, q: np.maximum(p * p, q * q),
 )
-"""Level functions of a leaf's own coordinates, 1 on the rim: ellipse, lens, rectangle."""
+"""Level functions in a leaf's coordinates, 1 on the rim: ellipse, lens, rectangle."""
 
 
 class _Leaf(NamedTuple):
-    """Centre, half length, half width over half length, direction ``(ux, uy)``, shape, light, texture's contrast."""
+    """Hold a leaf's centre, half length, width over length, direction ``(ux, uy)``, shape and contrast of texture."""
 
     y: float
     x: float
@@ -212,7 +212,7 @@ class _Leaf(NamedTuple):
 
 
 def _dead_leaves(draws: _Draws, height: int, width: int) -> Float:
-    """Large leaves first as the forest's floor, so that no gap is left, then every size at once."""
+    """Draw large leaves first, so that no gap is left, then all sizes."""
     palette = _light(LEAF_PALETTES[draws.pick(len(LEAF_PALETTES))])
     area = height * width
     radii = np.concatenate([_radii(draws, 45.0, 150.0, area // 2600), _radii(draws, 4.5, 130.0, area // 210)])
@@ -228,7 +228,7 @@ def _dead_leaves(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _radii(draws: _Draws, low: float, high: float, count: int) -> Float:
-    """Sizes with density 1/r³, by which every octave covers the same area; its inverse needs a square root only."""
+    """Return sizes with density 1/r³: every octave covers the same area, and the inverse needs a square root only."""
     return 1.0 / np.sqrt(draws.between(1.0 / (high * high), 1.0 / (low * low), count))
 
 
@@ -249,7 +249,7 @@ def _leaves(draws: _Draws, radii: Float, height: int, width: int) -> list[_Leaf]
 
 
 def _drop(canvas: Float, texture: Float, leaf: _Leaf, colour: Float) -> None:
-    """Drop one leaf on ``canvas``: it darkens what lies around its rim, then hides what lies under it."""
+    """Draw one leaf: it darkens the surroundings of its rim and hides what is below it."""
     reach = leaf.radius * 1.45
     top, left = max(0, int(leaf.y - reach)), max(0, int(leaf.x - reach))
     window = (slice(top, int(leaf.y + reach) + 2), slice(left, int(leaf.x + reach) + 2))
@@ -273,7 +273,7 @@ PATCHES: tuple[Codes, ...] = (
     (190, 40, 54), (236, 150, 40), (62, 152, 82), (34, 62, 150), (192, 76, 142), (26, 140, 168),
     (244, 244, 240), (202, 202, 200), (160, 160, 160), (120, 120, 121), (80, 80, 82), (44, 44, 46),
 )  # fmt: skip
-"""Six columns by four rows of our own; the last row is gray."""
+"""Six columns by four rows, chosen for this chart; the last row is gray."""
 
 BAR_PERIODS = (24, 18, 14, 10, 8, 6, 5, 4, 3, 2)
 
@@ -292,7 +292,7 @@ def _colour_chart(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _frame(canvas: Float, y: Float, x: Float, top: int, left: int, bottom: int, right: int) -> None:
-    """The dark board, with the shadow it throws on the wall."""
+    """Draw the dark board and its shadow on the wall."""
     dy = np.maximum(np.maximum(top + 8 - y, y - bottom - 8), 0.0)
     dx = np.maximum(np.maximum(left + 8 - x, x - right - 8), 0.0)
     canvas *= 1.0 - 0.6 / (1.0 + (dx * dx + dy * dy) / 120.0)
@@ -300,7 +300,7 @@ def _frame(canvas: Float, y: Float, x: Float, top: int, left: int, bottom: int, 
 
 
 def _patches(canvas: Float, draws: _Draws, top: int, left: int, bottom: int, right: int) -> None:
-    """The 6 x 4 patches; hues are shuffled and shifted from chart to chart, grays stay in their order."""
+    """Draw the 6 x 4 patches; hues are permuted and shifted in each chart, grays keep their order."""
     codes = np.array(PATCHES, dtype=np.int64)
     codes[:18] = np.clip(codes[draws.order(18)] + draws.below(25, 54).reshape(18, 3) - 12, 0, 255)
     for i, light in enumerate(_light(tuple(map(tuple, codes.tolist())))):
@@ -311,7 +311,7 @@ def _patches(canvas: Float, draws: _Draws, top: int, left: int, bottom: int, rig
 
 
 def _ramp_strip(canvas: Float, top: int, left: int, bottom: int, right: int) -> None:
-    """A smooth ramp over every gray, and under it the same in 16 steps."""
+    """Draw a smooth ramp over all grays, and below it the same in 16 steps."""
     t = np.arange(right - left - 10) / float(right - left - 11)
     steps = np.floor(np.minimum(t * 16.0, 15.0)) / 15.0
     middle = (top + bottom) // 2
@@ -320,7 +320,7 @@ def _ramp_strip(canvas: Float, top: int, left: int, bottom: int, right: int) -> 
 
 
 def _resolution(canvas: Float, y: Float, x: Float, top: int, left: int, bottom: int, right: int) -> None:
-    """Left: bars of rising frequency, upright over level. Middle: a slanted edge. Right: a zone plate."""
+    """Draw bars of rising frequency on the left, a slanted edge in the middle, and a zone plate on the right."""
     side = bottom - top
     plate, edge = right - 5 - side, right - 15 - 2 * side
     middle = (top + bottom) // 2
@@ -334,21 +334,21 @@ def _resolution(canvas: Float, y: Float, x: Float, top: int, left: int, bottom: 
 
 
 def _bars(length: int) -> Float:
-    """Black and white bars ``[length]``, a group of equal width for every period; odd periods get a wider white."""
+    """Return black and white bars ``[length]``, a group of equal width per period; odd periods have a wider white."""
     groups = np.minimum(np.arange(length) * len(BAR_PERIODS) // length, len(BAR_PERIODS) - 1)
     periods = np.array(BAR_PERIODS)[groups]
     return np.where(np.arange(length) % periods < periods // 2, 0.004, 0.8)
 
 
 def _wave(phase: Float) -> Float:
-    """A wave of period 1 in 0 .. 1, made of parabolas: near enough to a sine for the eye."""
+    """Return a wave of period 1 in [0, 1], made of parabolas that look like a sine."""
     t = phase - np.floor(phase)
     arch = 4.0 * t * (1.0 - t)
     return arch * arch
 
 
 def _lamp(draws: _Draws, y: Float, x: Float, height: int, width: int) -> Float:
-    """The chart's light ``[3, H, W]``: a bright side, corners that fall off, and a cast."""
+    """Return the illumination of the chart ``[3, H, W]``: a bright side, vignetting, and a colour cast."""
     dy = (y - draws.one(0.3, 0.6) * height) / height
     dx = (x - draws.one(0.25, 0.75) * width) / width
     fall = 1.12 / (1.0 + 0.45 * (dx * dx + dy * dy))
@@ -356,22 +356,22 @@ def _lamp(draws: _Draws, y: Float, x: Float, height: int, width: int) -> Float:
     return _planes(np.array([1.0 + warm, 1.0, 1.0 - warm])) * fall
 
 
-# Gradients: panels without an edge in them, where banding and quantisation would show first.
+# Gradients: panels without edges, where banding and quantisation are visible first.
 
 
 def _gradients(draws: _Draws, height: int, width: int) -> Float:
-    """Six panels over three ramps: the shadows, the highlights, and all grays."""
+    """Draw six panels above three ramps: shadows, highlights, and all grays."""
     canvas = np.zeros((3, height, width))
-    floor = height * 13 // 16
+    ramps_top = height * 13 // 16
     gap = 6
     for i, which in enumerate(draws.order(len(PANELS))):
         row, column = divmod(i, 3)
-        top, bottom = gap + row * floor // 2, (row + 1) * floor // 2
+        top, bottom = gap + row * ramps_top // 2, (row + 1) * ramps_top // 2
         left, right = gap + column * (width - gap) // 3, (column + 1) * (width - gap) // 3
         shown = _unit(PANELS[which](draws, bottom - top, right - left))
         canvas[:, top:bottom, left:right] = shown * shown
     for i, (low, high) in enumerate(RAMPS):
-        top, bottom = (floor + gap + (height - floor - gap) * (i + k) // len(RAMPS) for k in (0, 1))
+        top, bottom = (ramps_top + gap + (height - ramps_top - gap) * (i + k) // len(RAMPS) for k in (0, 1))
         t = np.arange(width - 2 * gap) / float(width - 2 * gap - 1)
         shown = (low + (high - low) * t) / 255.0
         canvas[:, top : bottom - gap, gap : width - gap] = shown * shown
@@ -382,7 +382,7 @@ RAMPS = ((0, 40), (255, 200), (0, 255))
 
 
 def _hue(t: Float) -> Float:
-    """Hue ``t`` (period 1) as R, G, B ``[3, ...]`` in 0 .. 1: the colour hexagon with its corners rounded."""
+    """Return hue ``t`` (period 1) as R, G, B ``[3, ...]`` in [0, 1]: the colour hexagon with rounded corners."""
     offsets = np.array([0.0, 2.0, 4.0]).reshape((3,) + (1,) * t.ndim)
     turn = t / 1.0 * 6.0 - offsets + 3.0
     turn = turn - 6.0 * np.floor(turn / 6.0)
@@ -390,12 +390,12 @@ def _hue(t: Float) -> Float:
 
 
 def _tint(draws: _Draws, strength: float, value: float) -> Float:
-    """A random hue ``[3]``, mixed with gray and scaled, as display values of 0 .. 1."""
+    """Return a random hue ``[3]``, mixed with gray and scaled, as display values in [0, 1]."""
     return value * (1.0 - strength + strength * _hue(draws.between(0.0, 1.0, 1))[:, 0])
 
 
 def _corners(draws: _Draws, height: int, width: int) -> Float:
-    """Four colours, one for each corner."""
+    """Return four colours, one for each corner."""
     y, x = _grid(height, width)
     v, u = _smooth(y / height), _smooth(x / width)
     a, b, c, d = (_planes(_tint(draws, 0.6, value)) for value in (0.95, 0.7, 0.45, 0.85))
@@ -403,7 +403,7 @@ def _corners(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _halo(draws: _Draws, height: int, width: int) -> Float:
-    """A bright spot on a dark ground."""
+    """Return a bright spot on a dark ground."""
     y, x = _grid(height, width)
     dy, dx = (y - draws.one(0.35, 0.65) * height) / height, (x - draws.one(0.35, 0.65) * width) / height
     near, far = _planes(_tint(draws, 0.35, 1.06)), _planes(_tint(draws, 0.7, 0.22))
@@ -411,14 +411,14 @@ def _halo(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _spectrum(draws: _Draws, height: int, width: int) -> Float:
-    """Hue along, paleness down."""
+    """Return all hues from left to right, paler towards the bottom."""
     y, x = _grid(height, width)
     strength = _smooth(1.0 - y / height) * 0.75
     return (1.0 - strength + strength * _hue(x / width + draws.one(0.0, 1.0))) * (0.55 + 0.4 * (y / height))
 
 
 def _dusk(draws: _Draws, height: int, width: int) -> Float:
-    """An evening sky."""
+    """Return an evening sky."""
     y, x = _grid(height, width)
     stops = np.array([(24, 34, 74), (72, 84, 140), (190, 140, 150), (244, 176, 110), (255, 222, 160)]) / 255.0
     at = y[:, 0] / height * (len(stops) - 1.001)
@@ -429,7 +429,7 @@ def _dusk(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _silk(draws: _Draws, height: int, width: int) -> Float:
-    """Two tints that fold into each other."""
+    """Return two tints that fold into each other."""
     cell = (height // 2 + 1, width // 2 + 1)
     fold = 0.5 + 0.5 * _noise(draws, height, width, cell)
     dark, pale = _planes(_tint(draws, 0.6, 0.3)), _planes(_tint(draws, 0.4, 0.95))
@@ -437,7 +437,7 @@ def _silk(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _pools(draws: _Draws, height: int, width: int) -> Float:
-    """Four pools of colour on a middle gray."""
+    """Return four pools of colour on middle gray."""
     y, x = _grid(height, width)
     shown = np.full((3, height, width), 0.45)
     for _ in range(4):
@@ -468,7 +468,7 @@ def _night_lamps(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _night_sky(draws: _Draws, y: Float, x: Float, horizon: int) -> Float:
-    """Deep blue above, the town's glow below, a few stars."""
+    """Return deep blue at the top, the glow of a town at the horizon, and a few stars."""
     height, width = y.size, x.size
     town = 1.0 / (1.0 + 6.0 * ((y - horizon) / horizon) * ((y - horizon) / horizon))
     cloud = 1.0 + 0.35 * _noise(draws, height, width, (70, 150))
@@ -484,7 +484,7 @@ def _night_sky(draws: _Draws, y: Float, x: Float, horizon: int) -> Float:
 def _skyline(
     canvas: Float, draws: _Draws, y: Float, x: Float, foot: int, tall: tuple[float, float], wall: Float
 ) -> None:
-    """A row of houses along ``foot``, ``tall`` = the range of their heights as shares of ``foot``."""
+    """Draw a row of buildings along ``foot``; ``tall`` is the range of their heights as fractions of ``foot``."""
     left = -draws.pick(40)
     while left < x.size:
         right = left + 38 + draws.pick(70)
@@ -495,7 +495,7 @@ def _skyline(
 
 
 def _windows(canvas: Float, draws: _Draws, top: int, left: int, bottom: int, right: int) -> None:
-    """Windows in a grid of 12 x 9 pixels, a quarter of them lit."""
+    """Draw windows in a grid of 12 x 9 pixels, a quarter of them lit."""
     rows, columns = max((bottom - top) // 12, 0), max((right - left) // 9, 0)
     for i in np.flatnonzero(draws.below(4, rows * columns) == 0).tolist():
         row, column = divmod(i, columns)
@@ -505,7 +505,7 @@ def _windows(canvas: Float, draws: _Draws, top: int, left: int, bottom: int, rig
 
 
 def _road(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> None:
-    """Wet ground: a dim, rippled mirror of what stands above the horizon, darker the nearer it lies."""
+    """Draw wet ground: a dim, rippled mirror image of everything above the horizon, darker towards the viewer."""
     height, width = y.size, x.size
     depth = height - horizon
     ripple = _noise(draws, height, width, (3, 40))[horizon:] * (np.arange(depth) / 8.0)[:, None]
@@ -516,7 +516,7 @@ def _road(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> Non
 
 
 def _sources(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> None:
-    """Two rows of lamps that recede to a point on the horizon, and the signs between them."""
+    """Draw two rows of lamps that recede to a point on the horizon, and signs between them."""
     height, width = y.size, x.size
     vanish = draws.one(0.4, 0.6) * width
     streaks = 0.75 + 0.5 * _noise(draws, height, width, (2, 26))
@@ -546,7 +546,7 @@ def _glow(
     colour: Float,
     horizon: int,
 ) -> None:
-    """A source at ``at`` = (row, column, row of its foot): a core beyond white, a halo, a streak on the wet ground."""
+    """Draw a lamp at ``at`` = (row, column, row of its foot): a core above white, a halo, a streak on wet ground."""
     dy, dx = (y - at[0]) / size, (x - at[1]) / size
     square = dx * dx + dy * dy
     near = 1.0 / (1.0 + square)
@@ -560,7 +560,7 @@ def _glow(
 # Highlights: colours driven past what a display can show, one channel at a time or all three.
 
 SUN = (3.0 / 7.0, -6.0 / 7.0, 2.0 / 7.0)
-"""Towards the sun: right, up and to the viewer, a unit vector in rationals (y points down)."""
+"""Unit vector towards the sun, in rationals: right, up and to the viewer (y points down)."""
 
 BALLS = np.array(
     [
@@ -593,7 +593,7 @@ def _highlights(draws: _Draws, height: int, width: int) -> Float:
 
 
 def _day_sky(draws: _Draws, y: Float, x: Float, horizon: int) -> Float:
-    """Blue to white towards the horizon, clouds that burn out, the sun's disc and the glare around it."""
+    """Return a sky from blue to white at the horizon, with clipped clouds, the sun and its glare."""
     height, width = y.size, x.size
     t = _unit(y / horizon)
     low, high = _planes(np.array([0.72, 0.84, 0.95])), _planes(np.array([0.10, 0.26, 0.68]))
@@ -608,7 +608,7 @@ def _day_sky(draws: _Draws, y: Float, x: Float, horizon: int) -> Float:
 
 
 def _hills(canvas: Float, draws: _Draws, y: Float, horizon: int) -> None:
-    """Two ridges against the light: the far one hazy, the near one close to black."""
+    """Draw two backlit ridges: the far one hazy, the near one almost black."""
     width = canvas.shape[2]
     for lift, rough, colour in ((0.20, 90, (0.10, 0.16, 0.24)), (0.06, 60, (0.004, 0.007, 0.002))):
         ridge = 0.07 * _noise(draws, 1, width, (1, rough)) + 0.02 * _noise(draws, 1, width, (1, rough // 5))
@@ -617,7 +617,7 @@ def _hills(canvas: Float, draws: _Draws, y: Float, horizon: int) -> None:
 
 
 def _table(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> None:
-    """A wooden table up to the horizon and a sheet of white paper on it, in perspective."""
+    """Draw a wooden table up to the horizon and a sheet of white paper on it, in perspective."""
     height, width = y.size, x.size
     near = (y[horizon:] - horizon) / float(height - horizon)
     grain = 1.0 + 0.22 * _noise(draws, height, width, (3, 120)) + 0.12 * _noise(draws, height, width, (9, 60))
@@ -629,7 +629,7 @@ def _table(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> No
 
 
 def _ball(canvas: Float, y: Float, x: Float, centre: tuple[float, float, float], colour: Float) -> None:
-    """A glossy ball at ``centre`` = (row, column, radius), with its shadow away from the sun."""
+    """Draw a glossy ball at ``centre`` = (row, column, radius), with its shadow away from the sun."""
     row, column, radius = centre
     _shade(canvas, y, x, (row + 0.86 * radius, column - 0.62 * radius), (0.36 * radius, 1.25 * radius), 0.72)
     _shade(canvas, y, x, (row + 0.97 * radius, column - 0.08 * radius), (0.12 * radius, 0.50 * radius), 0.80)
