@@ -27,7 +27,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from unprocess_gen.cli.hydra_app import conf_dir
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError

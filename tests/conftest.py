@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from unprocess_gen.cli import main as door_room
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline import generate as runner
@@ -110,12 +111,12 @@ def settings() -> Settings:
     @functools.cache
     def groups(*choices: str) -> DictConfig:
         ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
-        with initialize_config_dir(str(door_room.conf_dir()), version_base="1.3"):
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
             return compose("config", overrides=list(choices))
 
     def composed(*overrides: str) -> Config:
         keys = {override: override.lstrip("+").split("=")[0] for override in overrides}
-        chosen = [override for override, key in keys.items() if (door_room.conf_dir() / key).is_dir()]
+        chosen = [override for override, key in keys.items() if (conf_dir() / key).is_dir()]
         node = copy.deepcopy(groups(*chosen))  # composing takes 0.1 s, so single values are set afterwards
         for override in OverridesParser.create().parse_overrides([one for one in overrides if one not in chosen]):
             OmegaConf.update(node, override.key_or_group, override.value())

@@ -16,9 +16,9 @@ from conftest import Door, fill
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.cli.hydra_app import conf_dir
 from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
 from unprocess_gen.config.interpretation import accuracy_budget
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config

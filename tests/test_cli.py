@@ -48,7 +48,7 @@ REFUSED = [
     (["source.recursive=perhaps"], r"source.recursive=perhaps: .*\bbool"),
     (["source.include=a.jpg"], r"source.include=a.jpg: "),
     (["seed=${no.such}"], r"seed=\$\{no.such\}: Interpolation key 'no.such' not found"),
-    (["seed=1,2"], r"Ambiguous value for argument 'seed=1,2'.*--multirun"),
+    (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
     (["word"], r"word: no such verb; expected generate, plan, .*again, completion or settings key=value"),
     (["camera=convex", "word"], r"word: expected a setting key=value"),
     (["camera.name"], r"camera.name: expected a setting key=value"),

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from unprocess_gen.cli import hydra_app as compose
 from unprocess_gen.config import distributions as draws
 from unprocess_gen.config.distributions import DISTRIBUTION_NUMBERS, parse_distribution
 from unprocess_gen.config.noise_validation import PROFILE_RANGES
+from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import (
     NOT_DATA,
@@ -36,9 +36,7 @@ from unprocess_gen.simulation.reference import unprocess
 
 Settings = Callable[..., Config]
 FILES = sorted(
-    path.relative_to(compose.conf_dir())
-    for path in compose.conf_dir().glob("*/*.yaml")
-    if path.parent.name != compose.RECIPE
+    path.relative_to(conf_dir()) for path in conf_dir().glob("*/*.yaml") if path.parent.name not in ADDED_GROUPS
 )
 MATRIX = "[0.7, 0.1, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]"
 NEEDS = {
@@ -65,7 +63,7 @@ def test_every_option_composes_and_passes_the_checks(file: Path, settings: Setti
 @pytest.mark.parametrize("file", FILES, ids=str)
 def test_every_option_says_all_keys_of_its_group(file: Path) -> None:
     group = getattr(Config(), str(file.parent))
-    written = yaml.safe_load((compose.conf_dir() / file).read_text(encoding="utf-8"))
+    written = yaml.safe_load((conf_dir() / file).read_text(encoding="utf-8"))
     keys = {field.name for field in dataclasses.fields(group)}
     if str(file.parent) == "noise":
         assert keys == NOISE_KEYS | TWO_NUMBERS | PHYSICAL | CHOSEN
@@ -74,7 +72,7 @@ def test_every_option_says_all_keys_of_its_group(file: Path) -> None:
 
 
 def test_options_are_those_of_the_contract() -> None:
-    options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in compose.conf_dir().glob("*/")}
+    options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in conf_dir().glob("*/")}
     assert options == {
         "source": {"default"},
         "camera": {
@@ -95,6 +93,7 @@ def test_options_are_those_of_the_contract() -> None:
         "accuracy": {"reference", "exact", "fast"},
         "output": {"webdataset"},
         "experiment": {"ipol_demo", "brooks2019_training", "crvd_like", "eld_low_light"},
+        "sweep": {"iso_ladder", "cameras", "camera_by_iso", "gain_extremes", "paper_figure6"},
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import pytest
 from conftest import Door, Settings, pixels
 from PIL import Image
 
-from unprocess_gen.cli import hydra_app as compose
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GainsConfig, NoiseConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports import figure_pictures, paper_figures, paper_sources, report_files
@@ -33,12 +33,8 @@ FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
 
 @pytest.fixture(scope="module")
 def options() -> PaperOptions:
-    gains = {
-        name: read_option(compose.conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_sources.GAINS
-    }
-    return PaperOptions(
-        gains, read_option(compose.conf_dir() / "noise" / f"{paper_sources.AUTHORS_NOISE}.yaml", NoiseConfig)
-    )
+    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_sources.GAINS}
+    return PaperOptions(gains, read_option(conf_dir() / "noise" / f"{paper_sources.AUTHORS_NOISE}.yaml", NoiseConfig))
 
 
 @pytest.fixture(scope="module")

@@ -12,14 +12,17 @@ import unprocess_gen
 PACKAGE = Path(unprocess_gen.__file__).parent
 
 ONLY_IN = {
-    "hydra": {"cli.hydra_app", "config.composition", "config.composition_errors"},
-    "omegaconf": {"cli.hydra_app", "config.composition", "config.composition_errors", "config.serialization"},
-    "joblib": {"pipeline.generate"},
+    "hydra": {"cli.hydra_app", "config.composition", "config.composition_errors", "config.sweep_expansion"},
+    "omegaconf": {
+        *("cli.hydra_app", "config.composition", "config.composition_errors", "config.serialization"),
+        "config.sweep_expansion",
+    },
+    "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},
     "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
-        *("sources.image.decode", "reports.dataset_report", "reports.contact_sheet"),
-        *("simulation.reference.isp", "pipeline.generate"),
+        *("sources.image.decode", "reports.dataset_report", "reports.contact_sheet", "reports.panels"),
+        *("reports.stages_sheet", "simulation.reference.isp", "pipeline.worker"),
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},

@@ -11,13 +11,14 @@ from conftest import CRVD, Door, Make, Settings, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.cli.hydra_app import RECIPE, conf_dir
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.types import Srgb
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.scenes import synthetic
 
+RECIPE = "experiment"
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml"))
 NO_CLIPS = {"crvd_like": ("source.clips=false",)}
 """What the built-in scenes, which are no clips, ask of a recipe."""

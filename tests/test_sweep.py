@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -13,6 +15,8 @@ from typing import Any
 
 import pytest
 from conftest import COMMAND, environment, fill
+
+from unprocess_gen.cli.sweep import SHARES, folder_name, overrides_text
 
 Door = Callable[..., Any]
 Make = Callable[..., Any]
@@ -35,27 +39,64 @@ def source(tmp_path: Path) -> Path:
     return fill(tmp_path / "p", 3)
 
 
-def test_every_combination_is_a_dataset_of_its_own(door: Door, source: Path, tmp_path: Path) -> None:
+def test_every_combination_has_its_own_dataset(door: Door, source: Path, tmp_path: Path) -> None:
     done = door(*TWO_BY_TWO, "n_jobs=1")
     assert done.code == 0, done.err
     assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*FOLDERS, "sweep.csv"])
     assert sorted(os.listdir(tmp_path)) == ["p", "sweep"]
 
 
-def test_sweep_csv_tells_of_every_job(door: Door, source: Path, tmp_path: Path) -> None:
+def test_sweep_csv_has_a_row_for_every_job(door: Door, source: Path, tmp_path: Path) -> None:
     door(*TWO_BY_TWO, "n_jobs=1")
-    expected = [{"folder": folder, "overrides": folder, "rows": "3", "failed": "0", "exit": "0"} for folder in FOLDERS]
-    assert sorted(table(tmp_path / "sweep"), key=str) == sorted(expected, key=str)
+    rows = table(tmp_path / "sweep")
+
+    assert [row["folder"] for row in rows] == [row["overrides"] for row in rows] == FOLDERS
+    assert [(row["camera"], row["noise"]) for row in rows] == COMBINATIONS
+    assert [(row["rows"], row["failed"], row["exit"]) for row in rows] == [("3", "0", "0")] * 4
 
 
-def test_sweep_csv_has_the_columns_of_the_contract_and_line_feeds(door: Door, source: Path, tmp_path: Path) -> None:
-    door("-m", "source.root=p", "out=sweep", "n_jobs=1")
+def test_sweep_csv_has_the_columns_of_the_contract(door: Door, source: Path, tmp_path: Path) -> None:
+    door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
     content = (tmp_path / "sweep/sweep.csv").read_bytes()
-    assert content.startswith(b"folder,overrides,rows,failed,exit\n")
+    assert content.split(b"\n")[0].decode().split(",") == [
+        "folder", "overrides", "seed", "rows", "failed", "clean_clipped_low_share", "clean_clipped_high_share",
+        "noisy_clipped_low_share", "noisy_clipped_high_share", "saturated_share", "seconds", "bytes", "exit",
+    ]  # fmt: skip
     assert b"\r" not in content
 
 
-def test_a_dataset_of_a_sweep_is_that_of_a_single_run(
+def test_sweep_csv_agrees_with_the_datasets(door: Door, source: Path, tmp_path: Path) -> None:
+    door("-m", "gains=paper_max,fig6_bottom", "source.root=p", "out=sweep", "n_jobs=1")
+    for row in table(tmp_path / "sweep"):
+        folder = tmp_path / "sweep" / row["folder"]
+        sites = json.loads((folder / "dataset.json").read_text())["sites"]
+
+        for name in SHARES:
+            assert float(row[f"{name}_share"]) == sites[name] / sites["all"]
+        assert int(row["bytes"]) == sum(path.stat().st_size for path in (folder / "shards").iterdir())
+        assert float(row["seconds"]) > 0
+
+
+def test_sweep_csv_of_version_0_1_keeps_its_rows(door: Door, source: Path, tmp_path: Path) -> None:
+    (tmp_path / "sweep").mkdir()
+    old = "folder,overrides,rows,failed,exit\nseed=7,seed=7,3,0,0\nseed=1,seed=1,2,0,5\n"
+    (tmp_path / "sweep/sweep.csv").write_text(old)
+    door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+
+    rows = table(tmp_path / "sweep")
+    assert [(row["folder"], row["rows"], row["seed"], row["exit"]) for row in rows] == [
+        ("seed=1", "3", "1", "0"), ("seed=2", "3", "2", "0"), ("seed=7", "3", "", "0"),
+    ]  # fmt: skip
+
+
+def test_sweeps_over_other_keys_share_one_table(door: Door, source: Path, tmp_path: Path) -> None:
+    for swept in ("seed=1,2", "isp=linear,srgb"):
+        door("-m", swept, "source.root=p", "out=sweep", "n_jobs=1")
+    rows = table(tmp_path / "sweep")
+    assert sorted((row["seed"], row["isp"]) for row in rows) == [("", "linear"), ("", "srgb"), ("1", ""), ("2", "")]
+
+
+def test_datasets_of_a_sweep_equal_those_of_single_runs(
     door: Door, source: Path, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
     door(*TWO_BY_TWO, "n_jobs=1")
@@ -64,9 +105,7 @@ def test_a_dataset_of_a_sweep_is_that_of_a_single_run(
         assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
 
 
-def test_a_job_that_fails_stops_no_other_and_the_worst_code_is_returned(
-    door: Door, source: Path, tmp_path: Path
-) -> None:
+def test_failing_job_does_not_stop_others_and_decides_exit_code(door: Door, source: Path, tmp_path: Path) -> None:
     done = door("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     assert done.code == 2
     assert [(row["folder"], row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [
@@ -75,13 +114,13 @@ def test_a_job_that_fails_stops_no_other_and_the_worst_code_is_returned(
     assert (tmp_path / "sweep/gains.red=2/dataset.json").exists()
 
 
-def test_the_error_of_a_job_is_one_line_that_names_it(door: Door, source: Path) -> None:
+def test_error_of_a_job_is_one_line_with_its_name(door: Door, source: Path) -> None:
     done = door("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     errors = [line for line in done.err.splitlines() if "images/s" not in line]
     assert errors == ["gen-dataset: gains.red=0: gains.red=0: a gain must be above 0, from 0.001 to 1000"]
 
 
-def test_an_option_that_is_not_there_stops_no_other_job(door: Door, source: Path, tmp_path: Path) -> None:
+def test_unknown_option_in_one_job_does_not_stop_others(door: Door, source: Path, tmp_path: Path) -> None:
     done = door("source.root=p", "-m", "camera=sony_a7r,nosuch,nexus_6p", "out=sweep", "n_jobs=1")
     assert done.code == 2
     assert "gen-dataset: camera=nosuch: camera=nosuch: no such option; expected one of choice, " in done.err
@@ -93,28 +132,28 @@ def test_an_option_that_is_not_there_stops_no_other_job(door: Door, source: Path
         ]
 
 
-def test_a_glob_stands_for_the_options_that_match(door: Door, source: Path, tmp_path: Path) -> None:
+def test_glob_expands_to_matching_options(door: Door, source: Path, tmp_path: Path) -> None:
     assert door("-m", "camera=glob(s*)", "source.root=p", "out=sweep", "n_jobs=1").code == 0
     assert sorted(os.listdir(tmp_path / "sweep")) == ["camera=sony_a7r", "camera=sony_rx100", "sweep.csv"]
 
 
-def test_a_sweep_in_which_every_job_is_refused_writes_nothing(door: Door, source: Path, tmp_path: Path) -> None:
+def test_sweep_of_refused_jobs_writes_nothing(door: Door, source: Path, tmp_path: Path) -> None:
     assert door("-m", "gains.red=0,-1", "source.root=p", "out=sweep").code == 2
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
-def test_failed_photographs_of_a_job_are_counted_and_end_with_3(door: Door, source: Path, tmp_path: Path) -> None:
+def test_failed_images_are_counted_and_exit_code_is_3(door: Door, source: Path, tmp_path: Path) -> None:
     (source / "001.png").write_bytes(b"")
     assert door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1").code == 3
     assert [(row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [("3", "1", "3")] * 2
 
 
-def test_a_setting_is_worse_than_a_failed_photograph(door: Door, source: Path) -> None:
+def test_config_error_is_worse_than_a_failed_image(door: Door, source: Path) -> None:
     (source / "001.png").write_bytes(b"")
     assert door("-m", "gains.red=2,0", "source.root=p", "out=sweep", "n_jobs=1").code == 2
 
 
-def test_a_second_sweep_does_nothing_and_tells_the_same(door: Door, source: Path, tmp_path: Path) -> None:
+def test_repeated_sweep_changes_nothing(door: Door, source: Path, tmp_path: Path) -> None:
     door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
     before = (tmp_path / "sweep/sweep.csv").read_bytes()
     done = door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
@@ -122,28 +161,28 @@ def test_a_second_sweep_does_nothing_and_tells_the_same(door: Door, source: Path
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 
-def test_another_sweep_into_the_same_folder_keeps_the_rows_of_the_first(
-    door: Door, source: Path, tmp_path: Path
-) -> None:
+def test_second_sweep_into_a_folder_keeps_earlier_rows(door: Door, source: Path, tmp_path: Path) -> None:
     for seeds in ("seed=1,2", "seed=2,3"):
         door("-m", seeds, "source.root=p", "out=sweep", "n_jobs=1")
     assert sorted(row["folder"] for row in table(tmp_path / "sweep")) == ["seed=1", "seed=2", "seed=3"]
 
 
-@pytest.mark.parametrize("excluded", ["n_jobs=2", "out=sweep", "source.root=p"])
-def test_keys_that_do_not_decide_the_data_are_not_in_the_names(
+@pytest.mark.parametrize(
+    "excluded", ["n_jobs=2", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on", "hydra.mode=MULTIRUN"]
+)
+def test_folder_names_omit_keys_that_do_not_decide_data(
     excluded: str, door: Door, source: Path, tmp_path: Path
 ) -> None:
     door("-m", "seed=1", "source.root=p", "out=sweep", "n_jobs=1", excluded)
     assert sorted(os.listdir(tmp_path / "sweep")) == ["seed=1", "sweep.csv"]
 
 
-def test_a_sweep_of_nothing_has_a_folder_with_a_name(door: Door, source: Path, tmp_path: Path) -> None:
+def test_sweep_without_values_has_one_folder(door: Door, source: Path, tmp_path: Path) -> None:
     door("-m", "source.root=p", "out=sweep", "n_jobs=1")
     assert sorted(os.listdir(tmp_path / "sweep")) == ["default", "sweep.csv"]
 
 
-def test_a_value_with_a_slash_nests_no_folders(door: Door, source: Path, tmp_path: Path) -> None:
+def test_slash_in_a_value_creates_no_nested_folder(door: Door, source: Path, tmp_path: Path) -> None:
     (source / "sub").mkdir()
     (source / "001.png").rename(source / "sub/001.png")
     done = door("-m", "source.include=['sub/*.png'],['0*.png']", "source.root=p", "out=sweep", "n_jobs=1")
@@ -154,7 +193,7 @@ def test_a_value_with_a_slash_nests_no_folders(door: Door, source: Path, tmp_pat
     assert all((tmp_path / "sweep" / name / "dataset.json").exists() for name in folders)
 
 
-def test_long_overrides_still_name_a_folder_each(door: Door, source: Path, tmp_path: Path) -> None:
+def test_long_overrides_have_distinct_folder_names(door: Door, source: Path, tmp_path: Path) -> None:
     numbers = ",".join(["0.123456789012345678"] * 12)
     one, other = (f"['*.png','{numbers}{end}']" for end in "ab")
     done = door("-m", f"source.include={one},{other}", "source.root=p", "out=sweep", "n_jobs=1")
@@ -164,20 +203,21 @@ def test_long_overrides_still_name_a_folder_each(door: Door, source: Path, tmp_p
     assert max(len(name) for name in folders) <= 255
 
 
-def test_plan_of_a_sweep_tells_of_every_job_and_writes_nothing(door: Door, source: Path, tmp_path: Path) -> None:
-    done = door("plan", *TWO_BY_TWO)
+def test_plan_of_a_sweep_prints_every_job_and_totals(door: Door, source: Path, tmp_path: Path) -> None:
+    done = door("plan", *TWO_BY_TWO, "n_jobs=1")
     assert (done.code, done.out.count("sources   3")) == (0, 4)
+    assert re.search(r"^totals    4 jobs: 12 pairs in 4 shards, 116,736 bytes, about [\d.]+ s$", done.out, re.MULTILINE)
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
-def test_plan_of_a_sweep_that_was_made_leaves_its_table_alone(door: Door, source: Path, tmp_path: Path) -> None:
+def test_plan_does_not_change_sweep_csv(door: Door, source: Path, tmp_path: Path) -> None:
     door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
     before = (tmp_path / "sweep/sweep.csv").read_bytes()
     door("plan", "-m", "seed=1,2", "source.root=p", "out=sweep")
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 
-def test_a_sweep_that_is_killed_is_finished_by_a_rerun(door: Door, make: Make, tree_hash: Hash, tmp_path: Path) -> None:
+def test_rerun_finishes_a_killed_sweep(door: Door, make: Make, tree_hash: Hash, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 12)
     arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")
     folders = [f"{folder},output.pairs_per_shard=1" for folder in FOLDERS]
@@ -201,3 +241,31 @@ def test_a_sweep_that_is_killed_is_finished_by_a_rerun(door: Door, make: Make, t
     for (camera, noise), folder in zip(COMBINATIONS, folders, strict=True):
         make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}", "output.pairs_per_shard=1")
         assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
+
+
+def test_jobs_are_announced_with_their_place(door: Door, source: Path) -> None:
+    done = door("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    assert "1/2 seed=1" in done.err
+    assert "2/2 seed=2" in done.err
+
+
+def test_too_many_jobs_are_refused_at_once(door: Door, tmp_path: Path) -> None:
+    done = door("-m", "seed=range(0,1000000000)", "out=sweep")
+    assert (done.code, done.err) == (2, "gen-dataset: a sweep of more than 100000 jobs; expected fewer values\n")
+    assert os.listdir(tmp_path) == []
+
+
+def test_interval_is_refused_in_one_line(door: Door) -> None:
+    done = door("-m", "gains.red=interval(1,2)")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "gains.red=interval(1,2): an interval has no list of values; expected choice or range" in done.err
+
+
+def test_names_omit_keys_of_the_executor() -> None:
+    overrides = ["seed=1", "executor=dask", "executor.address=x", "append=true", "+experiment=e", "output.dtype=uint16"]
+    assert overrides_text(overrides) == "+experiment=e,output.dtype=uint16,seed=1"
+
+
+def test_names_encode_slashes_and_percent_signs() -> None:
+    assert folder_name("a=b/c%") == "a=b%2Fc%25"
+    assert folder_name("") == "default"

@@ -1,75 +1,202 @@
-"""A sweep's bookkeeping: the folder of each job, ``sweep.csv``, and what the whole came to."""
+"""Record a sweep: the folder of each job, ``sweep.csv`` and the exit code."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from unprocess_gen.pipeline.generate import Summary
+    from unprocess_gen.reports.estimate import RunEstimate
 
 SEVERITY = (0, 3, 11, 4, 2, 5, 1)
-"""Exit codes from good to bad: a sweep ends with the worst of its jobs."""
+"""Exit codes from good to bad; a sweep exits with the worst code of its jobs."""
 
-NOT_IN_NAMES = ("out", "n_jobs", "self_test", "check_disk", "source.root")
-"""Settings that do not tell one job's data from another's."""
+NOT_IN_NAMES = ("out", "n_jobs", "source.root", "executor", "append", "self_test", "check_disk")
+"""Settings that do not decide a dataset's bytes, and so are not in the names of folders."""
 
 LONGEST_NAME = 200
+"""Longest name of a folder, bytes; file systems allow 255."""
+
+SHARES = ("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy_clipped_high", "saturated")
+"""Counts of CFA sites whose fractions are columns of ``sweep.csv``, with ``_share`` appended."""
+
+FIRST_COLUMNS = ("folder", "overrides")
+LAST_COLUMNS = ("rows", "failed", *(f"{name}_share" for name in SHARES), "seconds", "bytes", "exit")
+"""Columns of ``sweep.csv`` before and after those of the swept keys."""
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One dataset of a sweep, as ``sweep.csv`` tells it; ``rows`` and ``failed`` are None where none was made."""
+class JobRow:
+    """Hold the row of one job in ``sweep.csv``.
+
+    Attributes
+    ----------
+    folder : str
+        Name of the dataset's folder in the sweep's folder.
+    exit : int
+        Exit code of the job.
+    cells : mapping of str to str
+        Text of the other columns; a missing column is empty.
+    generated : bool
+        Whether the job generated pairs, or found its dataset complete.
+    """
 
     folder: str
-    overrides: str
-    rows: int | None
-    failed: int | None
     exit: int
+    cells: Mapping[str, str] = field(default_factory=dict)
+    generated: bool = True
+
+    @classmethod
+    def of(cls, folder: str, overrides: str, swept: Mapping[str, str], code: int, summary: Summary | Any) -> JobRow:
+        """Return the row of a job; ``summary`` is None if it has no dataset."""
+        cells = {"folder": folder, "overrides": overrides, **swept, "exit": str(code)}
+        sites = getattr(summary, "sites", None)
+        if sites is None:
+            return cls(folder, code, cells)
+        cells |= {
+            "rows": str(summary.rows),
+            "failed": str(sum(summary.failed.values())),
+            "seconds": f"{summary.seconds:.3f}",
+            "bytes": str(summary.bytes),
+        }
+        if sites["all"]:
+            cells |= {f"{name}_share": repr(sites[name] / sites["all"]) for name in SHARES}
+        return cls(folder, code, cells, generated=bool(summary.made))
 
 
 def overrides_text(overrides: Iterable[str]) -> str:
-    """Return a job's overrides in one line, sorted, as Hydra's ``override_dirname`` spells them."""
-    return ",".join(sorted(override for override in overrides if override.split("=")[0] not in NOT_IN_NAMES))
+    """Return the overrides that name a job's folder on one line, sorted, as Hydra's ``override_dirname`` does.
+
+    Parameters
+    ----------
+    overrides : iterable of str
+        The job's overrides.
+
+    Returns
+    -------
+    str
+        ``key=value`` pairs separated by commas, without the keys in `NOT_IN_NAMES`.
+    """
+
+    def decides_data(override: str) -> bool:
+        key = override.lstrip("+").partition("=")[0]
+        return not any(key == name or key.startswith(f"{name}.") for name in NOT_IN_NAMES)
+
+    return ",".join(sorted(filter(decides_data, overrides)))
 
 
 def folder_name(text: str) -> str:
-    """Return the folder of a job: its overrides, slashes encoded, a long name cut and told apart by its digest."""
+    """Return the name of a job's folder.
+
+    Parameters
+    ----------
+    text : str
+        Result of `overrides_text`.
+
+    Returns
+    -------
+    str
+        The text with slashes encoded. A name longer than `LONGEST_NAME` is cut and ends with a digest.
+    """
     name = text.replace("%", "%25").replace("/", "%2F") or "default"
     if len(os.fsencode(name)) <= LONGEST_NAME:
         return name
-    return os.fsencode(name)[: LONGEST_NAME - 20].decode(errors="ignore") + "-" + _digest(name)
-
-
-def _digest(name: str) -> str:
-    return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    return os.fsencode(name)[: LONGEST_NAME - 20].decode(errors="ignore") + "-" + digest
 
 
 def worst(exit_codes: Iterable[int]) -> int:
-    """Return the exit code of a whole sweep."""
+    """Return the exit code of a sweep.
+
+    Parameters
+    ----------
+    exit_codes : iterable of int
+        Exit codes of its jobs.
+
+    Returns
+    -------
+    int
+        The worst of them (`SEVERITY`); 0 if there is none.
+    """
     return max(exit_codes, key=SEVERITY.index, default=0)
 
 
-def write_table(out: Path, jobs: Sequence[Job]) -> None:
-    """Write ``sweep.csv`` anew, where the sweep's folder exists; rows of other sweeps into it are kept."""
+def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
+    """Write ``sweep.csv`` in the sweep's folder, if the folder exists; rows of other sweeps are kept.
+
+    Parameters
+    ----------
+    out : Path
+        The sweep's folder.
+    jobs : sequence of JobRow
+        The jobs that have finished, in order.
+    """
     if not out.is_dir():
         return
     path = out / "sweep.csv"
-    ours = {job.folder for job in jobs}
-    earlier = [cells for cells in _read(path) if cells[0] not in ours]
-    aside = out / "sweep.csv.part"
-    with aside.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(field.name for field in fields(Job))
-        writer.writerows(astuple(job) for job in jobs)
-        writer.writerows(earlier)
-    os.replace(aside, path)
+    earlier = {row["folder"]: row for row in read_table(path)}
+    rows = []
+    for job in jobs:
+        row = dict(job.cells)
+        before = earlier.pop(job.folder, {})
+        if not job.generated and before.get("seconds"):
+            row["seconds"] = before["seconds"]
+        rows.append(row)
+    rows += earlier.values()
+    keys = dict.fromkeys(key for row in rows for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS})
+    temporary = out / "sweep.csv.part"
+    with temporary.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(temporary, path)
 
 
-def _read(path: Path) -> list[list[str]]:
+def read_table(path: Path) -> list[dict[str, str]]:
+    """Read ``sweep.csv``; a file of version 0.1 has fewer columns.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    list of dict
+        One mapping of column to text for each job; empty if the file does not exist.
+    """
     try:
         with path.open(encoding="utf-8", newline="") as stream:
-            return [cells for cells in csv.reader(stream) if cells][1:]
+            rows = list(csv.DictReader(stream, restval=""))
     except FileNotFoundError:
         return []
+    return [{column: text for column, text in row.items() if column} for row in rows if row.get("folder")]
+
+
+def plan_totals(estimates: Sequence[RunEstimate]) -> str:
+    """Return the totals of a planned sweep, whose jobs run one after the other.
+
+    Parameters
+    ----------
+    estimates : sequence of RunEstimate
+        Estimates of the jobs whose configs are valid.
+
+    Returns
+    -------
+    str
+        One line: jobs, pairs, shards, bytes and time.
+    """
+    pairs = sum(sum(one.pairs for one in job.looks) * job.sources // max(len(job.looks), 1) for job in estimates)
+    about = "" if all(job.exact for job in estimates) else "about "
+    seconds = sum(job.seconds for job in estimates)
+    return (
+        f"totals    {len(estimates)} jobs: {about}{pairs:,} pairs in {sum(job.shards for job in estimates):,} shards, "
+        f"{about}{sum(job.bytes for job in estimates):,} bytes, about "
+        + (f"{seconds:,.1f} s" if seconds < 90 else f"{seconds / 60:,.0f} min")
+    )

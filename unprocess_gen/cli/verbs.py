@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from unprocess_gen.cli.arguments import SOURCE, Argument, Call, Place, Verb
 from unprocess_gen.cli.completion import SHELLS, print_completion
 from unprocess_gen.cli.messages import print_result, report, report_error
-from unprocess_gen.cli.sweep import worst
+from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
     from unprocess_gen.pipeline.replay import ReplayResult
     from unprocess_gen.pipeline.verify import Damage
+    from unprocess_gen.reports.estimate import RunEstimate
 
 # ------------------------------------------------------------------------------------------- verbs that take settings
 
@@ -55,7 +56,7 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary]:
     """
     from unprocess_gen.pipeline.generate import generate
 
-    summary = generate(config)
+    summary = generate(config, label)
     print_result(_summary_line(summary))
     if summary.made and summary.sites["all"]:
         print_result(_clipping_line(summary.sites))
@@ -88,17 +89,17 @@ def run_plan(call: Call) -> int:
     """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
     from unprocess_gen.cli.hydra_app import compose
 
-    return compose(call.overrides, partial(_plan, read_all="all" in call.values))
+    return compose(call.overrides, partial(_plan, read_all="all" in call.values), totals=plan_totals)
 
 
-def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, None]:
+def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate]:
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run, format_estimate
 
     estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
     print_result(f"out       {config.out}")
     print_result(format_estimate(config, estimate))
-    return 0, None
+    return 0, estimate
 
 
 def run_accuracy(call: Call) -> int:

@@ -33,9 +33,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from unprocess_gen.config.composition_errors import explain, unknown_key
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import check_override, conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
 
 SCHEMA_NAME = "gen_dataset_schema"
@@ -46,8 +47,8 @@ ConfigStore.instance().store(name=SCHEMA_NAME, node=Config)
 VERSION_BASE = "1.3"
 """Version of Hydra whose behaviour is requested."""
 
-ADDED_GROUPS = {"experiment": "a recipe", "sweep": "a sweep"}
-"""Groups without settings of their own, and what their options are: added with ``+``, in no defaults list."""
+PLAIN_ERRORS = (ValueError, TypeError, AttributeError, AssertionError, OSError, RecursionError)
+"""Other exceptions that Hydra and OmegaConf raise for wrong overrides and files."""
 
 PATH_KEYS = ("source.root", "out")
 """Keys whose values are paths, which are quoted for Hydra's grammar."""
@@ -129,7 +130,7 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     try:
         with _hydra_for(folders):
             return hydra.compose(folders.name, [quoted_path(one) for one in overrides], return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError, RecursionError) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
         raise ConfigError(explain(error, overrides)) from error
 
 
@@ -164,32 +165,6 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
     assert isinstance(config, Config)
     validate_config(config)
     return config
-
-
-def check_override(override: str) -> None:
-    """Refuse an override that Hydra would take for something else, or answer with several lines.
-
-    Parameters
-    ----------
-    override : str
-        Override as the user wrote it.
-
-    Raises
-    ------
-    ConfigError
-        If it is not ``key=value``, removes a key, or gives a group something that is not the name of an option.
-    """
-    key, equals, value = override.lstrip("+").partition("=")
-    if override.startswith("~"):
-        raise ConfigError(f"{override}: a setting cannot be taken away; choose another value or option")
-    if not equals:
-        raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
-    if key in ADDED_GROUPS and not override.startswith("+"):
-        raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; say +{override}")
-    options = group_options(key) if key.isalpha() else []
-    word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
-    if options and not word:
-        raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}")
 
 
 def quoted_path(override: str) -> str:
@@ -275,6 +250,7 @@ class CheckedFiles(ConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """Read one YAML file."""
         path = self._file(config_path)
+        read_yaml_mapping(path)  # OmegaConf has no limits on nesting and aliases, and accepts an empty file
         text = path.read_text(encoding="utf-8")
         config = OmegaConf.create(text)
         header = self._get_header_dict(text[:512])

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
+
+ADDED_GROUPS = {"experiment": "a recipe", "sweep": "a sweep"}
+"""Groups without settings of their own, and what their options are: added with ``+``, in no defaults list."""
 
 
 def conf_dir() -> Path:
@@ -45,3 +49,29 @@ def group_options(group: str, *folders: Path) -> list[str]:
         File names without ``.yaml``, sorted; empty if no root has the group.
     """
     return sorted({path.stem for folder in folders or (conf_dir(),) for path in (folder / group).glob("*.yaml")})
+
+
+def check_override(override: str) -> None:
+    """Refuse an override that Hydra would take for something else, or answer with several lines.
+
+    Parameters
+    ----------
+    override : str
+        Override as the user wrote it.
+
+    Raises
+    ------
+    ConfigError
+        If it is not ``key=value``, removes a key, or gives a group something that is not the name of an option.
+    """
+    key, equals, value = override.lstrip("+").partition("=")
+    if override.startswith("~"):
+        raise ConfigError(f"{override}: a setting cannot be taken away; choose another value or option")
+    if not equals:
+        raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
+    if key in ADDED_GROUPS and not override.startswith("+"):
+        raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; say +{override}")
+    options = group_options(key) if key.isalpha() else []
+    word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
+    if options and not word:
+        raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}")

@@ -1,0 +1,328 @@
+"""Expand a sweep into its jobs: values on the command line, ``hydra.sweeper.params`` in option files, or both.
+
+Design: ``docs/design/composition_and_sweeps.md``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from unprocess_gen.config.composition import OptionFolders, compose_node, quoted_path
+from unprocess_gen.config.composition_errors import explain
+from unprocess_gen.config.option_files import check_override, conf_dir, group_options
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import ConfigError
+
+MAX_JOBS = 100_000
+"""Most jobs of one sweep: each takes 0.2 s to compose, so a larger number is a mistake."""
+
+PLUGIN_KEYS = ("sweeper", "launcher")
+BUILT_IN = "hydra._internal.core_plugins.basic_"
+"""Start of the ``_target_`` of Hydra's own sweeper and launcher, which the sweep of this package replaces."""
+
+FIXED_KEYS: dict[str, tuple[Any, ...]] = {
+    "run.dir": (".", "outputs/${now:%Y-%m-%d}/${now:%H-%M-%S}"),
+    "sweep.dir": ("${out}/.hydra", "multirun/${now:%Y-%m-%d}/${now:%H-%M-%S}"),
+    "sweep.subdir": ("${hydra.job.num}",),
+    "job.chdir": (False, None),
+    "job.env_set": ({},),
+    "job.env_copy": ([],),
+    "callbacks": ({}, None),
+}
+"""Settings of Hydra that have no effect here, with the values that are accepted: those of ``conf/`` and of Hydra."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepJob:
+    """One combination of a sweep.
+
+    Attributes
+    ----------
+    overrides : tuple of str
+        All overrides of the job.
+    named : tuple of str
+        The overrides that name its folder: without settings of Hydra, and without the option that described the sweep.
+    swept : mapping of str to str
+        Value of each swept key.
+    """
+
+    overrides: tuple[str, ...]
+    named: tuple[str, ...]
+    swept: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """What a list of overrides describes: one config, or a sweep.
+
+    Attributes
+    ----------
+    node : DictConfig or None
+        The composed config of a single run; None for a sweep.
+    jobs : tuple of SweepJob
+        Jobs of a sweep, in order; the value written last changes fastest.
+    plugins : tuple of str
+        Classes of the user's Hydra launcher and sweeper that run the sweep, if any.
+    described_by : tuple of str
+        The overrides whose option files contain the swept values; they are not in the names of folders.
+    """
+
+    node: DictConfig | None
+    jobs: tuple[SweepJob, ...] = ()
+    plugins: tuple[str, ...] = ()
+    described_by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """One override, with the values that a sweep gives it."""
+
+    key: str
+    values: tuple[str, ...]
+    swept: bool
+    text: str
+
+    @property
+    def name(self) -> str:
+        return self.key.lstrip("+")
+
+    @property
+    def of_hydra(self) -> bool:
+        return self.name.startswith(("hydra.", "hydra/"))
+
+    @property
+    def adds_group(self) -> bool:
+        """Whether it chooses option files that can contain settings of Hydra."""
+        return self.key.startswith("+") and "." not in self.key and not hasattr(Config(), self.name)
+
+    def overrides(self) -> list[str]:
+        return [f"{self.key}={value}" for value in self.values]
+
+
+def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = False) -> Expansion:
+    """Decide whether overrides describe one run or a sweep, and list the jobs of a sweep.
+
+    A sweep is requested by ``multirun`` or by ``hydra.mode: MULTIRUN`` in an option file. Its values come from the
+    overrides and from ``hydra.sweeper.params``; an override of a key wins over a parameter of the same key.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Overrides as the user wrote them.
+    folders : OptionFolders
+        What to compose from.
+    multirun : bool
+        Whether the user asked for a sweep (``-m``).
+
+    Returns
+    -------
+    Expansion
+        The composed config, or the jobs.
+
+    Raises
+    ------
+    ConfigError
+        If an override or option file of a single run is refused, or a sweep cannot be honoured.
+    """
+    choices = _parse(overrides, folders)
+    swept_groups = [choice for choice in choices if choice.swept and choice.adds_group]
+    jobs: list[SweepJob] = []
+    plugins: tuple[str, ...] = ()
+    described: tuple[str, ...] = ()
+    bases: dict[tuple[str, ...], tuple[list[_Choice], tuple[str, ...]]] = {}
+    for combination in itertools.product(*(choice.overrides() for choice in swept_groups)):
+        fixed = [choice.text for choice in choices if not choice.swept]
+        try:
+            node = compose_node([*fixed, *combination], folders)
+        except ConfigError:
+            if not multirun:
+                raise
+            bases[combination] = [], ()  # each job reports the error itself
+            continue
+        _check_hydra_settings(node)
+        plugins = plugins or _plugins(node)
+        if not multirun and not _is_multirun(node):
+            _refuse_values_without_sweep(choices, node)
+            return Expansion(node)
+        params = _params(node, choices, folders)
+        origin = _described_by(_raw_params(node), choices, [*fixed, *combination], folders)
+        described += origin
+        bases[combination] = params, origin
+    for own in _combinations(choices):
+        combination = tuple(own[choice.key] for choice in swept_groups)
+        params, origin = bases[combination]
+        for added in _combinations(params):
+            jobs.append(_job(own, added, [*choices, *params], origin))
+            if len(jobs) > MAX_JOBS:
+                raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
+    return Expansion(None, tuple(jobs), plugins, tuple(dict.fromkeys(described)))
+
+
+def check_job(node: DictConfig, job: SweepJob) -> None:
+    """Refuse a job whose option files contain swept values that the expansion has not seen.
+
+    Parameters
+    ----------
+    node : DictConfig
+        The composed job, with Hydra's settings.
+    job : SweepJob
+        The job as it was expanded.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter of ``hydra.sweeper.params`` is not fixed by the job.
+    """
+    given = {override.partition("=")[0].lstrip("+") for override in job.overrides}
+    for key in _raw_params(node):
+        if key.lstrip("+") not in given:
+            raise ConfigError(
+                f"hydra.sweeper.params.{key}: found in an option that the sweep itself selects; expected it in the "
+                "primary config or in an option added with +group=option"
+            )
+    _check_hydra_settings(node)
+
+
+def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
+    """Parse overrides with Hydra's grammar; a key that occurs twice has its last value."""
+    parser = OverridesParser.create(config_loader=_GroupOptions(folders))  # type: ignore[arg-type]
+    try:
+        parsed = parser.parse_overrides([quoted_path(one) for one in overrides])
+        choices = {}
+        for text, one in zip(overrides, parsed, strict=True):
+            key = one.get_key_element()
+            if not one.is_sweep_override():
+                choices[key] = _Choice(key, (one.get_value_element_as_str(),), False, text)
+            elif not one.is_discrete_sweep():
+                raise ConfigError(f"{one.input_line}: an interval has no list of values; expected choice or range")
+            else:
+                values = tuple(itertools.islice(one.sweep_string_iterator(), MAX_JOBS + 1))
+                choices[key] = _Choice(key, values, True, text)
+    except (HydraException, ValueError, RecursionError) as error:
+        raise ConfigError(explain(error, overrides)) from error
+    if math.prod(len(choice.values) for choice in choices.values()) > MAX_JOBS:
+        raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
+    return list(choices.values())
+
+
+def _combinations(choices: Iterable[_Choice]) -> Iterator[dict[str, str]]:
+    """Yield one override for each key; the last key changes fastest."""
+    choices = list(choices)
+    for values in itertools.product(*(choice.overrides() for choice in choices)):
+        yield dict(zip((choice.key for choice in choices), values, strict=True))
+
+
+def _job(own: dict[str, str], added: dict[str, str], choices: list[_Choice], origin: tuple[str, ...]) -> SweepJob:
+    overrides = own | added
+    named = [overrides[choice.key] for choice in choices if not choice.of_hydra and overrides[choice.key] not in origin]
+    swept = {choice.name: overrides[choice.key].partition("=")[2] for choice in choices if choice.swept}
+    return SweepJob(tuple(overrides.values()), tuple(named), swept)
+
+
+def _is_multirun(node: DictConfig) -> bool:
+    mode = OmegaConf.select(node, "hydra.mode")
+    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
+def _raw_params(node: DictConfig) -> dict[str, Any]:
+    """Return ``hydra.sweeper.params`` with interpolations resolved."""
+    try:
+        params = OmegaConf.select(node, "hydra.sweeper.params")
+        loaded = OmegaConf.to_container(params, resolve=True) if OmegaConf.is_config(params) else params
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"hydra.sweeper.params: {explain(error, ())}") from error
+    if loaded is not None and not isinstance(loaded, dict):
+        raise ConfigError(f"hydra.sweeper.params={loaded}: expected a mapping, key: values")
+    return {str(key): value for key, value in (loaded or {}).items()}
+
+
+def _params(node: DictConfig, choices: Sequence[_Choice], folders: OptionFolders) -> list[_Choice]:
+    """Return the swept values of option files, without the keys that the command line sets."""
+    given = {choice.name for choice in choices}
+    overrides = [f"{key}={_spelling(value)}" for key, value in _raw_params(node).items()]
+    for override in overrides:
+        check_override(override)
+        if override.lstrip("+").startswith("hydra"):
+            raise ConfigError(f"hydra.sweeper.params.{override}: a sweep over settings of Hydra is not supported")
+    return [choice for choice in _parse(overrides, folders) if choice.name not in given]
+
+
+def _spelling(value: Any) -> str:
+    """Return a YAML value as an override spells it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "null" if value is None else str(value)
+
+
+def _described_by(
+    params: Mapping[str, Any],
+    choices: Sequence[_Choice],
+    overrides: Sequence[str],
+    folders: OptionFolders,
+) -> tuple[str, ...]:
+    """Return the added options that contain the sweep's values: without one of them, its values are missing."""
+    if not params:
+        return ()
+    keys = {choice.key for choice in choices if choice.adds_group}
+    found = []
+    for override in overrides:
+        if override.partition("=")[0] in keys:
+            try:
+                rest = _raw_params(compose_node([one for one in overrides if one != override], folders))
+            except ConfigError:
+                rest = {}
+            if params.keys() - rest.keys():
+                found.append(override)
+    return tuple(found)
+
+
+def _plugins(node: DictConfig) -> tuple[str, ...]:
+    """Return the classes of a sweeper or launcher that is not Hydra's own."""
+    targets = [OmegaConf.select(node, f"hydra.{key}._target_") for key in PLUGIN_KEYS]
+    return tuple(target for target in targets if target is not None and not str(target).startswith(BUILT_IN))
+
+
+def _check_hydra_settings(node: DictConfig) -> None:
+    """Refuse settings of Hydra that would have no effect."""
+    settings: Any = OmegaConf.to_container(node.hydra, resolve=False)
+    for key, accepted in FIXED_KEYS.items():
+        value = settings
+        for name in key.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        if value is not None and value not in accepted:
+            raise ConfigError(f"hydra.{key}={_spelling(value)}: has no effect here; remove it and set out instead")
+
+
+def _refuse_values_without_sweep(choices: Sequence[_Choice], node: DictConfig) -> None:
+    for choice in choices:
+        if choice.swept:
+            raise ConfigError(
+                f"{choice.name}={','.join(choice.values[:20])}: several values; expected one; to sweep over them, add "
+                f"--multirun; for a list, write {choice.name}=[{','.join(choice.values[:20])}]"
+            )
+    params = _raw_params(node)
+    if params:
+        raise ConfigError(
+            f"hydra.sweeper.params.{next(iter(params))}: values of a sweep without hydra.mode: MULTIRUN; add it to the "
+            "file, or -m to the command line"
+        )
+
+
+class _GroupOptions:
+    """Answer ``glob(…)`` of Hydra's override parser with the options of a group."""
+
+    def __init__(self, folders: OptionFolders) -> None:
+        self._folders = [folders.main or conf_dir(), *([folders.own] if folders.own else [])]
+
+    def get_group_options(self, group_name: str, *_: Any, **__: Any) -> list[str]:
+        """Return the names of the group's options, built-in ones and the user's."""
+        return group_options(group_name, *self._folders)
