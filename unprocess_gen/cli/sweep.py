@@ -192,7 +192,7 @@ def plan_totals(estimates: Sequence[RunEstimate]) -> str:
     str
         One line: jobs, pairs, shards, bytes and time.
     """
-    pairs = sum(sum(one.pairs for one in job.looks) * job.sources // max(len(job.looks), 1) for job in estimates)
+    pairs = sum(job.pairs for job in estimates)
     about = "" if all(job.exact for job in estimates) else "about "
     seconds = sum(job.seconds for job in estimates)
     return (
