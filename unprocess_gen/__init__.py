@@ -1,23 +1,76 @@
-"""Clean and noisy raw pairs from ordinary sRGB photographs.
+"""Generate clean and noisy raw pairs from sRGB photographs.
 
-``RawPairs(path)`` reads a finished dataset.
+``load_config`` composes a config, ``make_pair`` makes a pair from an array, ``generate`` a dataset from files, and
+``RawPairs`` reads datasets. The command line is ``gen-dataset``.
+
+Names are imported on first access. ``RawPairs`` needs only NumPy and xxhash.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
-__all__ = ["RawPairs", "__version__"]
-
 if TYPE_CHECKING:
-    from unprocess_gen.dataset.reader import RawPairs
+    from unprocess_gen.api import RawPair, develop, generate, make_pair, plan_image, replay, verify
+    from unprocess_gen.config.composition import load_config
+    from unprocess_gen.config.schema import Config
+    from unprocess_gen.core.errors import (
+        ConfigError,
+        DamageError,
+        LockedError,
+        MachineError,
+        SourceError,
+        UnprocessGenError,
+    )
+    from unprocess_gen.core.types import Plan
+    from unprocess_gen.dataset.reader import RawPairs, Sample
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Config",
+    "ConfigError",
+    "DamageError",
+    "LockedError",
+    "MachineError",
+    "Plan",
+    "RawPair",
+    "RawPairs",
+    "Sample",
+    "SourceError",
+    "UnprocessGenError",
+    "__version__",
+    "develop",
+    "generate",
+    "load_config",
+    "make_pair",
+    "plan_image",
+    "replay",
+    "verify",
+]
+
+_MODULES = {
+    "api": ("RawPair", "develop", "generate", "make_pair", "plan_image", "replay", "verify"),
+    "config.composition": ("load_config",),
+    "config.schema": ("Config",),
+    "core.errors": (
+        *("ConfigError", "DamageError", "LockedError", "MachineError", "SourceError", "UnprocessGenError"),
+    ),
+    "core.types": ("Plan",),
+    "dataset.reader": ("RawPairs", "Sample"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Import the reader, and NumPy with it, only when it is asked for: the command line answers ``--help`` at once."""
-    if name == "RawPairs":
-        from unprocess_gen.dataset.reader import RawPairs
+    """Import a name on first access (PEP 562), so that importing the package takes no time."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
 
-        return RawPairs
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

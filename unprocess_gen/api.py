@@ -1,0 +1,385 @@
+"""Make, generate, verify and develop pairs from Python: the functions that `unprocess_gen` exports.
+
+Each function does what the verb of its name does on the command line, without signal handlers or exit codes. Exceptions
+carry the sentence that the command line prints. `load_config` is in `config.composition`, `RawPairs` in
+`dataset.reader`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.types import PACKED, Frame, Pair, Patch, Plan, Row, Source, Srgb, Value
+from unprocess_gen.dataset.keys import key_text
+from unprocess_gen.dataset.manifest import pair_row, plan_from_row
+from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.pipeline import generate as _generate
+from unprocess_gen.pipeline import replay as _replay
+from unprocess_gen.pipeline import verify as _verify
+from unprocess_gen.planning import plan as _plan
+from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.simulation import pair as _pair
+from unprocess_gen.simulation import self_test
+from unprocess_gen.simulation.reference import isp
+from unprocess_gen.sources.loader import downscaled
+from unprocess_gen.sources.patches import crop_patch, list_patches
+
+ARRAY_NAME = "array"
+"""The column ``source`` of a pair made from an array."""
+
+PathLike = str | os.PathLike[str]
+
+
+class RawPair:
+    """Hold a clean and a noisy raw frame of one array of pixels.
+
+    Attributes
+    ----------
+    clean, noisy : ndarray
+        uint16 mosaics [H, W] in DN; other ``output.dtype`` and ``output.layout`` as in a dataset.
+    plan : Plan
+        All parameters of the pair.
+    counts : Counts
+        Sites that were clipped, saturated or have no variance.
+    row : mapping
+        Manifest row of the pair: value by column. ``source_sha256`` is the digest of the array, or of ``key``. Built on
+        first access.
+    """
+
+    def __init__(self, pair: Pair, plan: Plan, source: Source, patch: Patch) -> None:
+        self.clean = pair.clean
+        self.noisy = pair.noisy
+        self.counts = pair.counts
+        self.plan = plan
+        self._source = source
+        self._patch = patch
+
+    @cached_property
+    def row(self) -> Row:
+        """Return the manifest row of the pair."""
+        pair = Pair(self.clean, self.noisy, self.counts)
+        digests = array_xxh3(self.clean), array_xxh3(self.noisy)
+        identity = self._source.sha256 or ""
+        return pair_row(key_text(0), self._source, identity, 1, 0, self.plan, pair, digests, self._patch)
+
+    def __repr__(self) -> str:
+        return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise})"
+
+
+def array_identity(srgb: Srgb) -> str:
+    """Return the digest that identifies an array of pixels.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16
+        Pixels.
+
+    Returns
+    -------
+    str
+        SHA-256 of dtype, shape and little-endian bytes, 64 hexadecimal digits.
+    """
+    digest = hashlib.sha256(f"{srgb.dtype.name} {'x'.join(map(str, srgb.shape))}\n".encode())
+    digest.update(np.ascontiguousarray(srgb, dtype=srgb.dtype.newbyteorder("<")).data)
+    return digest.hexdigest()
+
+
+def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key: str | int | None = None) -> Plan:
+    """Draw all parameters of one image.
+
+    Parameters
+    ----------
+    srgb : array_like of uint8 or uint16, [H, W, 3]
+        Display-referred codes, R, G, B.
+    config : Config
+        From `load_config`. ``source.root`` and ``source.limit`` are ignored.
+    seed : int, optional
+        Replaces ``config.seed``.
+    key : str or int, optional
+        Identity of the image, from which its random streams follow together with the seed; by default a digest of the
+        array. The ``source_sha256`` of a dataset's row gives the parameters of that row.
+
+    Returns
+    -------
+    Plan
+        Parameters of the first noise level and draw.
+
+    Raises
+    ------
+    ConfigError
+        If the config is incomplete or not allowed, or ``source.patch`` is set.
+    ValueError
+        If ``srgb`` has another dtype or shape.
+    """
+    pixels = _pixels_of(srgb)
+    return _planned(pixels, _identity(pixels, key), config, seed)
+
+
+def make_pair(
+    srgb: ArrayLike, config: Config | Plan, *, seed: int | None = None, key: str | int | None = None
+) -> RawPair:
+    """Make the clean and the noisy raw frame of one image.
+
+    The same array, config, seed and key give the same pair on every machine.
+
+    Parameters
+    ----------
+    srgb : array_like of uint8 or uint16, [H, W, 3]
+        Display-referred codes, R, G, B. Downscaled and dequantized as the config or plan requires.
+    config : Config or Plan
+        From `load_config` or `plan_image`. ``source.root`` and ``source.limit`` are ignored.
+    seed : int, optional
+        Replaces ``config.seed``. Not with a plan.
+    key : str or int, optional
+        Identity of the image, see `plan_image`. Not with a plan.
+
+    Returns
+    -------
+    RawPair
+        Clean and noisy frame, plan and manifest row.
+
+    Raises
+    ------
+    ConfigError
+        If the config is incomplete or not allowed, ``source.patch`` is set, or ``seed`` or ``key`` come with a plan.
+    MachineError
+        If the self-test of the kernels fails on this machine.
+    ValueError
+        If ``srgb`` has another dtype or shape.
+
+    Examples
+    --------
+    >>> config = load_config(["camera=sony_a7r", "noise=imx385_iso3200"])  # doctest: +SKIP
+    >>> pair = make_pair(srgb, config)  # doctest: +SKIP
+    """
+    pixels = _pixels_of(srgb)
+    identity = _identity(pixels, key)
+    if not isinstance(config, Plan):
+        plan = _planned(pixels, identity, config, seed)
+    elif seed is None and key is None:
+        plan = config
+    else:
+        raise ConfigError("make_pair: a plan has its own seed and key; expected them with a config only")
+    if isinstance(config, Plan) or config.self_test == "stop":
+        self_test.check(self_test.kernels(plan))
+    recorded = _downscaled(pixels, plan.downscale)
+    patch = _full_frame(recorded, plan.layout)
+    pair = _pair.make_pair(crop_patch(recorded, patch), plan)
+    return RawPair(pair, plan, Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=identity), patch)
+
+
+def generate(config: Config) -> _generate.Summary:
+    """Generate the dataset that a config describes, or resume it.
+
+    Progress is shown on stderr. Failed sources are counted in the result; ``source.max_failed`` is not applied.
+
+    Parameters
+    ----------
+    config : Config
+        From `load_config`; ``config.out`` is the folder of the dataset.
+
+    Returns
+    -------
+    Summary
+        Pairs, failures by reason, shards, bytes and seconds.
+
+    Raises
+    ------
+    ConfigError
+        If the config is not allowed, or ``out`` cannot be used or was begun with other settings or sources.
+    LockedError
+        If another run holds ``out``.
+    DamageError
+        If ``out`` is a finished dataset with missing files.
+    MachineError
+        If the disk is full or fails, or a source was changed or deleted.
+    """
+    _check_complete(config)
+    validate_config(config)
+    return _generate.generate(config)
+
+
+def verify(folder: PathLike) -> list[_verify.Damage]:
+    """Compare every byte of a dataset, or of all datasets of a sweep, with what it records.
+
+    Parameters
+    ----------
+    folder : path-like
+        Folder of the dataset or of the sweep.
+
+    Returns
+    -------
+    list of Damage
+        Empty if every byte is as it was written. For a sweep ``file`` begins with the folder of the dataset.
+
+    Raises
+    ------
+    DamageError
+        If the folder contains no finished dataset.
+    MachineError
+        If a file exists but cannot be read.
+    """
+    path = Path(folder)
+    if not _verify.is_sweep(path):
+        return _verify.verify(path)
+    return [
+        dataclasses.replace(damage, file=f"{one.folder}/{damage.file}")
+        for one in _verify.verify_sweep(path)
+        for damage in one.damages
+    ]
+
+
+def replay(
+    folder: PathLike,
+    keys: str | Iterable[str | int] | None = None,
+    *,
+    root: PathLike | None = None,
+    to: PathLike | None = None,
+) -> list[_replay.ReplayResult]:
+    """Regenerate pairs from their manifest rows and sources, and compare them bit for bit.
+
+    Parameters
+    ----------
+    folder : path-like
+        Folder of the dataset, or a ``manifest.csv``.
+    keys : str or iterable of str and int, optional
+        Source indices, ranges and keys: ``"3,7-9"`` or ``[3, "7-9", "00000003-p0007"]``; all rows if omitted.
+    root : path-like, optional
+        Folder of the sources; by default the one that ``dataset.json`` records.
+    to : path-like, optional
+        Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
+
+    Returns
+    -------
+    list of ReplayResult
+        One for each pair; ``complaint`` is empty if the pair is identical.
+
+    Raises
+    ------
+    ConfigError
+        If a key does not exist, or the sources' folder is unknown.
+    DamageError
+        If the manifest cannot be read.
+    MachineError
+        If the self-test fails or the arrays cannot be written.
+    """
+    manifest = Path(folder)
+    manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
+    selected = keys if keys is None or isinstance(keys, str) else ",".join(map(str, keys))
+    rows = select_rows(manifest, None, selected)
+    source_root = _replay.source_root(manifest, None if root is None else os.fspath(root))
+    return list(_replay.replay(rows, source_root, None if to is None else Path(to)))
+
+
+def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
+    """Render a raw frame as an sRGB photograph.
+
+    Parameters
+    ----------
+    raw : ndarray of uint16 or float32
+        Clean or noisy frame in the ``dtype`` and ``layout`` of the row: mosaic [H, W] or packed planes.
+    row : mapping or Plan
+        Manifest row or plan of the pair.
+
+    Returns
+    -------
+    ndarray of uint8, [H, W, 3]
+        Display-referred codes, R, G, B. Noise is kept; clipped light does not come back.
+
+    Raises
+    ------
+    DamageError
+        If the row is not the row of a pair.
+    ValueError
+        If the frame has fewer than 2 x 2 sites or another shape.
+    """
+    plan = row if isinstance(row, Plan) else plan_from_row(row)
+    recorded: Row = {
+        "pattern": plan.pattern,
+        "layout": plan.layout,
+        "dtype": plan.dtype,
+        "black_level_dn": plan.black_level_dn,
+        "white_level_dn": plan.white_level_dn,
+    }
+    dimensions = 3 if plan.layout == PACKED else 2
+    if np.ndim(raw) != dimensions:
+        raise ValueError(f"raw has {np.ndim(raw)} dimensions, expected {dimensions} for layout={plan.layout}")
+    return isp.to_codes(isp.develop(mosaic_dn(raw, recorded), plan)).astype(np.uint8)
+
+
+def _pixels_of(srgb: ArrayLike) -> Srgb:
+    pixels = np.asarray(srgb)
+    if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        raise ValueError(f"srgb is {pixels.dtype} {list(pixels.shape)}, expected uint8 or uint16 [H, W, 3]")
+    if not pixels.size:
+        raise ValueError(f"srgb is {list(pixels.shape)}, expected at least one pixel")
+    return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
+
+
+def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> Plan:
+    config = _config_for_arrays(config, seed)
+    facts = facts_for(config, _downscaled(pixels, config.source.downscale))
+    return _plan.plan_pairs(config, identity, facts=facts)[0]
+
+
+def _identity(pixels: Srgb, key: str | int | None) -> str:
+    """Return the digest of the pixels, or of a key that is not a digest itself."""
+    if key is None:
+        return array_identity(pixels)
+    text = str(key)
+    is_digest = len(text) == 64 and set(text) <= set("0123456789abcdef")
+    return text if is_digest else hashlib.sha256(text.encode()).hexdigest()
+
+
+def _config_for_arrays(config: Config, seed: int | None) -> Config:
+    """Return a validated copy of a config without the keys that choose files; ConfigError for patches."""
+    _check_complete(config)
+    if config.source.patch is not None:
+        raise ConfigError(
+            f"source.patch={config.source.patch}: make_pair returns complete frames; expected null; "
+            "cut the arrays of the pair at even rows and columns"
+        )
+    source = dataclasses.replace(config.source, root=None, limit=None, clips=False, include=["*"])
+    config = dataclasses.replace(config, source=source, seed=config.seed if seed is None else seed)
+    validate_config(config)
+    return config
+
+
+def _check_complete(config: Config) -> None:
+    """Raise ConfigError for ``Config()``, whose gains are in the option files."""
+    for name in ("red", "blue", "inverse_rgb"):
+        if getattr(config.gains, name) is None:
+            raise ConfigError(
+                f"gains.{name}=null: Config() lacks the values of the option files; expected a complete config; "
+                "make it with unprocess_gen.load_config(['camera=sony_a7r', 'noise=imx385_iso3200'])"
+            )
+
+
+def _downscaled(pixels: Srgb, downscale: int) -> Srgb:
+    if min(pixels.shape[:2]) < downscale:
+        raise ConfigError(
+            f"source.downscale={downscale}: srgb is {list(pixels.shape)}; expected at least {downscale} x {downscale}"
+        )
+    return pixels if downscale == 1 else downscaled(pixels, downscale)
+
+
+def _full_frame(recorded: Srgb, layout: str) -> Patch:
+    """Return the part of the pixels that a pair shows: all, except the last row or column of odd packed planes."""
+    height, width = recorded.shape[:2]
+    if layout == PACKED and min(height, width) < 2:
+        raise ConfigError(f"output.layout=packed: srgb is {list(recorded.shape)}; expected at least 2 x 2 sites")
+    (patch,) = list_patches(None, 0, height, width, layout)
+    return patch
