@@ -34,7 +34,7 @@ from unprocess_gen.dataset.manifest import (
     row_json,
     write_rows,
 )
-from unprocess_gen.planning.effect_selection import STATISTICS
+from unprocess_gen.planning.effect_contributions import STATISTICS
 from unprocess_gen.planning.plan import plan_image, plan_with_reasons
 from unprocess_gen.simulation.reference.noise import EFFECTS
 

@@ -21,7 +21,8 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
 from unprocess_gen.pipeline import generate as runner
-from unprocess_gen.planning.effect_selection import Light, Prediction, decide, facts_of, light_of
+from unprocess_gen.planning.effect_contributions import SignalRange, signal_range
+from unprocess_gen.planning.effect_selection import Prediction, facts_of, select_effects
 from unprocess_gen.planning.plan import plan_image, plan_with_reasons
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.noise import EFFECTS, black_error, noise_variance, response
@@ -213,7 +214,7 @@ def decided(config: Config, plan: Plan, srgb: Srgb, frames: int = 1) -> tuple[st
     """Which effects auto simulates with the numbers of a plan."""
     assert plan.physics is not None
     facts, span_dn = facts_of(srgb, frames), float(plan.white_level_dn - plan.black_level_dn)
-    light = light_of(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    light = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
     return chosen(automatic(config), plan.physics, facts, light)
 
 
@@ -227,8 +228,8 @@ def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
     return replace(config, effects=effects, noise=noise)
 
 
-def chosen(config: Config, physics: Physics, facts: Facts, light: Light) -> tuple[str, ...]:
-    return tuple(one.effect for one in decide(config, physics, facts, light) if one.simulated)
+def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:
+    return tuple(one.effect for one in select_effects(config, physics, facts, light) if one.simulated)
 
 
 def test_fixed_patterns_of_the_clean_frame_are_hidden_by_its_rounding_alone(
@@ -288,7 +289,7 @@ def base(settings: Settings) -> tuple[Config, Physics]:
 
 
 FACTS = Facts(768, 512, 256, 10, 255)
-LIGHT = Light(10.0, 3000.0)
+LIGHT = SignalRange(10.0, 3000.0)
 
 
 def test_weak_effects_are_left_out(base: tuple[Config, Physics]) -> None:
@@ -334,7 +335,7 @@ def test_a_pattern_that_a_frame_hides_and_a_clip_shows_is_called_for_in_the_clip
     config, physics = base
     physics = replace(physics, **numbers)
     assert effect not in chosen(config, physics, FACTS, LIGHT)
-    predictions = decide(config, physics, replace(FACTS, frames=100_000), LIGHT)
+    predictions = select_effects(config, physics, replace(FACTS, frames=100_000), LIGHT)
     found = next(one for one in predictions if one.effect == effect)
     assert found.simulated
     assert found.statistic.startswith("clip's")
@@ -344,7 +345,9 @@ def test_what_is_new_in_every_frame_shows_no_better_in_a_clip(base: tuple[Config
     config, physics = base
     physics = replace(physics, row_std_dn=0.01, dark_e=0.01)
     for one, many in zip(
-        decide(config, physics, FACTS, LIGHT), decide(config, physics, replace(FACTS, frames=100), LIGHT), strict=True
+        select_effects(config, physics, FACTS, LIGHT),
+        select_effects(config, physics, replace(FACTS, frames=100), LIGHT),
+        strict=True,
     ):
         if one.effect in ("shot", "dark_current", "read", "row"):
             assert (many.statistic, many.ratio) == (one.statistic, pytest.approx(one.ratio))
@@ -395,7 +398,9 @@ def test_hot_pixels_are_called_for_where_a_tenth_of_one_stands_out(
     physics = replace(physics, hot_pixel_share=10**share, hot_pixel_e=10**electrons)
     facts = replace(FACTS, width=side, height=side)
     expected = expected_hot(physics, facts, dark)
-    hot = next(one for one in decide(config, physics, facts, Light(dark, 3000.0)) if one.effect == "hot_pixels")
+    hot = next(
+        one for one in select_effects(config, physics, facts, SignalRange(dark, 3000.0)) if one.effect == "hot_pixels"
+    )
     assert hot.simulated == (expected >= 0.1)
     assert math.isclose(hot.outliers, expected, rel_tol=0.01)  # what else is left out hid a little of it
 
@@ -424,7 +429,7 @@ def test_dead_pixels_are_called_for_where_a_tenth_of_one_is_expected(
 def test_dead_pixels_of_a_black_picture_show_by_the_pedestal_alone(base: tuple[Config, Physics]) -> None:
     config, physics = base
     physics = replace(physics, dead_pixel_share=1e-4)
-    dark = Light(0.0, 0.0)
+    dark = SignalRange(0.0, 0.0)
     assert "dead_pixels" in chosen(config, physics, FACTS, dark)
     config = replace(config, sensor=replace(config.sensor, black_level_dn=0))
     assert "dead_pixels" not in chosen(config, physics, FACTS, dark)
@@ -485,7 +490,9 @@ def test_no_site_is_darker_or_brighter_than_the_light_that_is_judged(
         srgb = np.random.default_rng(number).integers(low, high + 1, (40, 40, 3)).astype(np.uint8)
         srgb[0, 0], srgb[0, 1] = (high, high, low), (high, low, high)
         plan = switched(config, "auto", srgb, number)
-        light = light_of(*(facts_of(srgb), plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, 1.0, plan.rgb2cam))
+        light = signal_range(
+            *(facts_of(srgb), plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, 1.0, plan.rgb2cam)
+        )
         found = np.clip(camera_light(srgb, plan), 0, 1) * plan.exposure
         assert light.dark_dn <= found.min() * (1 + 1e-12)
         assert found.max() <= light.bright_dn * (1 + 1e-12)
@@ -493,8 +500,8 @@ def test_no_site_is_darker_or_brighter_than_the_light_that_is_judged(
 
 def test_light_of_gray_by_hand() -> None:
     curve = linear_table("none", 1, 256)
-    light = light_of(Facts(4, 4, 256, 51, 102), "none", 1, (0.5, 2.0, 0.25), 0.5, 1000.0, IDENTITY)
-    assert light == Light(curve[51] * 0.25 * 0.5 * 1000, curve[102] * 2.0 * 0.5 * 1000)
+    light = signal_range(Facts(4, 4, 256, 51, 102), "none", 1, (0.5, 2.0, 0.25), 0.5, 1000.0, IDENTITY)
+    assert light == SignalRange(curve[51] * 0.25 * 0.5 * 1000, curve[102] * 2.0 * 0.5 * 1000)
 
 
 def test_the_same_picture_in_8_and_in_16_bits_has_the_same_effects(
@@ -554,7 +561,7 @@ def test_a_greater_tolerance_never_simulates_more(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, one: float, other: float
 ) -> None:
     config, physics = base
-    physics, light = replace(physics, **sensor), Light(dark, dark + more)
+    physics, light = replace(physics, **sensor), SignalRange(dark, dark + more)
     narrow, wide = (chosen(automatic(config, tolerance), physics, FACTS, light) for tolerance in sorted((one, other)))
     assert set(wide) <= set(narrow)
 
@@ -565,8 +572,8 @@ def test_a_tiny_tolerance_simulates_all_that_has_a_size(
 ) -> None:
     config, physics = base
     physics = replace(physics, **sensor)
-    for one in decide(automatic(config, 1e-12), physics, FACTS, Light(dark, dark + more)):
-        assert one.simulated == (one.predicted_dn > 1e-9 * one.hidden_dn) or 1e-15 < one.ratio < 1e-9
+    for one in select_effects(automatic(config, 1e-12), physics, FACTS, SignalRange(dark, dark + more)):
+        assert one.simulated == (one.predicted_dn > 1e-9 * one.masking_dn) or 1e-15 < one.ratio < 1e-9
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)
@@ -575,7 +582,7 @@ def test_what_shows_on_its_own_is_always_simulated(
 ) -> None:
     config, physics = base
     physics = replace(physics, **sensor)
-    for one in decide(automatic(config, tolerance), physics, FACTS, Light(dark, dark + more)):
+    for one in select_effects(automatic(config, tolerance), physics, FACTS, SignalRange(dark, dark + more)):
         assert one.simulated or (one.ratio <= tolerance * (1 + 1e-9) and one.outliers < 0.1)
 
 
@@ -637,9 +644,11 @@ def test_reasons_are_words_with_numbers_and_fit_a_row(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
 ) -> None:
     config, physics = base
-    for one in decide(automatic(config, tolerance), replace(physics, **sensor), FACTS, Light(dark, dark + more)):
+    for one in select_effects(
+        automatic(config, tolerance), replace(physics, **sensor), FACTS, SignalRange(dark, dark + more)
+    ):
         assert not {";", "\n"} & set(one.reason)
-        assert one.said or (" DN in the " in one.reason and f"tolerance {tolerance:g}" in one.reason)
+        assert one.forced or (" DN in the " in one.reason and f"tolerance {tolerance:g}" in one.reason)
 
 
 def test_reasons_of_settings_fit_a_row(settings: Settings) -> None:
@@ -686,9 +695,9 @@ def test_a_prediction_is_what_is_measured(
     plan = of_sensor(switched(config, "auto", srgb, 0), physics)
     rest = replace(plan, effects=tuple(one for one in EFFECTS if one != effect))
     facts, span_dn = facts_of(srgb), float(plan.white_level_dn - plan.black_level_dn)
-    light = light_of(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    light = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
     everything = replace(config, effects=replace(config.effects, all="on"))
-    predicted = next(one for one in decide(everything, physics, facts, light) if one.effect == effect)
+    predicted = next(one for one in select_effects(everything, physics, facts, light) if one.effect == effect)
     squares = np.concatenate(
         [
             omission(
@@ -708,9 +717,11 @@ def test_what_hides_is_the_noise_of_the_plan(base: tuple[Config, Physics]) -> No
     """The variance that a pixel is said to have in the dark is that of the effects that stay on."""
     config, physics = base
     plan = replace(switched(config, "auto", flat(0, 0, 0), 0), physics=physics, a_dn=1.0, b_dn2=9.0)
-    column = next(one for one in decide(config, physics, FACTS, Light(0.0, 3000.0)) if one.effect == "column")
+    column = next(
+        one for one in select_effects(config, physics, FACTS, SignalRange(0.0, 3000.0)) if one.effect == "column"
+    )
     variance = float(noise_variance(np.full((1, 1), float(plan.black_level_dn)), plan)[0, 0]) + 1 / 12
-    assert math.isclose(column.hidden_dn, math.sqrt(variance / FACTS.height), rel_tol=1e-12)
+    assert math.isclose(column.masking_dn, math.sqrt(variance / FACTS.height), rel_tol=1e-12)
 
 
 # The table ------------------------------------------------------------------------------------------------------------

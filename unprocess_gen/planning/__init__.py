@@ -1,1 +1,1 @@
-"""Draw every random parameter of a pair and decide which effects to simulate."""
+"""Draw every random parameter of a pair, and decide which sensor effects to simulate."""

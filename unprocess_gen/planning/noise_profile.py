@@ -1,9 +1,9 @@
-"""From a physical noise profile and a scene to the numbers of one frame, on the sensor in use.
+"""Evaluate a physical noise profile for the ISO, exposure and temperature of one image.
 
-Profiles speak in electrons up to the system gain K and in DN of the sensor they were calibrated on after it; a number
-may depend on ISO, in one of the forms of `FORMS`. A profile holds for the ISOs that were measured and for no others: a
-sensor whose gain is dual has a branch on either side. What needs an exponential or a logarithm is computed in `decimal`
-and rounded once, since no libm gives the same last bit everywhere.
+Profiles are in electrons before the system gain K, and behind it in DN of the sensor they were calibrated on. A number
+may depend on ISO, in one of `FORMS`. A profile is valid for the calibrated ISOs only; a dual-gain sensor has a branch
+on each side of the switch. Exponentials and logarithms are computed in `decimal` and rounded once, because the last bit
+of libm's results differs between machines.
 """
 
 from __future__ import annotations
@@ -21,10 +21,23 @@ from unprocess_gen.core.types import Physics
 
 
 def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) -> Physics:
-    """Draw what the scene and the profile leave open, and convert it to the sensor's DN.
+    """Draw ISO, exposure, temperature and the scatter of a profile, and convert its numbers to the sensor's DN.
 
-    DN of the profile become DN of the sensor by s = (W - B) / (W_profile - B_profile): gains and offsets times s.
-    ``uniforms`` holds a uniform for each name of `plan.PARAMETERS`; ``config`` has passed `config.check`.
+    DN of the profile become DN of the sensor by the factor s = (W - B) / (W_profile - B_profile).
+
+    Parameters
+    ----------
+    config : Config
+        A configuration with a physical noise profile that `validate_config` accepts.
+    uniforms : dict of str to float
+        A uniform in (0, 1) for each name of `plan.PARAMETERS`.
+    stream_key : int
+        Key of the image's random stream; identifies the camera body if ``sensor.units=image``.
+
+    Returns
+    -------
+    Physics
+        Numbers of the sensor for this image: electrons before the gain, DN of the sensor behind it.
     """
     noise, scene, sensor = config.noise, config.scene, config.sensor
     iso, seconds, celsius = (
@@ -68,16 +81,17 @@ def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) ->
 
 
 def _doublings(celsius: float, noise: NoiseConfig) -> float:
-    """Return by how much the dark current grows from the reference temperature: 2**((T - T_ref) / T_doubling)."""
+    """Return the factor of the dark current against the reference temperature: 2**((T - T_ref) / T_doubling)."""
     with localcontext(prec=DIGITS):
         exponent = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)
         return float((exponent * Decimal(2).ln()).exp())
 
 
 def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:
-    """Return what a form of `FORMS` comes to; 0 for None.
+    """Evaluate a number of a branch: a plain number, or one of `FORMS`; None gives 0.
 
-    ``gain`` is the profile's own K; ``uniform`` draws the scatter of a line; ``shape`` is that of Tukey's law.
+    ``gain`` is K in DN of the profile; ``uniform`` draws the scatter of a line; ``shape`` is the λ of the Tukey-λ
+    distribution.
     """
     if form is None:
         return 0.0
@@ -94,7 +108,7 @@ def _per_iso(
 
 
 def _root(iso: Decimal, gain: Decimal, u: float, shape: float, *coefficients: Decimal) -> Decimal:
-    """√(c0 + c1·ISO + c2·ISO² …): a deviation, from a variance that is a polynomial."""
+    """Return √(c0 + c1·ISO + c2·ISO²): the standard deviation of a variance that is a polynomial in ISO."""
     total = Decimal(0)
     for coefficient in reversed(coefficients):
         total = total * iso + coefficient
@@ -104,13 +118,13 @@ def _root(iso: Decimal, gain: Decimal, u: float, shape: float, *coefficients: De
 def _line(
     iso: Decimal, gain: Decimal, u: float, shape: float, slope: Decimal, intercept: Decimal, std: Decimal
 ) -> Decimal:
-    """Ln σ = slope · ln K + intercept + std · n (ELD; natural logarithms)."""
+    """Return σ from ln σ = slope · ln K + intercept + std · n, where n is a standard normal deviate (ELD)."""
     scatter = std * normal_quantile(Decimal(u)) if std else Decimal(0)
     return (slope * gain.ln() + intercept + scatter).exp()
 
 
 def _scale_line(iso: Decimal, gain: Decimal, u: float, shape: float, *line: Decimal) -> Decimal:
-    """As a line, of the scale of Tukey's law; times its deviation at scale 1."""
+    """Return the standard deviation of Tukey-λ noise: its scale by `_line`, times its standard deviation at scale 1."""
     return _line(iso, gain, u, shape, *line) * tukey_std(shape)
 
 
@@ -120,13 +134,13 @@ FORMS: dict[str, Callable[..., Decimal]] = {
     "line": _line,
     "scale_line": _scale_line,
 }
-"""What may stand in a branch in place of a number, ``[form, number, …]``."""
+"""Functions that a branch may contain instead of a number, as ``[form, number, …]``."""
 
 
 def _black_error(branch: BranchConfig, iso: float) -> Sequence[float]:
-    """Return the offsets of the four sites: one for all, four, or a row of a table.
+    """Return the black-level errors of the four sites of the CFA pattern, DN of the profile.
 
-    The rows share the branch's range of ln ISO among them, in equal parts.
+    A branch has one for all sites, four, or a table of rows. Rows divide the branch's range of ln ISO into equal parts.
     """
     value = branch.black_error_dn
     if value is None:
@@ -134,10 +148,10 @@ def _black_error(branch: BranchConfig, iso: float) -> Sequence[float]:
     if not isinstance(value, list):
         return (float(value),) * 4
     if value[0] != "by_log_iso":
-        return [float(one) for one in value]
+        return [float(each) for each in value]
     table, (low, high) = value[1:], branch.iso
     if low == high:
-        return [float(one) for one in table[0]]
+        return [float(each) for each in table[0]]
     with localcontext(prec=DIGITS):
         place = (Decimal(iso) / Decimal(low)).ln() / (Decimal(high) / Decimal(low)).ln()
-    return [float(one) for one in table[min(int(place * len(table)), len(table) - 1)]]
+    return [float(each) for each in table[min(int(place * len(table)), len(table) - 1)]]

@@ -1,7 +1,7 @@
-"""The plan of an image: every parameter, drawn once. After this nothing is random; all is a function of (pixels, plan).
+"""Draw every parameter of an image once, and record them in a `Plan`.
 
-Draws come from the image's own stream ``parameters`` (`streams`), a counter for each name in `PARAMETERS`, so a draw
-that is not needed moves no other.
+A pair is a pure function of pixels and plan. Draws come from the stream ``parameters`` of the image
+(`core.random_streams`), with one counter for each name in `PARAMETERS`; so a draw that is not used moves no other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from unprocess_gen.config.interpretation import (
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Facts, Plan
-from unprocess_gen.planning.effect_selection import NOT_ROUNDED, Prediction, decide, light_of
+from unprocess_gen.planning.effect_contributions import signal_range
+from unprocess_gen.planning.effect_selection import NOT_ROUNDED, Prediction, select_effects
 from unprocess_gen.planning.noise_profile import plan_physics
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
@@ -36,18 +37,37 @@ PARAMETERS = (
     *("iso", "exposure_s", "temperature_c", "exposure_ratio", "read_shape", "read_std", "row_std", "column_std"),
     "sensor_unit",
 )
-"""The number of each draw in the image's stream. Part of every dataset ever made: append, never reorder."""
+"""Names of the draws; the position is the counter in the stream. All datasets depend on it: append, never reorder."""
 
 NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std")
-"""Those that every noise level draws for itself."""
+"""Parameters that every noise level draws separately."""
 
 
 def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None) -> Plan:
-    """Draw every parameter of one image.
+    """Draw every parameter of one image, at the first noise level.
 
-    ``source_sha256`` is the hex digest of the source's bytes and ``occurrence`` the number of identical files before
-    it; together with ``config.seed`` they decide all draws. What the effects of a physical profile are judged by are
-    the ``facts`` of the pixels (`planner.facts_of`). ``config`` has passed `config.check`.
+    All draws are functions of ``config.seed``, ``source_sha256`` and ``occurrence``.
+
+    Parameters
+    ----------
+    config : Config
+        A configuration that `validate_config` accepts.
+    source_sha256 : str
+        Hex digest of the bytes of the source.
+    occurrence : int
+        Number of identical files before this one.
+    facts : Facts or None
+        `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
+
+    Returns
+    -------
+    Plan
+        All parameters of the pair.
+
+    Raises
+    ------
+    ValueError
+        If the noise profile is physical and ``facts`` is None.
     """
     return plan_with_reasons(config, source_sha256, occurrence, facts)[0]
 
@@ -55,36 +75,91 @@ def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: F
 def plan_pairs(
     config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, frame: int = 0
 ) -> tuple[Plan, ...]:
-    """Return the plans of all pairs of one image, level by level and draw by draw: one clean frame, many noisy ones.
+    """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level.
 
-    Of a frame of a clip, ``source_sha256`` and ``occurrence`` are the clip's, so that all of its frames share their
-    draws, and ``frame`` is its number, so that they do not share their noise.
+    Parameters
+    ----------
+    config : Config
+        A configuration that `validate_config` accepts.
+    source_sha256 : str
+        Hex digest of the bytes of the source. For a frame of a clip, of the clip: its frames share their parameters.
+    occurrence : int
+        Number of identical sources before this one.
+    facts : Facts or None
+        `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
+    frame : int
+        Number of the frame in its clip; each frame has its own noise. 0 for a photograph.
+
+    Returns
+    -------
+    tuple of Plan
+        Level by level, and draw by draw within a level. The pairs share their clean frame.
+
+    Raises
+    ------
+    ValueError
+        If the noise profile is physical and ``facts`` is None.
     """
     levels = plan_levels(config, source_sha256, occurrence, facts)
     return with_draws(config, [plan for plan, _ in levels], frame)
 
 
 def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
-    """Return a plan for every draw at each level."""
+    """Return a plan for each draw of the noise at each level.
+
+    Parameters
+    ----------
+    config : Config
+        ``noise.draws`` is the number of draws.
+    levels : iterable of Plan
+        One plan for each noise level.
+    frame : int
+        Number of the frame in its clip.
+
+    Returns
+    -------
+    tuple of Plan
+        Draw by draw within each level.
+    """
     return tuple(replace(plan, draw=draw, frame=frame) for plan in levels for draw in range(config.noise.draws))
 
 
-Reasoned = tuple[Plan, tuple[Prediction, ...]]
-"""A plan, and what was predicted of every effect of a physical profile."""
+PlanAndPredictions = tuple[Plan, tuple[Prediction, ...]]
+"""A plan, and a prediction for every effect of a physical profile; no predictions for a profile with two numbers."""
 
 
 def plan_levels(
     config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None
-) -> tuple[Reasoned, ...]:
-    """Return the plan of every noise level, with its reasons."""
+) -> tuple[PlanAndPredictions, ...]:
+    """Draw the parameters of one image at every noise level, with the predictions behind the selected effects.
+
+    Parameters
+    ----------
+    config : Config
+        A configuration that `validate_config` accepts.
+    source_sha256 : str
+        Hex digest of the bytes of the source.
+    occurrence : int
+        Number of identical sources before this one.
+    facts : Facts or None
+        `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
+
+    Returns
+    -------
+    tuple of (Plan, tuple of Prediction)
+        One for each noise level; no predictions for a profile with two numbers.
+    """
     levels = range(len(noise_levels(config.noise)))
     return tuple(plan_with_reasons(config, source_sha256, occurrence, facts, level) for level in levels)
 
 
 def plan_with_reasons(
     config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, level: int = 0
-) -> Reasoned:
-    """Return the plan of one noise level, with its reasons."""
+) -> PlanAndPredictions:
+    """Draw the parameters of one image at one noise level, with the predictions behind the selected effects.
+
+    Parameters are those of `plan_levels`, and the number of the level.
+    """
     key = stream_key(config.seed, source_sha256, occurrence)
     uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
     if level:
@@ -98,26 +173,26 @@ def plan_with_reasons(
         raise ValueError("a physical profile needs the facts of the pixels")
     physics = plan_physics(config, uniforms, key)
     span_dn = float(plan.white_level_dn - plan.black_level_dn)
-    light = light_of(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
-    predictions = decide(config, physics, facts, light)
+    signals = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    predictions = select_effects(config, physics, facts, signals)
     return (
         replace(
             plan,
             physics=physics,
             a_dn=physics.dn_per_e,
             b_dn2=physics.read_std_dn * physics.read_std_dn,
-            effects=tuple(one.effect for one in predictions if one.simulated),
-            skipped=tuple(f"{one.effect}: {one.reason}" for one in predictions if not one.simulated),
+            effects=tuple(each.effect for each in predictions if each.simulated),
+            skipped=tuple(f"{each.effect}: {each.reason}" for each in predictions if not each.simulated),
         ),
         predictions,
     )
 
 
 def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> Plan:
-    """Return the plan without what a physical profile adds."""
+    """Return the plan without the numbers and effects of a physical profile."""
     camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
     red, blue, inverse_rgb = gain_distributions(config.gains)
-    darkened = parse_distribution("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_DISTRIBUTIONS)
+    exposure_ratio = parse_distribution("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_DISTRIBUTIONS)
     a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
     span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
     effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
@@ -127,7 +202,7 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
         downscale=config.source.downscale,
         dequantize=dequantize_method(config.source),
         scene=config.scene.name,
-        exposure_ratio=draw_parameter(darkened, uniforms["exposure_ratio"]),
+        exposure_ratio=draw_parameter(exposure_ratio, uniforms["exposure_ratio"]),
         camera=camera,
         weights=weights,
         rgb2cam=rgb2cam,
@@ -169,7 +244,7 @@ Weights = tuple[float, float, float, float]
 
 
 def plan_camera(camera: CameraConfig, uniforms: dict[str, float]) -> tuple[str, Weights, colour.Matrix]:
-    """Return the camera's name, the weights of the four known cameras in it, and the matrix from RGB to camera."""
+    """Return the name of the camera, the weights of the four known cameras in it, and its matrix from linear sRGB."""
     names = tuple(colour.CAMERAS)
     if camera.law == "identity":
         return camera.name, (0.0, 0.0, 0.0, 0.0), colour.IDENTITY
@@ -184,7 +259,7 @@ def plan_camera(camera: CameraConfig, uniforms: dict[str, float]) -> tuple[str, 
 
 
 def convex_weights(uniforms: dict[str, float]) -> Weights:
-    """Return four uniforms over their sum (Brooks et al. 2019, random_ccm())."""
+    """Return four uniforms, each divided by their sum (Brooks et al. 2019, random_ccm())."""
     u0, u1, u2, u3 = (uniforms[f"weight_{i}"] for i in range(4))
     total = u0 + u1 + u2 + u3
     return u0 / total, u1 / total, u2 / total, u3 / total
@@ -194,11 +269,11 @@ def convex_weights(uniforms: dict[str, float]) -> Weights:
 
 
 def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float]:
-    """Draw the noise level and convert it to the sensor's DN."""
+    """Draw the two numbers of a noise profile and convert them to the sensor's DN: (a_dn, b_dn2)."""
     noise, sensor = config.noise, config.sensor
-    a_law, b_law = noise_distributions(noise)
-    a = draw_parameter(a_law, uniforms["a"])
-    b = draw_parameter(b_law, uniforms["b"], a)
+    a_distribution, b_distribution = noise_distributions(noise)
+    a = draw_parameter(a_distribution, uniforms["a"])
+    b = draw_parameter(b_distribution, uniforms["b"], a)
     return noise_in_dn(
         a,
         b,
@@ -210,17 +285,19 @@ def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float
 
 
 def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the effects of a two-parameter profile that are simulated, in order, and those skipped, with the reason.
+    """Return the simulated effects of a profile with two numbers, in order, and the skipped ones with their reasons.
 
-    ``span_dn`` is white less black: where the variance is nowhere above 0 in it, there is no noise to simulate.
+    ``span_dn`` is the white level minus the black level. If the variance is 0 or less in all of it, no noise is
+    simulated.
     """
     noise = config.noise.name
     rounded = not is_normalised(config)
     last = ("quantise",) if rounded else ()
-    skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)
+    skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)  # recorded: decides bytes of datasets
     if effect_switch(config.effects, "heteroscedastic") == "off":
-        return last, ("heteroscedastic: switched off", *skipped)
+        return last, ("heteroscedastic: switched off", *skipped)  # recorded: decides bytes of datasets
     if a_dn * span_dn + b_dn2 <= 0:
-        none = f"heteroscedastic: noise={noise} has no variance (a_dn={a_dn!r}, b_dn2={b_dn2!r})"
+        numbers = f"a_dn={a_dn!r}, b_dn2={b_dn2!r}"
+        none = f"heteroscedastic: noise={noise} has no variance ({numbers})"  # recorded: decides bytes of datasets
         return last, (none, *skipped)
     return ("heteroscedastic", *last), skipped

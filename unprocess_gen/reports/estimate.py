@@ -360,7 +360,7 @@ def _effect_table(predictions: list[tuple[Prediction, ...]]) -> list[str]:
         simulated = f"{sum(one.simulated for one in of_effect)} of {len(of_effect)}"
         cost = f"{COST_NS[best.effect]:.1f}"
         lines.append(
-            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:13}  {best.hidden_dn:10.3g}    "
+            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:13}  {best.masking_dn:10.3g}    "
             f"{simulated:9}  {cost:>8}  {best.why}"
         )
     return lines

@@ -1,0 +1,335 @@
+"""Predict the contribution of each sensor effect to the statistics of a frame, and the noise that masks it.
+
+A contribution has a random part and an offset common to all pixels. Both are predicted in every statistic: single
+pixels and row, column and colour-plane means, of one frame and of the mean over the frames of a clip. The mean over a
+clip keeps fixed patterns and averages out temporal noise.
+
+All arithmetic is + - × ÷ √ and `decimal`, and the pixels enter as integer facts only (`core.types.Facts`): predictions
+are the same on every machine and in every tier. Derivations: ``docs/design/effect_selection.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+
+from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.core.types import Facts, Physics
+from unprocess_gen.simulation.reference import colour
+
+STATISTICS = (
+    *("pixel", "row mean", "column mean", "plane mean"),
+    *("clip's pixel", "clip's row", "clip's column", "clip's plane"),
+)
+"""Statistics of one frame, then the same of the mean over the frames of a clip. A photograph is a clip of one frame.
+Rows record these names."""
+
+FIXED_PATTERNS = frozenset({"prnu", "hot_pixels", "column", "black_error", "dead_pixels"})
+"""Effects that are the same in all frames of a camera body. Clean frames may contain them; then only the rounding of
+the clean frame masks them."""
+
+BEFORE_WELL = frozenset({"prnu", "shot", "dark_current", "hot_pixels"})
+"""Effects that act before the full well limits the electrons of a pixel."""
+
+QUANTISATION_VARIANCE = 1 / 12
+"""Variance of rounding to integers, DN²."""
+
+MEAN_ABS_NORMAL = 0.7978845608028654
+"""Mean absolute value of a standard normal deviate, √(2/π)."""
+
+FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
+"""Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignalRange:
+    """Hold the lowest and highest signal that a site of an image can have, DN above black."""
+
+    dark_dn: float
+    bright_dn: float
+
+
+def signal_range(
+    facts: Facts,
+    tone: str,
+    gamma: float | str,
+    gains: tuple[float, float, float],
+    exposure: float,
+    span_dn: float,
+    rgb2cam: colour.Matrix = colour.IDENTITY,
+) -> SignalRange:
+    """Return the signal range of an image with any colours between its lowest and highest code.
+
+    Every treatment of highlights maps light i to at least k·i and at most i·max(1, k), where k is the inverse gain.
+
+    Parameters
+    ----------
+    facts : Facts
+        Lowest and highest code of the image.
+    tone, gamma : str, float or str
+        Curves of the camera; see `tone_curves.linear_table`.
+    gains : tuple of float
+        Inverse gains k of red, green and blue.
+    exposure : float
+        Factor by which the scene is darkened.
+    span_dn : float
+        White level minus black level, DN.
+    rgb2cam : Matrix
+        Nine numbers, row by row, from linear sRGB to the camera.
+
+    Returns
+    -------
+    SignalRange
+        Limits within 0 and ``span_dn``.
+    """
+    curve = linear_table(tone, gamma, facts.codes)
+    low, high = float(curve[facts.dark_code]), float(curve[facts.bright_code])
+    rows = [rgb2cam[at : at + 3] for at in (0, 3, 6)]
+    lowest = min(
+        sum(entry * (low if entry > 0 else high) for entry in row) * k for row, k in zip(rows, gains, strict=True)
+    )
+    highest = max(
+        sum(entry * (high if entry > 0 else low) for entry in row) * max(k, 1.0)
+        for row, k in zip(rows, gains, strict=True)
+    )
+    return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
+
+
+def ratio_to_noise(size: float, noise: float) -> float:
+    """Return ``size / noise``; without noise, 0 for no size and infinity otherwise."""
+    return size / noise if noise else math.inf if size else 0.0
+
+
+PerStatistic = tuple[float, ...]
+"""One value for each of `STATISTICS`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contribution:
+    """Hold what an effect contributes: a variance in each of `STATISTICS`, DN², and an offset of all pixels, DN."""
+
+    variances: PerStatistic
+    offset_dn: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class FrameModel:
+    """Hold what predictions depend on: numbers of the sensor, size and signal range of the frame, black level."""
+
+    physics: Physics
+    facts: Facts
+    signals: SignalRange
+    black_level_dn: float
+
+    def levels(self, on: frozenset[str]) -> tuple[float, float]:
+        """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
+        full_dn = self.physics.full_well_e * self.physics.dn_per_e if "full_well" in on else math.inf
+        return min(self.signals.dark_dn, full_dn), min(self.signals.bright_dn, full_dn)
+
+    @property
+    def counts(self) -> PerStatistic:
+        """Return the number of sites that each statistic is a mean of."""
+        width, height, frames = self.facts.width, self.facts.height, float(self.facts.frames)
+        counts = 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
+        return *counts, *(count * frames for count in counts)
+
+    def masking_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
+        """Return the variance of a pixel at a signal due to all random effects in ``on`` except ``effect``, DN²."""
+        rounding = QUANTISATION_VARIANCE if "quantise" in on - {effect} else 0.0
+        if effect in FIXED_PATTERNS and self.physics.fixed_pattern_in_clean:
+            return rounding
+        return rounding + sum(
+            variance(self.physics, level_dn) for name, variance in VARIANCES.items() if name in on - {effect}
+        )
+
+    def ratios(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> PerStatistic:
+        """Return the ratio of several effects together to the masking noise, in each statistic.
+
+        Variances add; offsets add linearly.
+        """
+        squares, offsets = [0.0] * len(STATISTICS), [0.0] * len(STATISTICS)
+        before_well = 0.0
+        for effect in effects:
+            masking = self.masking_variance(effect, level_dn, on)
+            contribution = CONTRIBUTIONS[effect](self, level_dn, masking)
+            before_well += contribution.variances[0] if effect in BEFORE_WELL else 0.0
+            for at, count in enumerate(self.counts):
+                squares[at] += ratio_to_noise(contribution.variances[at] * count, masking)
+                offsets[at] += ratio_to_noise(abs(contribution.offset_dn) * math.sqrt(count), math.sqrt(masking))
+        if before_well and "full_well" in on:
+            masking = self.masking_variance("full_well", level_dn, on)
+            lost_dn = self.lost_in_well(before_well, level_dn, on)
+            for at, count in enumerate(self.counts):
+                offsets[at] += lost_dn * math.sqrt(ratio_to_noise(count, masking)) if lost_dn else 0.0
+        return tuple(math.sqrt(square + offset * offset) for square, offset in zip(squares, offsets, strict=True))
+
+    def lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:
+        """Return by how much ``variance`` before the full well lowers the mean signal behind it, DN.
+
+        At a signal that fills the well the upper half of the distribution is cut, which lowers the mean of a normal
+        distribution by σ/√(2π).
+        """
+        if CONTRIBUTIONS["full_well"](self, level_dn, 0.0).offset_dn == 0:
+            return 0.0
+        other = sum(VARIANCES[name](self.physics, level_dn) for name in VARIANCES if name in on & BEFORE_WELL)
+        return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
+
+    def ratio(self, effects: Sequence[str], on: frozenset[str]) -> float:
+        """Return the largest ratio of several effects together, over all statistics and both signals."""
+        return max(max(self.ratios(effects, level_dn, on)) for level_dn in self.levels(on))
+
+    def outliers(self, effect: str, on: frozenset[str]) -> float:
+        """Return the expected number of pixels per frame that an effect moves by more than one standard deviation."""
+        if effect not in OUTLIERS:
+            return 0.0
+        shares = (OUTLIERS[effect](self, level, self.masking_variance(effect, level, on)) for level in self.levels(on))
+        return self.facts.width * self.facts.height * max(shares)
+
+
+VARIANCES: dict[str, Callable[[Physics, float], float]] = {
+    "shot": lambda physics, level_dn: physics.dn_per_e * level_dn,
+    "dark_current": lambda physics, level_dn: physics.dn_per_e * physics.dn_per_e * physics.dark_e,
+    "read": lambda physics, level_dn: physics.read_std_dn * physics.read_std_dn,
+}
+"""Variance of each random effect of single pixels, DN², at a signal in DN above black."""
+
+
+def _independent(
+    frame: FrameModel, variance: float, offset_dn: float = 0.0, fixed_variance: float = 0.0
+) -> Contribution:
+    """Return the contribution of an effect that is independent from pixel to pixel.
+
+    ``variance``: of the part that is new in every frame; ``fixed_variance``: of the part that all frames share.
+    """
+    per_frame = frame.counts[: len(frame.counts) // 2]
+    return Contribution(
+        tuple(
+            variance / count + fixed_variance / sites
+            for count, sites in zip(frame.counts, (*per_frame, *per_frame), strict=True)
+        ),
+        offset_dn,
+    )
+
+
+def _prnu(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    """Predict PRNU as a change of the mean of the shot noise.
+
+    Poisson counts of nearby means differ by √(|Δλ| + Δλ²) even for equal uniforms.
+    """
+    physics = frame.physics
+    change_e = physics.prnu_std * level_dn / physics.dn_per_e
+    squared = physics.dn_per_e * physics.dn_per_e
+    return _independent(frame, squared * MEAN_ABS_NORMAL * change_e, fixed_variance=squared * change_e * change_e)
+
+
+def _shot(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    return _independent(frame, VARIANCES["shot"](frame.physics, level_dn))
+
+
+def _dark_current(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    physics = frame.physics
+    offset_dn = physics.dn_per_e * physics.dark_e if physics.dark_offset == "kept" else 0.0
+    return _independent(frame, VARIANCES["dark_current"](physics, level_dn), offset_dn)
+
+
+def _hot_pixels(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    """Predict hot pixels: a Poisson count with exponentially distributed mean m has the mean square m + 2m²."""
+    physics = frame.physics
+    mean_dn = physics.dn_per_e * physics.hot_pixel_e
+    mean_square = (physics.dn_per_e + 2 * mean_dn) * mean_dn
+    return _inconspicuous(frame, physics.hot_pixel_share, mean_dn, mean_square, masking)
+
+
+def _dead_pixels(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    """Predict dead pixels: they read 0 DN, which is below black."""
+    depth_dn = frame.black_level_dn + level_dn
+    return _inconspicuous(frame, frame.physics.dead_pixel_share, depth_dn, depth_dn * depth_dn, masking)
+
+
+def _inconspicuous(frame: FrameModel, share: float, mean_dn: float, mean_square: float, masking: float) -> Contribution:
+    """Return the contribution of rare pixels up to one standard deviation each; larger ones count as outliers."""
+    fixed_variance = share * min(mean_square, masking)
+    return _independent(frame, 0.0, share * min(mean_dn, math.sqrt(masking)), fixed_variance)
+
+
+def _full_well(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    """Predict the full well by the most that any pixel can lose."""
+    physics = frame.physics
+    if physics.full_well_e == 0:
+        return _independent(frame, 0.0)
+    signal_e = level_dn / physics.dn_per_e * (1 + FARTHEST_NORMAL * physics.prnu_std)
+    reach_e = sum(_reach(mean_e) for mean_e in (signal_e, physics.dark_e, FARTHEST_HOT * physics.hot_pixel_e))
+    return _independent(frame, 0.0, max(reach_e - physics.full_well_e, 0.0) * physics.dn_per_e)
+
+
+def _reach(mean_e: float) -> float:
+    """Return an upper limit of the Poisson counts of 2**32 uniforms, electrons."""
+    return mean_e + 7 * math.sqrt(mean_e) + 12 if mean_e else 0.0
+
+
+def _read(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    return _independent(frame, VARIANCES["read"](frame.physics, level_dn))
+
+
+def _row(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    variance, height = frame.physics.row_std_dn * frame.physics.row_std_dn, frame.facts.height
+    per_frame = variance, variance, variance / height, variance / max(height // 2, 1)
+    return Contribution((*per_frame, *(each / frame.facts.frames for each in per_frame)))
+
+
+def _column(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    variance, width = frame.physics.column_std_dn * frame.physics.column_std_dn, frame.facts.width
+    per_frame = variance, variance / width, variance, variance / max(width // 2, 1)
+    return Contribution((*per_frame, *per_frame))
+
+
+def _black_error(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    return _independent(frame, 0.0, max(abs(error) for error in frame.physics.black_error_dn))
+
+
+def _quantise(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    return _independent(frame, QUANTISATION_VARIANCE)
+
+
+CONTRIBUTIONS: dict[str, Callable[[FrameModel, float, float], Contribution]] = {
+    "prnu": _prnu,
+    "shot": _shot,
+    "dark_current": _dark_current,
+    "hot_pixels": _hot_pixels,
+    "full_well": _full_well,
+    "read": _read,
+    "row": _row,
+    "column": _column,
+    "black_error": _black_error,
+    "dead_pixels": _dead_pixels,
+    "quantise": _quantise,
+}
+"""Contribution of each effect; arguments: frame, signal in DN above black, variance of the masking noise in DN²."""
+
+
+def _share_of_bright_hot_pixels(frame: FrameModel, level_dn: float, masking: float) -> float:
+    """Return the fraction of pixels that are hot and exceed one standard deviation.
+
+    Counts with exponentially distributed mean m are geometrically distributed: P(N >= k) = (m / (1 + m))**k.
+    """
+    physics = frame.physics
+    least = math.floor(math.sqrt(masking) / physics.dn_per_e) + 1
+    with localcontext(prec=20):
+        mean_e = Decimal(physics.hot_pixel_e)
+        if not mean_e:
+            return 0.0
+        return float(Decimal(physics.hot_pixel_share) * (least * (mean_e / (1 + mean_e)).ln()).exp())
+
+
+def _share_of_dead_pixels(frame: FrameModel, level_dn: float, masking: float) -> float:
+    depth_dn = frame.black_level_dn + level_dn
+    return frame.physics.dead_pixel_share if depth_dn * depth_dn > masking else 0.0
+
+
+OUTLIERS: dict[str, Callable[[FrameModel, float, float], float]] = {
+    "hot_pixels": _share_of_bright_hot_pixels,
+    "dead_pixels": _share_of_dead_pixels,
+}
+"""Fraction of pixels that an effect moves by more than one standard deviation; arguments as in `CONTRIBUTIONS`."""
