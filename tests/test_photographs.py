@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Make, Settings, pixels
+from conftest import Door, Make, Settings, pixels
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -111,3 +111,19 @@ def test_dataset_of_a_single_picture_equals_that_of_its_folder(make: Make, tmp_p
     assert (tmp_path / "one" / "manifest.csv").read_bytes() == (tmp_path / "all" / "manifest.csv").read_bytes()
     (replayed,) = replay(read_rows(tmp_path / "one" / "manifest.csv"), str(picture))
     assert (replayed.source, replayed.complaint) == ("%25one.png", "")
+
+
+def test_summary_and_plan_name_files_that_nothing_matches(door: Door, tmp_path: Path) -> None:
+    Image.fromarray(pixels(1, 9, 14)).save(tmp_path / "a.png")
+    (tmp_path / "b.HEIC").touch()
+    for command in ([], ["plan"]):
+        done = door(*command, f"source.root={tmp_path}", "n_jobs=1")
+        assert "1 file is not matched by source.include (1 .heic)" in done.out, done
+
+
+def test_clip_of_different_photographs_gives_warnings(door: Door, tmp_path: Path) -> None:
+    Image.fromarray(pixels(1, 9, 14)).save(tmp_path / "a.png")
+    Image.fromarray(pixels(2, 12, 8)).save(tmp_path / "b.png")
+    done = door(f"source.root={tmp_path}", "source.clips=true", "n_jobs=1")
+    assert (done.code, "all 2 photographs are in one folder" in done.err) == (0, True), done
+    assert "has frames of 14 x 9 and of 8 x 12 pixels" in done.err

@@ -138,10 +138,14 @@ def test_several_clips_or_one_photograph_give_no_warning(tmp_path: Path) -> None
 
 
 def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
+    def row(clip: str, width: int, height: int, **others: object) -> dict:
+        return {"status": "ok", "clip": clip, "width": width, "height": height, "patch": 0} | others
+
     sizes = ClipSizes()
-    assert [sizes.warning("a", 4, 3), sizes.warning("b", 8, 6), sizes.warning("a", 4, 3)] == ["", "", ""]
-    assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in sizes.warning("a", 3, 4)
-    assert sizes.warning("a", 5, 5) == ""
+    assert sizes.warnings([row("a", 4, 3), row("b", 8, 6), row("a", 4, 3), row("none", 1, 1)]) == ()
+    assert sizes.warnings([row("a", 2, 2, patch=1), row("a", 5, 5, status="failed")]) == ()
+    (warning,) = sizes.warnings([row("a", 3, 4), row("a", 5, 5)])
+    assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in warning
 
 
 def test_sub_folders_are_left_alone_when_not_recursive(tmp_path: Path) -> None:

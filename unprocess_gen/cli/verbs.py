@@ -55,11 +55,14 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary]:
         Exit code: 3 if more sources failed than ``source.max_failed`` allows; and what was generated.
     """
     from unprocess_gen.pipeline.generate import generate
+    from unprocess_gen.sources.listing import unmatched_sentence
 
     summary = generate(config, label)
     print_result(_summary_line(summary))
     if summary.made and summary.sites["all"]:
         print_result(_clipping_line(summary.sites))
+    if summary.unmatched:
+        print_result(unmatched_sentence(summary.unmatched))
     too_many = sum(summary.failed.values()) > config.source.max_failed
     return 3 if too_many else 0, summary
 

@@ -18,7 +18,7 @@ import os
 import platform
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
 from unprocess_gen.pipeline.workspace import Workspace
+from unprocess_gen.sources.listing import ClipSizes, Listing
 from unprocess_gen.sources.loader import list_photographs
 from unprocess_gen.sources.video.decode import is_installed
 
@@ -65,6 +66,8 @@ class Summary:
         Rows that this run made; 0 if the dataset was complete before.
     seconds : float
         Time that this run took.
+    unmatched : dict of str to int
+        Files that no include pattern matches, by suffix.
     """
 
     out: Path
@@ -75,6 +78,7 @@ class Summary:
     bytes: int
     made: int
     seconds: float
+    unmatched: dict[str, int] = field(default_factory=dict)
 
     @property
     def rows(self) -> int:
@@ -115,7 +119,7 @@ def generate(config: Config, label: str = "") -> Summary:
         workspace.open()
         if workspace.complete:
             facts = workspace.check_complete(listing.sources)
-            return _summary(workspace.out, facts, made=0, started=started)
+            return _summary(workspace.out, facts, listing, made=0, started=started)
         workspace.begin(listing.sources)
         tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
         done = set(workspace.committed(len(tasks)))
@@ -127,6 +131,8 @@ def generate(config: Config, label: str = "") -> Summary:
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)
         with Progress(len(listing.sources), images_done, label) as progress:
             progress.report_compiling(context.compiling_path)
+            for warning in listing.warnings:
+                progress.warn(warning)
             provisional, rows_made = _run(context, todo, n_jobs, workspace, progress)
         seconds = time.monotonic() - started
         try:
@@ -147,7 +153,7 @@ def generate(config: Config, label: str = "") -> Summary:
                 "versions": {package: version(package) for package in PACKAGES},
             },
         )
-    return _summary(Path(config.out), facts, made=rows_made, started=started)
+    return _summary(Path(config.out), facts, listing, made=rows_made, started=started)
 
 
 def _run(
@@ -155,7 +161,7 @@ def _run(
 ) -> tuple[dict[int, ShardResult], int]:
     """Make and commit shards; return the provisional results by shard, and the number of rows of all results."""
     provisional: dict[int, ShardResult] = {}
-    warned, rows = False, 0
+    warned, rows, clip_sizes = False, 0, ClipSizes()
     for result in run_tasks(context, tasks, n_jobs):
         if result.killer is None:
             workspace.commit(result)
@@ -165,6 +171,8 @@ def _run(
         if result.self_test and not warned:
             warned = True
             progress.warn(f"the self-test failed: {result.self_test}; continuing because of self_test=go_on")
+        for warning in clip_sizes.warnings(result.rows):
+            progress.warn(warning)
         rows += len(result.rows)
         statuses = [rows_of_image[0]["status"] for rows_of_image in group_by_image(result.rows)]
         progress.advance(len(statuses), statuses.count("failed"))
@@ -208,7 +216,7 @@ def _absolute(root: str | None) -> str | None:
     return None if root is None else os.path.abspath(root)
 
 
-def _summary(out: Path, facts: dict[str, Any], made: int, started: float) -> Summary:
+def _summary(out: Path, facts: dict[str, Any], listing: Listing, made: int, started: float) -> Summary:
     return Summary(
         out=out,
         pairs=facts["pairs"],
@@ -218,4 +226,5 @@ def _summary(out: Path, facts: dict[str, Any], made: int, started: float) -> Sum
         bytes=sum(entry["bytes"] for entry in facts["shards"]),
         made=made,
         seconds=time.monotonic() - started,
+        unmatched=listing.unmatched,
     )

@@ -25,7 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, TypeVar
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
-from unprocess_gen.core.types import Source
+from unprocess_gen.core.types import NO_CLIP, Row, Source
 
 _Result = TypeVar("_Result")
 
@@ -330,16 +330,16 @@ class ClipSizes:
     def __init__(self) -> None:
         self._sizes: dict[str, tuple[int, int] | None] = {}
 
-    def warning(self, clip: str, width: int, height: int) -> str:
-        """Return a warning when a clip's frame first differs in size from an earlier one; else an empty text.
+    def warnings(self, rows: Iterable[Row]) -> tuple[str, ...]:
+        """Return a warning for each clip whose frames first differ in size within these manifest rows.
 
-        Parameters
-        ----------
-        clip : str
-            Name of the clip; frames of `NO_CLIP` are not passed here.
-        width, height : int
-            Size of the frame in pixels.
+        Rows of failed sources, of photographs outside clips and of patches are ignored.
         """
+        frames = [row for row in rows if row["status"] == "ok" and row["clip"] != NO_CLIP and row["patch"] == 0]
+        texts = (self._warning(str(row["clip"]), int(row["width"] or 0), int(row["height"] or 0)) for row in frames)
+        return tuple(text for text in texts if text)
+
+    def _warning(self, clip: str, width: int, height: int) -> str:
         known = self._sizes.setdefault(clip, (width, height))
         if known is None or known == (width, height):
             return ""
