@@ -114,10 +114,12 @@ def test_dataset_of_a_single_picture_equals_that_of_its_folder(make: Make, tmp_p
 
 
 def test_summary_and_plan_name_files_that_nothing_matches(door: Door, tmp_path: Path) -> None:
-    Image.fromarray(pixels(1, 9, 14)).save(tmp_path / "a.png")
-    (tmp_path / "b.HEIC").touch()
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.fromarray(pixels(1, 9, 14)).save(photos / "a.png")
+    (photos / "b.HEIC").touch()
     for command in ([], ["plan"]):
-        done = door(*command, f"source.root={tmp_path}", "n_jobs=1")
+        done = door(*command, f"source.root={photos}", "n_jobs=1")
         assert "1 file is not matched by source.include (1 .heic)" in done.out, done
 
 
