@@ -1,8 +1,8 @@
-"""Names made to break a list, a shell, a spreadsheet or a path: each is spelled harmlessly and found again to the byte.
+"""File and folder names that could break a list, a shell, a spreadsheet or a path.
 
-One dataset is made of photographs whose names and folders are hostile, all of another content; what is written is then
-read with Python's csv, json and tarfile. Folders with hostile names are given as ``source.root`` and as ``out`` on the
-command line. Hypothesis adds names that nobody thought of: two hundred, or ten thousand in the slow proof.
+One dataset is generated from photographs with hostile names and folders; its files are read with Python's csv, json and
+tarfile. Every name must be encoded harmlessly and decoded to the same bytes. Folders with hostile names are used as
+``source.root``, as ``out`` and as the dataset of every verb. Hypothesis adds random names (10,000 with ``-m slow``).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import io
 import json
 import os
 import re
+import shutil
 import tarfile
 import unicodedata
 from collections.abc import Callable, Iterator
@@ -34,7 +35,7 @@ from unprocess_gen.sources.listing import decode_name, encode_name, list_folder,
 
 FORMULA_STARTS = tuple("=+-@\t\r")
 UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
-"""What a terminal would obey, or a reader would not see: control and bidirectional characters, and ends of lines."""
+"""Control and bidirectional characters and line ends: a terminal would execute them, or a reader not see them."""
 
 NAMES: tuple[bytes, ...] = (
     # ends of lines, separators, quotes
@@ -130,24 +131,24 @@ FOLDERS: tuple[bytes, ...] = (
 
 
 def photograph(number: int) -> bytes:
-    """A photograph of three by four pixels unlike any other."""
+    """Return a PNG of 3 x 4 pixels that depend on ``number``."""
     stream = io.BytesIO()
     rgb = np.frombuffer(hashlib.sha256(b"%d" % number).digest() + bytes(4), np.uint8).reshape(3, 4, 3)
     Image.fromarray(rgb).save(stream, "PNG")
     return stream.getvalue()
 
 
-class Made(NamedTuple):
-    """A dataset of hostile names: the files' contents by their path, and all that stood beside the dataset."""
+class HostileDataset(NamedTuple):
+    """Hold a dataset of hostile names: contents of the files by path, and every other path next to the dataset."""
 
     root: Path
     out: Path
     contents: dict[bytes, bytes]
-    beside: list[tuple[bytes, int, int]]
+    others: list[tuple[bytes, int, int]]
 
 
-def beside(top: Path, out: Path) -> list[tuple[bytes, int, int]]:
-    """Every path below ``top`` but those in ``out``, with its size and time."""
+def paths_except(top: Path, out: Path) -> list[tuple[bytes, int, int]]:
+    """Return every path below ``top`` except those in ``out``, with size and time."""
     found = []
     for folder, folders, files in os.walk(os.fsencode(top)):
         folders[:] = [name for name in folders if os.path.join(folder, name) != os.fsencode(out)]
@@ -158,7 +159,7 @@ def beside(top: Path, out: Path) -> list[tuple[bytes, int, int]]:
 
 
 @pytest.fixture(scope="module")
-def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Made:
+def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> HostileDataset:
     """A dataset of photographs that bear `NAMES`, and of one in each of `FOLDERS`."""
     top = tmp_path_factory.mktemp("names")
     root, out = top / "photos", top / "ds"
@@ -168,9 +169,9 @@ def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Made:
         full = Path(os.fsdecode(os.path.join(os.fsencode(root), path)))
         full.parent.mkdir(parents=True, exist_ok=True)
         full.write_bytes(content)
-    before = beside(top, out)
+    before = paths_except(top, out)
     make(root, out, "output.pairs_per_shard=16")
-    return Made(root, out, contents, before)
+    return HostileDataset(root, out, contents, before)
 
 
 def cells(out: Path) -> list[list[str]]:
@@ -186,58 +187,58 @@ def table(out: Path) -> list[dict[str, str]]:
 # In the manifest ------------------------------------------------------------------------------------------------------
 
 
-def test_every_hostile_name_becomes_a_pair(made: Made) -> None:
+def test_every_hostile_name_gives_a_pair(made: HostileDataset) -> None:
     rows = table(made.out)
     assert (len(rows), {row["status"] for row in rows}) == (len(made.contents), {"ok"})
 
 
-def test_the_csv_gives_back_the_exact_bytes_of_every_name(made: Made) -> None:
+def test_manifest_preserves_bytes_of_every_name(made: HostileDataset) -> None:
     assert [os.fsencode(decode_name(row["source"])) for row in table(made.out)] == sorted(made.contents)
 
 
-def test_no_two_names_become_one(made: Made) -> None:
+def test_encoded_names_are_distinct(made: HostileDataset) -> None:
     assert len({row["source"] for row in table(made.out)}) == len(made.contents)
 
 
-def test_each_name_stands_beside_the_digest_of_its_own_file(made: Made) -> None:
+def test_each_row_has_the_digest_of_its_file(made: HostileDataset) -> None:
     stated = {os.fsencode(decode_name(row["source"])): row["source_sha256"] for row in table(made.out)}
     assert stated == {path: hashlib.sha256(content).hexdigest() for path, content in made.contents.items()}
 
 
-def test_a_row_is_one_line_for_any_reader_of_lines(made: Made) -> None:
+def test_each_row_is_one_line_for_str_splitlines(made: HostileDataset) -> None:
     text = (made.out / "manifest.csv").read_bytes().decode("utf-8")
     assert len(text.splitlines()) == len(made.contents) + 1
 
 
-def test_no_cell_begins_as_a_formula_unless_it_is_a_number(made: Made) -> None:
+def test_only_numbers_begin_like_a_formula(made: HostileDataset) -> None:
     suspicious = [cell for row in cells(made.out) for cell in row if cell.startswith(FORMULA_STARTS)]
     assert suspicious, "some entries of rgb2cam are negative"
     for cell in suspicious:
         float(cell)
 
 
-def test_no_source_begins_as_a_formula(made: Made) -> None:
+def test_no_source_begins_like_a_formula(made: HostileDataset) -> None:
     assert not [row["source"] for row in table(made.out) if row["source"].startswith(FORMULA_STARTS)]
 
 
-def test_no_cell_has_a_control_or_bidirectional_character(made: Made) -> None:
+def test_no_cell_has_control_or_bidirectional_characters(made: HostileDataset) -> None:
     assert not [cell for row in cells(made.out) for cell in row if UNSEEN.search(cell)]
 
 
-# On the disk ----------------------------------------------------------------------------------------------------------
+# Files -----------------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_beside_the_dataset_is_written_or_changed(made: Made) -> None:
-    assert beside(made.root.parent, made.out) == made.beside
+def test_nothing_outside_the_dataset_is_written_or_changed(made: HostileDataset) -> None:
+    assert paths_except(made.root.parent, made.out) == made.others
 
 
-def test_no_file_of_the_dataset_has_a_name_from_outside(made: Made) -> None:
+def test_no_dataset_file_is_named_after_a_source(made: HostileDataset) -> None:
     own = re.compile(r"(config\.yaml|dataset\.json|manifest\.csv|\.\w+|shards/shard-\d{5}\.tar)")
     files = [str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()]
     assert [name for name in files if not own.fullmatch(name)] == []
 
 
-def test_members_are_named_by_key_alone(made: Made) -> None:
+def test_shard_members_are_named_by_key(made: HostileDataset) -> None:
     found: list[str] = []
     for shard in sorted((made.out / "shards").iterdir()):
         with tarfile.open(shard) as opened:
@@ -246,7 +247,7 @@ def test_members_are_named_by_key_alone(made: Made) -> None:
     assert found == [f"{number:08d}.{kind}" for number in range(len(made.contents)) for kind in kinds]
 
 
-def test_the_json_in_a_shard_spells_the_name_as_the_manifest_does(made: Made) -> None:
+def test_json_members_have_the_names_of_the_manifest(made: HostileDataset) -> None:
     found: list[str] = []
     for shard in sorted((made.out / "shards").iterdir()):
         with tarfile.open(shard) as opened:
@@ -256,33 +257,33 @@ def test_the_json_in_a_shard_spells_the_name_as_the_manifest_does(made: Made) ->
     assert found == [row["source"] for row in table(made.out)]
 
 
-# Found again ----------------------------------------------------------------------------------------------------------
+# Replay, verify, read -------------------------------------------------------------------------------------------------
 
 
-def test_replay_finds_each_source_again_by_its_key(made: Made) -> None:
+def test_replay_finds_each_source_by_its_key(made: HostileDataset) -> None:
     for row in table(made.out):
         (one,) = replay(select_rows(made.out / "manifest.csv", None, row["key"]), str(made.root))
         assert (one.key, one.source, one.complaint) == (row["key"], row["source"], "")
 
 
-def test_replay_keeps_arrays_under_keys_alone(made: Made, door: Door, tmp_path: Path) -> None:
+def test_replay_names_arrays_by_key(made: HostileDataset, door: Door, tmp_path: Path) -> None:
     done = door("replay", made.out, "--keys", "00000000,00000007", "--to", tmp_path / "kept")
     assert done.code == 0
     kept = sorted(path.name for path in (tmp_path / "kept").iterdir())
     assert kept == [f"0000000{key}.{kind}.npy" for key in (0, 7) for kind in ("clean", "noisy")]
 
 
-def test_verify_makes_every_pair_again(made: Made, door: Door) -> None:
+def test_verify_regenerates_every_pair(made: HostileDataset, door: Door) -> None:
     count = len(made.contents)
     done = door("verify", made.out, "--regenerate", count)
     assert (done.code, done.out) == (0, f"{made.out} is intact; {count} pairs regenerated, bit for bit\n")
 
 
-def test_raw_pairs_gives_every_name(made: Made) -> None:
+def test_raw_pairs_returns_every_name(made: HostileDataset) -> None:
     assert [sample.row["source"] for sample in RawPairs(made.out)] == [row["source"] for row in table(made.out)]
 
 
-def test_the_same_folder_again_does_nothing(made: Made, door: Door) -> None:
+def test_rerun_on_a_finished_dataset_does_nothing(made: HostileDataset, door: Door) -> None:
     done = door(f"source.root={made.root}", f"out={made.out}", "output.pairs_per_shard=16")
     assert (done.code, "nothing to do" in done.out) == (0, True)
 
@@ -292,7 +293,7 @@ def test_the_same_folder_again_does_nothing(made: Made, door: Door) -> None:
 
 @pytest.fixture
 def broken(tmp_path: Path) -> Path:
-    """A folder of hostile names without a picture behind any of them."""
+    """Return a folder of files with hostile names that are no pictures."""
     folder = tmp_path / "broken"
     folder.mkdir()
     for name in NAMES:
@@ -301,11 +302,11 @@ def broken(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("verb", [(), ("plan", "--all")], ids=["a run", "plan"])
-def test_no_name_reaches_the_terminal_as_it_is(verb: tuple[str, ...], broken: Path, door: Door) -> None:
+def test_control_characters_of_names_do_not_reach_the_terminal(verb: tuple[str, ...], broken: Path, door: Door) -> None:
     done = door(*verb, f"source.root={broken}", "out=made", "n_jobs=1")
-    said = (done.out + done.err).replace("\n", "")
+    shown = (done.out + done.err).replace("\n", "")
     assert done.code in (0, 3)
-    assert UNSEEN.findall(said) == []
+    assert UNSEEN.findall(shown) == []
 
 
 # Folders on the command line ------------------------------------------------------------------------------------------
@@ -318,29 +319,61 @@ FOLDER_NAMES = (
 
 
 @pytest.mark.parametrize("name", FOLDER_NAMES, ids=ascii)
-def test_folders_of_any_name_are_used_as_they_are_or_refused_in_one_line(name: str, door: Door, tmp_path: Path) -> None:
+def test_folders_of_any_name_are_used_or_refused_in_one_line(name: str, door: Door, tmp_path: Path) -> None:
     root, out = tmp_path / name, tmp_path / f"{name[:254]}2"
     root.mkdir()
     (root / "a.png").write_bytes(photograph(0))
-    before = beside(tmp_path, tmp_path / "nowhere")
+    before = paths_except(tmp_path, tmp_path / "nowhere")
     done = door(f"source.root={root.name}", f"out={out.name}", "n_jobs=1")
     if done.code == 0:
         assert [(row["source"], row["status"]) for row in table(out)] == [("a.png", "ok")]
-        assert beside(tmp_path, out) == before
+        assert paths_except(tmp_path, out) == before
     else:
         assert (done.code, done.out, len(done.err.strip("\n").split("\n"))) == (2, "", 1)
-        assert beside(tmp_path, tmp_path / "nowhere") == before
+        assert paths_except(tmp_path, tmp_path / "nowhere") == before
 
 
 @pytest.mark.parametrize("mark", ["'", '"'])
-def test_a_folder_named_in_quotes_is_the_one_without_them(mark: str, door: Door, tmp_path: Path) -> None:
+def test_quotes_around_a_folder_name_are_removed(mark: str, door: Door, tmp_path: Path) -> None:
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "a.png").write_bytes(photograph(0))
     done = door(f"source.root={mark}a b{mark}", f"out={mark}c d{mark}", "n_jobs=1")
     assert (done.code, len(table(tmp_path / "c d"))) == (0, 1)
 
 
-# Names that nobody thought of -----------------------------------------------------------------------------------------
+VERB_ARGUMENTS = {
+    "verify": ["--regenerate", "1", "--source", "SOURCE"],
+    "replay": ["--keys", "0", "source.root=SOURCE"],
+    "report": ["--to", "page.html", "--source=SOURCE"],
+    "preview": ["--keys", "0", "--to", "sheets", "--source", "SOURCE"],
+    "dng": ["--keys", "0", "--clean", "--to", "dngs"],
+    "again": ["out=copy", "n_jobs=1", "source.root=SOURCE"],
+}
+DATASET_NAMES = ("camera=sony_a7r,seed=1", "source.root=x", "out=2", "-x", "--to", "a b", "verify", "~x")
+
+
+@pytest.mark.parametrize("name", DATASET_NAMES)
+@pytest.mark.parametrize("verb", VERB_ARGUMENTS)
+def test_every_verb_takes_a_dataset_of_any_name(verb: str, name: str, wide: Path, door: Door, tmp_path: Path) -> None:
+    shutil.copytree(wide, tmp_path / name)
+    arguments = [argument.replace("SOURCE", str(wide.parent / "photos")) for argument in VERB_ARGUMENTS[verb]]
+    done = door(verb, *arguments, "--", name)
+    assert done.code == 0, done.err
+    if not name.startswith("-"):
+        assert door("verify", name).out == f"{name} is intact\n"
+
+
+@pytest.fixture(scope="module")
+def wide(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of one photograph that a DNG file can hold."""
+    folder = tmp_path_factory.mktemp("wide")
+    (folder / "photos").mkdir()
+    Image.fromarray(np.arange(32 * 32 * 3, dtype=np.uint8).reshape(32, 32, 3)).save(folder / "photos/a.png")
+    make(folder / "photos", folder / "ds")
+    return folder / "ds"
+
+
+# Random names -----------------------------------------------------------------------------------------
 
 HARD_TEXT = st.text(st.characters(exclude_characters="\0/", exclude_categories=["Cs"]))
 HARD_BYTES = st.binary().map(lambda raw: raw.translate(None, b"\0/"))
@@ -352,7 +385,7 @@ PATHS = st.lists(PARTS, min_size=1, max_size=3).map(b"/".join).map(os.fsdecode)
 
 
 def check_spelling(path: str) -> None:
-    """One name: harmless, one line, in a CSV too, and found again to the byte."""
+    """Check that a name is encoded harmlessly, on one line of a CSV file, and decoded to the same bytes."""
     name = encode_name(path)
     assert decode_name(name) == path
     assert not name.startswith(FORMULA_STARTS)
@@ -367,48 +400,48 @@ def check_spelling(path: str) -> None:
 
 @given(PATHS)
 @settings(max_examples=200, deadline=None)
-def test_any_name_is_spelled_harmlessly_and_found_again(path: str) -> None:
+def test_random_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
     check_spelling(path)
 
 
 @pytest.mark.slow
 @given(PATHS)
 @settings(max_examples=10_000, deadline=None)
-def test_ten_thousand_names_are_spelled_harmlessly_and_found_again(path: str) -> None:
+def test_ten_thousand_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
     check_spelling(path)
 
 
 @given(PATHS, PATHS)
 @settings(max_examples=100, deadline=None)
-def test_two_names_never_share_a_spelling(one: str, other: str) -> None:
+def test_two_names_have_different_encodings(one: str, other: str) -> None:
     assert (encode_name(one) == encode_name(other)) == (one == other)
 
 
 @given(PATHS)
 @settings(max_examples=100, deadline=None)
-def test_a_spelling_is_never_taken_for_another_name(path: str) -> None:
+def test_encoded_names_can_be_encoded_again(path: str) -> None:
     name = encode_name(path)
     assert decode_name(encode_name(name)) == name
 
 
 @pytest.fixture(scope="module")
 def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[bytes], Path]]:
-    """Return a function that makes an empty folder with one file of a name in it."""
+    """Return a function that creates a folder with one file of the given name."""
     top = tmp_path_factory.mktemp("playground")
     count = iter(range(10**6))
 
-    def played(name: bytes) -> Path:
+    def created(name: bytes) -> Path:
         folder = top / str(next(count))
         folder.mkdir()
         Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(name)
         return folder
 
-    yield played
+    yield created
 
 
 @given(PARTS.map(lambda raw: raw[:255]).filter(lambda raw: raw not in (b"", b".", b"..")))
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_file_of_any_name_is_listed_and_read(playground: Callable[[bytes], Path], name: bytes) -> None:
+def test_files_of_any_name_are_listed_and_read(playground: Callable[[bytes], Path], name: bytes) -> None:
     root = playground(name)
     (source,) = list_folder(str(root), ["*"], True, None).sources
     found_again = Source(0, source.name, decode_name(source.name), source.size_bytes)

@@ -1,28 +1,63 @@
-"""Modules that a run loads before its first pair."""
+"""Modules that a run imports, and memory that a worker keeps."""
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 RUN = """
 import sys
-from unprocess_gen.cli import main as cli
-assert cli.main() == 0
+from unprocess_gen.cli.main import main
+assert main() == 0
 print(*sys.modules)
 """
 
-NEVER = {"joblib", "asyncio", "matplotlib", "PIL", "av"}
-"""Libraries that are slow to load and that a run of one job from a folder of photographs does not need."""
+UNUSED = {"joblib", "asyncio", "matplotlib", "PIL", "av", "jinja2"}
+"""Modules that are slow or large to import, and that a run of one job from a folder of photographs does not use."""
 
 
-def run(*arguments: str) -> set[str]:
-    """Run the tool in a process of its own; return the modules that it loaded."""
-    command = [sys.executable, "-c", RUN, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+def imported(*arguments: str) -> set[str]:
+    """Run the command in its own process, and return the modules that are imported at the end."""
+    done = subprocess.run([sys.executable, "-c", RUN, *arguments], capture_output=True, text=True, check=True)
     return set(done.stdout.splitlines()[-1].split())
 
 
-def test_a_run_of_one_job_loads_no_optional_libraries(photos: Path, tmp_path: Path) -> None:
-    assert not run(f"out={tmp_path / 'ds'}", f"source.root={photos}", "n_jobs=1") & NEVER
+def test_run_imports_no_unused_module(photos: Path, tmp_path: Path) -> None:
+    settings = (f"source.root={photos}", "n_jobs=1")
+    imported(f"out={tmp_path / 'before'}", *settings)  # compiles kernels that are not cached
+    assert not imported(f"out={tmp_path / 'ds'}", *settings) & UNUSED
+
+
+def test_help_and_version_import_nothing_slow() -> None:
+    slow = {"hydra", "omegaconf", "numpy", "numba", "cv2", "joblib", "PIL", "yaml", "tqdm"}
+    for argument in ("--help", "--version"):
+        assert not imported(argument) & slow
+    assert not imported("verify", "--help") & slow
+
+
+KEEPING = """
+import resource, sys
+import numpy as np
+from unprocess_gen.pipeline.worker import keep_memory
+if sys.argv[1] == "keep":
+    keep_memory()
+faults = [resource.getrusage(resource.RUSAGE_SELF).ru_minflt]
+for _ in range(9):
+    array = np.ones(40_000_000, dtype=np.uint8)
+    del array
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+print(faults[-1] - faults[1])
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="mallopt is glibc's")
+def test_worker_reuses_memory_of_the_previous_image() -> None:
+    def faults(how: str) -> int:
+        command = [sys.executable, "-c", KEEPING, how]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+    assert faults("keep") < 40 <= faults("give back") / 4

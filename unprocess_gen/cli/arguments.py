@@ -45,7 +45,7 @@ class Argument:
     Attributes
     ----------
     names : tuple of str
-        Its spellings: ``--flag`` is followed by a value, ``key`` stands for ``key=value``.
+        Its spellings: ``--flag`` is followed by its value; ``key`` means ``key=value``.
     help : str
         One phrase for ``--help``.
     metavar : str

@@ -45,13 +45,20 @@ class TerminationSignal(BaseException):
 
 
 def main() -> int:
-    """Run ``gen-dataset`` with the arguments of this process; return the exit code."""
+    """Run ``gen-dataset`` with the arguments of this process.
+
+    Returns
+    -------
+    int
+        The exit code; see ``gen-dataset --help``.
+    """
     for limit in OPENCV_LIMITS:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
     with checked_streams():
         signals = _catch_signals()
-        unraisable, sys.unraisablehook = sys.unraisablehook, _SignalRepeater()
+        repeater = _SignalRepeater()
+        unraisable, sys.unraisablehook = sys.unraisablehook, repeater
         try:
             code = _exit_code(lambda: run(arguments), arguments)
             return _exit_code(_flush_stdout, arguments) or code
@@ -59,6 +66,7 @@ def main() -> int:
             for number in signals:
                 signal.signal(number, signal.SIG_DFL)  # a late signal ends the process without a traceback
             sys.unraisablehook = unraisable
+            repeater.cancel()
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -201,6 +209,12 @@ class _SignalRepeater:
 
     def __init__(self) -> None:
         self.lost: int | None = None
+        self._timer: threading.Timer | None = None
+
+    def cancel(self) -> None:
+        """Do not send a signal that is still due."""
+        if self._timer is not None:
+            self._timer.cancel()
 
     def __call__(self, unraisable: sys.UnraisableHookArgs) -> None:
         """Repeat the signal that ``unraisable`` belongs to; pass anything else on."""
@@ -212,6 +226,7 @@ class _SignalRepeater:
         else:
             sys.__unraisablehook__(unraisable)
             return
-        timer = threading.Timer(self.DELAY_S, os.kill, (os.getpid(), self.lost))
-        timer.daemon = True
-        timer.start()
+        self.cancel()
+        self._timer = threading.Timer(self.DELAY_S, os.kill, (os.getpid(), self.lost))
+        self._timer.daemon = True
+        self._timer.start()
