@@ -225,7 +225,7 @@ def test_no_cell_has_control_or_bidirectional_characters(made: HostileDataset) -
     assert not [cell for row in cells(made.out) for cell in row if UNSEEN.search(cell)]
 
 
-# Files -----------------------------------------------------------------------------------------------------------------
+# Files ----------------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_outside_the_dataset_is_written_or_changed(made: HostileDataset) -> None:

@@ -281,7 +281,7 @@ def _assign_words(verb: Verb, words: list[str], values: dict[str, Any]) -> Call:
     others = []
     for word in words:
         key, equals, text = word.partition("=")
-        if verb.words and not equals:
+        if verb.words:
             others.append(word)
         elif not equals or key not in known:
             raise ConfigError(f"{verb.name}: {word}: unknown argument; {_expected(verb, key)}")
