@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import hydra
@@ -11,7 +15,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 
-from unprocess_gen.config.composition import load_config
+from unprocess_gen.config.composition import OptionFolders, compose_node, load_config
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
@@ -134,3 +138,88 @@ def test_home_folder_is_expanded() -> None:
 def test_options_of_a_group_are_listed() -> None:
     assert group_options("accuracy") == ["exact", "fast", "reference"]
     assert group_options("nope") == []
+
+
+BOMB = "".join(f"l{level}: &l{level} [{', '.join([f'*l{level - 1}' if level else '1'] * 9)}]\n" for level in range(12))
+HOSTILE = {
+    "empty": ("", "the file contains no keys"),
+    "comment only": ("# nothing\n", "the file contains no keys"),
+    "list": ("- a\n- b\n", "expected a YAML mapping"),
+    "text": ("word\n", "expected a YAML mapping"),
+    "alias bomb": (BOMB, "values after aliases are expanded"),
+    "brackets": ("a: " + "[" * 200_000, "nested more than"),
+    "open mapping": ("name: [", "not valid YAML"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+@pytest.mark.parametrize("place", ["noise", "experiment", "."])
+def test_hostile_option_files_are_refused_in_one_line(case: str, place: str, tmp_path: Path) -> None:
+    text, sentence = HOSTILE[case]
+    (tmp_path / place).mkdir(exist_ok=True)
+    (tmp_path / place / "own.yaml").write_text(text)
+    overrides = {"noise": ["noise=own"], "experiment": ["+experiment=own"], ".": []}[place]
+    folders = OptionFolders(name="own" if place == "." else "config", own=tmp_path)
+    started = time.monotonic()
+
+    with pytest.raises(ConfigError, match=sentence) as caught:
+        compose_node(overrides, folders)
+
+    assert str(tmp_path / place / "own.yaml") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert time.monotonic() - started < 5
+
+
+def test_hostile_option_files_that_are_not_used_do_no_harm(own: Path) -> None:
+    (own / "noise/empty.yaml").write_text("")
+    assert load_config(["noise=own", "noise.bits=null"], own).noise.name == "own"
+
+
+def test_files_of_searchpath_are_checked_too(own: Path) -> None:
+    (own / "noise/empty.yaml").write_text("")
+    with pytest.raises(ConfigError, match="the file contains no keys"):
+        load_config([f"hydra.searchpath=[file://{own}]", "noise=empty"])
+    assert load_config([f"hydra.searchpath=[{own}]", "noise=own", "noise.bits=null"]).noise.name == "own"
+
+
+def test_option_files_that_cannot_be_read_are_refused(own: Path) -> None:
+    (own / "noise/latin.yaml").write_bytes("name: \xe9t\xe9\n".encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"latin.yaml: not UTF-8"):
+        load_config(["noise=latin"], own)
+
+
+@pytest.mark.parametrize("depth", [300, 1000, 50_000])
+def test_nested_overrides_are_refused_quickly(depth: int) -> None:
+    started = time.monotonic()
+    with pytest.raises(ConfigError, match="nested too deeply"):
+        load_config(["source.include=" + "[" * depth + "]" * depth])
+    assert time.monotonic() - started < 5
+
+
+SLOW = """
+import os, sys, time
+from unprocess_gen.cli import main
+from unprocess_gen.config import yaml_files, composition
+def slowly(path):
+    open("started", "w").close()
+    time.sleep(60)
+composition.read_yaml_mapping = slowly
+sys.argv = ["gen-dataset", "--config-dir", "mine", "noise=own"]
+sys.exit(main.main())
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_signals_end_composing_within_two_seconds(number: int, code: int, own: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", SLOW], cwd=own.parent, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 60
+    while not (own.parent / "started").exists():
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.01)
+    process.send_signal(number)
+    started = time.monotonic()
+    _, errors = process.communicate(timeout=30)
+
+    assert time.monotonic() - started < 2
+    assert process.returncode in (code, -number)
+    assert "Traceback" not in errors

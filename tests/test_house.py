@@ -12,10 +12,16 @@ import unprocess_gen
 PACKAGE = Path(unprocess_gen.__file__).parent
 
 ONLY_IN = {
-    "hydra": {"cli.hydra_app", "config.composition", "config.composition_errors", "config.sweep_expansion"},
+    "hydra": {
+        "cli.hydra_app",
+        "config.composition",
+        "config.composition_errors",
+        "config.sweep_expansion",
+        "cli.sweep_plugins",
+    },
     "omegaconf": {
         *("cli.hydra_app", "config.composition", "config.composition_errors", "config.serialization"),
-        "config.sweep_expansion",
+        *("cli.sweep_plugins", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},
     "llvmlite": {"simulation.kernels.simd"},

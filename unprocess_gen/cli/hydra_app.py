@@ -131,13 +131,18 @@ def compose(
     from unprocess_gen.config.composition import validated_config
     from unprocess_gen.config.sweep_expansion import expand
 
-    expansion = expand(request.overrides, request.folders(), request.multirun)
+    use_plugins = sweep_csv and not request.prints_config
+    expansion = expand(request.overrides, request.folders(), request.multirun, use_plugins)
     if expansion.node is not None:
         if request.prints_config:
             return _print_with_hydra(request.flags, request.overrides)
         return task(validated_config(expansion.node, request.overrides), "")[0]
     if request.prints_config:
         return worst([_print_with_hydra(request.flags, list(job.overrides)) for job in expansion.jobs])
+    if expansion.plugins and use_plugins:
+        from unprocess_gen.cli.sweep_plugins import run_with_plugins
+
+        return run_with_plugins(request, expansion, task)
     return _run_sweep(request, expansion, task, sweep_csv, totals)
 
 
@@ -193,6 +198,27 @@ def _run_job(folders: OptionFolders, job: SweepJob, task: Task, place: str) -> t
 
 def _print_with_hydra(flags: Sequence[str], overrides: Sequence[str]) -> int:
     """Let Hydra print what its flags ask for, and return 0."""
+    run_hydra(flags, overrides, lambda node: None)
+    return 0
+
+
+def run_hydra(flags: Sequence[str], overrides: Sequence[str], job: Callable[[Any], Any]) -> None:
+    """Run a Hydra application.
+
+    Parameters
+    ----------
+    flags : sequence of str
+        Hydra's flags with their values.
+    overrides : sequence of str
+        Overrides as the user wrote them.
+    job : callable
+        Hydra's task function; takes the composed DictConfig.
+
+    Raises
+    ------
+    ConfigError
+        If Hydra refuses an override or an option file.
+    """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # documented switch: Hydra raises instead of printing several lines
     import hydra
     from hydra.errors import HydraException
@@ -206,10 +232,9 @@ def _print_with_hydra(flags: Sequence[str], overrides: Sequence[str]) -> int:
     sys.argv = ["gen-dataset", *flags, *map(quoted_path, overrides)]
     application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_dir()), config_name="config")
     try:
-        application(lambda node: None)()
+        application(job)()
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(explain(error, overrides)) from error
-    return 0
 
 
 # --------------------------------------------------------------------------------------------------------- arguments

@@ -22,6 +22,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
@@ -129,7 +130,8 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
         raise ConfigError(f"--config-dir: folder '{folders.own}' not found; expected a folder of option files")
     try:
         with _hydra_for(folders):
-            return hydra.compose(folders.name, [quoted_path(one) for one in overrides], return_hydra_config=True)
+            prepared = [_checked_searchpath(quoted_path(one)) for one in overrides]
+            return hydra.compose(folders.name, prepared, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
         raise ConfigError(explain(error, overrides)) from error
 
@@ -190,6 +192,19 @@ def quoted_path(override: str) -> str:
     path = re.sub(r"(\\*)'", r"\1\1\\'", path)
     path = re.sub(r"(\\+)$", r"\1\1", path)
     return f"{key}='{path}'"
+
+
+def _checked_searchpath(override: str) -> str:
+    """Return an override of ``hydra.searchpath`` with folders that are read through `CheckedFiles`."""
+    if not override.startswith("hydra.searchpath="):
+        return override
+    value = OverridesParser.create().parse_override(override).value()
+    if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
+        return override  # Hydra reports it
+    paths = [path.removeprefix("file://") for path in value]
+    checked = [path if "://" in path else f"{CheckedFiles.scheme()}://{Path(path).absolute()}" for path in paths]
+    quoted = ",".join("'" + re.sub(r"(\\*)'", r"\1\1\\'", path) + "'" for path in checked)
+    return f"hydra.searchpath=[{quoted}]"
 
 
 def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> Iterator[str]:

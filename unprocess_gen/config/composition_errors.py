@@ -30,6 +30,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         ``key=value: problem; expected …``, or the message of ``error`` on one line.
     """
     for link in _chain(error):
+        if isinstance(link, RecursionError):
+            return "an override or option file is nested too deeply; expected lists and mappings of a few levels"
         if isinstance(link, MissingConfigException) and link.missing_cfg_file:
             return _missing_file(link)
         if isinstance(link, OverrideParseException):

@@ -7,6 +7,9 @@ from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
 
+MAX_BRACKETS = 1000
+"""Most opening brackets of one override; Hydra's parser recurses once for each level of nesting."""
+
 ADDED_GROUPS = {"experiment": "a recipe", "sweep": "a sweep"}
 """Groups without settings of their own, and what their options are: added with ``+``, in no defaults list."""
 
@@ -65,6 +68,8 @@ def check_override(override: str) -> None:
         If it is not ``key=value``, removes a key, or gives a group something that is not the name of an option.
     """
     key, equals, value = override.lstrip("+").partition("=")
+    if max(override.count(bracket) for bracket in "[{(") > MAX_BRACKETS:
+        raise ConfigError(f"{override[:60]}…: nested too deeply; expected at most {MAX_BRACKETS} brackets")
     if override.startswith("~"):
         raise ConfigError(f"{override}: a setting cannot be taken away; choose another value or option")
     if not equals:

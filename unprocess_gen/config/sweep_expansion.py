@@ -31,7 +31,7 @@ BUILT_IN = "hydra._internal.core_plugins.basic_"
 
 FIXED_KEYS: dict[str, tuple[Any, ...]] = {
     "run.dir": (".", "outputs/${now:%Y-%m-%d}/${now:%H-%M-%S}"),
-    "sweep.dir": ("${out}/.hydra", "multirun/${now:%Y-%m-%d}/${now:%H-%M-%S}"),
+    "sweep.dir": ("multirun/${now:%Y-%m-%d}/${now:%H-%M-%S}",),
     "sweep.subdir": ("${hydra.job.num}",),
     "job.chdir": (False, None),
     "job.env_set": ({},),
@@ -74,12 +74,18 @@ class Expansion:
         Classes of the user's Hydra launcher and sweeper that run the sweep, if any.
     described_by : tuple of str
         The overrides whose option files contain the swept values; they are not in the names of folders.
+    fixed : tuple of str
+        The overrides that are equal in all jobs.
+    out : str
+        The sweep's folder; empty if no job can be composed.
     """
 
     node: DictConfig | None
     jobs: tuple[SweepJob, ...] = ()
     plugins: tuple[str, ...] = ()
     described_by: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+    out: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +114,9 @@ class _Choice:
         return [f"{self.key}={value}" for value in self.values]
 
 
-def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = False) -> Expansion:
+def expand(
+    overrides: Sequence[str], folders: OptionFolders, multirun: bool = False, use_plugins: bool = False
+) -> Expansion:
     """Decide whether overrides describe one run or a sweep, and list the jobs of a sweep.
 
     A sweep is requested by ``multirun`` or by ``hydra.mode: MULTIRUN`` in an option file. Its values come from the
@@ -122,6 +130,8 @@ def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = Fa
         What to compose from.
     multirun : bool
         Whether the user asked for a sweep (``-m``).
+    use_plugins : bool
+        Whether to leave the expansion to the user's Hydra launcher or sweeper plugin, if the config has one.
 
     Returns
     -------
@@ -138,6 +148,7 @@ def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = Fa
     jobs: list[SweepJob] = []
     plugins: tuple[str, ...] = ()
     described: tuple[str, ...] = ()
+    out = ""
     bases: dict[tuple[str, ...], tuple[list[_Choice], tuple[str, ...]]] = {}
     for combination in itertools.product(*(choice.overrides() for choice in swept_groups)):
         fixed = [choice.text for choice in choices if not choice.swept]
@@ -150,6 +161,7 @@ def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = Fa
             continue
         _check_hydra_settings(node)
         plugins = plugins or _plugins(node)
+        out = out or str(OmegaConf.select(node, "out"))
         if not multirun and not _is_multirun(node):
             _refuse_values_without_sweep(choices, node)
             return Expansion(node)
@@ -157,6 +169,13 @@ def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = Fa
         origin = _described_by(_raw_params(node), choices, [*fixed, *combination], folders)
         described += origin
         bases[combination] = params, origin
+    fixed_overrides = tuple(one for choice in choices if not choice.swept for one in choice.overrides())
+    described = tuple(dict.fromkeys(described))
+    if plugins and use_plugins:
+        return Expansion(None, (), plugins, described, fixed_overrides, out)
+    for choice in choices:
+        if choice.swept and not choice.values:
+            raise ConfigError(f"{choice.text}: an interval has no list of values; expected choice or range")
     for own in _combinations(choices):
         combination = tuple(own[choice.key] for choice in swept_groups)
         params, origin = bases[combination]
@@ -164,7 +183,7 @@ def expand(overrides: Sequence[str], folders: OptionFolders, multirun: bool = Fa
             jobs.append(_job(own, added, [*choices, *params], origin))
             if len(jobs) > MAX_JOBS:
                 raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
-    return Expansion(None, tuple(jobs), plugins, tuple(dict.fromkeys(described)))
+    return Expansion(None, tuple(jobs), plugins, described, fixed_overrides, out)
 
 
 def check_job(node: DictConfig, job: SweepJob) -> None:
@@ -203,13 +222,13 @@ def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
             if not one.is_sweep_override():
                 choices[key] = _Choice(key, (one.get_value_element_as_str(),), False, text)
             elif not one.is_discrete_sweep():
-                raise ConfigError(f"{one.input_line}: an interval has no list of values; expected choice or range")
+                choices[key] = _Choice(key, (), True, text)  # an interval: for sweeper plugins only
             else:
                 values = tuple(itertools.islice(one.sweep_string_iterator(), MAX_JOBS + 1))
                 choices[key] = _Choice(key, values, True, text)
     except (HydraException, ValueError, RecursionError) as error:
         raise ConfigError(explain(error, overrides)) from error
-    if math.prod(len(choice.values) for choice in choices.values()) > MAX_JOBS:
+    if math.prod(max(len(choice.values), 1) for choice in choices.values()) > MAX_JOBS:
         raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
     return list(choices.values())
 
