@@ -13,14 +13,14 @@ PACKAGE = Path(unprocess_gen.__file__).parent
 
 ONLY_IN = {
     "hydra": {
-        "cli.hydra_app",
+        "cli.hydra_request",
         "config.composition",
         "config.composition_errors",
         "config.sweep_expansion",
         "cli.sweep_plugins",
     },
     "omegaconf": {
-        *("cli.hydra_app", "config.composition", "config.composition_errors", "config.serialization"),
+        *("cli.hydra_request", "config.composition", "config.composition_errors", "config.serialization"),
         *("cli.sweep_plugins", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},

@@ -18,7 +18,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from unprocess_gen.cli.hydra_app import Request, Task, run_hydra
+from unprocess_gen.cli.hydra_request import Request, Task, run_hydra
 from unprocess_gen.cli.messages import report_error
 from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, worst, write_table
 from unprocess_gen.config.composition import validated_config
