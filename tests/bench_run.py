@@ -1,13 +1,12 @@
-"""What whole runs cost beside the least they can: every file decoded once, the same bytes hashed, written and synced.
+"""Time complete runs against a lower bound: every file decoded once, the same bytes hashed, written and synced.
 
     python tests/bench_run.py PHOTO [PHOTO ...] [--copies 10] [--rounds 3] [--to FOLDER]
 
-Copies the photographs under other names and, in turns, makes datasets of them and does only what no tool can leave
-out (the floor: `cv2.imdecode`, one SHA-256, one write and one fdatasync of as many bytes, one thread). Times are from
-the first pair to the last, the floor's those before and after a run; ratios are medians over the rounds. Prints a
-Markdown table: one worker with a core to spare, one worker pinned to one core, two workers and five noise levels
-against that, the start (from the process's to the first bytes in a shard, which are written when its first pair is
-made; the least of several), and the peak memory of a worker.
+The benchmark copies the photographs under other names. It alternates between making datasets of them and the lower
+bound: `cv2.imdecode`, one SHA-256, one write and one fdatasync of as many bytes, in one thread. Times last from the
+first pair to the last; ratios are medians over the rounds. It prints a Markdown table: one worker with a core to spare,
+one worker on one core, and two workers and five noise levels compared with that. Below it are the peak memory of a
+worker, and the shortest of several starts: from the start of the process to the first bytes in a shard.
 """
 
 from __future__ import annotations
@@ -35,15 +34,15 @@ from unprocess_gen.cli import main as cli
 from unprocess_gen.pipeline import workspace
 committed = []
 commit = workspace.Workspace.commit
-def told(self, made):
-    commit(self, made)
+def commit_timed(self, result):
+    commit(self, result)
     committed.append(time.time())
-workspace.Workspace.commit = told
+workspace.Workspace.commit = commit_timed
 begin = workspace.Workspace.begin
-def begun(self, sources):
+def begin_timed(self, sources):
     begin(self, sources)
     committed.append(time.time())
-workspace.Workspace.begin = begun
+workspace.Workspace.begin = begin_timed
 sys.argv = ["gen-dataset", *sys.argv[2:]]
 code = cli.main()
 peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -75,21 +74,21 @@ def run(cores: Sequence[int], *arguments: str) -> dict[str, float]:
     """Time one run of the tool in a process of its own."""
     command = [sys.executable, "-c", RUN, json.dumps(list(cores)), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    told: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    assert told["code"] == 0, done.stderr
-    return told
+    measured: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    assert measured["code"] == 0, done.stderr
+    return measured
 
 
 def has_pair(out: Path) -> bool:
-    """Whether a shard has bytes."""
+    """Return whether a shard has bytes."""
     try:
         return any(path.stat().st_size for path in out.glob(".work/*/shard-*.tar.*"))
     except FileNotFoundError:
-        return True  # it was put into place just now
+        return True  # it was committed just now
 
 
 def start(cores: Sequence[int], out: Path, *arguments: str) -> float:
-    """Time a process of the tool from its start to its first pair; it then goes on to its end."""
+    """Time a process of the tool from its start to its first pair, and wait for its end."""
     pin = f"import os; os.sched_setaffinity(0, {list(cores)}); from unprocess_gen.cli import main; main.main()"
     started = time.perf_counter()
     command = [sys.executable, "-c", pin, *arguments, f"out={out}"]
@@ -103,7 +102,7 @@ def start(cores: Sequence[int], out: Path, *arguments: str) -> float:
 
 
 def floor(names: Path, to: Path) -> float:
-    """Time what no tool can leave out, on one core."""
+    """Time the lower bound on one core."""
     command = [sys.executable, "-c", FLOOR, json.dumps(sorted(os.sched_getaffinity(0))[-1:]), str(to), str(names)]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
@@ -123,7 +122,7 @@ def main() -> None:
             files.append(shutil.copy(photo, source / f"{copy:02d}_{photo.name}"))
     names = options.to / "names.json"
     names.write_text(json.dumps([os.path.abspath(name) for name in sorted(files)]))
-    said = (f"source.root={source}", f"out={out}")
+    settings = (f"source.root={source}", f"out={out}")
     all_cores = sorted(os.sched_getaffinity(0))
     levels = "noise.levels=5"
     runs: dict[str, tuple[list[int], tuple[str, ...]]] = {
@@ -133,13 +132,13 @@ def main() -> None:
         "five levels": (all_cores[-1:], ("n_jobs=1", levels)),
     }
     against = {"core to spare": "", "one core": "", "two workers": "one core", "five levels": "one core"}
-    run(all_cores, "source.limit=1", f"out={options.to / 'warm'}", said[0], "n_jobs=1")
+    run(all_cores, "source.limit=1", f"out={options.to / 'warm'}", settings[0], "n_jobs=1")
     times: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
     floors: dict[str, list[float]] = {name: [] for name, other in against.items() if not other}
     for _ in range(options.rounds):
         for name, (cores, more) in runs.items():
             around = [] if against[name] else [floor(names, options.to / "floor.bin")]
-            times[name].append(run(cores, *said, *more))
+            times[name].append(run(cores, *settings, *more))
             shutil.rmtree(out)
             if around:
                 floors[name].append(statistics.mean([*around, floor(names, options.to / "floor.bin")]))
@@ -147,12 +146,12 @@ def main() -> None:
     print(f"| floor | {statistics.median(itertools.chain(*floors.values())):.2f} | | |")
     for name, other in against.items():
         own = [one["seconds"] for one in times[name]]
-        beside = [one["seconds"] for one in times[other]] if other else floors[name]
-        ratio = statistics.median(a / b for a, b in zip(own, beside, strict=True))
+        compared = [one["seconds"] for one in times[other]] if other else floors[name]
+        ratio = statistics.median(a / b for a, b in zip(own, compared, strict=True))
         print(f"| {name} | {statistics.median(own):.2f} | {ratio:.3f} | {other or 'floor'} |")
     peak = max(one["kib"] for one in times["one core"])
     print(f"\npeak of a process {peak:.0f} KiB; from the start to the first pair:")
-    small = (said[0], "source.limit=2", "output.pairs_per_shard=1")
+    small = (settings[0], "source.limit=2", "output.pairs_per_shard=1")
     for name in ("core to spare", "one core", "two workers"):
         cores, more = runs[name]
         least = min(start(cores, out, *small, *more) for _ in range(STARTS))

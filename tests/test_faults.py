@@ -1,9 +1,8 @@
-"""Faults that are real: kills at random moments, full and read-only disks, want of memory, folders that vanish.
+"""Real faults: kills at random moments, full and read-only disks, little memory, deleted folders, signals.
 
-Shown is that whatever happens costs one line and a few seconds, leaves no process behind, and that the same command
-then makes the dataset that an undisturbed run makes, to the byte. What a run leaves behind each of its renames, and
-what it refuses when it is started again, stands in ``test_resume``. Tests of disks mount small file systems; where that
-is not permitted they are skipped, and run under ``unshare -Urm``.
+Each fault costs one line and a few seconds and leaves no process. The same command then makes the dataset that an
+undisturbed run makes, to the byte. `test_resume` covers kills around each rename and refused reruns. Tests of disks
+mount small file systems; without permission to mount they are skipped, and run under ``unshare -Urm``.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ import numpy as np
 import pytest
 from conftest import Cli, fill, pixels
 from PIL import Image
-from test_resume import LOKY_TRACKER, ONE, Killed, assert_whole, committed, running, session, wait_for, workers
+from test_resume import ONE, Killed, assert_whole, committed, running, session, wait_for, workers
 
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
 from unprocess_gen.dataset.manifest import read_rows
@@ -52,17 +51,17 @@ def undisturbed(photographs: Path, make: Make, tree_hash: Hash) -> str:
 
 
 def own_lines(err: str) -> list[str]:
-    """Return the lines of stderr but progress, and what loky's own tracker process may say."""
-    return [line for line in err.splitlines() if "images/s" not in line and not any(p in line for p in LOKY_TRACKER)]
+    """Return the lines of stderr that are not progress."""
+    return [line for line in err.splitlines() if "images/s" not in line]
 
 
 def wait_for_the_end(leader: int) -> None:
-    """Wait until every process of a run is gone, three seconds at most."""
-    wait_for(lambda: not session(leader), seconds=10)  # one that still imports has no watch yet
+    """Wait until every process of a run has ended, ten seconds at most."""
+    wait_for(lambda: not session(leader), seconds=10)  # a worker that still imports has no watchdog
 
 
 def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let ``action`` happen when a run of this process has committed so many shards."""
+    """Call ``action`` once a run of this process has committed ``number`` shards."""
     commit, done = Workspace.commit, []
 
     def commits(self: Workspace, made: Any) -> None:
@@ -78,7 +77,7 @@ def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.Mo
 
 
 class Course(NamedTuple):
-    """When a run of two workers has its first worker, and when it is done, in seconds from its start."""
+    """Hold when a run of two workers starts its first worker and when it ends, in seconds from its start."""
 
     worker: float
     done: float
@@ -86,7 +85,7 @@ class Course(NamedTuple):
 
 @pytest.fixture(scope="module")
 def course(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Course:
-    """Measured on the second of two runs."""
+    """Measure the second of two runs."""
     for i in range(2):
         out = tmp_path_factory.mktemp("course")
         start = time.monotonic()
@@ -105,17 +104,17 @@ def workers_of(leader: int) -> list[int]:
 
 
 def moment_of(draw: random.Random, course: Course) -> float:
-    """Return a moment: one in four anywhere in a run, imports included, the others while shards are made."""
+    """Return a random moment: one in four anywhere in a run, imports included, the others while shards are made."""
     return draw.uniform(0 if draw.random() < 0.25 else course.worker, course.done)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("whom", "kills"), [("coordinator", 34), ("group", 33)])
-def test_a_run_killed_at_random_moments_ends_as_if_undisturbed_when_run_again(
+def test_run_killed_at_random_moments_resumes_to_the_same_bytes(
     whom: str, kills: int, photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: Hash,
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    """After a kill of the coordinator alone its workers are gone within ten seconds, in one where a core is free."""
+    """Workers of a killed coordinator end within ten seconds; within one if a core is free."""
     draw, hits, unfinished = random.Random(whom), 0, 0
     for kill in range(kills):
         out = tmp_path / str(kill) / "ds"
@@ -137,10 +136,10 @@ def test_a_run_killed_at_random_moments_ends_as_if_undisturbed_when_run_again(
 
 
 @pytest.mark.slow
-def test_a_run_whose_worker_is_killed_at_random_moments_goes_on(
+def test_run_continues_when_a_worker_is_killed_at_random_moments(
     photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
-    """It ends with 0; or with 3 where the kill met the same photograph's second try, and a rerun completes it."""
+    """The run ends with 0, or with 3 if the kill hit the retry of a photograph; a rerun then completes it."""
     draw, kills, hits, codes = random.Random("worker"), 33, 0, Counter[int]()
     for kill in range(kills):
         out = tmp_path / str(kill) / "ds"
@@ -166,10 +165,10 @@ def test_a_run_whose_worker_is_killed_at_random_moments_goes_on(
     assert hits >= kills / 2
 
 
-def test_orphans_of_a_killed_run_cannot_disturb_the_next(
+def test_orphaned_workers_do_not_disturb_the_next_run(
     photographs: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Workers are stopped in the middle of their shards, outlive their coordinator so, and wake in the next run."""
+    """Workers are stopped (SIGSTOP) amid a shard, outlive their coordinator, and continue in the next run."""
     out = tmp_path / "ds"
     with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path) as process:
         wait_for(lambda: committed(out) >= 2)
@@ -187,7 +186,7 @@ def test_orphans_of_a_killed_run_cannot_disturb_the_next(
     assert_whole(out)
 
 
-def test_a_file_that_an_orphan_adds_while_the_next_run_sweeps_stops_nothing(
+def test_file_added_by_an_orphan_at_the_start_is_harmless(
     photographs: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "ds"
@@ -233,12 +232,14 @@ def acting(data=b"", **options):
 
 hashlib.sha256 = acting
 """
-"""A module that every process of a run imports first: where it hashes one photograph, it acts."""
+"""Module that every process of a run imports first: when it hashes one photograph, it acts."""
 
 
 def acting_at(folder: Path, photograph: Path, action: str) -> dict[str, str]:
-    """Return the environment in which the first process that reads ``photograph`` waits while there is a note of it,
-    or every such process gets a limit of memory."""
+    """Return an environment in which processes act when they read ``photograph``.
+
+    ``wait``: the first one waits as long as the file ``note`` exists. ``limit``: every one gets a limit of memory.
+    """
     (folder / "site").mkdir()
     (folder / "site/sitecustomize.py").write_text(AT_ONE)
     return {
@@ -249,10 +250,10 @@ def acting_at(folder: Path, photograph: Path, action: str) -> dict[str, str]:
     }
 
 
-def test_a_worker_that_is_killed_while_the_other_idles_is_noticed_within_five_seconds(
+def test_killed_worker_is_noticed_within_five_seconds(
     photographs: Path, undisturbed: str, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is at the last photograph, where it would stay for ever."""
+    """The killed worker was at the last photograph, so no other work would reveal its death."""
     for name, value in acting_at(tmp_path, photographs / f"{COUNT - 1:03d}.png", "wait").items():
         monkeypatch.setenv(name, value)
     with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path) as process:
@@ -260,7 +261,7 @@ def test_a_worker_that_is_killed_while_the_other_idles_is_noticed_within_five_se
         idle = set(workers(process.pid)) - {asleep := int((tmp_path / "note").read_text())}
         assert len(idle) == 1
         os.kill(asleep, signal.SIGKILL)
-        wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # who notices ends them all, and begins anew
+        wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # loky ends all workers
         assert process.wait(20) == 0
     assert tree_hash(tmp_path / "ds") == undisturbed
 
@@ -270,14 +271,14 @@ LARGE = 3000, 4000
 
 @pytest.fixture(scope="module")
 def with_large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three small photographs and a large one, of few bytes, that takes 36 MB when decoded and 72 on the way."""
+    """Make three small photographs and one of few bytes that takes 36 MB once decoded and 72 MB while decoding."""
     source = fill(tmp_path_factory.mktemp("memory") / "p", 3)
     Image.fromarray(np.full((*LARGE, 3), 90, np.uint8)).save(source / "large.png")
     return source
 
 
 LEVELS = "noise.levels=5"
-"""Pairs that are made together: 144 MB of a large photograph."""
+"""Pairs of one photograph that are made together: 144 MB for the large one."""
 
 
 @pytest.fixture(scope="module")
@@ -289,11 +290,11 @@ def with_large_undisturbed(with_large: Path, make: Make, tree_hash: Hash) -> str
 @pytest.mark.parametrize(
     ("n_jobs", "megabytes"), [(1, 20), (1, 100), (2, 20), pytest.param(2, 100, marks=pytest.mark.slow)]
 )
-def test_want_of_memory_is_told_and_never_put_down_to_the_photograph(
+def test_out_of_memory_is_reported_and_rerun_completes_dataset(
     n_jobs: int, megabytes: int, with_large: Path, with_large_undisturbed: str, cli: Cli, make: Make, tree_hash: Hash,
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    """With 20 MB left it cannot be decoded, with 100 MB its pairs cannot be made; with more a rerun makes them."""
+    """With 20 MB left the large photograph cannot be decoded; with 100 MB its pairs cannot be simulated."""
     env = acting_at(tmp_path, with_large / "large.png", "limit")
     (tmp_path / "note").write_text(str(megabytes))
     done = cli(f"source.root={with_large}", ONE, LEVELS, f"n_jobs={n_jobs}", **env)
@@ -308,17 +309,17 @@ def test_want_of_memory_is_told_and_never_put_down_to_the_photograph(
 
 
 class Disk(NamedTuple):
-    """A small file system in memory."""
+    """Hold a small file system in memory."""
 
     folder: Path
 
     def remount(self, options: str) -> None:
-        """Change its size, or whether it can be written."""
+        """Change its size, or make it read-only or writable."""
         subprocess.run(["mount", "-o", f"remount,{options}", self.folder], check=True, capture_output=True)
 
     @property
     def kilobytes(self) -> int:
-        """What is used of it."""
+        """Kilobytes in use."""
         status = os.statvfs(self.folder)
         return (status.f_blocks - status.f_bfree) * status.f_frsize // 1024
 
@@ -362,7 +363,7 @@ def six_undisturbed(six: Path, make: Make, tree_hash: Hash) -> str:
 
 
 class Full(NamedTuple):
-    """A run whose disk was too small: what it raised, what was in place then, and what a rerun with room made."""
+    """Hold what a run raised on a disk that was too small, what it left, and the hash of the resumed dataset."""
 
     kilobytes: int
     error: UnprocessGenError | None
@@ -372,7 +373,7 @@ class Full(NamedTuple):
 
 
 def place_of(out: Path) -> str:
-    """Return what could not be written any more."""
+    """Return which kind of file met the full disk."""
     if (out / "manifest.csv").exists():
         return "dataset.json"
     if committed(out) == FULL_COUNT:
@@ -383,7 +384,7 @@ def place_of(out: Path) -> str:
 
 
 def intact(out: Path) -> bool:
-    """Return whether every shard in place has the size and SHA-256 that its rows' record says."""
+    """Return whether every committed shard has the recorded size and SHA-256."""
     for shard in sorted((out / "shards").glob("*.tar")):
         record = json.loads((out / ".work/rows" / f"{int(shard.stem[6:]):05d}.json").read_text())["entry"]
         content = shard.read_bytes()
@@ -394,7 +395,7 @@ def intact(out: Path) -> bool:
 
 @pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.slow)], ids=["1 job", "2 jobs"])
 def fulls(request: pytest.FixtureRequest, disk: Disk, six: Path, make: Make, tree_hash: Hash) -> list[Full]:
-    """A run on a disk of every size, in steps of 4 KB, from one block to enough."""
+    """Run on disks of every size, in steps of 4 KB, from one block to enough."""
     seen: list[Full] = []
     out, kilobytes, error = disk.folder / "ds", 0, MachineError("")
     while error:
@@ -415,39 +416,37 @@ def fulls(request: pytest.FixtureRequest, disk: Disk, six: Path, make: Make, tre
     return seen
 
 
-def test_a_disk_was_full_at_every_kind_of_file(fulls: list[Full]) -> None:
+def test_full_disk_occurred_at_every_kind_of_file(fulls: list[Full]) -> None:
     assert {full.place for full in fulls} >= {"first files", "shard or its rows", "manifest.csv", "dataset.json"}
 
 
-def test_a_full_disk_is_the_machines_failure_whatever_file_it_meets(fulls: list[Full]) -> None:
+def test_full_disk_is_a_system_error_for_every_file(fulls: list[Full]) -> None:
     assert [full for full in fulls if type(full.error) is not MachineError] == []
 
 
-def test_a_full_disk_is_told_with_a_path_and_the_bytes_that_are_free(fulls: list[Full], disk: Disk) -> None:
+def test_full_disk_is_reported_with_path_and_free_bytes(fulls: list[Full], disk: Disk) -> None:
     for full in fulls:
         assert f"{disk.folder}/" in str(full.error), full
         assert "No space left on device (" in str(full.error) and " bytes free)" in str(full.error), full
 
 
-def test_a_full_disk_leaves_every_committed_shard_intact(fulls: list[Full]) -> None:
+def test_full_disk_leaves_committed_shards_intact(fulls: list[Full]) -> None:
     assert [full for full in fulls if not full.intact] == []
 
 
-def test_a_run_on_a_disk_that_was_full_ends_as_if_undisturbed_once_there_is_room(
-    fulls: list[Full], six_undisturbed: str
-) -> None:
+def test_run_resumes_to_the_same_bytes_once_space_is_free(fulls: list[Full], six_undisturbed: str) -> None:
     assert [full for full in fulls if full.rerun != six_undisturbed] == []
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
-def test_a_full_disk_ends_the_run_with_5_and_one_line_within_five_seconds(
+def test_full_disk_ends_with_5_within_five_seconds(
     n_jobs: int, photographs: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path, empty_disk: Disk
 ) -> None:
     out = empty_disk.folder / "ds"
-    empty_disk.remount("size=320k")  # room for most shards, far more than wait for a coordinator on a busy machine
+    empty_disk.remount("size=320k")  # space for most shards
     with running(f"source.root={photographs}", f"out={out}", ONE, f"n_jobs={n_jobs}", cwd=tmp_path) as process:
         said, err = process.communicate(timeout=30)
-        seconds = time.time() - (out / "shards").stat().st_mtime  # since the last shard that found room
+        seconds = time.time() - (out / "shards").stat().st_mtime  # since the last commit
         wait_for_the_end(process.pid)
     assert (process.returncode, said) == (5, "")
     assert len(own_lines(err)) == 1 and " bytes free)" in err, err
@@ -459,7 +458,7 @@ def test_a_full_disk_ends_the_run_with_5_and_one_line_within_five_seconds(
 
 
 @pytest.mark.parametrize("name", ["ds", ""])
-def test_a_disk_that_cannot_be_written_is_refused_with_2(name: str, six: Path, empty_disk: Disk, door: Door) -> None:
+def test_read_only_disk_is_refused_with_2(name: str, six: Path, empty_disk: Disk, door: Door) -> None:
     empty_disk.remount("ro")
     done = door(f"source.root={six}", f"out={empty_disk.folder / name}", "n_jobs=1")
     assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
@@ -467,11 +466,11 @@ def test_a_disk_that_cannot_be_written_is_refused_with_2(name: str, six: Path, e
 
 
 @pytest.mark.parametrize("number", [1, FULL_COUNT // 2, FULL_COUNT])
-def test_a_disk_that_cannot_be_written_any_more_ends_the_run_with_5(
+def test_disk_that_becomes_read_only_ends_the_run_with_5(
     number: int, six: Path, six_undisturbed: str, empty_disk: Disk, door: Door, make: Make, tree_hash: Hash,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """As a file system is that found an error in itself."""
+    """The kernel remounts a file system read-only if it finds an error in it."""
     out = empty_disk.folder / "ds"
     after_commits(number, lambda: empty_disk.remount("ro"), monkeypatch)
     done = door(f"source.root={six}", f"out={out}", ONE, "n_jobs=1")
@@ -482,17 +481,17 @@ def test_a_disk_that_cannot_be_written_any_more_ends_the_run_with_5(
     assert tree_hash(out) == six_undisturbed
 
 
-# Folders that vanish --------------------------------------------------------------------------------------------------
+# Deleted folders ------------------------------------------------------------------------------------------------------
 
 
-def test_an_out_below_a_file_is_refused_with_2(six: Path, door: Door, tmp_path: Path) -> None:
+def test_out_below_a_file_is_refused_with_2(six: Path, door: Door, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     done = door(f"source.root={six}", "out=file/ds", "n_jobs=1")
     assert done == (2, "", "gen-dataset: out=file/ds: cannot be written (Not a directory)\n")
 
 
 @pytest.mark.parametrize("number", range(1, FULL_COUNT + 1))
-def test_an_out_that_vanishes_after_any_of_its_shards_ends_the_run_with_5(
+def test_out_deleted_after_any_shard_ends_the_run_with_5(
     number: int, six: Path, door: Door, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     after_commits(number, lambda: shutil.rmtree(tmp_path / "ds"), monkeypatch)
@@ -502,11 +501,11 @@ def test_an_out_that_vanishes_after_any_of_its_shards_ends_the_run_with_5(
 
 
 @pytest.mark.parametrize("what", ["ds", "p"])
-def test_a_folder_that_vanishes_under_two_workers_ends_the_run_with_5(
+def test_folder_deleted_under_two_workers_ends_the_run_with_5(
     what: str, photographs: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """One of them is at the third photograph; the other has a few left."""
+    """One worker is at the third photograph; the other has a few left."""
     shutil.copytree(photographs, tmp_path / "p")
     for name, value in acting_at(tmp_path, photographs / "002.png", "wait").items():
         monkeypatch.setenv(name, value)
@@ -524,11 +523,11 @@ def test_a_folder_that_vanishes_under_two_workers_ends_the_run_with_5(
 
 
 @pytest.mark.parametrize("what", ["folder", "photograph"])
-def test_a_source_that_vanishes_ends_the_run_with_5_and_costs_no_photograph(
+def test_deleted_source_ends_with_5_and_a_rerun_completes(
     what: str, six: Path, six_undisturbed: str, door: Door, make: Make, tree_hash: Hash, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """A share that was away for a minute must not become a dataset that is complete without its photographs."""
+    """A network share that is away for a minute must not give a finished dataset without its photographs."""
     shutil.copytree(six, tmp_path / "p")
     gone = tmp_path / "p" if what == "folder" else tmp_path / "p/004.png"
     after_commits(2, lambda: gone.rename(tmp_path / "away"), monkeypatch)
@@ -543,13 +542,13 @@ def test_a_source_that_vanishes_ends_the_run_with_5_and_costs_no_photograph(
 
 
 def bitmap(path: Path, seed: int) -> bytes:
-    """Write a photograph whose size is that of every other from here, and return its bytes."""
+    """Write a photograph in a format of constant size, and return its bytes."""
     Image.fromarray(pixels(seed, 30, 40)).save(path)
     return path.read_bytes()
 
 
 def begin(make: Make, source: Path, out: Path, shards: int) -> None:
-    """Make so many shards, then stop as if killed."""
+    """Make ``shards`` shards, then stop as if killed."""
 
     def stop() -> None:
         raise Killed
@@ -559,7 +558,7 @@ def begin(make: Make, source: Path, out: Path, shards: int) -> None:
         make(source, out, ONE)
 
 
-def test_a_photograph_that_appears_during_a_run_is_not_in_it_and_the_next_run_says_so(
+def test_photograph_added_during_a_run_is_reported_by_the_next(
     six: Path, six_undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(six, tmp_path / "p")
@@ -570,7 +569,7 @@ def test_a_photograph_that_appears_during_a_run_is_not_in_it_and_the_next_run_sa
         make(tmp_path / "p", tmp_path / "ds", ONE, "source.include=['*']")
 
 
-def test_a_photograph_replaced_before_it_is_read_has_the_row_of_its_new_bytes(
+def test_photograph_replaced_before_reading_gets_a_new_row(
     six: Path, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
     source = shutil.copytree(six, tmp_path / "p")
@@ -582,10 +581,8 @@ def test_a_photograph_replaced_before_it_is_read_has_the_row_of_its_new_bytes(
     assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "fresh")
 
 
-def test_a_photograph_replaced_after_it_was_committed_keeps_its_row_and_verify_tells(
-    six: Path, make: Make, tmp_path: Path
-) -> None:
-    """Its size is the same, and a resume reads no committed photograph again; its row stays that of its pair."""
+def test_photograph_replaced_after_commit_is_found_by_replay(six: Path, make: Make, tmp_path: Path) -> None:
+    """The size is the same, and a resumed run reads no committed photograph; the row remains that of its pair."""
     source = shutil.copytree(six, tmp_path / "p")
     old = bitmap(source / "000.bmp", 1)
     begin(make, source, tmp_path / "ds", 2)
@@ -599,10 +596,10 @@ def test_a_photograph_replaced_after_it_was_committed_keeps_its_row_and_verify_t
 
 
 @pytest.mark.parametrize("state", ["begun", "finished"])
-def test_a_photograph_replaced_by_another_of_its_size_is_refused_where_a_third_shares_the_size(
+def test_photograph_replaced_among_files_of_one_size_is_refused(
     state: str, six: Path, make: Make, tmp_path: Path
 ) -> None:
-    """Files that share a size are numbered by their content: a change there would move the noise of another."""
+    """Files of one size are numbered by content, so that a changed one would move the noise of another."""
     source = shutil.copytree(six, tmp_path / "p")
     (source / "zzz.bmp").write_bytes(bitmap(source / "000.bmp", 1))
     if state == "begun":
@@ -631,15 +628,15 @@ def signalled():
 
 threading._shutdown = signalled
 """
-"""A module that a run imports first: it gets a signal when all is done and Python waits for its threads to end."""
+"""Module that a run imports first: it sends a signal while Python waits for its threads at exit."""
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_after_the_last_word_leaves_no_trace(
+def test_signal_at_exit_prints_nothing(
     sent: signal.Signals, photographs: Path, undisturbed: str, tree_hash: Hash, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """As where Ctrl-C is pressed twice."""
+    """Pressing Ctrl-C twice has the same effect."""
     (tmp_path / "sitecustomize.py").write_text(AT_THE_END)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setenv("SIGNAL", str(int(sent)))
@@ -666,11 +663,11 @@ def slow(arguments):
 cli.run = slow
 sys.exit(cli.main())
 """
-"""A run whose signal arrives while C calls Python, as where LLVM tells Numba of machine code; C drops exceptions."""
+"""A run whose signal arrives while C calls Python, as LLVM does when it compiles; C drops exceptions."""
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_that_a_library_would_swallow_ends_the_run_too(sent: signal.Signals, tmp_path: Path) -> None:
+def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", IN_A_CALLBACK, str(int(sent))]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=10, restore_signals=True)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (128 + sent, "", 1)
@@ -678,13 +675,13 @@ def test_a_signal_that_a_library_would_swallow_ends_the_run_too(sent: signal.Sig
 
 
 @pytest.mark.parametrize("number", [6, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_signal_at_a_random_moment_ends_the_run_at_once_and_a_rerun_completes_it(
+def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
     number: int, photographs: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
-    """The moments begin where the command answers signals, 0.3 s from its start.
+    """The moments begin 0.3 s after the start, when the command handles signals.
 
-    A run that is as good as done may end well; so may one that gets SIGINT in the few hundredths of a second for which
-    it ignores it, while workers start.
+    A run may also complete if it was nearly done, or if SIGINT arrives in the hundredths of a second for which it is
+    ignored while workers start.
     """
     draw, codes = random.Random(number), Counter[int]()
     for kill in range(number):

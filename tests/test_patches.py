@@ -83,7 +83,7 @@ def pair_of(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def assert_cut_outs(patched: Path, whole: Path) -> int:
-    """Hold every pair of a dataset of patches against the same pair of whole images; return how many there were."""
+    """Compare every pair of a dataset of patches with the crop of the full image's pair; return their number."""
     frames = {pair_of(sample.row): sample for sample in RawPairs(whole)}
     for clean, noisy, row in RawPairs(patched):
         frame, (height, width), (y, x) = frames[pair_of(row)], clean.shape, (row["patch_y"], row["patch_x"])
@@ -109,7 +109,7 @@ def assert_cut_outs(patched: Path, whole: Path) -> int:
     ids=["levels", "poisson", "physical", "every effect", "averaged", "dark"],
 )
 @pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
-def test_every_patch_is_the_cut_out_of_its_full_frames_pair(
+def test_patch_equals_the_crop_of_its_full_pair(
     patch: str, overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
 ) -> None:
     make(sources, tmp_path / "whole", *overrides)
@@ -118,14 +118,14 @@ def test_every_patch_is_the_cut_out_of_its_full_frames_pair(
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_every_patch_has_the_pattern_of_its_full_frame(pattern: str, sources: Path, make: Make, tmp_path: Path) -> None:
+def test_patch_has_the_pattern_of_its_full_frame(pattern: str, sources: Path, make: Make, tmp_path: Path) -> None:
     for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=[grid,32,14]")):
         make(sources, tmp_path / name, patch, f"sensor.pattern={pattern}", "gains=fixed")
     assert_cut_outs(tmp_path / "patched", tmp_path / "whole")
     assert {row["pattern"] for row in rows(tmp_path / "patched") if row["status"] == "ok"} == {pattern}
 
 
-def test_patches_of_the_frames_of_a_clip_are_cut_outs_at_the_same_places(make: Make, tmp_path: Path) -> None:
+def test_frames_of_a_clip_have_patches_at_the_same_places(make: Make, tmp_path: Path) -> None:
     for clip, frame in ((clip, frame) for clip in ("one", "two") for frame in range(3)):
         (tmp_path / "clips" / clip).mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels(frame + 7 * len(clip), 60, 80)).save(tmp_path / "clips" / clip / f"{clip}{frame}.png")
@@ -153,7 +153,7 @@ OWN = {
 
 
 @pytest.mark.parametrize("overrides", [LEVELS, ("noise=nikon_d850", "scene=night")])
-def test_what_was_drawn_or_decided_for_an_image_holds_for_each_of_its_patches(
+def test_patches_share_the_plan_of_their_image(
     overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
 ) -> None:
     for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=16")):
@@ -163,7 +163,7 @@ def test_what_was_drawn_or_decided_for_an_image_holds_for_each_of_its_patches(
         assert {name: row[name] for name in row if name not in OWN} == shared[pair_of(row)]
 
 
-def test_counts_of_patches_that_tile_an_image_add_up_to_its_own(sources: Path, make: Make, tmp_path: Path) -> None:
+def test_counts_of_tiling_patches_add_up_to_the_image(sources: Path, make: Make, tmp_path: Path) -> None:
     """64 x 96 pixels, all of them in one patch of 32 x 32."""
     settings = ("source.limit=1", "noise=imx385_iso25600")
     one = make(sources, tmp_path / "whole", *settings)
@@ -179,7 +179,7 @@ sizes = st.integers(0, 300)
 
 
 @given(lengths, lengths, sizes, sizes)
-def test_a_grid_holds_every_place_at_its_stride_and_no_other(side: int, stride: int, down: int, right: int) -> None:
+def test_grid_contains_every_place_at_its_stride(side: int, stride: int, down: int, right: int) -> None:
     height, width = side + down, side + right
     found = list_patches(PatchRule("grid", side, stride=stride), 0, height, width)
     wanted = [(y, x) for y in range(0, down + 1, stride) for x in range(0, right + 1, stride)]
@@ -195,13 +195,13 @@ def test_random_places_are_even_and_inside(side: int, down: int, right: int, key
         assert 0 <= patch.x <= right
 
 
-def test_random_places_reach_the_first_and_the_last_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_random_places_include_the_first_and_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "patch_words", lambda key, count: [(0, 2**32 - 1), (2**32 - 1, 0)])
     found = list_patches(PatchRule("random", 10, count=2), 0, 31, 40)
     assert [patch.origin for patch in found] == [(0, 30), (20, 0)]
 
 
-def test_more_random_patches_leave_the_first_ones_where_they_are() -> None:
+def test_more_random_patches_leave_the_first_unchanged() -> None:
     few, many = (list_patches(PatchRule("random", 8, count=count), 5, 200, 300) for count in (10, 100))
     assert many[:10] == few
 
@@ -216,12 +216,12 @@ def test_random_places_are_uniform() -> None:
 
 
 def test_random_places_are_the_same_on_every_machine() -> None:
-    """The words are Philox's (`test_streams`); all that follows is whole numbers."""
+    """The words are Philox's (`test_streams`); the rest is integer arithmetic."""
     found = list_patches(PatchRule("random", 128, count=3), 0x0123456789ABCDEF, 2160, 2880)
     assert [patch.origin for patch in found] == [(1662, 92), (166, 2310), (1910, 72)]
 
 
-def test_an_image_that_is_not_cut_is_its_only_patch() -> None:
+def test_image_without_patches_is_its_only_patch() -> None:
     assert list_patches(None, 7, 5, 9) == (Patch(0, 0, 0, 5, 9),)
 
 
@@ -250,7 +250,7 @@ def test_pixels_in_no_patch_are_counted(law: PatchRule | None, left_out: int) ->
         (("[random,128,16]",), ["random", 128, 16]),
     ],
 )
-def test_all_spellings_of_a_setting_give_one_config_yaml(
+def test_spellings_of_a_patch_setting_give_one_config_yaml(
     spellings: tuple[str, ...], canonical: object, settings: Settings, tmp_path: Path
 ) -> None:
     texts = {dataset_yaml(settings(f"source.patch={spelling}")) for spelling in spellings}
@@ -269,18 +269,18 @@ def test_all_spellings_of_a_setting_give_one_config_yaml(
         "[spiral,8,8]",
     ],
 )
-def test_what_cannot_be_meant_is_refused(value: str, settings: Settings) -> None:
+def test_impossible_patch_settings_are_refused(value: str, settings: Settings) -> None:
     with pytest.raises(ConfigError, match=r"^source\.patch=.*: expected null, a side, \[grid, side\], ") as caught:
         validate_config(settings(f"source.patch={value}"))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("value", ["2", "32768", "[grid,2,32768]", "[random,2,1]", "[random,32768,10000]"])
-def test_the_ends_of_what_is_allowed_are_allowed(value: str, settings: Settings) -> None:
+def test_limits_of_the_patch_settings_are_accepted(value: str, settings: Settings) -> None:
     validate_config(settings(f"source.patch={value}"))
 
 
-def test_a_refusal_costs_one_line_and_writes_nothing(door: Door, tmp_path: Path) -> None:
+def test_refused_setting_prints_one_line_and_writes_nothing(door: Door, tmp_path: Path) -> None:
     done = door("source.patch=[grid,127]")
     assert (done.code, done.err.count("\n"), list(tmp_path.iterdir())) == (2, 1, [])
     assert done.err.startswith("gen-dataset: source.patch=[grid, 127]: expected null, a side, ")
@@ -289,7 +289,7 @@ def test_a_refusal_costs_one_line_and_writes_nothing(door: Door, tmp_path: Path)
 # Too small ------------------------------------------------------------------------------------------------------------
 
 
-def test_an_image_that_holds_no_patch_fails_with_the_reason_unsupported(make: Make, tmp_path: Path) -> None:
+def test_image_smaller_than_a_patch_is_unsupported(make: Make, tmp_path: Path) -> None:
     for name, size in (("fits.png", (40, 40)), ("high.png", (90, 39)), ("wide.png", (39, 90))):
         (tmp_path / "p").mkdir(exist_ok=True)
         Image.fromarray(pixels(len(name), *size)).save(tmp_path / "p" / name)
@@ -301,7 +301,7 @@ def test_an_image_that_holds_no_patch_fails_with_the_reason_unsupported(make: Ma
     assert (made.pairs, made.failed) == (2, {"unsupported": 2})
 
 
-def test_why_an_image_is_too_small_is_said(settings: Settings, tmp_path: Path) -> None:
+def test_failure_of_a_small_image_is_explained(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "source.patch=14")
     (source,) = photographs.list_photographs(config.source).sources
     why = r"unsupported: 16 x 12 pixels hold no patch of 14 x 14 \(source.patch\)$"
@@ -315,7 +315,7 @@ def test_why_an_image_is_too_small_is_said(settings: Settings, tmp_path: Path) -
 # The dataset ----------------------------------------------------------------------------------------------------------
 
 
-def test_there_is_a_row_for_every_pair_of_every_patch(cut_up: Path) -> None:
+def test_every_pair_of_every_patch_has_a_row(cut_up: Path) -> None:
     pairs = [f"-p{patch:04d}-l{level:02d}d{draw:02d}" for patch in range(5) for level in range(2) for draw in range(2)]
     assert [row["key"] for row in rows(cut_up)] == [
         *(f"00000000{pair}" for pair in pairs),
@@ -325,7 +325,7 @@ def test_there_is_a_row_for_every_pair_of_every_patch(cut_up: Path) -> None:
     ]
 
 
-def test_every_patch_is_a_sample_of_its_own(cut_up: Path) -> None:
+def test_every_patch_is_one_sample(cut_up: Path) -> None:
     with tarfile.open(cut_up / "shards" / "shard-00001.tar") as shard:
         names = shard.getnames()
     members = ("clean.npy", "noisy.npy", "noisy.l00d01.npy", "noisy.l01d00.npy", "noisy.l01d01.npy", "json")
@@ -349,7 +349,7 @@ def test_the_webdataset_library_loads_every_patch_as_a_sample(cut_up: Path) -> N
             np.testing.assert_array_equal(sample[member], noisy)
 
 
-def test_rows_of_patches_hold_no_empty_number(cut_up: Path) -> None:
+def test_rows_of_patches_have_no_empty_number(cut_up: Path) -> None:
     for row in read_rows(cut_up / "manifest.csv"):
         assert row["status"] == "failed" or None not in row.values()
 
@@ -361,9 +361,7 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(
     assert tree_hash(tmp_path / "ds") == tree_hash(cut_up)
 
 
-def test_adding_a_photograph_moves_no_other_ones_patches(
-    sources: Path, cut_up: Path, make: Make, tmp_path: Path
-) -> None:
+def test_adding_a_photograph_moves_no_other_patches(sources: Path, cut_up: Path, make: Make, tmp_path: Path) -> None:
     more = Path(shutil.copytree(sources, tmp_path / "more"))
     Image.fromarray(pixels(9, 50, 50)).save(more / "0.png")
     make(more, tmp_path / "ds", *LEVELS, RANDOM)
@@ -372,15 +370,13 @@ def test_adding_a_photograph_moves_no_other_ones_patches(
     assert [row for row in after if row[0] != "0.png"] == before
 
 
-def test_more_patches_leave_the_first_ones_as_they_were(
-    sources: Path, cut_up: Path, make: Make, tmp_path: Path
-) -> None:
+def test_more_patches_leave_the_first_bytes_unchanged(sources: Path, cut_up: Path, make: Make, tmp_path: Path) -> None:
     make(sources, tmp_path / "ds", *LEVELS, "source.patch=[random,30,9]")
     more = {row["key"]: row["noisy_xxh3"] for row in rows(tmp_path / "ds")}
     assert {row["key"]: row["noisy_xxh3"] for row in rows(cut_up)}.items() < more.items()
 
 
-def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(
+def test_stopped_run_resumes_to_the_same_bytes(
     sources: Path, cut_up: Path, make: Make, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = sources, tmp_path / "ds", *LEVELS, RANDOM, "output.pairs_per_shard=2"
@@ -398,12 +394,12 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(
     assert tree_hash(tmp_path / "ds") == tree_hash(cut_up)
 
 
-def test_other_patches_into_the_same_folder_are_refused(sources: Path, cut_up: Path, make: Make) -> None:
+def test_changed_patch_setting_is_refused(sources: Path, cut_up: Path, make: Make) -> None:
     with pytest.raises(ConfigError, match=r"source.patch=\[grid, 8, 8\] \(there: \[random, 30, 5\]\)"):
         make(sources, cut_up, *LEVELS, "source.patch=8", "output.pairs_per_shard=2")
 
 
-def test_progress_counts_images_and_the_end_pairs(sources: Path, door: Door) -> None:
+def test_progress_counts_images_and_the_summary_pairs(sources: Path, door: Door) -> None:
     done = door(f"source.root={sources}", GRID, "source.max_failed=1", "n_jobs=1")
     assert "gen-dataset: 4/4 images, " in done.err
     assert done.out.startswith("ds: 14 pairs in 1 shards")
@@ -411,7 +407,7 @@ def test_progress_counts_images_and_the_end_pairs(sources: Path, door: Door) -> 
     assert json.loads(Path("ds/dataset.json").read_text())["pairs"] == 14
 
 
-def test_a_photograph_is_decoded_once_and_only_pixels_of_its_patches_are_made(
+def test_photograph_is_decoded_once_for_all_its_patches(
     sources: Path, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     decoded: list[int] = []
@@ -429,11 +425,11 @@ def test_a_photograph_is_decoded_once_and_only_pixels_of_its_patches_are_made(
     assert len(decoded) == 3
 
 
-# Verified, made again, mended -----------------------------------------------------------------------------------------
+# Verify, replay, repair -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
-def test_every_patch_can_be_made_again_from_its_row(patch: str, sources: Path, make: Make, tmp_path: Path) -> None:
+def test_every_patch_is_replayed_from_its_row(patch: str, sources: Path, make: Make, tmp_path: Path) -> None:
     make(sources, tmp_path / "ds", patch, *EVERY_EFFECT, "source.downscale=1", "noise.draws=2")
     assert verify(tmp_path / "ds") == []
     replayed = list(replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(sources)))
@@ -441,7 +437,7 @@ def test_every_patch_can_be_made_again_from_its_row(patch: str, sources: Path, m
     assert [one for one in replayed if one.complaint] == []
 
 
-def test_a_row_whose_patch_lies_elsewhere_is_not_the_same(cut_up: Path, sources: Path) -> None:
+def test_row_with_a_moved_patch_differs(cut_up: Path, sources: Path) -> None:
     row = next(read_rows(cut_up / "manifest.csv"))
     (moved,) = replay([{**row, "patch_x": int(row["patch_x"] or 0) ^ 2}], str(sources))
     (outside,) = replay([{**row, "patch_y": 36}], str(sources))
@@ -453,7 +449,7 @@ def test_a_row_whose_patch_lies_elsewhere_is_not_the_same(cut_up: Path, sources:
     ("keys", "pairs"),
     [("00000003", 20), ("00000003-p0002", 4), ("00000003-p0002-l01d00", 1), ("00000000,00000001", 40)],
 )
-def test_a_key_chooses_the_pairs_of_an_image_or_of_a_patch(keys: str, pairs: int, cut_up: Path, door: Door) -> None:
+def test_key_selects_pairs_of_an_image_or_a_patch(keys: str, pairs: int, cut_up: Path, door: Door) -> None:
     assert door("replay", cut_up, "--keys", keys).out.startswith(f"{pairs} pairs are the same")
 
 
@@ -467,7 +463,7 @@ def test_replayed_patches_are_written_under_their_keys(cut_up: Path, door: Door,
         np.testing.assert_array_equal(np.load(tmp_path / "to" / f"{name}.clean.npy"), found[name].clean)
 
 
-def test_a_damaged_patch_is_named_and_mended_alone(cut_up: Path, door: Door, tmp_path: Path) -> None:
+def test_damaged_patch_is_named_and_repaired_alone(cut_up: Path, door: Door, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(cut_up, tmp_path / "ds"))
     path = copy / "shards" / "shard-00000.tar"
     content = bytearray(path.read_bytes())
@@ -489,7 +485,7 @@ def test_a_damaged_patch_is_named_and_mended_alone(cut_up: Path, door: Door, tmp
         ("config.yaml",),
     ],
 )
-def test_what_is_missing_is_made_again(
+def test_missing_files_of_patches_are_restored(
     lost: tuple[str, ...], cut_up: Path, sources: Path, door: Door, tree_hash: Hash, tmp_path: Path
 ) -> None:
     copy = Path(shutil.copytree(cut_up, tmp_path / "ds"))
@@ -512,14 +508,14 @@ def test_rows_of_more_than_ten_thousand_patches_keep_their_order(
     assert kept == [failures[0], *inside, failures[1]]
 
 
-def test_a_dataset_of_patches_is_made_again_from_its_config(cut_up: Path, sources: Path, door: Door) -> None:
+def test_dataset_of_patches_is_regenerated_from_its_config(cut_up: Path, sources: Path, door: Door) -> None:
     done = door("again", cut_up, f"source.root={sources}", "out=ds2", "source.max_failed=1", "n_jobs=1")
     assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {cut_up}, bit for bit")
 
 
 @pytest.mark.parametrize("side", [16, 64])
-def test_the_noise_of_small_patches_is_found_to_be_that_of_their_rows(side: int, make: Make, tmp_path: Path) -> None:
-    """Few sites tell little: the errors have to say so. Of 800 normal deviations the largest lies below 5."""
+def test_fitted_noise_of_small_patches_matches_their_rows(side: int, make: Make, tmp_path: Path) -> None:
+    """Few sites give large errors of the fit. The largest of 800 standard normal values is below 5."""
     make(None, tmp_path / "ds", "source.limit=2", f"source.patch=[random,{side},400]")
     found = list(transfer.iterate_fits(tmp_path / "ds"))
     assert len(found) > 300
@@ -530,7 +526,7 @@ def test_the_noise_of_small_patches_is_found_to_be_that_of_their_rows(side: int,
 
 
 @pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
-def test_bytes_and_pairs_are_foretold_exactly(patch: str, sources: Path, make: Make, tmp_path: Path) -> None:
+def test_plan_reports_bytes_and_pairs_exactly(patch: str, sources: Path, make: Make, tmp_path: Path) -> None:
     made = make(sources, tmp_path / "ds", patch, *LEVELS, "output.pairs_per_shard=2")
     config, _ = read_dataset_yaml(tmp_path / "ds" / "config.yaml")
     config.source.root = str(sources)
@@ -546,11 +542,11 @@ def test_bytes_and_pairs_are_foretold_exactly(patch: str, sources: Path, make: M
         ("source.patch=[random,32,7]", "patches   32 x 32, 7 at random places: 7 per image; "),
     ],
 )
-def test_what_is_cut_and_what_is_left_out_is_told(patch: str, line: str, sources: Path, settings: Settings) -> None:
+def test_plan_reports_patches_and_unused_pixels(patch: str, line: str, sources: Path, settings: Settings) -> None:
     config = settings(f"source.root={sources}", patch)
     assert line in format_estimate(config, estimate_run(config, 1, True))
 
 
-def test_of_whole_images_no_patches_are_told(sources: Path, settings: Settings) -> None:
+def test_plan_without_patches_reports_none(sources: Path, settings: Settings) -> None:
     config = settings(f"source.root={sources}")
     assert "\npatches " not in format_estimate(config, estimate_run(config, 1, True))

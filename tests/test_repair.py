@@ -1,4 +1,4 @@
-"""Whatever is damaged is made again to the same bytes, nothing else is touched, and what cannot be repaired is said."""
+"""Repair restores damaged files to the same bytes, changes no other file, and reports what it cannot restore."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Hash = Callable[[Path], str]
 
 @pytest.fixture(scope="module")
 def sources(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The photographs, and two files that cannot be used."""
+    """Return a folder with the photographs and two files that cannot be used."""
     folder = tmp_path_factory.mktemp("sources") / "photos"
     shutil.copytree(photos, folder)
     (folder / "broken.jpg").write_bytes((folder / "turned.jpg").read_bytes()[:300])
@@ -31,22 +31,22 @@ def sources(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(sources: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def intact(sources: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("repair") / "ds"
     make(sources, out, "output.pairs_per_shard=4")
     return out
 
 
 @pytest.fixture
-def copy(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "ds"))
+def copy(intact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(intact, tmp_path / "ds"))
 
 
-def assert_mended(copy: Path, whole: Path, door: Door, *arguments: object) -> str:
-    """Return what the command said."""
+def assert_repaired(copy: Path, intact: Path, door: Door, *arguments: object) -> str:
+    """Repair, compare with the intact dataset, and return the output."""
     done = door("verify", copy, "--repair", *arguments)
     assert done.code == 0, done.err
-    assert contents(copy) == contents(whole)
+    assert contents(copy) == contents(intact)
     assert verify(copy) == []
     return done.out
 
@@ -63,89 +63,91 @@ def flip(path: Path, bit: int) -> None:
 
 
 def lost(folder: Path) -> bool:
-    """Whether ``dataset.json`` could not be proved to be the run's own."""
+    """Return whether the facts about the run were lost."""
     return json.loads((folder / "dataset.json").read_text())["run"] is None
 
 
-def hold_flips_mended(whole: Path, copy: Path, door: Door, name: str, count: int, seed: int) -> None:
+def assert_flips_repaired(intact: Path, copy: Path, door: Door, name: str, count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    for bit in rng.integers(0, 8 * (whole / name).stat().st_size, count):
+    for bit in rng.integers(0, 8 * (intact / name).stat().st_size, count):
         flip(copy / name, int(bit))
         assert door("verify", copy, "--repair").code == 0, f"bit {bit} of {name}"
         assert verify(copy) == []
-        found, wanted = contents(copy), contents(whole)
+        found, wanted = contents(copy), contents(intact)
         if name == "dataset.json" and lost(copy):
             del found[name], wanted[name]
-            shutil.copy(whole / name, copy / name)
+            shutil.copy(intact / name, copy / name)
         assert found == wanted
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_flipped_bit_is_mended(name: str, whole: Path, copy: Path, door: Door) -> None:
-    hold_flips_mended(whole, copy, door, name, 4, seed=1)
+def test_flipped_bit_is_repaired(name: str, intact: Path, copy: Path, door: Door) -> None:
+    assert_flips_repaired(intact, copy, door, name, 4, seed=1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
-def test_a_hundred_flipped_bits_in_every_file_are_mended(name: str, whole: Path, copy: Path, door: Door) -> None:
-    hold_flips_mended(whole, copy, door, name, 100, seed=2)
+def test_hundred_flipped_bits_in_every_file_are_repaired(name: str, intact: Path, copy: Path, door: Door) -> None:
+    assert_flips_repaired(intact, copy, door, name, 100, seed=2)
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name != "dataset.json"])
-def test_a_missing_file_is_made_again(name: str, whole: Path, copy: Path, door: Door) -> None:
+def test_missing_file_is_restored(name: str, intact: Path, copy: Path, door: Door) -> None:
     (copy / name).unlink()
-    assert_mended(copy, whole, door)
+    assert_repaired(copy, intact, door)
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name != "dataset.json"])
 @pytest.mark.parametrize("share", [0, 0.3, 0.8])
-def test_a_truncated_file_is_made_again(name: str, share: float, whole: Path, copy: Path, door: Door) -> None:
+def test_truncated_file_is_restored(name: str, share: float, intact: Path, copy: Path, door: Door) -> None:
     os.truncate(copy / name, int(share * (copy / name).stat().st_size))
-    assert_mended(copy, whole, door)
+    assert_repaired(copy, intact, door)
 
 
 @pytest.mark.parametrize("size", [0, 50, 100, 150, 200, 250, 300, 350, 500, 1000, -2])
-def test_a_truncated_dataset_json_is_written_anew(size: int, whole: Path, copy: Path, door: Door) -> None:
+def test_truncated_dataset_json_is_rebuilt(size: int, intact: Path, copy: Path, door: Door) -> None:
     os.truncate(copy / "dataset.json", size % (copy / "dataset.json").stat().st_size)
 
     assert door("verify", copy, "--repair").code == 0
     assert verify(copy) == []
     assert {name: copy.joinpath(name).read_bytes() for name in FILES if name != "dataset.json"} == {
-        name: whole.joinpath(name).read_bytes() for name in FILES if name != "dataset.json"
+        name: intact.joinpath(name).read_bytes() for name in FILES if name != "dataset.json"
     }
 
 
-def test_all_shards_are_made_again(whole: Path, copy: Path, door: Door) -> None:
+def test_all_shards_are_regenerated(intact: Path, copy: Path, door: Door) -> None:
     shutil.rmtree(copy / "shards")
-    assert_mended(copy, whole, door)
+    assert_repaired(copy, intact, door)
 
 
-def test_manifest_and_shards_are_made_again_together(whole: Path, copy: Path, door: Door) -> None:
+def test_manifest_and_shards_are_restored_together(intact: Path, copy: Path, door: Door) -> None:
     (copy / "manifest.csv").unlink()
     flip(copy / FILES[4], 40_000)
     (copy / FILES[5]).unlink()
-    assert_mended(copy, whole, door)
+    assert_repaired(copy, intact, door)
 
 
-def test_swapped_shards_change_places_again(whole: Path, copy: Path, door: Door) -> None:
+def test_swapped_shards_are_restored(intact: Path, copy: Path, door: Door) -> None:
     first, second = copy / FILES[3], copy / FILES[4]
     first.rename(copy / "other")
     second.rename(first)
     (copy / "other").rename(second)
-    assert_mended(copy, whole, door)
+    assert_repaired(copy, intact, door)
 
 
-def test_a_foreign_file_is_moved_not_lost(whole: Path, copy: Path, door: Door) -> None:
+def test_foreign_file_is_moved_and_kept(intact: Path, copy: Path, door: Door) -> None:
     for content in ("one", "two"):
         (copy / "shards" / "notes.txt").write_text(content)
-        said = assert_mended(copy, whole, door)
-        assert "shards/notes.txt: moved to" in said
+        output = assert_repaired(copy, intact, door)
+        assert "shards/notes.txt: moved to" in output
     assert [path.read_text() for path in sorted((copy / "set_aside").iterdir())] == ["one", "two"]
 
 
-def test_only_damaged_pairs_are_made_again(whole: Path, copy: Path, door: Door, sources: Path, tmp_path: Path) -> None:
-    """With no source there but that of the damaged pair."""
-    rows = [json.loads(line) for line in _json_rows(whole, 1)]
+def test_only_damaged_pairs_are_regenerated(
+    intact: Path, copy: Path, door: Door, sources: Path, tmp_path: Path
+) -> None:
+    """The folder of sources contains only the source of the damaged pair."""
+    rows = [json.loads(line) for line in _json_rows(intact, 1)]
     only = tmp_path / "only"
     only.mkdir()
     shutil.copy(sources / rows[1]["source"], only / rows[1]["source"])
@@ -153,18 +155,16 @@ def test_only_damaged_pairs_are_made_again(whole: Path, copy: Path, door: Door, 
     at = content.index(f"{rows[1]['key']}.noisy.npy".encode()) + 512 + 128
     flip(copy / FILES[4], 8 * at + 3)
 
-    said = assert_mended(copy, whole, door, f"source.root={only}")
+    output = assert_repaired(copy, intact, door, f"source.root={only}")
 
-    assert said.splitlines()[0] == f"{FILES[4]}: 1 of {len(rows)} pairs regenerated, the others kept"
+    assert output.splitlines()[0] == f"{FILES[4]}: 1 of {len(rows)} pairs regenerated, the others kept"
 
 
 def _json_rows(folder: Path, shard: int) -> list[str]:
     return [json.dumps(json.loads(row)) for row in room.json_inside(folder / "shards" / f"shard-{shard:05d}.tar")]
 
 
-def test_a_lost_manifest_needs_no_source_while_the_shards_are_sound(
-    copy: Path, door: Door, make: Make, tmp_path: Path
-) -> None:
+def test_lost_manifest_needs_no_source_if_shards_are_intact(copy: Path, door: Door, make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "scenes", "source.limit=3")
     before = contents(tmp_path / "scenes")
     (tmp_path / "scenes" / "manifest.csv").unlink()
@@ -175,12 +175,12 @@ def test_a_lost_manifest_needs_no_source_while_the_shards_are_sound(
     assert contents(tmp_path / "scenes") == before
 
 
-def test_a_lost_dataset_json_is_written_anew_and_says_so(whole: Path, copy: Path, door: Door) -> None:
+def test_lost_dataset_json_is_rebuilt_and_reported(intact: Path, copy: Path, door: Door) -> None:
     (copy / "dataset.json").unlink()
 
-    done = door("verify", copy, "--repair", f"source.root={whole}")
+    done = door("verify", copy, "--repair", f"source.root={intact}")
 
-    new, old = (json.loads((folder / "dataset.json").read_text()) for folder in (copy, whole))
+    new, old = (json.loads((folder / "dataset.json").read_text()) for folder in (copy, intact))
     assert done.code == 0
     assert "host, time and versions of the run are lost" in done.out
     assert {name for name in old if old[name] != new[name]} == {
@@ -188,11 +188,11 @@ def test_a_lost_dataset_json_is_written_anew_and_says_so(whole: Path, copy: Path
     }
 
 
-def test_a_changed_source_is_named_and_the_rest_is_mended(
-    copy: Path, whole: Path, door: Door, sources: Path, tmp_path: Path
+def test_changed_source_is_named_and_other_shards_are_repaired(
+    copy: Path, intact: Path, door: Door, sources: Path, tmp_path: Path
 ) -> None:
     changed = Path(shutil.copytree(sources, tmp_path / "changed"))
-    row = json.loads(_json_rows(whole, 1)[0])
+    row = json.loads(_json_rows(intact, 1)[0])
     shutil.copy(changed / "wide.png", changed / row["source"])
     (copy / FILES[4]).unlink()
     (copy / FILES[5]).unlink()
@@ -202,12 +202,12 @@ def test_a_changed_source_is_named_and_the_rest_is_mended(
     assert done.code == 5
     assert f"{FILES[4]}: cannot be repaired: " in done.err
     assert f"cannot be repaired: source {row['source']}" in done.err
-    assert (copy / FILES[5]).read_bytes() == (whole / FILES[5]).read_bytes()
+    assert (copy / FILES[5]).read_bytes() == (intact / FILES[5]).read_bytes()
     assert not (copy / ".work").exists()
 
 
 @pytest.mark.parametrize("other", ["config.yaml", "manifest.csv"])
-def test_what_no_part_holds_any_more_is_refused_in_one_line(other: str, copy: Path, door: Door) -> None:
+def test_damage_to_both_proofs_is_refused_in_one_line(other: str, copy: Path, door: Door) -> None:
     flip(copy / other, 8 * (copy / other).read_bytes().index(b"deep.png" if other == "manifest.csv" else b"webp") + 1)
     flip(copy / "dataset.json", 8 * (copy / "dataset.json").read_bytes().index(b'"host"') + 1)
 
@@ -219,7 +219,7 @@ def test_what_no_part_holds_any_more_is_refused_in_one_line(other: str, copy: Pa
     )
 
 
-def test_a_dataset_that_a_run_holds_is_left_alone(copy: Path, door: Door) -> None:
+def test_dataset_locked_by_a_run_stays_unchanged(copy: Path, door: Door) -> None:
     flip(copy / FILES[3], 999)
     before = contents(copy)
     handle = os.open(copy, os.O_RDONLY)
@@ -232,14 +232,14 @@ def test_a_dataset_that_a_run_holds_is_left_alone(copy: Path, door: Door) -> Non
     assert contents(copy) == before
 
 
-def test_a_whole_dataset_is_not_touched(whole: Path, copy: Path, door: Door) -> None:
+def test_intact_dataset_is_not_written_to(intact: Path, copy: Path, door: Door) -> None:
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*")}
     assert door("verify", copy, "--repair").out == f"{copy} is intact\n"
     assert {path: path.stat().st_mtime_ns for path in copy.rglob("*")} == before
 
 
-def test_an_interrupted_repair_makes_nothing_worse(
-    whole: Path, copy: Path, door: Door, monkeypatch: pytest.MonkeyPatch
+def test_interrupted_repair_adds_no_damage(
+    intact: Path, copy: Path, door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     damaged = (FILES[3], FILES[5])
     for name in damaged:
@@ -249,16 +249,14 @@ def test_an_interrupted_repair_makes_nothing_worse(
         assert door("verify", copy, "--repair").code == 130
     assert {damage.file for damage in verify(copy)} == set(damaged)
 
-    assert_mended(copy, whole, door)
+    assert_repaired(copy, intact, door)
 
 
 def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def test_a_finished_dataset_with_a_missing_shard_points_to_the_repair(
-    copy: Path, sources: Path, make: Make, door: Door
-) -> None:
+def test_rerun_with_a_missing_shard_names_the_repair(copy: Path, sources: Path, make: Make, door: Door) -> None:
     (copy / FILES[3]).unlink()
 
     done = door(f"source.root={sources}", "out=ds", "output.pairs_per_shard=4")

@@ -1,4 +1,4 @@
-"""A run that is killed, stopped, refused or run again: what is on disk afterwards."""
+"""Runs that are killed, stopped, refused or repeated: what is on disk afterwards."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def undisturbed(forty: Path, make: Make, tree_hash: Hash) -> str:
 
 @contextmanager
 def running(*arguments: object, cwd: Path) -> Iterator[subprocess.Popen[str]]:
-    """Start ``gen-dataset`` in a session of its own; whatever of it is left afterwards is killed."""
+    """Start ``gen-dataset`` in a new session; processes of it that are left afterwards are killed."""
     process = subprocess.Popen(
         [str(COMMAND), *map(str, arguments)], cwd=cwd, env=environment(), text=True, start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -103,10 +103,10 @@ def assert_whole(out: Path) -> None:
 # Killed ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_killed_ten_times_ends_as_if_undisturbed(
+def test_run_killed_ten_times_ends_as_if_undisturbed(
     forty: Path, undisturbed: str, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
-    """The moments are spread over the run: each is so many shards in, and a few random milliseconds later."""
+    """Each kill comes a few random milliseconds after a number of shards that grows from kill to kill."""
     moment = random.Random(385)
     out = tmp_path / "ds"
     for kill in range(10):
@@ -123,16 +123,16 @@ def test_a_run_killed_ten_times_ends_as_if_undisturbed(
 
 
 class Killed(BaseException):
-    """The machine stopped here."""
+    """Simulate a kill at this point."""
 
 
 FILES = 10
-"""Renames of a run of three shards: sources.json, config.yaml, rows and shard of each, manifest.csv, dataset.json."""
+"""Renames of a run with three shards: sources.json, config.yaml, rows and file of each, manifest and dataset.json."""
 
 
 @pytest.mark.parametrize("renamed", [False, True])
 @pytest.mark.parametrize("number", range(FILES))
-def test_a_run_that_ends_before_or_after_any_of_its_renames_can_be_finished(
+def test_run_killed_around_any_rename_can_be_resumed(
     number: int, renamed: bool, make: Make, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source, out = fill(tmp_path / "p", 5), tmp_path / "ds"
@@ -157,7 +157,7 @@ def test_a_run_that_ends_before_or_after_any_of_its_renames_can_be_finished(
     assert_whole(out)
 
 
-def test_a_run_has_as_many_renames_as_are_tested(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_rename_of_a_run_is_tested(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
     replace = os.replace
     monkeypatch.setattr(os, "replace", lambda old, new: (seen.append(Path(new).name), replace(old, new)))
@@ -174,7 +174,7 @@ def test_a_run_has_as_many_renames_as_are_tested(make: Make, tmp_path: Path, mon
 
 @pytest.fixture
 def begun(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Photographs p, and a dataset ds of which two shards of three are committed."""
+    """Make photographs p, and a dataset ds of which two shards of three are committed."""
     source = fill(tmp_path / "p", 6)
     replace = os.replace
 
@@ -198,7 +198,7 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
     }
 
 
-def test_a_run_goes_on_with_what_is_not_committed(begun: Path, make: Make) -> None:
+def test_resumed_run_makes_only_missing_shards(begun: Path, make: Make) -> None:
     before = snapshot(begun / "ds/shards")
     summary = make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
     assert (summary.made, summary.rows) == (2, 6)
@@ -206,9 +206,7 @@ def test_a_run_goes_on_with_what_is_not_committed(begun: Path, make: Make) -> No
     assert {name: after[name] for name in before} == before
 
 
-def test_what_an_earlier_run_left_half_written_is_swept_at_the_start(
-    begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unfinished_shards_are_deleted_at_the_start(begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     left = begun / "ds/.work/tmp/shard-00002.tar.1.1"
     left.write_bytes(b"half")
     there: list[bool] = []
@@ -218,7 +216,7 @@ def test_what_an_earlier_run_left_half_written_is_swept_at_the_start(
     assert there == [False]
 
 
-def test_nothing_half_written_is_left_at_the_end(begun: Path, make: Make) -> None:
+def test_unfinished_files_are_deleted_at_the_end(begun: Path, make: Make) -> None:
     (begun / "ds/.work/tmp/shard-00002.tar.1.1").write_bytes(b"half")
     (begun / "ds/.work/manifest.csv.part").write_text("half")
     make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
@@ -226,7 +224,7 @@ def test_nothing_half_written_is_left_at_the_end(begun: Path, make: Make) -> Non
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: os.truncate(path, 600)], ids=["deleted", "cut off"])
-def test_a_committed_shard_that_is_not_whole_is_made_again(
+def test_incomplete_committed_shard_is_regenerated(
     damage: Callable[[Path], Any], begun: Path, make: Make, tree_hash: Hash
 ) -> None:
     damage(begun / "ds/shards/shard-00000.tar")
@@ -236,7 +234,7 @@ def test_a_committed_shard_that_is_not_whole_is_made_again(
     assert tree_hash(begun / "ds") == tree_hash(begun / "undisturbed")
 
 
-def test_progress_begins_where_the_earlier_run_ended(begun: Path, make: Make, capfd: Any) -> None:
+def test_progress_of_a_resumed_run_counts_finished_images(begun: Path, make: Make, capfd: Any) -> None:
     with logging_to():
         make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
     assert "gen-dataset: 6/6 images" in capfd.readouterr().err
@@ -278,7 +276,7 @@ CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
 
 @pytest.mark.parametrize("state", ["begun", "finished"])
 @pytest.mark.parametrize(("override", "change", "sentence"), CHANGES)
-def test_other_settings_or_sources_on_the_same_out_are_refused_and_change_nothing(
+def test_changed_settings_or_sources_are_refused_and_change_nothing(
     state: str, override: str, change: Callable[[Path], Any], sentence: str, request: pytest.FixtureRequest, make: Make
 ) -> None:
     folder: Path = request.getfixturevalue(state)
@@ -289,7 +287,7 @@ def test_other_settings_or_sources_on_the_same_out_are_refused_and_change_nothin
     assert snapshot(folder / "ds") == before
 
 
-def test_a_scene_dataset_is_not_gone_on_with_from_a_folder(begun: Path, make: Make) -> None:
+def test_scene_run_is_not_resumed_from_a_folder(begun: Path, make: Make) -> None:
     with pytest.raises(ConfigError, match=r"source.kind=synthetic \(there: folder\)"):
         make(None, begun / "ds", "output.pairs_per_shard=2")
 
@@ -297,7 +295,7 @@ def test_a_scene_dataset_is_not_gone_on_with_from_a_folder(begun: Path, make: Ma
 # Finished -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_second_run_does_nothing_and_says_so(finished: Path, door: Door) -> None:
+def test_rerun_of_a_finished_dataset_reports_nothing_to_do(finished: Path, door: Door) -> None:
     before = snapshot(finished)
     done = door("source.root=p", "output.pairs_per_shard=2")
     assert (done.code, done.err) == (0, "")
@@ -306,31 +304,31 @@ def test_a_second_run_does_nothing_and_says_so(finished: Path, door: Door) -> No
     assert snapshot(finished) == before
 
 
-def test_a_finished_dataset_of_scenes_is_complete_too(make: Make, tmp_path: Path) -> None:
+def test_finished_dataset_of_scenes_is_complete(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1")
     assert make(None, tmp_path / "ds", "source.limit=1").made == 0
 
 
-def test_a_finished_dataset_whose_shard_is_missing_is_damage(finished: Path, door: Door) -> None:
+def test_missing_shard_of_a_finished_dataset_is_damage(finished: Path, door: Door) -> None:
     (finished / "ds/shards/shard-00001.tar").unlink()
     done = door("source.root=p", "output.pairs_per_shard=2")
     assert (done.code, done.err.count("\n")) == (4, 1)
     assert "shard-00001.tar: is missing, expected " in done.err
 
 
-def test_a_finished_dataset_whose_shard_has_another_size_is_damage(finished: Path, make: Make) -> None:
+def test_shard_of_another_size_is_damage(finished: Path, make: Make) -> None:
     os.truncate(finished / "ds/shards/shard-00001.tar", 700)
     with pytest.raises(DamageError, match=r"shard-00001.tar: has 700 bytes, expected \d+ bytes"):
         make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
 
 
-def test_a_finished_dataset_without_its_manifest_is_damage(finished: Path, make: Make) -> None:
+def test_finished_dataset_without_manifest_is_damage(finished: Path, make: Make) -> None:
     (finished / "ds/manifest.csv").unlink()
     with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
         make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
 
 
-def test_a_finished_dataset_without_its_config_is_damage(finished: Path, make: Make) -> None:
+def test_finished_dataset_without_config_is_damage(finished: Path, make: Make) -> None:
     (finished / "ds/config.yaml").unlink()
     with pytest.raises((DamageError, ConfigError)):
         make(finished / "p", finished / "ds", "output.pairs_per_shard=2", "seed=1")
@@ -344,7 +342,7 @@ def test_a_finished_dataset_without_its_config_is_damage(finished: Path, make: M
         ("finished", "dataset.json"),
     ],
 )
-def test_a_file_of_ours_that_cannot_be_read_is_told_in_one_line(
+def test_unreadable_dataset_file_is_reported_in_one_line(
     state: str, name: str, request: pytest.FixtureRequest, door: Door
 ) -> None:
     folder: Path = request.getfixturevalue(state)
@@ -354,19 +352,19 @@ def test_a_file_of_ours_that_cannot_be_read_is_told_in_one_line(
     assert done.err.count("\n") == 1
 
 
-def test_a_committed_shard_whose_rows_cannot_be_read_is_made_again(begun: Path, make: Make) -> None:
+def test_committed_shard_with_unreadable_rows_is_regenerated(begun: Path, make: Make) -> None:
     (begun / "ds/.work/rows/00000.json").write_text("{[")
     make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
     assert_whole(begun / "ds")
 
 
-def test_what_a_kill_between_the_last_rename_and_the_sweep_left_goes(finished: Path, make: Make) -> None:
+def test_work_folder_left_by_a_kill_is_deleted(finished: Path, make: Make) -> None:
     (finished / "ds/.work/rows").mkdir(parents=True)
     make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
     assert_whole(finished / "ds")
 
 
-# Whose folder ---------------------------------------------------------------------------------------------------------
+# Lock and foreign files -----------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -381,7 +379,7 @@ def held(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", ["shards/shard-00000.tar", "manifest.csv", "dataset.json", "photo.jpg"])
-def test_a_folder_with_files_of_anyone_else_is_refused_and_left_alone(name: str, make: Make, tmp_path: Path) -> None:
+def test_folder_with_foreign_files_is_refused_and_unchanged(name: str, make: Make, tmp_path: Path) -> None:
     path = tmp_path / "ds" / name
     path.parent.mkdir(parents=True)
     path.write_text("precious")
@@ -391,13 +389,13 @@ def test_a_folder_with_files_of_anyone_else_is_refused_and_left_alone(name: str,
     assert sorted(entry.name for entry in (tmp_path / "ds").iterdir()) == [name.split("/")[0]]
 
 
-def test_a_shard_that_no_run_made_is_refused(begun: Path, make: Make) -> None:
+def test_foreign_shard_is_refused(begun: Path, make: Make) -> None:
     (begun / "ds/shards/shard-00009.tar").write_text("stale")
     with pytest.raises(ConfigError, match=r"unexpected file .*shard-00009.tar; expected only committed shards"):
         make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
 
 
-def test_a_folder_that_another_run_holds_is_refused_with_11(door: Door, tmp_path: Path) -> None:
+def test_folder_locked_by_another_run_is_refused_with_11(door: Door, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
     with held(tmp_path / "ds"):
         done = door("source.root=p")
@@ -405,17 +403,17 @@ def test_a_folder_that_another_run_holds_is_refused_with_11(door: Door, tmp_path
     assert list((tmp_path / "ds").iterdir()) == []
 
 
-def test_a_finished_dataset_that_another_run_holds_is_refused(finished: Path, make: Make) -> None:
+def test_locked_finished_dataset_is_refused(finished: Path, make: Make) -> None:
     with held(finished / "ds"), pytest.raises(LockedError):
         make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
 
 
-def test_a_run_holds_its_folder_for_itself_alone(finished: Path, make: Make) -> None:
+def test_run_locks_its_folder_exclusively(finished: Path, make: Make) -> None:
     with held(finished / "ds", fcntl.LOCK_SH), pytest.raises(LockedError):
         make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
 
 
-def test_a_run_lets_go_of_its_folder(finished: Path) -> None:
+def test_finished_run_releases_its_folder(finished: Path) -> None:
     with held(finished / "ds"):
         pass
 
@@ -428,7 +426,7 @@ def test_two_runs_at_once_make_one_dataset(forty: Path, undisturbed: str, tree_h
     assert tree_hash(tmp_path / "ds") == undisturbed
 
 
-def test_a_folder_with_other_files_is_refused_and_left_alone(make: Make, tmp_path: Path) -> None:
+def test_folder_with_a_foreign_file_names_it_and_stays_unchanged(make: Make, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds/thesis.tex").write_text("mine")
     with pytest.raises(ConfigError, match=r"out=.*/ds: contains thesis.tex, which is not of a dataset; choose"):
@@ -436,7 +434,7 @@ def test_a_folder_with_other_files_is_refused_and_left_alone(make: Make, tmp_pat
     assert os.listdir(tmp_path / "ds") == ["thesis.tex"]
 
 
-def test_an_empty_folder_is_taken(make: Make, tmp_path: Path) -> None:
+def test_empty_folder_is_accepted(make: Make, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     make(fill(tmp_path / "p", 1), tmp_path / "ds")
     assert_whole(tmp_path / "ds")
@@ -448,7 +446,7 @@ LONG = ("source.limit=400", ONE, "n_jobs=2")
 
 
 class Stopped(NamedTuple):
-    """A run that got a signal: its exit code, stderr, processes left five seconds later, and its folder."""
+    """Hold the exit code, stderr, folder, and processes five seconds after the signal, of a run that got one."""
 
     number: int
     code: int
@@ -457,10 +455,14 @@ class Stopped(NamedTuple):
     out: Path
 
 
-SIGNALS = [(number, group) for number in (signal.SIGINT, signal.SIGTERM) for group in (False, True)]
+SIGNALS = [(number, group) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) for group in (False, True)]
 
 
-@pytest.fixture(scope="module", params=SIGNALS, ids=["INT", "INT to the group", "TERM", "TERM to the group"])
+@pytest.fixture(
+    scope="module",
+    params=SIGNALS,
+    ids=[f"{number.name}{' to the group' if group else ''}" for number, group in SIGNALS],
+)
 def stopped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     number, group = request.param
     folder = tmp_path_factory.mktemp("stopped")
@@ -476,7 +478,7 @@ def stopped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def test_a_signal_ends_the_run_with_its_code(stopped: Stopped) -> None:
-    assert stopped.code == {signal.SIGINT: 130, signal.SIGTERM: 143}[stopped.number]
+    assert stopped.code == 128 + stopped.number
 
 
 def test_a_signal_leaves_no_process_behind(stopped: Stopped) -> None:
@@ -488,16 +490,12 @@ def test_a_signal_leaves_the_dataset_unfinished(stopped: Stopped) -> None:
     assert not (stopped.out / "dataset.json").exists()
 
 
-LOKY_TRACKER = ("resource_tracker", "objects to clean up at shutdown", "  warnings.warn(")
-"""What loky's own tracker process may say when it outlives the run by a moment: not ours to prevent."""
-
-
-def test_a_signal_leaves_nothing_on_stderr_but_our_own_lines(stopped: Stopped) -> None:
+def test_signal_prints_only_lines_of_gen_dataset(stopped: Stopped) -> None:
     others = [line for line in stopped.err.splitlines() if not line.startswith("gen-dataset: ")]
-    assert [line for line in others if not any(part in line for part in LOKY_TRACKER)] == []
+    assert others == []
 
 
-def test_workers_end_with_a_run_that_is_killed(tmp_path: Path) -> None:
+def test_workers_end_when_their_coordinator_is_killed(tmp_path: Path) -> None:
     with running(*LONG, cwd=tmp_path) as process:
         wait_for(lambda: committed(tmp_path / "ds"))
         assert len(workers(process.pid)) == 2
@@ -521,13 +519,13 @@ def deadly(data=b"", **options):
 
 hashlib.sha256 = deadly
 """
-"""A module that every process of a run imports first: hashing one photograph kills the worker, so many times."""
+"""Module that every process of a run imports first: hashing one photograph kills the worker a number of times."""
 
 TWELVE = ("source.root=p", "output.pairs_per_shard=4", "n_jobs=2")
 
 
 def run_with_deaths(cli: Cli, folder: Path, deaths: int) -> subprocess.CompletedProcess[str]:
-    """Make the dataset of twelve photographs, of which the tenth (in the third shard) kills its worker."""
+    """Make a dataset of twelve photographs; the tenth, in the third shard, kills its worker."""
     fill(folder / "p", 12)
     (folder / "site").mkdir()
     (folder / "site/sitecustomize.py").write_text(DEADLY)
@@ -543,7 +541,7 @@ def twelve_undisturbed(make: Make, tree_hash: Hash, tmp_path_factory: pytest.Tem
     return tree_hash(folder / "ds")
 
 
-def test_a_worker_that_dies_once_changes_nothing(
+def test_worker_that_dies_once_changes_no_byte(
     twelve_undisturbed: str, cli: Cli, tree_hash: Hash, tmp_path: Path
 ) -> None:
     done = run_with_deaths(cli, tmp_path, deaths=1)
@@ -554,7 +552,7 @@ def test_a_worker_that_dies_once_changes_nothing(
     assert not (tmp_path / "ds/.work").exists()
 
 
-def test_a_photograph_that_kills_twice_is_given_up_and_tried_again_by_the_next_run(
+def test_source_that_kills_two_workers_is_retried_by_the_next_run(
     twelve_undisturbed: str, cli: Cli, make: Make, tree_hash: Hash, tmp_path: Path
 ) -> None:
     done = run_with_deaths(cli, tmp_path, deaths=2)
@@ -572,13 +570,11 @@ def test_a_photograph_that_kills_twice_is_given_up_and_tried_again_by_the_next_r
     assert not (tmp_path / "ds/.work").exists()
 
 
-# The machine ----------------------------------------------------------------------------------------------------------
+# System errors --------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_that_cannot_be_written_ends_the_run_with_5_and_a_rerun_finishes_it(
-    make: Make, tree_hash: Hash, tmp_path: Path
-) -> None:
-    """A limit on the size of files stands for a full disk."""
+def test_failed_write_ends_with_5_and_a_rerun_finishes(make: Make, tree_hash: Hash, tmp_path: Path) -> None:
+    """A limit on the size of files acts as a full disk."""
     source = fill(tmp_path / "p", 3)
     Image.fromarray(pixels(5, 300, 300)).save(source / "large.png")
     command = f"ulimit -f 300; exec {COMMAND} source.root=p n_jobs=1 {ONE}"
@@ -602,9 +598,7 @@ def test_a_file_that_cannot_be_written_ends_the_run_with_5_and_a_rerun_finishes_
     assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "twelve_undisturbed")
 
 
-def test_an_out_that_vanishes_is_the_machines_failure(
-    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_deleted_out_is_a_system_error(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_tasks = runner.run_tasks
 
     def vanishing(*arguments: Any) -> Iterator[Any]:
@@ -644,8 +638,8 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, sum(1 for _ in (out / 
 
 
 @pytest.mark.slow
-def test_a_million_rows_are_merged_in_the_memory_of_a_thousand(tmp_path: Path) -> None:
-    """The rows of committed shards, simulated: what else a run does with each is bounded by its shard."""
+def test_million_rows_are_merged_in_constant_memory(tmp_path: Path) -> None:
+    """The rows of committed shards are simulated; memory for everything else is bounded by one shard."""
     manifest = str(Path(__file__).parents[1] / "manifests" / "scenes_imx385_iso3200.csv")
     peaks_kib = []
     for shards in (10, 10_000):

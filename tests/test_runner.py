@@ -1,4 +1,4 @@
-"""A run: what the data depend on and what not, shards, failed photographs, dataset.json, progress."""
+"""Runs: what the data depend on, shards, failed photographs, ``dataset.json``, progress."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def sha256(path: Path) -> str:
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
-def test_the_number_of_workers_moves_no_byte(
+def test_number_of_workers_changes_no_byte(
     n_jobs: int, make: Make, photos: Path, dataset: Path, tree_hash: Hash, tmp_path: Path
 ) -> None:
     make(photos, tmp_path / "ds", SHARDS_OF_5, n_jobs=n_jobs)
@@ -58,7 +58,7 @@ def test_the_number_of_workers_moves_no_byte(
 
 
 class Backwards:
-    """A folder's entries in the opposite order."""
+    """List a folder's entries in reverse order."""
 
     scandir = staticmethod(os.scandir)
 
@@ -72,7 +72,7 @@ class Backwards:
     def __exit__(self, *_: object) -> None: ...
 
 
-def test_the_order_in_which_the_file_system_lists_moves_no_byte(
+def test_order_of_directory_entries_changes_no_byte(
     make: Make, photos: Path, dataset: Path, tree_hash: Hash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "scandir", Backwards)
@@ -80,7 +80,7 @@ def test_the_order_in_which_the_file_system_lists_moves_no_byte(
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
 
 
-def test_the_order_in_which_files_were_created_moves_no_byte(
+def test_order_of_file_creation_changes_no_byte(
     make: Make, photos: Path, dataset: Path, tree_hash: Hash, tmp_path: Path
 ) -> None:
     for path in sorted(photos.rglob("*"), reverse=True):
@@ -92,7 +92,7 @@ def test_the_order_in_which_files_were_created_moves_no_byte(
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
 
 
-def test_place_locale_clock_and_hash_seed_move_no_byte(
+def test_place_locale_clock_and_hash_seed_change_no_byte(
     cli: Cli, photos: Path, dataset: Path, tree_hash: Hash, tmp_path: Path
 ) -> None:
     (tmp_path / "a/b").mkdir(parents=True)
@@ -105,7 +105,7 @@ def test_place_locale_clock_and_hash_seed_move_no_byte(
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
 
 
-def test_the_umask_moves_no_byte(make: Make, photos: Path, dataset: Path, tree_hash: Hash, tmp_path: Path) -> None:
+def test_umask_changes_no_byte(make: Make, photos: Path, dataset: Path, tree_hash: Hash, tmp_path: Path) -> None:
     before = os.umask(0o077)
     try:
         make(photos, tmp_path / "ds", SHARDS_OF_5)
@@ -114,18 +114,18 @@ def test_the_umask_moves_no_byte(make: Make, photos: Path, dataset: Path, tree_h
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
 
 
-def test_the_seed_moves_every_pair_with_noise_in_it(make: Make, photos: Path, dataset: Path, tmp_path: Path) -> None:
+def test_seed_changes_every_noisy_frame(make: Make, photos: Path, dataset: Path, tmp_path: Path) -> None:
     make(photos, tmp_path / "ds", SHARDS_OF_5, "seed=1")
     for mine, theirs in zip(rows(tmp_path / "ds"), rows(dataset), strict=True):
         assert mine["stream_key"] != theirs["stream_key"]
         assert mine["noisy_xxh3"] != theirs["noisy_xxh3"]
 
 
-# Images do not touch each other ---------------------------------------------------------------------------------------
+# Images are independent -----------------------------------------------------------------------------------------------
 
 
 def by_source(out: Path) -> dict[str, Any]:
-    """Everything about each image but its place in the listing."""
+    """Return row and arrays of each image, without its place in the listing."""
     return {
         str(sample.row["source"]): (
             {name: value for name, value in sample.row.items() if name not in ("key", "shard")},
@@ -137,7 +137,7 @@ def by_source(out: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("shard", [1, 3])
-def test_adding_a_file_changes_nothing_about_the_others(shard: int, make: Make, tmp_path: Path) -> None:
+def test_adding_a_file_leaves_other_images_unchanged(shard: int, make: Make, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 5)
     make(source, tmp_path / "before", f"output.pairs_per_shard={shard}", "camera=choice", "noise=brooks2019")
     Image.fromarray(pixels(99, 14, 14)).save(source / "000-first.png")
@@ -147,7 +147,7 @@ def test_adding_a_file_changes_nothing_about_the_others(shard: int, make: Make, 
     assert {name: after[name] for name in before} == before
 
 
-def test_removing_a_file_changes_nothing_about_the_others(make: Make, tmp_path: Path) -> None:
+def test_removing_a_file_leaves_other_images_unchanged(make: Make, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 5)
     make(source, tmp_path / "before", "noise=brooks2019")
     (source / "001.png").unlink()
@@ -157,23 +157,21 @@ def test_removing_a_file_changes_nothing_about_the_others(make: Make, tmp_path: 
     assert {name: before[name] for name in after} == after
 
 
-def test_the_size_of_shards_changes_nothing_about_an_image(
-    make: Make, dataset: Path, photos: Path, tmp_path: Path
-) -> None:
+def test_shard_size_leaves_images_unchanged(make: Make, dataset: Path, photos: Path, tmp_path: Path) -> None:
     make(photos, tmp_path / "ds", "output.pairs_per_shard=2")
     assert by_source(tmp_path / "ds") == by_source(dataset)
 
 
-def test_a_limit_changes_nothing_about_the_images_it_keeps(
-    make: Make, dataset: Path, photos: Path, tmp_path: Path
-) -> None:
+def test_source_limit_leaves_kept_images_unchanged(make: Make, dataset: Path, photos: Path, tmp_path: Path) -> None:
     make(photos, tmp_path / "ds", "source.limit=4")
     kept, whole = by_source(tmp_path / "ds"), by_source(dataset)
     assert list(kept) == list(PHOTOS[:4])
     assert kept == {name: whole[name] for name in kept}
 
 
-def test_another_noise_leaves_the_other_draws_alone(make: Make, photos: Path, dataset: Path, tmp_path: Path) -> None:
+def test_another_noise_profile_leaves_other_draws_unchanged(
+    make: Make, photos: Path, dataset: Path, tmp_path: Path
+) -> None:
     make(photos, tmp_path / "ds", SHARDS_OF_5, "noise=brooks2019")
     for mine, theirs in zip(rows(tmp_path / "ds"), rows(dataset), strict=True):
         for name in ("red_gain", "blue_gain", "inverse_rgb_gain", "rgb2cam_00", "w_sony_a7r", "clean_xxh3"):
@@ -196,7 +194,7 @@ def test_identical_files_get_different_parameters_and_noise(twins: Path, make: M
     assert len({row["noisy_xxh3"] for row in same}) == 3
 
 
-def test_the_first_of_identical_files_by_name_is_as_if_alone(twins: Path, make: Make, tmp_path: Path) -> None:
+def test_first_of_identical_files_by_name_is_as_if_alone(twins: Path, make: Make, tmp_path: Path) -> None:
     make(twins, tmp_path / "three")
     for name in ("a.png", "z.png"):
         (twins / name).unlink()
@@ -204,7 +202,7 @@ def test_the_first_of_identical_files_by_name_is_as_if_alone(twins: Path, make: 
     assert by_source(tmp_path / "three")["001.png"] == by_source(tmp_path / "one")["001.png"]
 
 
-def test_identical_files_are_numbered_by_name_whatever_they_are_called(twins: Path, make: Make, tmp_path: Path) -> None:
+def test_identical_files_are_numbered_in_name_order(twins: Path, make: Make, tmp_path: Path) -> None:
     make(twins, tmp_path / "before")
     (twins / "a.png").rename(twins / "m.png")
     make(twins, tmp_path / "after")
@@ -216,23 +214,23 @@ def test_identical_files_are_numbered_by_name_whatever_they_are_called(twins: Pa
 # Rows, shards, failures -----------------------------------------------------------------------------------------------
 
 
-def test_rows_stand_in_source_order_with_keys_that_count(dataset: Path) -> None:
+def test_rows_are_in_source_order_with_consecutive_keys(dataset: Path) -> None:
     assert [row["source"] for row in rows(dataset)] == list(PHOTOS)
     assert [row["key"] for row in rows(dataset)] == [f"{i:08d}" for i in range(len(PHOTOS))]
 
 
-def test_shard_s_holds_the_sources_from_s_n_on(dataset: Path) -> None:
+def test_shard_s_contains_sources_from_index_s_n(dataset: Path) -> None:
     assert [row["shard"] for row in rows(dataset)] == [i // 5 for i in range(13)]
 
 
-def test_every_digest_is_that_of_its_array(dataset: Path) -> None:
+def test_recorded_digests_equal_those_of_the_arrays(dataset: Path) -> None:
     for sample in RawPairs(dataset):
         assert sample.row["clean_xxh3"] == array_xxh3(sample.clean)
         assert sample.row["noisy_xxh3"] == array_xxh3(sample.noisy)
         assert sample.clean.shape == sample.noisy.shape == (sample.row["height"], sample.row["width"])
 
 
-def test_every_source_digest_is_that_of_its_file(dataset: Path, photos: Path) -> None:
+def test_recorded_source_digests_equal_those_of_the_files(dataset: Path, photos: Path) -> None:
     files = sorted(
         (path for path in photos.rglob("*.*") if path.name != "notes.txt"), key=lambda p: bytes(p.relative_to(photos))
     )
@@ -240,7 +238,7 @@ def test_every_source_digest_is_that_of_its_file(dataset: Path, photos: Path) ->
     assert [row["source_bytes"] for row in rows(dataset)] == [path.stat().st_size for path in files]
 
 
-def test_counts_of_saturated_sites_are_those_of_the_array(dataset: Path) -> None:
+def test_recorded_saturated_sites_equal_those_of_the_array(dataset: Path) -> None:
     for sample in RawPairs(dataset):
         assert sample.row["saturated"] == int((sample.clean == sample.row["white_level_dn"]).sum())
 
@@ -251,12 +249,12 @@ def test_orientation_is_applied_and_recorded(dataset: Path) -> None:
     assert found["comma, and space.jpg"] == (1, 37, 23)
 
 
-def test_names_of_every_kind_are_found_again_in_the_csv(dataset: Path) -> None:
+def test_file_names_survive_the_csv(dataset: Path) -> None:
     with (dataset / "manifest.csv").open(encoding="utf-8", newline="") as stream:
         assert [row["source"] for row in csv.DictReader(stream)] == list(PHOTOS)
 
 
-def test_names_that_csv_or_utf8_cannot_hold_are_percent_encoded(make: Make, tmp_path: Path) -> None:
+def test_unsafe_file_names_are_percent_encoded(make: Make, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 1)
     names = [b"@at.png", b"a\nb.png", b"bad\xff.png", b'quote".png', "right\u202eleft.png".encode()]
     for i, name in enumerate(names):
@@ -271,7 +269,7 @@ def test_names_that_csv_or_utf8_cannot_hold_are_percent_encoded(make: Make, tmp_
 
 @pytest.fixture(scope="module")
 def broken(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of 9 photographs in shards of 2, some of which fail: all of shard 1, one of shard 2."""
+    """Make a dataset of 9 photographs in shards of 2; all of shard 1 and one of shard 2 fail."""
     source = fill(tmp_path_factory.mktemp("broken") / "p", 9)
     whole = (source / "002.png").read_bytes()
     (source / "002.png").write_bytes(whole[: len(whole) // 2])
@@ -292,7 +290,7 @@ def test_failed_photographs_have_rows_with_a_reason(broken: Path) -> None:
     assert [row["status"] == "failed" for row in rows(broken)] == [row["reason"] != "" for row in rows(broken)]
 
 
-def test_a_failed_row_says_nothing_about_a_pair(broken: Path) -> None:
+def test_failed_rows_have_no_values_of_a_pair(broken: Path) -> None:
     row = rows(broken)[2]
     filled = {name for name, value in row.items() if value not in (None, "")}
     assert filled == {
@@ -300,7 +298,7 @@ def test_a_failed_row_says_nothing_about_a_pair(broken: Path) -> None:
     }
 
 
-def test_a_file_that_could_not_be_read_has_no_digest(broken: Path) -> None:
+def test_unreadable_files_have_no_digest(broken: Path) -> None:
     assert [i for i, row in enumerate(rows(broken)) if not row["source_sha256"]] == [3, 6, 8]
 
 
@@ -309,7 +307,7 @@ def test_failed_photographs_leave_gaps(broken: Path) -> None:
     assert [row["shard"] for row in rows(broken)] == [0, 0, 1, 1, 2, 2, 3, 3, 4]
 
 
-def test_a_shard_with_no_pair_has_an_entry_and_no_file(broken: Path) -> None:
+def test_shard_without_pairs_has_an_entry_and_no_file(broken: Path) -> None:
     assert facts(broken)["shards"][1] == {"file": None, "pairs": 0, "failed": 2, "bytes": 0, "sha256": None}
     assert sorted(path.name for path in (broken / "shards").iterdir()) == [
         "shard-00000.tar", "shard-00002.tar", "shard-00003.tar",
@@ -321,12 +319,12 @@ def test_failures_are_counted_by_reason(broken: Path) -> None:
     assert facts(broken)["pairs"] == 4
 
 
-def test_pairs_and_failures_of_the_shards_sum_up(broken: Path) -> None:
+def test_entries_count_pairs_and_failures_of_each_shard(broken: Path) -> None:
     entries = facts(broken)["shards"]
     assert [(entry["pairs"], entry["failed"]) for entry in entries] == [(2, 0), (0, 2), (1, 1), (1, 1), (0, 1)]
 
 
-def test_a_dataset_without_any_pair_is_still_whole(make: Make, tmp_path: Path) -> None:
+def test_dataset_without_pairs_is_complete(make: Make, tmp_path: Path) -> None:
     (tmp_path / "p").mkdir()
     (tmp_path / "p/empty.png").touch()
     summary = make(tmp_path / "p", tmp_path / "ds")
@@ -334,9 +332,7 @@ def test_a_dataset_without_any_pair_is_still_whole(make: Make, tmp_path: Path) -
     assert len(RawPairs(tmp_path / "ds")) == 0
 
 
-def test_a_source_that_changes_while_the_run_is_on_stops_it(
-    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_source_that_changes_during_a_run_stops_it(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = fill(tmp_path / "p", 2)
     make_shard = local.make_shard
 
@@ -351,18 +347,18 @@ def test_a_source_that_changes_while_the_run_is_on_stops_it(
 
 
 @pytest.mark.parametrize("key", ["camera.name", "noise.name"])
-def test_a_name_that_would_end_the_line_of_its_row_is_refused(key: str, make: Make, tmp_path: Path) -> None:
+def test_option_name_with_a_line_end_is_refused(key: str, make: Make, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=rf"{key}='my name\\n': expected up to 100 letters, digits"):
         make(fill(tmp_path / "p", 2), tmp_path / "ds", f'{key}="my name\n"')
 
 
 @pytest.mark.parametrize("key", ["camera.name", "noise.name"])
-def test_a_long_name_is_refused_or_fits(key: str, make: Make, tmp_path: Path) -> None:
+def test_long_option_name_is_refused_or_fits_its_row(key: str, make: Make, tmp_path: Path) -> None:
     with contextlib.suppress(ConfigError):
         make(fill(tmp_path / "p", 1), tmp_path / "ds", f"{key}={'n' * 3000}")
 
 
-def test_no_number_of_a_plan_is_infinite(make: Make, tmp_path: Path) -> None:
+def test_infinite_plan_values_are_refused(make: Make, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"noise.b"):
         make(fill(tmp_path / "p", 1), tmp_path / "ds", "sensor=generic_16bit", "noise.b=1e308")
 
@@ -370,7 +366,7 @@ def test_no_number_of_a_plan_is_infinite(make: Make, tmp_path: Path) -> None:
 # The three files ------------------------------------------------------------------------------------------------------
 
 
-def test_dataset_json_knows_the_digests_as_sha256sum_says_them(dataset: Path) -> None:
+def test_dataset_json_records_the_digests_of_sha256sum(dataset: Path) -> None:
     known = facts(dataset)
     assert known["manifest_sha256"] == sha256(dataset / "manifest.csv")
     assert known["config_sha256"] == sha256(dataset / "config.yaml")
@@ -379,24 +375,24 @@ def test_dataset_json_knows_the_digests_as_sha256sum_says_them(dataset: Path) ->
     ]
 
 
-def test_dataset_json_knows_the_bytes_and_pairs_of_every_shard(dataset: Path) -> None:
+def test_dataset_json_records_bytes_and_pairs_of_every_shard(dataset: Path) -> None:
     entries = facts(dataset)["shards"]
     assert [entry["file"] for entry in entries] == [f"shards/shard-{i:05d}.tar" for i in range(3)]
     assert [entry["bytes"] for entry in entries] == [(dataset / entry["file"]).stat().st_size for entry in entries]
     assert [(entry["pairs"], entry["failed"]) for entry in entries] == [(5, 0), (5, 0), (3, 0)]
 
 
-def test_the_fingerprint_is_that_of_config_and_manifest(dataset: Path) -> None:
+def test_fingerprint_is_the_digest_of_config_and_manifest(dataset: Path) -> None:
     known = facts(dataset)
     text = f"{known['config_sha256']}\n{known['manifest_sha256']}\n"
     assert known["fingerprint"] == hashlib.sha256(text.encode()).hexdigest()
 
 
-def test_dataset_json_counts_what_no_glob_matches(dataset: Path) -> None:
+def test_dataset_json_counts_unmatched_files(dataset: Path) -> None:
     assert (facts(dataset)["not_matched"], facts(dataset)["skipped_links"]) == (1, 0)
 
 
-def test_dataset_json_says_where_from_and_with_what(dataset: Path, photos: Path) -> None:
+def test_dataset_json_records_source_and_versions(dataset: Path, photos: Path) -> None:
     known = facts(dataset)
     assert known["source"] == {"kind": "folder", "root": str(photos)}
     assert set(runner.PACKAGES) == set(known["versions"])
@@ -408,12 +404,12 @@ def test_config_yaml_is_the_resolved_config(dataset: Path, settings: Callable[..
     assert (dataset / "config.yaml").read_text(encoding="utf-8") == dataset_yaml(config)
 
 
-def test_nothing_else_is_left_in_the_folder(dataset: Path) -> None:
+def test_finished_folder_contains_only_the_dataset(dataset: Path) -> None:
     assert sorted(os.listdir(dataset)) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "manifest.csv"])
-def test_no_place_host_or_version_stands_in_the_data(name: str, dataset: Path, photos: Path) -> None:
+def test_data_contain_no_path_host_or_version(name: str, dataset: Path, photos: Path) -> None:
     text = (dataset / name).read_text(encoding="utf-8")
     for word in (str(photos), str(dataset), os.uname().nodename + ".", np.__version__):
         assert word not in text
@@ -422,7 +418,7 @@ def test_no_place_host_or_version_stands_in_the_data(name: str, dataset: Path, p
 # Synthetic scenes -----------------------------------------------------------------------------------------------------
 
 
-def test_scenes_are_a_source_of_their_own(make: Make, tmp_path: Path) -> None:
+def test_built_in_scenes_are_the_source_without_a_root(make: Make, tmp_path: Path) -> None:
     summary = make(None, tmp_path / "ds", "source.limit=3")
     assert (summary.pairs, summary.made, summary.rows) == (3, 3, 3)
     assert [row["source"] for row in rows(tmp_path / "ds")] == ["dead_leaves-0", "colour_chart-0", "gradients-0"]
@@ -451,13 +447,11 @@ def test_no_more_workers_than_tasks_and_at_least_one() -> None:
     assert [local.effective_jobs(4, tasks) for tasks in (0, 1, 3, 9)] == [1, 1, 3, 4]
 
 
-def test_minus_one_worker_stands_for_the_cores_this_process_may_use() -> None:
+def test_n_jobs_minus_one_uses_all_allowed_cores() -> None:
     assert local.effective_jobs(-1, 10**6) == len(os.sched_getaffinity(0))
 
 
-def test_progress_is_plain_lines_where_there_is_no_terminal(
-    make: Make, photos: Path, tmp_path: Path, capfd: Any
-) -> None:
+def test_progress_is_plain_lines_without_a_terminal(make: Make, photos: Path, tmp_path: Path, capfd: Any) -> None:
     with logging_to():
         make(photos, tmp_path / "ds")
     out, err = capfd.readouterr()
@@ -465,14 +459,14 @@ def test_progress_is_plain_lines_where_there_is_no_terminal(
     assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)
 
 
-def test_the_first_run_of_a_machine_says_that_it_compiles_and_no_other(cli: Cli, tmp_path: Path) -> None:
+def test_only_the_first_run_reports_compiling(cli: Cli, tmp_path: Path) -> None:
     line = "gen-dataset: 0/1 images, compiling kernels (needed once per machine and version)"
     said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
 
     assert [line in one for one in said] == [True, False]
 
 
-def test_the_summary_adds_up_the_manifests_counts(dataset: Path) -> None:
+def test_summary_adds_up_the_counts_of_the_manifest(dataset: Path) -> None:
     rows = [sample.row for sample in RawPairs(dataset)]
     known = facts(dataset)["sites"]
     assert known["all"] == sum(row["width"] * row["height"] for row in rows)
@@ -481,8 +475,8 @@ def test_the_summary_adds_up_the_manifests_counts(dataset: Path) -> None:
     }
 
 
-def test_sites_without_noise_variance_are_told(make: Make, tmp_path: Path) -> None:
-    """The line of RVDD has a variance below 0 up to 15.33 DN above black."""
+def test_summary_counts_sites_without_noise_variance(make: Make, tmp_path: Path) -> None:
+    """The variance of the RVDD profile is below 0 up to 15.33 DN above black."""
     Image.fromarray(np.zeros((10, 10, 3), np.uint8)).save(tmp_path / "black.png")
     summary = make(tmp_path, tmp_path / "ds", "noise=imx385_iso3200_rvdd")
     assert (summary.sites["all"], summary.sites["zero_variance"]) == (100, 100)

@@ -1,4 +1,4 @@
-"""Verify finds any damage and names it; a replay makes any pair again from its row and its source."""
+"""Verify finds and names any damage; replay regenerates any pair from its row and its source."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ FILES = ("config.yaml", "manifest.csv", "dataset.json", "shards/shard-00000.tar"
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
-    """A small dataset of three pairs in two shards, beside its photographs."""
-    folder = tmp_path_factory.mktemp("whole")
+def intact(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
+    """Make a dataset of three pairs in two shards, next to its photographs."""
+    folder = tmp_path_factory.mktemp("intact")
     make(fill(folder / "p", 3), folder / "ds", "output.pairs_per_shard=2")
     return folder / "ds"
 
 
 @pytest.fixture
-def copy(whole: Path, tmp_path: Path) -> Path:
-    shutil.copytree(whole, tmp_path / "ds")
+def copy(intact: Path, tmp_path: Path) -> Path:
+    shutil.copytree(intact, tmp_path / "ds")
     return tmp_path / "ds"
 
 
-def said(folder: Path) -> list[str]:
+def damage_texts(folder: Path) -> list[str]:
     return [str(damage) for damage in verify(folder)]
 
 
-def test_a_whole_dataset_has_no_damage(whole: Path) -> None:
-    assert said(whole) == []
+def test_intact_dataset_has_no_damage(intact: Path) -> None:
+    assert damage_texts(intact) == []
 
 
 def flip(path: Path, at: int, bit: int) -> None:
@@ -54,8 +54,8 @@ def flip(path: Path, at: int, bit: int) -> None:
         stream.write(bytes([byte ^ 1 << bit]))
 
 
-def flips_found(whole: Path, folder: Path, count: int, seed: int) -> int:
-    """How many of ``count`` random flips, the files chosen by their sizes, are found."""
+def flips_found(intact: Path, folder: Path, count: int, seed: int) -> int:
+    """Return how many of ``count`` random flips are found; half of the files are drawn by size."""
     rng, found = random.Random(seed), 0
     sizes = [(folder / name).stat().st_size for name in FILES]
     for _ in range(count):
@@ -64,21 +64,21 @@ def flips_found(whole: Path, folder: Path, count: int, seed: int) -> int:
         flip(folder / name, at, bit)
         found += bool(verify(folder))
         flip(folder / name, at, bit)
-    assert said(folder) == []
+    assert damage_texts(folder) == []
     return found
 
 
-def test_every_flipped_bit_is_found(whole: Path, copy: Path) -> None:
-    assert flips_found(whole, copy, 150, seed=1) == 150
+def test_every_flipped_bit_is_found(intact: Path, copy: Path) -> None:
+    assert flips_found(intact, copy, 150, seed=1) == 150
 
 
 @pytest.mark.slow
-def test_a_thousand_flipped_bits_are_found(whole: Path, copy: Path) -> None:
-    assert flips_found(whole, copy, 1000, seed=2) == 1000
+def test_a_thousand_flipped_bits_are_found(intact: Path, copy: Path) -> None:
+    assert flips_found(intact, copy, 1000, seed=2) == 1000
 
 
 def boundaries(shard: Path) -> list[int]:
-    """Where members begin, their data begin and end, and the last byte of the file."""
+    """Return where members begin, where their data begin and end, and the last byte of the file."""
     places = [
         (member.offset - 512, member.offset, member.offset + member.size) for member in read_index(shard).values()
     ]
@@ -93,7 +93,7 @@ def test_every_truncation_is_found(name: str, copy: Path) -> None:
     cuts |= set(boundaries(copy / name)) if name.endswith(".tar") else set()
     for cut in sorted(cuts - {len(content)}):
         (copy / name).write_bytes(content[:cut])
-        assert said(copy), f"{name} cut to {cut} of {len(content)} bytes"
+        assert damage_texts(copy), f"{name} cut to {cut} of {len(content)} bytes"
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_a_thousand_truncations_are_found(copy: Path) -> None:
         path = copy / rng.choice(FILES)
         content = path.read_bytes()
         path.write_bytes(content[: rng.randrange(len(content))])
-        assert said(copy), path
+        assert damage_texts(copy), path
         path.write_bytes(content)
 
 
@@ -111,7 +111,7 @@ def test_damage_is_named_by_shard_key_and_member(copy: Path) -> None:
     shard = copy / "shards/shard-00000.tar"
     member = read_index(shard)["00000001.noisy.npy"]
     flip(shard, member.offset + member.size - 1, 0)
-    (damage,) = said(copy)
+    (damage,) = damage_texts(copy)
     assert damage.startswith("shards/shard-00000.tar: 00000001.noisy.npy: the XXH3-128 of its data is ")
 
 
@@ -123,21 +123,21 @@ def test_damage_is_named_by_shard_key_and_member(copy: Path) -> None:
         ("json", 5, "its member differs from what the manifest says, from byte 517 on"),
     ],
 )
-def test_damage_beside_the_data_is_named(member: str, at: int, what: str, copy: Path) -> None:
+def test_damage_of_headers_and_json_is_named(member: str, at: int, what: str, copy: Path) -> None:
     shard = copy / "shards/shard-00000.tar"
     flip(shard, read_index(shard)[f"00000000.{member}"].offset + at, 3)
-    assert said(copy) == [f"shards/shard-00000.tar: 00000000.{member}: {what}"]
+    assert damage_texts(copy) == [f"shards/shard-00000.tar: 00000000.{member}: {what}"]
 
 
 def test_bytes_after_the_end_are_named(copy: Path) -> None:
     with (copy / "shards/shard-00001.tar").open("ab") as stream:
         stream.write(b"\0")
-    assert said(copy) == ["shards/shard-00001.tar: something follows the end"]
+    assert damage_texts(copy) == ["shards/shard-00001.tar: something follows the end"]
 
 
-def test_a_missing_and_a_foreign_shard_are_named(copy: Path) -> None:
+def test_missing_and_foreign_shards_are_named(copy: Path) -> None:
     (copy / "shards/shard-00001.tar").rename(copy / "shards/shard-00007.tar")
-    assert said(copy) == [
+    assert damage_texts(copy) == [
         "shards/shard-00007.tar: is not part of this dataset",
         "shards/shard-00001.tar: is missing",
     ]
@@ -147,26 +147,26 @@ def test_swapped_shards_are_named(copy: Path) -> None:
     (copy / "shards/shard-00000.tar").rename(copy / "aside")
     (copy / "shards/shard-00001.tar").rename(copy / "shards/shard-00000.tar")
     (copy / "aside").rename(copy / "shards/shard-00001.tar")
-    places = {line.split(":")[0] for line in said(copy)}
+    places = {line.split(":")[0] for line in damage_texts(copy)}
     assert places == {"shards/shard-00000.tar", "shards/shard-00001.tar"}
 
 
-def test_a_shard_of_a_dataset_with_another_seed_is_found(copy: Path, whole: Path, make: Make, tmp_path: Path) -> None:
-    make(whole.parent / "p", tmp_path / "other", "output.pairs_per_shard=2", "seed=1")
+def test_a_shard_of_a_dataset_with_another_seed_is_found(copy: Path, intact: Path, make: Make, tmp_path: Path) -> None:
+    make(intact.parent / "p", tmp_path / "other", "output.pairs_per_shard=2", "seed=1")
     shutil.copy(tmp_path / "other/shards/shard-00000.tar", copy / "shards/shard-00000.tar")
-    assert "00000000.noisy.npy: the XXH3-128 of its data is" in "\n".join(said(copy))
+    assert "00000000.noisy.npy: the XXH3-128 of its data is" in "\n".join(damage_texts(copy))
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "manifest.csv", "dataset.json"])
 def test_a_missing_file_is_named(name: str, copy: Path) -> None:
     (copy / name).unlink()
-    assert any(line.startswith(f"{name}: ") for line in said(copy))
+    assert any(line.startswith(f"{name}: ") for line in damage_texts(copy))
 
 
-def test_the_digests_of_a_manifest_that_fits_its_shards_but_was_edited_do_not_fit(copy: Path) -> None:
+def test_edited_manifest_is_found_by_its_digest(copy: Path) -> None:
     text = (copy / "manifest.csv").read_text()
     (copy / "manifest.csv").write_text(text.replace(",ok,,", ",ok,empty,", 1))
-    assert any(line.startswith("manifest.csv: its SHA-256 is") for line in said(copy))
+    assert any(line.startswith("manifest.csv: its SHA-256 is") for line in damage_texts(copy))
 
 
 def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
@@ -174,23 +174,23 @@ def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
         verify(tmp_path)
 
 
-def test_the_command_ends_with_4_and_a_line_for_each_damage(copy: Path, door: Door) -> None:
+def test_command_ends_with_4_and_a_line_for_each_damage(copy: Path, door: Door) -> None:
     (copy / "shards/shard-00001.tar").unlink()
     done = door("verify", copy)
     assert (done.code, done.out) == (4, "")
     assert done.err == f"gen-dataset: {copy}: shards/shard-00001.tar: is missing\n"
 
 
-def test_the_command_says_that_a_dataset_is_whole(copy: Path, door: Door) -> None:
+def test_command_reports_an_intact_dataset(copy: Path, door: Door) -> None:
     assert door("verify", copy) == (0, f"{copy} is intact\n", "")
 
 
 # Replay ---------------------------------------------------------------------------------------------------------------
 
 
-def test_every_row_gives_its_pair_again(whole: Path) -> None:
-    root = str(whole.parent / "p")
-    replayed = list(replay(read_rows(whole / "manifest.csv"), root))
+def test_replay_regenerates_the_pair_of_every_row(intact: Path) -> None:
+    root = str(intact.parent / "p")
+    replayed = list(replay(read_rows(intact / "manifest.csv"), root))
     assert [(one.key, one.complaint) for one in replayed] == [(f"{i:08d}", "") for i in range(3)]
 
 
@@ -200,12 +200,12 @@ def test_rows_of_built_in_scenes_need_no_folder(tmp_path: Path, make: Make) -> N
     assert [one.complaint for one in replayed] == ["", ""]
 
 
-def test_a_replay_needs_the_row_and_the_source_alone(whole: Path, door: Door, tmp_path: Path) -> None:
-    shutil.copy(whole / "manifest.csv", tmp_path / "rows.csv")
-    shutil.copytree(whole.parent / "p", tmp_path / "moved")
+def test_replay_needs_only_the_row_and_the_source(intact: Path, door: Door, tmp_path: Path) -> None:
+    shutil.copy(intact / "manifest.csv", tmp_path / "rows.csv")
+    shutil.copytree(intact.parent / "p", tmp_path / "moved")
     done = door("replay", "rows.csv", "source.root=moved", "--to", "arrays")
     assert (done.code, done.out) == (0, "3 pairs are the same, bit for bit; 0 are not; arrays in arrays\n")
-    for sample in RawPairs(whole):
+    for sample in RawPairs(intact):
         assert np.array_equal(np.load(tmp_path / f"arrays/{sample.row['key']}.clean.npy"), sample.clean)
         assert np.array_equal(np.load(tmp_path / f"arrays/{sample.row['key']}.noisy.npy"), sample.noisy)
 
@@ -225,43 +225,43 @@ def changed(path: Path) -> None:
     ],
     ids=["changed", "gone", "cut"],
 )
-def test_a_source_that_is_not_the_rows_is_named(
-    harm: Callable[[Path], None], complaint: str, whole: Path, tmp_path: Path
+def test_changed_or_deleted_source_is_named(
+    harm: Callable[[Path], None], complaint: str, intact: Path, tmp_path: Path
 ) -> None:
-    shutil.copytree(whole.parent / "p", tmp_path / "p")
-    rows = list(read_rows(whole / "manifest.csv"))
+    shutil.copytree(intact.parent / "p", tmp_path / "p")
+    rows = list(read_rows(intact / "manifest.csv"))
     harm(tmp_path / "p" / str(rows[1]["source"]))
     replayed = list(replay(rows, str(tmp_path / "p")))
     assert [bool(one.complaint) for one in replayed] == [False, True, False]
     assert complaint in replayed[1].complaint
 
 
-def test_a_row_whose_plan_was_edited_gives_other_arrays(whole: Path) -> None:
-    row = dict(next(read_rows(whole / "manifest.csv")))
-    (one,) = replay([row | {"red_gain": 1.0}], str(whole.parent / "p"))
+def test_a_row_whose_plan_was_edited_gives_other_arrays(intact: Path) -> None:
+    row = dict(next(read_rows(intact / "manifest.csv")))
+    (one,) = replay([row | {"red_gain": 1.0}], str(intact.parent / "p"))
     assert "the XXH3-128 of clean is" in one.complaint
 
 
-def test_a_row_of_a_file_needs_a_folder(whole: Path) -> None:
+def test_a_row_of_a_file_needs_a_folder(intact: Path) -> None:
     with pytest.raises(ConfigError, match=r"row 00000000 was made from the file .*: give source.root="):
-        list(replay(read_rows(whole / "manifest.csv"), root=None))
+        list(replay(read_rows(intact / "manifest.csv"), root=None))
 
 
-def test_verify_makes_pairs_again_on_request(whole: Path, door: Door) -> None:
-    done = door("verify", whole, "--regenerate", "2")
-    assert (done.code, done.out) == (0, f"{whole} is intact; 2 pairs regenerated, bit for bit\n")
+def test_verify_regenerates_pairs_on_request(intact: Path, door: Door) -> None:
+    done = door("verify", intact, "--regenerate", "2")
+    assert (done.code, done.out) == (0, f"{intact} is intact; 2 pairs regenerated, bit for bit\n")
 
 
-def test_verify_names_a_source_that_changed(whole: Path, door: Door, tmp_path: Path) -> None:
-    shutil.copytree(whole.parent / "p", tmp_path / "q")
+def test_verify_reports_a_changed_source_with_5(intact: Path, door: Door, tmp_path: Path) -> None:
+    shutil.copytree(intact.parent / "p", tmp_path / "q")
     changed(sorted((tmp_path / "q").iterdir())[0])
-    done = door("verify", whole, "--regenerate=99", "source.root=q")
+    done = door("verify", intact, "--regenerate=99", "source.root=q")
     assert done.code == 5
     assert "its source has changed" in done.err
 
 
-def test_rows_are_chosen_by_number_or_key(whole: Path) -> None:
-    manifest = whole / "manifest.csv"
+def test_rows_are_selected_by_number_or_key(intact: Path) -> None:
+    manifest = intact / "manifest.csv"
     assert [row["key"] for row in select_rows(manifest, "1:", None)] == ["00000001", "00000002"]
     assert [row["key"] for row in select_rows(manifest, "0:1", None)] == ["00000000"]
     assert [row["key"] for row in select_rows(manifest, None, "00000002,00000000")] == ["00000000", "00000002"]
@@ -269,16 +269,16 @@ def test_rows_are_chosen_by_number_or_key(whole: Path) -> None:
 
 
 @pytest.mark.parametrize(("rows", "keys"), [("1", None), ("a:b", None), ("-1:2", None), (None, "7"), (None, "")])
-def test_a_choice_of_nothing_that_is_there_is_refused(rows: str | None, keys: str | None, whole: Path) -> None:
+def test_selection_of_missing_rows_is_refused(rows: str | None, keys: str | None, intact: Path) -> None:
     with pytest.raises(ConfigError, match=r"--rows|--keys"):
-        list(select_rows(whole / "manifest.csv", rows, keys))
+        list(select_rows(intact / "manifest.csv", rows, keys))
 
 
-def test_a_sample_is_spread_over_the_manifest(whole: Path) -> None:
-    manifest = whole / "manifest.csv"
+def test_regenerated_rows_are_spread_over_the_manifest(intact: Path) -> None:
+    manifest = intact / "manifest.csv"
     assert [row["key"] for row in evenly_spaced_rows(manifest, 2)] == ["00000000", "00000001"]
     assert len(list(evenly_spaced_rows(manifest, 99))) == 3
 
 
-def test_dataset_json_holds_its_own_digest_last(whole: Path) -> None:
-    assert list(json.loads((whole / "dataset.json").read_text()))[-1] == "dataset_sha256"
+def test_dataset_json_ends_with_its_own_digest(intact: Path) -> None:
+    assert list(json.loads((intact / "dataset.json").read_text()))[-1] == "dataset_sha256"

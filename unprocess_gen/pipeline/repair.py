@@ -77,7 +77,7 @@ class RepairStep:
 
     @property
     def repaired(self) -> bool:
-        """Whether the file is intact now."""
+        """True if the file is intact now."""
         return self.exit_code == 0
 
     def __str__(self) -> str:

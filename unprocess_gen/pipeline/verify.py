@@ -4,8 +4,8 @@
 every byte of its sample except the contents of the arrays, of which it records a digest. So each shard is compared with
 the manifest member by member (`shards.check_members`), and damage is reported by shard, key and member.
 
-Each shard is read once for its members, at the speed of XXH3. If they are intact, it is read again for its SHA-256, at
-about 1.5 GB/s.
+Each shard is read once for its members, at the speed of XXH3. If they are intact, a second pass computes its SHA-256
+at about 1.5 GB/s.
 """
 
 from __future__ import annotations

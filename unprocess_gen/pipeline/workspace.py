@@ -117,7 +117,7 @@ class Workspace:
 
     @property
     def complete(self) -> bool:
-        """Whether the dataset is finished: no shard is missing or provisional."""
+        """True if the dataset is finished: no shard is missing or provisional."""
         path = self.out / "dataset.json"
         return path.exists() and not any(entry.get("provisional") for entry in read_dataset(path)["shards"])
 

@@ -117,18 +117,20 @@ def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> I
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore SIGINT while workers start; they inherit this, so that only the coordinator answers Ctrl-C.
+    """Ignore SIGINT and SIGHUP while workers and loky's tracker start.
 
-    Blocking the signal instead has no lasting effect, because loky's resource tracker unblocks it when it starts.
+    The new processes inherit this, so that only the coordinator answers Ctrl-C and the loss of its terminal. Blocking
+    the signals instead has no lasting effect, because the tracker unblocks them when it starts.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGHUP)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
