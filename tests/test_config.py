@@ -56,12 +56,12 @@ SHA256 = "0" * 64
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
-def test_every_option_composes_and_passes_the_checks(file: Path, settings: Settings) -> None:
+def test_every_option_composes_and_is_valid(file: Path, settings: Settings) -> None:
     validate_config(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
-def test_every_option_says_all_keys_of_its_group(file: Path) -> None:
+def test_every_option_has_all_keys_of_its_group(file: Path) -> None:
     group = getattr(Config(), str(file.parent))
     written = yaml.safe_load((conf_dir() / file).read_text(encoding="utf-8"))
     keys = {field.name for field in dataclasses.fields(group)}
@@ -110,7 +110,7 @@ def test_defaults_are_those_of_the_contract(settings: Settings) -> None:
 
 
 @pytest.mark.parametrize("name", ["photo.jpg", "photo.JPEG", "photo.png", "a.tif", "a.tiff", "a.webp", "a.bmp"])
-def test_default_globs_match_every_kind_of_photograph(name: str, settings: Settings, tmp_path: Path) -> None:
+def test_default_globs_match_every_image_format(name: str, settings: Settings, tmp_path: Path) -> None:
     from unprocess_gen.sources.listing import list_folder
 
     (tmp_path / name).write_bytes(b"x")
@@ -118,7 +118,7 @@ def test_default_globs_match_every_kind_of_photograph(name: str, settings: Setti
 
 
 @pytest.mark.parametrize("iso", CRVD)
-def test_imx385_profiles_hold_the_numbers_of_crvd(iso: int, settings: Settings) -> None:
+def test_imx385_profiles_have_the_numbers_of_crvd(iso: int, settings: Settings) -> None:
     noise = settings(f"noise=imx385_iso{iso}").noise
     assert (noise.a, noise.b) == CRVD[iso]
     assert (noise.units, noise.black, noise.bits, noise.black_level_dn, noise.white_level_dn) == (
@@ -127,12 +127,12 @@ def test_imx385_profiles_hold_the_numbers_of_crvd(iso: int, settings: Settings) 
 
 
 @pytest.mark.parametrize("iso", CRVD)
-def test_imx385_profiles_reach_the_plan_unchanged_on_their_own_sensor(iso: int, settings: Settings) -> None:
+def test_imx385_profiles_are_unchanged_in_the_plan(iso: int, settings: Settings) -> None:
     plan = plan_image(settings(f"noise=imx385_iso{iso}"), SHA256)
     assert (plan.a_dn, plan.b_dn2) == CRVD[iso]
 
 
-def test_rvdd_profile_is_the_authors_line_with_black_included(settings: Settings) -> None:
+def test_rvdd_profile_is_the_line_of_its_author(settings: Settings) -> None:
     noise = settings("noise=imx385_iso3200_rvdd").noise
     assert (noise.a, noise.b, noise.black, noise.negative_variance) == (8.0034, -2043.51144, "included", "clip")
 
@@ -143,25 +143,25 @@ def test_rvdd_line_is_122_dn2_below_zero_at_black(settings: Settings) -> None:
     assert -plan.b_dn2 / plan.a_dn == pytest.approx(15.33, abs=0.005)
 
 
-def test_brooks_noise_is_the_published_law(settings: Settings) -> None:
+def test_brooks_noise_is_the_published_distribution(settings: Settings) -> None:
     noise = settings("noise=brooks2019").noise
     assert (noise.units, noise.a, noise.b) == (
         "normalized", ["log_uniform", 0.0001, 0.012], ["log_linear_in_a", 2.18, 1.2, 0.26],
     )  # fmt: skip
 
 
-def test_no_noise_has_no_variance(settings: Settings) -> None:
+def test_noise_none_has_no_variance(settings: Settings) -> None:
     plan = plan_image(settings("noise=none"), SHA256)
     assert (plan.a_dn, plan.b_dn2, plan.effects) == (0, 0, ("quantise",))
 
 
 @pytest.mark.parametrize("sensor", ["imx385_12bit", "generic_10bit", "generic_14bit", "generic_16bit"])
-def test_heteroscedastic_numbers_are_in_dn_of_the_sensor_in_use(sensor: str, settings: Settings) -> None:
+def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(sensor: str, settings: Settings) -> None:
     plan = plan_image(settings(f"sensor={sensor}", "noise=heteroscedastic", "noise.a=3.5", "noise.b=12"), SHA256)
     assert (plan.a_dn, plan.b_dn2) == (3.5, 12)
 
 
-def test_a_profile_meets_a_sensor_of_other_levels_by_their_ratio(settings: Settings) -> None:
+def test_profile_is_scaled_by_the_ratio_of_levels(settings: Settings) -> None:
     plan = plan_image(settings("sensor=generic_14bit", "noise=imx385_iso1600"), SHA256)
     scale = (16383 - 1024) / (4095 - 240)
     assert (plan.a_dn, plan.b_dn2) == pytest.approx((3.513262 * scale, 11.917691 * scale**2), rel=1e-15)
@@ -343,9 +343,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("overrides", "sentence"), REFUSED, ids=[overrides for overrides, _ in REFUSED])
-def test_a_bad_value_is_refused_with_its_key_its_value_and_what_is_allowed(
-    overrides: str, sentence: str, settings: Settings
-) -> None:
+def test_bad_value_is_refused_with_key_value_and_expectation(overrides: str, sentence: str, settings: Settings) -> None:
     config = settings(*overrides.split(";"))
     with pytest.raises(ConfigError, match="^" + sentence) as error:
         validate_config(config)
@@ -362,11 +360,11 @@ ACCEPTED = [
 
 
 @pytest.mark.parametrize("override", ACCEPTED)
-def test_values_on_the_edge_of_what_is_allowed_are_accepted(override: str, settings: Settings) -> None:
+def test_limits_of_ranges_are_accepted(override: str, settings: Settings) -> None:
     validate_config(settings(override))
 
 
-def test_a_negative_b_is_accepted_where_the_profile_says_clip(settings: Settings) -> None:
+def test_negative_b_is_accepted_with_negative_variance_clip(settings: Settings) -> None:
     validate_config(settings("noise.b=-1", "noise.negative_variance=clip"))
 
 
@@ -376,14 +374,14 @@ def test_single_picture_is_accepted_as_source_root(settings: Settings, tmp_path:
 
 
 @given(low=st.floats(0.01, 5), width=st.floats(0.01, 5))
-def test_a_law_reads_as_its_kind_and_numbers(low: float, width: float) -> None:
+def test_distribution_is_parsed_to_kind_and_numbers(low: float, width: float) -> None:
     assert parse_distribution("gains.red", ["uniform", low, low + width], ("uniform",)) == Distribution(
         "uniform", (low, low + width)
     )
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53))
-def test_a_number_reads_as_a_constant(value: float) -> None:
+def test_number_is_parsed_to_constant(value: float) -> None:
     assert parse_distribution("noise.a", value, ("uniform",)) == Distribution("constant", (float(value),))
 
 
@@ -391,7 +389,7 @@ def test_a_number_reads_as_a_constant(value: float) -> None:
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
-def test_config_yaml_reads_back_to_the_same_text(file: Path, settings: Settings, tmp_path: Path) -> None:
+def test_config_yaml_round_trip_keeps_the_text(file: Path, settings: Settings, tmp_path: Path) -> None:
     config = settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), []))
     text = dataset_yaml(config)
     (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
@@ -405,32 +403,32 @@ def test_config_yaml_reads_back_to_the_same_text(file: Path, settings: Settings,
     numbers=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=3, max_size=3),
     seed=st.integers(0, 2**63 - 1),
 )
-def test_config_yaml_keeps_every_number_to_the_last_bit(numbers: list[float], seed: int) -> None:
+def test_config_yaml_round_trip_keeps_every_bit(numbers: list[float], seed: int) -> None:
     config = Config(seed=seed)
     config.noise.a, config.noise.b, config.gains.threshold = numbers
     again, _ = parse_dataset_yaml(dataset_yaml(config))
     assert repr((again.seed, again.noise.a, again.noise.b, again.gains.threshold)) == repr((seed, *numbers))
 
 
-def test_config_yaml_of_a_folder_says_so_and_not_where_it_is(settings: Settings, tmp_path: Path) -> None:
+def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_path: Path) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings(f"source.root={tmp_path}")))
     assert loaded["source"]["kind"] == "folder"
     assert str(tmp_path) not in dataset_yaml(settings(f"source.root={tmp_path}"))
 
 
-def test_source_kind_follows_from_the_root(settings: Settings) -> None:
+def test_source_kind_is_derived_from_root(settings: Settings) -> None:
     assert source_kind(settings()) == "synthetic"
     assert source_kind(settings("source.root=photos")) == "folder"
 
 
-def test_keys_that_do_not_decide_the_data_are_left_out(settings: Settings) -> None:
+def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings()))
     assert NOT_DATA == {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
     assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)
     assert {"root", "max_failed"}.isdisjoint(loaded["source"])
 
 
-def test_every_other_key_is_there(settings: Settings) -> None:
+def test_config_yaml_contains_every_other_key(settings: Settings) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings()))
     for field in dataclasses.fields(Config):
         if dataclasses.is_dataclass(group := getattr(Config(), field.name)):
@@ -443,7 +441,7 @@ def test_every_other_key_is_there(settings: Settings) -> None:
 @pytest.mark.parametrize(
     "keys", ["out=elsewhere", "n_jobs=3", "self_test=go_on", "check_disk=false", "source.max_failed=7"]
 )
-def test_what_does_not_decide_the_data_does_not_change_the_text(keys: str, settings: Settings) -> None:
+def test_keys_that_do_not_decide_data_keep_the_text(keys: str, settings: Settings) -> None:
     assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
 
 
@@ -460,7 +458,7 @@ SPELLINGS = [
 
 
 @pytest.mark.parametrize(("one", "other"), SPELLINGS)
-def test_one_number_has_one_spelling(one: str, other: str, settings: Settings) -> None:
+def test_equal_numbers_have_one_spelling(one: str, other: str, settings: Settings) -> None:
     assert dataset_yaml(settings(one)) == dataset_yaml(settings(other))
 
 
@@ -468,11 +466,11 @@ def test_one_number_has_one_spelling(one: str, other: str, settings: Settings) -
     "override",
     ["seed=1", "source.limit=3", "camera=choice", "gains.red=2", "isp=srgb", "sensor.clip=black", "noise.a=3"],
 )
-def test_what_decides_the_data_changes_the_text(override: str, settings: Settings) -> None:
+def test_keys_that_decide_data_change_the_text(override: str, settings: Settings) -> None:
     assert dataset_yaml(settings(override)) != dataset_yaml(settings())
 
 
-def test_differences_name_key_and_both_values(settings: Settings) -> None:
+def test_differences_contain_key_and_both_values(settings: Settings) -> None:
     ours, theirs = dataset_yaml(settings("seed=1", "isp=srgb")), dataset_yaml(settings())
     assert differences(ours, theirs) == [
         "isp.gamma=srgb (there: 2.2)",
@@ -481,11 +479,11 @@ def test_differences_name_key_and_both_values(settings: Settings) -> None:
     ]
 
 
-def test_equal_settings_have_no_differences(settings: Settings) -> None:
+def test_equal_configs_have_no_differences(settings: Settings) -> None:
     assert differences(dataset_yaml(settings()), dataset_yaml(settings())) == []
 
 
-def test_a_missing_config_yaml_is_refused(tmp_path: Path) -> None:
+def test_missing_config_yaml_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"config.yaml: no such file; expected the config.yaml of a dataset"):
         read_dataset_yaml(tmp_path / "config.yaml")
 
@@ -497,21 +495,21 @@ NOT_CONFIGS: list[Any] = [
 
 
 @pytest.mark.parametrize("content", NOT_CONFIGS)
-def test_what_is_not_a_datasets_config_yaml_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+def test_invalid_config_yaml_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_bytes(content)
     with pytest.raises(ConfigError, match=r"config.yaml: not the config.yaml of a dataset \(") as error:
         read_dataset_yaml(tmp_path / "config.yaml")
     assert "\n" not in str(error.value)
 
 
-def test_choices_are_those_of_the_rooms_that_serve_them() -> None:
+def test_choices_match_their_implementations() -> None:
     assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
     assert set(unprocess.TONES) == set(tone_curves.TONES) == {"smoothstep", "none"}
     assert set(DISTRIBUTION_NUMBERS) == set(draws.DISTRIBUTIONS)
 
 
 @pytest.mark.parametrize("gain", [0, ["per_iso", 0.0], 1e-12])
-def test_a_gain_without_electrons_is_refused(gain: Any, settings: Settings) -> None:
+def test_gain_without_electrons_is_refused(gain: Any, settings: Settings) -> None:
     config = settings("noise=sony_a7s2")
     config.noise.branches[0].dn_per_e = gain
     with pytest.raises(ConfigError, match=r"noise.branches\[0\].dn_per_e=.*: expected a gain above 0"):
@@ -519,7 +517,7 @@ def test_a_gain_without_electrons_is_refused(gain: Any, settings: Settings) -> N
 
 
 @pytest.mark.parametrize("shape", [-0.5, -0.7, 10, "x"])
-def test_a_shape_without_a_variance_is_refused(shape: Any, settings: Settings) -> None:
+def test_shape_without_variance_is_refused(shape: Any, settings: Settings) -> None:
     config = settings("noise=sony_a7s2")
     config.noise.branches[0].read_shape = shape
     with pytest.raises(ConfigError, match=r"noise.branches\[0\].read_shape="):
@@ -527,7 +525,7 @@ def test_a_shape_without_a_variance_is_refused(shape: Any, settings: Settings) -
 
 
 @pytest.mark.parametrize("error", ["x", [1.0, 2.0], ["by_log_iso"], ["by_log_iso", 1.0], ["by_log_iso", None], []])
-def test_a_black_error_of_another_form_is_refused(error: Any, settings: Settings) -> None:
+def test_black_error_of_unknown_form_is_refused(error: Any, settings: Settings) -> None:
     config = settings("noise=sony_a7s2")
     config.noise.branches[0].black_error_dn = error
     with pytest.raises(ConfigError, match=r"noise.branches\[0\].black_error_dn=.*: expected a number, four"):

@@ -118,13 +118,13 @@ def misfits(plan: Plan, found: np.ndarray, law: Law = promised) -> list[str]:
 
 @pytest.mark.parametrize("std", [0.0, 0.05, 0.3, 1.0, 20.0])
 @pytest.mark.parametrize("mean", [0.0, 0.3, 10.49, 99.7])
-def test_exact_shares_sum_to_1(mean: float, std: float) -> None:
+def test_exact_probabilities_sum_to_1(mean: float, std: float) -> None:
     _, probability = shares(mean, std, 0, 100)
     assert abs(probability.sum() - 1) <= len(probability) * 2.0**-52
     assert (probability >= 0).all()
 
 
-def test_exact_moments_of_a_wide_gaussian_are_its_own_and_those_of_rounding() -> None:
+def test_exact_moments_of_wide_gaussian_include_rounding() -> None:
     """Sheppard's corrections: variance + 1/12, fourth moment 3s⁴ + s²/2 + 1/80; what they leave out is e^(-2pi²s²)."""
     found = moments(500.3, 2.0, 0, 1000)
     slack = 1e-12 * 500
@@ -134,14 +134,14 @@ def test_exact_moments_of_a_wide_gaussian_are_its_own_and_those_of_rounding() ->
     assert abs(found.fourth - (48 + 2 + 1 / 80)) <= slack
 
 
-def test_exact_moments_at_a_clip_are_the_half_normals() -> None:
+def test_exact_moments_at_a_clip_are_half_normal() -> None:
     """Clipped at its own mean a Gaussian has mean s/√(2pi); in steps of s/1000 rounding matters by 1e-6."""
     found = moments(0.0, 1000.0, 0, 10**5)
     assert abs(found.mean / 1000 - 1 / math.sqrt(2 * math.pi)) <= 1e-6
     assert abs(found.variance / 1e6 - (1 / 2 - 1 / (2 * math.pi))) <= 1e-6
 
 
-def test_exact_moments_without_noise_are_a_number() -> None:
+def test_exact_moments_without_noise_have_no_variance() -> None:
     assert moments(10.4, 0.0, 0, 100) == Moments(10.0, 0.0, 0.0, 0.0, 0.0)
     assert moments(300.0, 0.0, 0, 255).mean == 255
 
@@ -151,25 +151,25 @@ def test_exact_moments_without_noise_are_a_number() -> None:
 
 @pytest.mark.parametrize("clip", ["sensor", "black"])
 @pytest.mark.parametrize("noise", OPTIONS)
-def test_mean_and_variance_of_flats_are_those_of_the_law(settings: Settings, noise: str, clip: str) -> None:
+def test_mean_and_variance_of_flats_follow_the_distribution(settings: Settings, noise: str, clip: str) -> None:
     plan = plan_of(settings, noise, f"sensor.clip={clip}")
     assert misfits(plan, histograms(plan, 1)) == []
 
 
 @pytest.mark.parametrize("image", [1, 2, 3, 4])
-def test_they_are_at_random_noise_levels(settings: Settings, image: int) -> None:
+def test_mean_and_variance_of_flats_hold_at_random_levels(settings: Settings, image: int) -> None:
     plan = plan_of(settings, "brooks2019", image=image)
     assert misfits(plan, histograms(plan, 1)) == []
 
 
 @pytest.mark.parametrize("sensor", ["generic_10bit", "generic_12bit", "generic_14bit", "generic_16bit"])
-def test_they_are_on_every_sensor(settings: Settings, sensor: str) -> None:
+def test_mean_and_variance_of_flats_hold_on_every_sensor(settings: Settings, sensor: str) -> None:
     plan = plan_of(settings, "imx385_iso1600", f"sensor={sensor}")
     assert misfits(plan, histograms(plan, 1)) == []
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.01), (0.0, 0.09), (0.0, 0.25), (0.002, 0.0), (1.0, 0.0), (0.0, 1e6)])
-def test_they_are_for_noise_far_below_and_far_above_a_dn(settings: Settings, a: float, b: float) -> None:
+def test_mean_and_variance_of_flats_hold_for_extreme_noise(settings: Settings, a: float, b: float) -> None:
     plan = with_noise(plan_of(settings, "none"), a, b)
     assert misfits(plan, histograms(plan, 1)) == []
 
@@ -177,15 +177,13 @@ def test_they_are_for_noise_far_below_and_far_above_a_dn(settings: Settings, a: 
 @pytest.mark.slow
 @pytest.mark.parametrize("clip", ["sensor", "black"])
 @pytest.mark.parametrize("noise", OPTIONS)
-def test_mean_and_variance_of_flats_are_those_of_the_law_in_four_million_pixels_a_level(
-    settings: Settings, noise: str, clip: str
-) -> None:
+def test_mean_and_variance_of_flats_hold_for_four_million_pixels(settings: Settings, noise: str, clip: str) -> None:
     plan = plan_of(settings, noise, f"sensor.clip={clip}")
     assert misfits(plan, histograms(plan, 32)) == []
 
 
 @pytest.mark.parametrize("noise", OPTIONS)
-def test_the_clean_flat_is_its_value_rounded_once(settings: Settings, noise: str) -> None:
+def test_clean_flat_is_rounded_once(settings: Settings, noise: str) -> None:
     plan = plan_of(settings, noise)
     for code in CODES:
         pair = make_pair(np.full((2, 2, 3), code, dtype=np.uint16), plan)
@@ -212,18 +210,18 @@ WRONG: dict[str, Law] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_wrong_law_does_not_fit(settings: Settings, wrong: str) -> None:
+def test_wrong_noise_parameters_are_detected(settings: Settings, wrong: str) -> None:
     plan = with_noise(plan_of(settings, "none"), 3.0, 0.5)
     assert misfits(plan, histograms(plan, 1), WRONG[wrong]) != []
 
 
 @pytest.mark.parametrize(("made", "said"), [("sensor", "black"), ("black", "sensor")])
-def test_a_wrong_clip_does_not_fit(settings: Settings, made: str, said: str) -> None:
+def test_wrong_clip_is_detected(settings: Settings, made: str, said: str) -> None:
     plan = plan_of(settings, "imx385_iso3200", f"sensor.clip={made}")
     assert misfits(dataclasses.replace(plan, sensor_clip=said), histograms(plan, 1)) != []
 
 
-def test_a_variance_below_zero_that_is_mirrored_does_not_fit(settings: Settings) -> None:
+def test_mirrored_negative_variance_is_detected(settings: Settings) -> None:
     plan = plan_of(settings, "imx385_iso3200_rvdd")
     mirrored: Law = lambda plan, x: (x, math.sqrt(abs(plan.a_dn * (x - plan.black_level_dn) + plan.b_dn2)))  # noqa: E731
     assert misfits(plan, histograms(plan, 1), mirrored) != []
@@ -241,7 +239,7 @@ def deep_flat(plan: Plan) -> np.ndarray:
     return make_pair(np.full((2048, 2048, 3), DEEP_CODE, dtype=np.uint16), plan).noisy
 
 
-def test_third_and_fourth_moment_are_those_of_the_law(settings: Settings) -> None:
+def test_third_and_fourth_moments_follow_the_distribution(settings: Settings) -> None:
     plan = plan_of(settings, "imx385_iso3200")
     x, std = promised(plan, clean_value(plan, DEEP_CODE))
     exact = exact_moments(plan, x, promised)
@@ -256,7 +254,7 @@ def test_third_and_fourth_moment_are_those_of_the_law(settings: Settings) -> Non
 
 @pytest.mark.parametrize("multiple", [1, 2, 3, 4, 5])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_tails_hold_as_many_pixels_as_the_law_says(settings: Settings, side: int, multiple: int) -> None:
+def test_tails_have_the_expected_number_of_pixels(settings: Settings, side: int, multiple: int) -> None:
     plan = plan_of(settings, "imx385_iso3200")
     x, std = promised(plan, clean_value(plan, DEEP_CODE))
     levels, probability = shares(x, std, 0, 4095)
@@ -268,7 +266,7 @@ def test_tails_hold_as_many_pixels_as_the_law_says(settings: Settings, side: int
 @pytest.mark.parametrize(
     ("noise", "code"), [("imx385_iso3200", DEEP_CODE), ("imx385_iso1600", 100), ("imx385_iso25600", 65000)]
 )
-def test_every_dn_is_as_frequent_as_the_law_says(settings: Settings, noise: str, code: int) -> None:
+def test_every_dn_has_its_expected_frequency(settings: Settings, noise: str, code: int) -> None:
     """Near black and near white too, the clip's own DN included."""
     plan = plan_of(settings, noise)
     x, std = promised(plan, clean_value(plan, code))
@@ -281,7 +279,7 @@ def test_every_dn_is_as_frequent_as_the_law_says(settings: Settings, noise: str,
     assert (np.abs(found - expected) <= bounds + SAMPLER_ERROR).all()
 
 
-def test_no_pixel_is_farther_out_than_the_samplers_reach(settings: Settings) -> None:
+def test_no_pixel_exceeds_the_range_of_the_sampler(settings: Settings) -> None:
     plan = plan_of(settings, "imx385_iso3200")
     x, std = promised(plan, clean_value(plan, DEEP_CODE))
     assert np.abs(deep_flat(plan) - x).max() <= REACH * std + 0.5
@@ -290,7 +288,7 @@ def test_no_pixel_is_farther_out_than_the_samplers_reach(settings: Settings) -> 
 # Where there is no variance -------------------------------------------------------------------------------------------
 
 
-def test_a_line_below_zero_leaves_shadows_without_noise(settings: Settings) -> None:
+def test_negative_variance_leaves_shadows_without_noise(settings: Settings) -> None:
     """RVDD's line: none up to 122.69544 / 8.0034 = 15.33 DN above black, some at once above it."""
     plan = plan_of(settings, "imx385_iso3200_rvdd")
     for code in CODES:
@@ -301,7 +299,7 @@ def test_a_line_below_zero_leaves_shadows_without_noise(settings: Settings) -> N
         assert bool((pair.noisy == pair.clean).all()) is still
 
 
-def test_no_noise_is_the_clean_frame(settings: Settings) -> None:
+def test_noise_none_gives_the_clean_frame(settings: Settings) -> None:
     plan = plan_of(settings, "none")
     pair = make_pair(flats(), plan)
     assert (pair.noisy == pair.clean).all()
@@ -343,10 +341,10 @@ def transfer(settings: Settings, a: float, b: float, rounding: float) -> list[fl
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.49), (0.02, 0.49), (0.5, 0.49), (3.513262, 11.917691)])
-def test_photon_transfer_is_a_line_with_a_sixth_for_two_roundings(settings: Settings, a: float, b: float) -> None:
+def test_photon_transfer_is_linear_plus_a_sixth_for_two_roundings(settings: Settings, a: float, b: float) -> None:
     assert max(transfer(settings, a, b, 1 / 6)) <= 1
 
 
 @pytest.mark.parametrize("rounding", [0.0, 1 / 12, 1 / 4])
-def test_photon_transfer_with_another_share_for_rounding_does_not_fit(settings: Settings, rounding: float) -> None:
+def test_photon_transfer_with_wrong_rounding_term_is_detected(settings: Settings, rounding: float) -> None:
     assert max(transfer(settings, 0.0, 0.49, rounding)) > 1

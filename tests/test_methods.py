@@ -51,13 +51,13 @@ def test_each_tier_has_a_method_for_every_stage(settings: Settings, tier: str) -
     assert [one.partition(":")[0] for one in chosen] == list(STAGES)
 
 
-def test_a_budget_for_everything_takes_the_cheapest_of_every_stage() -> None:
+def test_unlimited_budget_chooses_cheapest_method_of_every_stage() -> None:
     assert choose_methods(ALL, counts_electrons=False) == tuple(
         methods_of_stage(stage)[0].spelled for stage in STAGES if stage not in ("shot", "effects")
     )
 
 
-def test_counts_are_taken_for_normals_where_the_budget_allows() -> None:
+def test_normals_replace_counts_if_the_budget_allows() -> None:
     assert "shot:gaussian_where_near" in choose_methods(ALL, counts_electrons=True)
     assert "shot:inversion" in choose_methods(replace(ALL, law_distance=0.0), counts_electrons=True)
 
@@ -68,7 +68,7 @@ def test_counts_are_taken_for_normals_where_the_budget_allows() -> None:
     normal=st.sampled_from([1.5e-7, 1e-6, 1e-3, 1.0]),
     distance=st.sampled_from([0.0, 5e-3]),
 )
-def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
+def test_chosen_methods_fit_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
     some = Budget("some", False, dn, share, normal, distance)
     chosen = [method(*spelled.split(":")) for spelled in choose_methods(some, counts_electrons=False)]
     cheaper = IMPLEMENTATIONS[: IMPLEMENTATIONS.index(chosen[0].implementation)]
@@ -79,23 +79,23 @@ def test_what_is_chosen_fits_and_nothing_cheaper_does(dn: float, share: float, n
         assert not all(one.fits(some) for one in METHODS if one.implementation == form)
 
 
-def test_the_exact_tier_gives_no_dn_away() -> None:
+def test_exact_tier_has_no_error_in_dn() -> None:
     chosen = set(choose_methods(EXACT, counts_electrons=True))
 
     assert all(one.clean_dn == 0 and not one.approximates_law for one in METHODS if one.spelled in chosen)
 
 
-def test_noise_that_counts_nothing_has_no_method_for_it() -> None:
+def test_noise_without_counts_has_no_shot_method() -> None:
     assert not any(one.startswith("shot:") for one in choose_methods(EXACT, counts_electrons=False))
 
 
-def test_the_reference_reads_like_the_method(settings: Settings) -> None:
+def test_reference_tier_uses_numpy_methods_only(settings: Settings) -> None:
     chosen = choose_methods(accuracy_budget(settings("accuracy=reference").accuracy), counts_electrons=True)
 
     assert all(one.readable for one in METHODS if one.spelled in set(chosen))
 
 
-def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
+def test_custom_budget_chooses_by_its_limits(settings: Settings) -> None:
     said = ("accuracy.name=mine", "accuracy.normal_error=6e-4", "accuracy.clean_dn=1")
     own = accuracy_budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
     stricter = accuracy_budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
@@ -116,7 +116,7 @@ def test_a_budget_of_ones_own_works_the_same_way(settings: Settings) -> None:
         ("accuracy.name='a b'", "accuracy.name='a b': expected up to 100 letters"),
     ],
 )
-def test_an_impossible_budget_is_refused_with_the_best_that_can_be_had(
+def test_impossible_budget_is_refused_with_smallest_error_possible(
     settings: Settings, override: str, message: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
@@ -126,7 +126,7 @@ def test_an_impossible_budget_is_refused_with_the_best_that_can_be_had(
 
 
 @pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=nikon_d850"])
-def test_the_plan_names_the_methods_of_its_tier(settings: Settings, noise: str, scene: np.ndarray) -> None:
+def test_plan_contains_the_methods_of_its_tier(settings: Settings, noise: str, scene: np.ndarray) -> None:
     config = settings(noise, "accuracy=fast")
     plan = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
 
@@ -135,7 +135,7 @@ def test_the_plan_names_the_methods_of_its_tier(settings: Settings, noise: str, 
 
 
 @pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=sony_a7s2"])
-def test_reference_and_exact_give_the_same_pair(settings: Settings, noise: str, scene: np.ndarray) -> None:
+def test_reference_and_exact_give_equal_pairs(settings: Settings, noise: str, scene: np.ndarray) -> None:
     plans = {}
     for tier in ("reference", "exact"):
         config = settings(noise, f"accuracy={tier}")
@@ -147,7 +147,7 @@ def test_reference_and_exact_give_the_same_pair(settings: Settings, noise: str, 
     assert readable.counts == fused.counts
 
 
-def test_the_reference_tier_takes_the_curve_from_its_exact_table(
+def test_reference_tier_uses_the_exact_table_of_the_curve(
     settings: Settings, scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The formulas' last bit differs between machines."""
@@ -163,9 +163,7 @@ def test_the_reference_tier_takes_the_curve_from_its_exact_table(
 
 
 @given(read_std_e=st.floats(0.0, 30.0), law_distance=st.floats(1e-4, 0.05), rate_e=st.floats(0.0, 1e6))
-def test_the_distance_is_within_the_budget_just_where_it_says(
-    read_std_e: float, law_distance: float, rate_e: float
-) -> None:
+def test_normals_are_used_exactly_where_distance_allows(read_std_e: float, law_distance: float, rate_e: float) -> None:
     below, above = gaussian_from(read_std_e, law_distance)
     within = gaussian_distance(rate_e, read_std_e) <= law_distance
     near = any(math.isclose(rate_e, edge, rel_tol=1e-9, abs_tol=1e-9) for edge in (below, above))
@@ -173,20 +171,18 @@ def test_the_distance_is_within_the_budget_just_where_it_says(
     assert near or within == (rate_e <= below or rate_e >= above)
 
 
-def test_no_budget_is_counts_everywhere() -> None:
+def test_budget_of_zero_uses_counts_everywhere() -> None:
     assert gaussian_from(3.0, 0.0) == (0.0, math.inf)
 
 
-def test_much_read_noise_hides_the_counts_everywhere() -> None:
+def test_strong_read_noise_allows_normals_everywhere() -> None:
     below, above = gaussian_from(6.0, 5e-3)
 
     assert below == above
 
 
 @pytest.mark.parametrize(("rate_e", "read_std_e"), [(20.0, 1.0), (50.0, 3.0), (200.0, 2.0), (30.0, 6.0)])
-def test_the_distance_is_the_greatest_difference_of_the_two_distribution_functions(
-    rate_e: float, read_std_e: float
-) -> None:
+def test_distance_is_largest_difference_of_the_two_cdfs(rate_e: float, read_std_e: float) -> None:
     """Against numerical integration of the densities: counts under a normal each, and one normal of their variance."""
     grid = np.linspace(rate_e - 12 * math.sqrt(rate_e + 36), rate_e + 14 * math.sqrt(rate_e + 36), 40001)
     counts = np.arange(0, int(rate_e + 20 * math.sqrt(rate_e) + 20))
@@ -205,7 +201,7 @@ def test_the_distance_is_the_greatest_difference_of_the_two_distribution_functio
     assert gaussian_distance(rate_e, read_std_e) == pytest.approx(distance, rel=0.12)
 
 
-def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
+def test_methods_of_each_stage_are_in_order_of_cost() -> None:
     """Cheapest first; the readable form last, and there is one."""
     for stage in STAGES:
         forms = [IMPLEMENTATIONS.index(one.implementation) for one in methods_of_stage(stage)]
@@ -213,7 +209,7 @@ def test_stages_keep_their_methods_in_one_order_of_cost() -> None:
         assert forms[-1] == IMPLEMENTATIONS.index("numpy")
 
 
-def test_a_method_is_named_once() -> None:
+def test_names_of_methods_are_unique() -> None:
     assert len({one.spelled for one in METHODS}) == len(METHODS)
     assert all(replace(one, meaning="") != one for one in METHODS)
 
@@ -222,7 +218,7 @@ def test_a_method_is_named_once() -> None:
     "steep",
     ["gains.threshold=0.999", "gains.red=0.05", "camera=custom camera.xyz2cam=[1,0,0,0,0,1,1,-0.94,0]"],
 )
-def test_what_float32_would_blow_up_is_computed_in_float64(settings: Settings, steep: str) -> None:
+def test_plans_that_amplify_rounding_errors_use_float64(settings: Settings, steep: str) -> None:
     chosen = [
         plan_image(settings("accuracy=fast", "noise=imx385_iso3200", *words), "0" * 64).methods
         for words in ([], steep.split())

@@ -67,16 +67,16 @@ def tukey_std(shape: float) -> Any:
 
 
 @pytest.mark.parametrize("value", [0, 3, 2.5])
-def test_a_number_is_itself(value: float) -> None:
+def test_plain_number_is_unchanged(value: float) -> None:
     assert number(value, iso=800) == value
 
 
-def test_a_number_that_is_not_given_is_0() -> None:
+def test_missing_number_is_0() -> None:
     assert number(None, iso=800) == 0
 
 
 @given(iso=st.floats(1, 1e6), slope=st.floats(1e-6, 10), intercept=st.floats(0, 10))
-def test_per_iso_is_a_line_in_iso(iso: float, slope: float, intercept: float) -> None:
+def test_per_iso_is_linear_in_iso(iso: float, slope: float, intercept: float) -> None:
     with mpmath.workdps(40):
         assert close(number(["per_iso", slope], iso=iso), mpmath.mpf(slope) * iso)
         expected = mpmath.mpf(slope) * iso + intercept
@@ -84,7 +84,7 @@ def test_per_iso_is_a_line_in_iso(iso: float, slope: float, intercept: float) ->
 
 
 @given(iso=st.floats(1, 1e6), numbers=st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=3))
-def test_a_root_is_the_deviation_of_a_variance_that_is_a_polynomial(iso: float, numbers: list[float]) -> None:
+def test_root_is_standard_deviation_of_a_polynomial_variance(iso: float, numbers: list[float]) -> None:
     with mpmath.workdps(40):
         variance = sum(mpmath.mpf(one) * mpmath.mpf(iso) ** power for power, one in enumerate(numbers))
         assert close(number(["root", *numbers], iso=iso), mpmath.sqrt(variance))
@@ -94,7 +94,7 @@ uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) * 2.0**-52)
 
 
 @given(gain=st.floats(1e-4, 100), slope=st.floats(-2, 2), intercept=st.floats(-3, 3), std=st.floats(0, 1), u=uniforms)
-def test_a_line_is_straight_in_the_logarithms_with_a_normal_scatter(
+def test_line_is_linear_in_logarithms_with_normal_scatter(
     gain: float, slope: float, intercept: float, std: float, u: float
 ) -> None:
     with mpmath.workdps(40):
@@ -104,20 +104,20 @@ def test_a_line_is_straight_in_the_logarithms_with_a_normal_scatter(
 
 
 @given(gain=st.floats(1e-4, 100), shape=st.floats(-0.4, 2).filter(lambda one: abs(one) > 1e-3))
-def test_a_scale_line_is_a_line_times_the_deviation_of_its_law(gain: float, shape: float) -> None:
+def test_scale_line_is_line_times_standard_deviation_at_scale_1(gain: float, shape: float) -> None:
     with mpmath.workdps(40):
         expected = mpmath.exp(mpmath.mpf(0.5) * mpmath.log(gain) + mpmath.mpf(0.25)) * tukey_std(shape)
         assert close(number(["scale_line", 0.5, 0.25, 0], iso=100, gain=gain, shape=shape), expected)
 
 
-def test_the_scatter_of_a_line_is_lognormal_in_its_uniform() -> None:
+def test_scatter_of_a_line_is_lognormal() -> None:
     """Equal steps of probability; the logarithm is the normal quantile times the deviation."""
     for k in range(1, 200):
         value = number(["line", 0, 1, 0.3], iso=100, gain=5.0, uniform=k / 200)
         assert math.isclose((math.log(value) - 1) / 0.3, NormalDist().inv_cdf(k / 200), abs_tol=1e-9)
 
 
-def test_black_errors_of_a_table_share_the_range_of_ln_iso(settings: Settings) -> None:
+def test_rows_of_black_errors_divide_the_range_of_ln_iso(settings: Settings) -> None:
     config = on_its_own_sensor(settings, "nikon_d850", 100)
     table = [[float(row), 0.0, 0.0, -float(row)] for row in range(6)]
     branch = replace(config.noise.branches[0], iso=[100, 6400], black_error_dn=["by_log_iso", *table])
@@ -128,7 +128,7 @@ def test_black_errors_of_a_table_share_the_range_of_ln_iso(settings: Settings) -
         assert physics(config).black_error_dn == (row, 0.0, 0.0, -row)
 
 
-def test_a_table_for_a_single_iso_gives_its_first_row(settings: Settings) -> None:
+def test_table_for_a_single_iso_gives_its_first_row(settings: Settings) -> None:
     config = on_its_own_sensor(settings, "imx385", 1600)
     branch = replace(config.noise.branches[0], black_error_dn=["by_log_iso", [1.0, 2.0, 3.0, 4.0], [0.0] * 4])
     config = replace(config, noise=replace(config.noise, branches=[branch]))
@@ -154,7 +154,7 @@ def line_of(form: list[Any], gain: Any, shape: float | None = None) -> Any:
         (12800, 9.563e-4, (0.749, -0.123), (0.629, -1.510)),
     ],
 )
-def test_sony_a7s2_on_either_side_of_its_dual_gain(
+def test_sony_a7s2_has_published_numbers_on_both_sides_of_dual_gain(
     settings: Settings, iso: int, slope: float, read: tuple[float, float], row: tuple[float, float]
 ) -> None:
     made = physics(on_its_own_sensor(settings, "sony_a7s2", iso))
@@ -166,7 +166,7 @@ def test_sony_a7s2_on_either_side_of_its_dual_gain(
         assert close(made.row_std_dn, line_of(["", *row], gain))
 
 
-def test_the_dual_gain_of_sony_a7s2_lowers_the_read_noise_at_its_step(settings: Settings) -> None:
+def test_dual_gain_of_sony_a7s2_lowers_the_read_noise(settings: Settings) -> None:
     below, above = (physics(on_its_own_sensor(settings, "sony_a7s2", iso)) for iso in (1600, 2000))
     assert above.dn_per_e > below.dn_per_e
     assert above.read_std_dn < 0.5 * below.read_std_dn
@@ -177,7 +177,7 @@ def test_the_dual_gain_of_sony_a7s2_lowers_the_read_noise_at_its_step(settings: 
     [("nikon_d850", 0.00415039), ("canon_5d4", 0.0021819), ("canon_70d", 0.00407497), ("canon_700d", 0.00447629)],
 )
 @pytest.mark.parametrize("iso", [100, 400, 1234, 6400])
-def test_the_profiles_of_eld(settings: Settings, noise: str, least_gain: float, iso: int) -> None:
+def test_profiles_of_eld_have_published_numbers(settings: Settings, noise: str, least_gain: float, iso: int) -> None:
     """K = Kmin · ISO / 100, Kmin in DN per electron at ISO 1 here; each line at the middle of its scatter."""
     config = on_its_own_sensor(settings, noise, iso)
     branch, made = config.noise.branches[0], physics(config)
@@ -194,7 +194,7 @@ def test_the_profiles_of_eld(settings: Settings, noise: str, least_gain: float, 
 
 
 @pytest.mark.parametrize("iso", [100, 800, 6400])
-def test_the_polynomials_of_pmrid(settings: Settings, iso: int) -> None:
+def test_profile_of_pmrid_has_published_polynomials(settings: Settings, iso: int) -> None:
     """run_benchmark.py: K = 0.0005995267·ISO + 0.00868861; Sigma = 7.11772e-7·ISO² + 6.514934e-4·ISO + 0.11492713."""
     made = physics(on_its_own_sensor(settings, "oppo_reno10x", iso))
     with mpmath.workdps(40):
@@ -214,7 +214,7 @@ def test_the_polynomials_of_pmrid(settings: Settings, iso: int) -> None:
         (25600, 52.032536, 1819.818657, -12.669),
     ],
 )
-def test_imx385_has_the_gain_and_the_read_variance_of_crvd(
+def test_imx385_has_gain_and_read_variance_of_crvd(
     settings: Settings, iso: int, a: float, b: float, error: float
 ) -> None:
     made = physics(on_its_own_sensor(settings, "imx385", iso))
@@ -227,7 +227,7 @@ def test_imx385_has_the_gain_and_the_read_variance_of_crvd(
 
 
 @pytest.mark.parametrize("noise", SAME_SENSOR)
-def test_numbers_of_a_profile_go_to_another_sensor_by_the_ratio_of_their_ranges(settings: Settings, noise: str) -> None:
+def test_profile_is_converted_by_the_ratio_of_ranges(settings: Settings, noise: str) -> None:
     iso = 1600
     _, black, white = SAME_SENSOR[noise]
     own, here = physics(on_its_own_sensor(settings, noise, iso)), physics(settings(f"noise={noise}", "noise.iso=1600"))
@@ -269,7 +269,7 @@ def test_each_number_is_drawn_from_its_own_uniform(settings: Settings) -> None:
         assert {name for name in fields if getattr(other, name) != getattr(middle, name)} == moved, uniform
 
 
-def test_a_shape_is_each_of_the_choices_as_often(settings: Settings) -> None:
+def test_shapes_are_chosen_equally_often(settings: Settings) -> None:
     config = on_its_own_sensor(settings, "sony_a7s2", 800)
     shapes = config.noise.branches[1].read_shape[1:]
     drawn = [physics(config, read_shape=(k + 0.5) / len(shapes)).read_shape for k in range(len(shapes))]
@@ -286,13 +286,13 @@ def test_a_shape_is_each_of_the_choices_as_often(settings: Settings) -> None:
         ("[log_uniform,400,1600]", 0.5, 800.0),
     ],
 )
-def test_iso_is_drawn_from_its_law(settings: Settings, law: str, uniform: float, iso: float) -> None:
+def test_iso_is_drawn_from_its_distribution(settings: Settings, law: str, uniform: float, iso: float) -> None:
     config = settings("noise=sony_a7s2", f"noise.iso={law}")
     validate_config(config)
     assert math.isclose(physics(config, iso=uniform).iso, iso, rel_tol=1e-15)
 
 
-def test_the_isos_of_a_dataset_are_those_of_its_law(settings: Settings) -> None:
+def test_isos_of_a_dataset_follow_their_distribution(settings: Settings) -> None:
     config = settings("noise=oppo_reno10x", "noise.iso=[log_uniform,100,6400]")
     validate_config(config)
     isos = sorted(
@@ -306,27 +306,27 @@ def test_the_isos_of_a_dataset_are_those_of_its_law(settings: Settings) -> None:
 
 
 @pytest.mark.parametrize(("celsius", "times"), [(25, 1.0), (32, 2.0), (39, 4.0), (18, 0.5), (28.5, math.sqrt(2))])
-def test_dark_current_doubles_every_so_many_degrees(settings: Settings, celsius: float, times: float) -> None:
+def test_dark_current_doubles_with_temperature(settings: Settings, celsius: float, times: float) -> None:
     made = physics(settings("noise=imx385", "noise.iso=1600", f"scene.temperature_c={celsius}", "scene.exposure_s=4"))
     assert math.isclose(made.dark_e, 4 * times, rel_tol=1e-15)
     assert math.isclose(made.hot_pixel_e, 200 * times, rel_tol=1e-15)
 
 
 @pytest.mark.parametrize("doubling", [5.0, 8.0])
-def test_the_doubling_is_the_profiles_own(settings: Settings, doubling: float) -> None:
+def test_doubling_temperature_is_that_of_the_profile(settings: Settings, doubling: float) -> None:
     overrides = (f"noise.dark_doubling_c={doubling}", "noise.dark_reference_c=20", "scene.temperature_c=45")
     made = physics(settings("noise=imx385", "noise.iso=1600", "scene.exposure_s=1", *overrides))
     assert close(made.dark_e, mpmath.mpf(2) ** (25 / mpmath.mpf(doubling)))
 
 
-def test_every_image_has_a_body_of_its_own_by_default(settings: Settings) -> None:
+def test_every_image_has_its_own_body_by_default(settings: Settings) -> None:
     config = settings("noise=imx385", "noise.iso=1600")
     bodies = {physics(config, key).body_key for key in range(50)}
     assert len(bodies) == 50
     assert physics(config, 7) == physics(config, 7)
 
 
-def test_a_number_of_bodies_is_shared_by_all_images(settings: Settings) -> None:
+def test_images_share_a_number_of_bodies(settings: Settings) -> None:
     config = settings("noise=imx385", "noise.iso=1600", "sensor.units=3")
     made = [physics(config, key, sensor_unit=(key + 0.5) / 30) for key in range(30)]
     assert [one.sensor_unit for one in made] == [str(key // 10) for key in range(30)]
@@ -334,7 +334,7 @@ def test_a_number_of_bodies_is_shared_by_all_images(settings: Settings) -> None:
     assert len({(one.sensor_unit, one.body_key) for one in made}) == 3
 
 
-def test_a_body_is_the_same_at_every_iso_and_another_with_another_seed_or_camera(settings: Settings) -> None:
+def test_body_depends_on_seed_and_camera_but_not_on_iso(settings: Settings) -> None:
     config = settings("noise=canon_70d", "noise.iso=1600", "sensor.units=1")
     body = physics(config).body_key
     assert physics(replace(config, noise=replace(config.noise, iso=100))).body_key == body
@@ -379,7 +379,7 @@ def test_a_body_is_the_same_at_every_iso_and_another_with_another_seed_or_camera
         (("noise=nikon_d850", "sensor.units=0"), "sensor.units=0: expected image, or a number of bodies"),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused(
+def test_inconsistent_physical_profiles_are_refused(
     settings: Settings, overrides: tuple[str, ...], message: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
@@ -388,7 +388,7 @@ def test_settings_that_cannot_be_meant_are_refused(
     assert "\n" not in str(refused.value)
 
 
-def test_an_effect_that_does_not_exist_is_refused_at_the_door(cli: Callable[..., Any]) -> None:
+def test_unknown_effect_is_refused_by_the_command_line(cli: Callable[..., Any]) -> None:
     done = cli("noise=nikon_d850", "effects.foo=on")
     assert done.returncode == 2
     assert "foo" in done.stderr
@@ -424,7 +424,7 @@ def test_an_effect_that_does_not_exist_is_refused_at_the_door(cli: Callable[...,
         ({"iso": [800, 100]}, "branches[0].iso=[800, 100]: expected the lowest and the highest ISO"),
     ],
 )
-def test_a_branch_that_cannot_be_meant_is_refused(settings: Settings, change: dict[str, Any], message: str) -> None:
+def test_branch_with_invalid_numbers_is_refused(settings: Settings, change: dict[str, Any], message: str) -> None:
     config = settings("noise=nikon_d850")
     branch = replace(config.noise.branches[0], **change)
     config = replace(config, noise=replace(config.noise, branches=[branch, *config.noise.branches[1:]]))
@@ -433,7 +433,7 @@ def test_a_branch_that_cannot_be_meant_is_refused(settings: Settings, change: di
     assert message in str(refused.value)
 
 
-def test_a_branch_without_optional_numbers_has_none_of_their_effects(settings: Settings) -> None:
+def test_branch_without_optional_numbers_lacks_their_effects(settings: Settings) -> None:
     config = settings("noise=nikon_d850", "noise.iso=100")
     branch = BranchConfig(iso=[100, 100], dn_per_e=1.0, read_std_dn=2.0)
     config = replace(config, noise=replace(config.noise, branches=[branch], prnu_std=None, dark_e_per_s=None))

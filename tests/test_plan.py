@@ -99,7 +99,7 @@ def by_mpmath(law: Distribution, uniform: float, a: float) -> mpmath.mpf:
     ],
     ids=lambda law: f"{law.kind} {law.numbers}",
 )
-def test_a_draw_is_its_laws_quantile_correctly_rounded(law: Distribution) -> None:
+def test_draw_is_correctly_rounded_quantile_of_its_distribution(law: Distribution) -> None:
     """Half a unit in the last place; both sides hold 24 digits or more, so only a tie to 1e-8 of it could go astray."""
     with mpmath.workdps(40):
         for uniform in UNIFORMS:
@@ -109,7 +109,7 @@ def test_a_draw_is_its_laws_quantile_correctly_rounded(law: Distribution) -> Non
 
 
 @given(uniforms, st.floats(0.01, 10), st.floats(1e-6, 10))
-def test_a_uniform_draw_is_on_the_line_to_its_three_roundings(uniform: float, low: float, width: float) -> None:
+def test_uniform_draw_is_linear_within_three_roundings(uniform: float, low: float, width: float) -> None:
     high = low + width
     exact = Fraction(low) + Fraction(uniform) * (Fraction(high) - Fraction(low))
     slack = (2 * (Fraction(high) - Fraction(low)) + exact) / 2**53
@@ -119,7 +119,7 @@ def test_a_uniform_draw_is_on_the_line_to_its_three_roundings(uniform: float, lo
 
 
 @given(uniforms)
-def test_a_constant_is_no_draw(uniform: float) -> None:
+def test_constant_ignores_the_uniform(uniform: float) -> None:
     assert draw(Distribution("constant", (2.15,)), uniform) == 2.15
 
 
@@ -138,26 +138,24 @@ def test_a_constant_is_no_draw(uniform: float) -> None:
     ],
     ids=lambda value: f"{value.kind} {value.numbers}" if isinstance(value, Distribution) else "",
 )
-def test_a_draw_lies_within_its_limits_whatever_the_uniform(
-    law: Distribution, low: float, high: float, uniform: float
-) -> None:
+def test_draw_is_within_limits_for_any_uniform(law: Distribution, low: float, high: float, uniform: float) -> None:
     assert low <= draw(law, uniform) <= high
 
 
 @given(uniforms)
-def test_the_articles_literal_gain_is_the_inverse_of_brooks(uniform: float) -> None:
+def test_paper_literal_gain_is_inverse_of_brooks_gain(uniform: float) -> None:
     """Each rounded once, so the product of the two is within two half units of 1."""
     product = Fraction(draw(GAIN, uniform)) * Fraction(draw(LITERAL, uniform))
     assert abs(product - 1) <= Fraction(2, 2**53) * (1 + Fraction(1, 10**6))
 
 
 @pytest.mark.parametrize("law", [Distribution("uniform", (1.9, 2.4)), GAIN, SHOT, READ], ids=lambda law: law.kind)
-def test_a_greater_uniform_never_gives_a_smaller_draw(law: Distribution) -> None:
+def test_draw_increases_with_its_uniform(law: Distribution) -> None:
     drawn = [draw(law, uniform, 0.01) for uniform in sorted(UNIFORMS)]
     assert all(a <= b for a, b in itertools.pairwise(drawn))
 
 
-def test_the_median_of_brooks_read_noise_is_his_line() -> None:
+def test_median_of_brooks_read_noise_is_the_published_line() -> None:
     """At u = ½ there is no scatter: e^1.2 · 0.01^2.18."""
     with mpmath.workdps(40):
         exact = mpmath.exp(mpmath.mpf(1.2)) * mpmath.mpf(0.01) ** mpmath.mpf(2.18)
@@ -168,7 +166,7 @@ def test_the_median_of_brooks_read_noise_is_his_line() -> None:
 
 
 @given(st.tuples(uniforms, uniforms, uniforms, uniforms))
-def test_weights_are_four_uniforms_over_their_sum(drawn: tuple[float, ...]) -> None:
+def test_weights_are_four_uniforms_divided_by_their_sum(drawn: tuple[float, ...]) -> None:
     _, weights, matrix = plan_camera(Config().camera, named(**{f"weight_{i}": u for i, u in enumerate(drawn)}))
     total = sum(Fraction(u) for u in drawn)
     for weight, u in zip(weights, drawn, strict=True):
@@ -179,14 +177,14 @@ def test_weights_are_four_uniforms_over_their_sum(drawn: tuple[float, ...]) -> N
     assert matrix == colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
 
 
-def test_every_camera_is_as_likely_to_be_the_heaviest() -> None:
+def test_every_camera_is_equally_likely_to_have_largest_weight() -> None:
     """The law is symmetric: a quarter each, of 4000 images."""
     heaviest = Counter(int(np.argmax(plan_camera(Config().camera, drawn)[1])) for drawn in images(4000))
     for camera in range(4):
         assert abs(heaviest[camera] / 4000 - 1 / 4) <= bernstein(3 / 16, 1, 4000)
 
 
-def test_a_choice_takes_each_camera_as_often(settings: Settings) -> None:
+def test_choice_takes_each_camera_equally_often(settings: Settings) -> None:
     camera = settings("camera=choice").camera
     chosen = Counter(plan_camera(camera, drawn)[0] for drawn in images(4000))
     assert set(chosen) == set(colour.CAMERAS)
@@ -206,37 +204,37 @@ def test_a_choice_takes_each_camera_as_often(settings: Settings) -> None:
         (LAST, 3),
     ],
 )
-def test_a_choice_is_the_quarter_the_uniform_lies_in(settings: Settings, uniform: float, camera: int) -> None:
+def test_choice_is_the_quarter_that_contains_the_uniform(settings: Settings, uniform: float, camera: int) -> None:
     name, weights, _ = plan_camera(settings("camera=choice").camera, named(choice=uniform))
     assert name == list(colour.CAMERAS)[camera]
     assert weights.index(1.0) == camera
 
 
 @pytest.mark.parametrize("name", colour.CAMERAS)
-def test_a_camera_of_its_own_has_weight_1(settings: Settings, name: str) -> None:
+def test_fixed_camera_has_weight_1(settings: Settings, name: str) -> None:
     plan = plan_of(settings, f"camera={name}")
     assert plan.camera == name
     assert plan.weights == tuple(float(name == other) for other in colour.CAMERAS)
     assert plan.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
 
 
-def test_a_chosen_camera_is_that_camera(settings: Settings) -> None:
+def test_chosen_camera_equals_the_fixed_camera(settings: Settings) -> None:
     plan = plan_of(settings, "camera=choice")
     assert plan == plan_of(settings, f"camera={plan.camera}")
 
 
-def test_a_mix_is_called_convex(settings: Settings) -> None:
+def test_mixed_camera_is_named_convex(settings: Settings) -> None:
     plan = plan_of(settings)
     assert plan.camera == "convex"
     assert all(0 < weight < 1 for weight in plan.weights)
 
 
-def test_the_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
+def test_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
     plan = plan_of(settings, "camera=identity")
     assert (plan.camera, plan.weights, plan.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
 
 
-def test_a_matrix_of_ones_own_has_no_weights(settings: Settings) -> None:
+def test_custom_matrix_has_no_weights(settings: Settings) -> None:
     own = list(colour.CAMERAS["sony_a7r"])
     plan = plan_of(settings, "camera=custom", f"camera.xyz2cam={own}")
     assert (plan.camera, plan.weights) == ("custom", (0.0,) * 4)
@@ -246,13 +244,13 @@ def test_a_matrix_of_ones_own_has_no_weights(settings: Settings) -> None:
 # Draws and names ------------------------------------------------------------------------------------------------------
 
 
-def test_the_numbers_of_the_draws_are_those_of_every_dataset_ever_made() -> None:
+def test_counters_of_parameters_never_change() -> None:
     names = ("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b")
     assert PARAMETERS[: len(names)] == names
     assert len(set(PARAMETERS)) == len(PARAMETERS)
 
 
-def test_each_draw_takes_the_uniform_of_its_name(settings: Settings) -> None:
+def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None:
     plan = plan_of(settings, "noise=brooks2019")
     u = dict(zip(PARAMETERS, parameter_uniforms(plan.stream_key, len(PARAMETERS)), strict=True))
     assert plan.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u["red"])
@@ -284,7 +282,7 @@ CAMERA_DRAWS = ("camera", "weights", "rgb2cam")
         ("isp=srgb", CAMERA_DRAWS + GAIN_DRAWS + NOISE_DRAWS),
     ],
 )
-def test_a_draw_that_is_not_needed_moves_no_other(settings: Settings, override: str, unmoved: tuple[str, ...]) -> None:
+def test_unused_draw_moves_no_other(settings: Settings, override: str, unmoved: tuple[str, ...]) -> None:
     before = plan_of(settings, "noise=brooks2019")
     after = plan_of(settings, *([] if override.startswith("noise=") else ["noise=brooks2019"]), override)
     assert after != before
@@ -296,7 +294,7 @@ DRAWN = (*GAIN_DRAWS, *NOISE_DRAWS, "weights", "stream_key")
 
 
 @pytest.mark.parametrize("other", ["seed", "photograph", "occurrence"])
-def test_another_seed_photograph_or_occurrence_changes_every_draw(settings: Settings, other: str) -> None:
+def test_other_seed_source_or_occurrence_changes_every_draw(settings: Settings, other: str) -> None:
     before = plan_of(settings, "noise=brooks2019")
     after = plan_of(
         settings,
@@ -309,16 +307,16 @@ def test_another_seed_photograph_or_occurrence_changes_every_draw(settings: Sett
         assert getattr(after, name) != getattr(before, name), name
 
 
-def test_the_same_settings_and_photograph_give_the_same_plan(settings: Settings) -> None:
+def test_equal_config_and_source_give_equal_plans(settings: Settings) -> None:
     assert plan_of(settings, "noise=brooks2019") == plan_of(settings, "noise=brooks2019")
 
 
-def test_the_streams_key_is_that_of_the_seed_and_the_photograph(settings: Settings) -> None:
+def test_stream_key_is_derived_from_seed_and_source(settings: Settings) -> None:
     plan = plan_of(settings, "seed=7", occurrence=2)
     assert (plan.seed, plan.stream_key) == (7, stream_key(7, SHA, 2))
 
 
-def test_draws_of_many_images_lie_within_their_laws(settings: Settings) -> None:
+def test_draws_of_many_images_are_within_their_distributions(settings: Settings) -> None:
     config = settings("noise=brooks2019")
     for image in range(300):
         plan = plan_image(config, f"{image:064x}")
@@ -333,12 +331,12 @@ def test_draws_of_many_images_lie_within_their_laws(settings: Settings) -> None:
 # Noise ----------------------------------------------------------------------------------------------------------------
 
 
-def test_a_profile_on_its_own_sensor_is_as_published(settings: Settings) -> None:
+def test_profile_is_unchanged_on_its_own_sensor(settings: Settings) -> None:
     plan = plan_of(settings, "noise=imx385_iso3200")
     assert (plan.noise, plan.a_dn, plan.b_dn2) == ("imx385_iso3200", 6.955588, 38.117816)
 
 
-def test_a_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
+def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     """Slope times s, intercept times s², s = 15359/3855; twice would be s² and s⁴."""
     config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
     s = Fraction(15359, 3855)
@@ -349,13 +347,13 @@ def test_a_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     assert (plan.a_dn, plan.b_dn2) == (a, b)
 
 
-def test_a_line_with_black_in_it_is_converted_before_it_is_recorded(settings: Settings) -> None:
+def test_profile_with_black_included_is_converted_before_recording(settings: Settings) -> None:
     plan = plan_of(settings, "noise=imx385_iso3200_rvdd")
     assert plan.a_dn == 8.0034
     assert plan.b_dn2 == -2043.51144 + 8.0034 * 240
 
 
-def test_ones_own_noise_is_in_the_sensors_dn(settings: Settings) -> None:
+def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> None:
     for sensor in ("imx385_12bit", "generic_10bit", "generic_16bit"):
         plan = plan_of(settings, "noise=heteroscedastic", "noise.a=1.25", "noise.b=7.5", f"sensor={sensor}")
         assert (plan.a_dn, plan.b_dn2) == (1.25, 7.5)
@@ -364,13 +362,13 @@ def test_ones_own_noise_is_in_the_sensors_dn(settings: Settings) -> None:
 # What is recorded -----------------------------------------------------------------------------------------------------
 
 
-def test_noise_that_is_there_is_named_among_the_effects(settings: Settings) -> None:
+def test_simulated_noise_is_listed_among_effects(settings: Settings) -> None:
     plan = plan_of(settings)
     assert (plan.effects, plan.skipped) == (("heteroscedastic", "quantise"), ())
 
 
 @pytest.mark.parametrize("b", [0.0, -3.0])
-def test_noise_without_variance_is_skipped_with_its_reason(settings: Settings, b: float) -> None:
+def test_noise_without_variance_is_skipped_with_reason(settings: Settings, b: float) -> None:
     plan = plan_of(settings, "noise=none", f"noise.b={b}", "noise.negative_variance=clip")
     assert plan.effects == ("quantise",)
     (reason,) = plan.skipped
@@ -378,12 +376,12 @@ def test_noise_without_variance_is_skipped_with_its_reason(settings: Settings, b
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.1), (0.1, 0.0), (0.1, -5.0)])
-def test_noise_with_any_variance_at_all_is_simulated(settings: Settings, a: float, b: float) -> None:
+def test_noise_with_any_positive_variance_is_simulated(settings: Settings, a: float, b: float) -> None:
     plan = plan_of(settings, "noise=heteroscedastic", f"noise.a={a}", f"noise.b={b}", "noise.negative_variance=clip")
     assert "heteroscedastic" in plan.effects
 
 
-def test_a_plan_holds_the_settings_it_was_made_with(settings: Settings) -> None:
+def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
     plan = plan_of(
         settings, "sensor=generic_10bit", "sensor.pattern=GBRG", "sensor.clip=black", "isp=srgb", "gains=unity",
         "gains.threshold=0.75", "gains.highlight=gray_mean",
@@ -395,12 +393,12 @@ def test_a_plan_holds_the_settings_it_was_made_with(settings: Settings) -> None:
 
 
 @pytest.mark.parametrize(("isp", "gamma"), [("linear", 1.0), ("gamma22", 2.2), ("srgb", "srgb")])
-def test_gamma_is_a_number_or_srgb(settings: Settings, isp: str, gamma: float | str) -> None:
+def test_gamma_is_number_or_srgb(settings: Settings, isp: str, gamma: float | str) -> None:
     found = plan_of(settings, f"isp={isp}").gamma
     assert found == gamma
     assert type(found) is type(gamma)
 
 
-def test_noise_whose_variance_is_below_0_at_every_level_is_skipped(settings: Settings) -> None:
+def test_noise_with_negative_variance_at_all_signals_is_skipped(settings: Settings) -> None:
     plan = plan_of(settings, "noise=heteroscedastic", "noise.a=0.001", "noise.b=-1e6", "noise.negative_variance=clip")
     assert plan.effects == ("quantise",)

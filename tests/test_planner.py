@@ -121,7 +121,7 @@ def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("noise", PROFILES)
-def test_what_auto_leaves_out_is_hidden_by_the_noise(
+def test_omitted_effects_are_masked_by_the_noise(
     settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
 ) -> None:
     config = configured(settings, f"noise={noise}", f"scene={scene}")
@@ -130,7 +130,7 @@ def test_what_auto_leaves_out_is_hidden_by_the_noise(
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("noise", PROFILES)
-def test_what_auto_leaves_out_is_hidden_where_it_decides_about_all(
+def test_omitted_effects_are_masked_if_auto_decides_about_all(
     settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
 ) -> None:
     """The numbers that no source gives count as if one did, and a full well that cuts the daylight is among them."""
@@ -142,7 +142,7 @@ def test_what_auto_leaves_out_is_hidden_where_it_decides_about_all(
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("noise", PROFILES)
-def test_what_auto_leaves_out_is_hidden_in_larger_frames(settings: Settings, noise: str, scene: str) -> None:
+def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: str, scene: str) -> None:
     """Means over more sites show more."""
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
     names = ("highlights-0", "night_lamps-0", "gradients-0", "dead_leaves-0")
@@ -176,7 +176,7 @@ def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
 
 
 @pytest.mark.parametrize("frames", [1, 12])
-def test_the_promise_holds_of_any_sensor(settings: Settings, pictures: dict[str, Srgb], frames: int) -> None:
+def test_omitted_effects_are_masked_for_any_sensor(settings: Settings, pictures: dict[str, Srgb], frames: int) -> None:
     """Of single frames, and of the mean over a clip's."""
     config = configured(settings, "noise=nikon_d850", "scene=night", "noise.assumed=[]", "noise.full_well_e=1000")
     rng = np.random.default_rng(5)
@@ -232,9 +232,7 @@ def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -
     return tuple(one.effect for one in select_effects(config, physics, facts, light) if one.simulated)
 
 
-def test_fixed_patterns_of_the_clean_frame_are_hidden_by_its_rounding_alone(
-    settings: Settings, pictures: dict[str, Srgb]
-) -> None:
+def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, pictures: dict[str, Srgb]) -> None:
     """An average of many frames has no other noise."""
     overrides = ("scene=night", "noise=nikon_d850", "noise.assumed=[]", "clean.includes_fixed_pattern=true")
     fixed = ("prnu", "black_error")
@@ -292,7 +290,7 @@ FACTS = Facts(768, 512, 256, 10, 255)
 LIGHT = SignalRange(10.0, 3000.0)
 
 
-def test_weak_effects_are_left_out(base: tuple[Config, Physics]) -> None:
+def test_weak_effects_are_omitted(base: tuple[Config, Physics]) -> None:
     assert chosen(*base, FACTS, LIGHT) == ("shot", "read", "quantise")
 
 
@@ -310,7 +308,7 @@ def test_weak_effects_are_left_out(base: tuple[Config, Physics]) -> None:
         ("dead_pixels", {"dead_pixel_share": 1e-3}),
     ],
 )
-def test_an_effect_that_is_called_for_is_simulated_and_no_other(
+def test_only_the_strong_effect_is_simulated(
     base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
 ) -> None:
     """Even read noise need not be, where that much dark current hides it."""
@@ -329,7 +327,7 @@ def test_an_effect_that_is_called_for_is_simulated_and_no_other(
         ("black_error", {"black_error_dn": (0.0, 0.0, 1e-3, 0.0)}),
     ],
 )
-def test_a_pattern_that_a_frame_hides_and_a_clip_shows_is_called_for_in_the_clip(
+def test_pattern_masked_in_one_frame_is_simulated_for_a_clip(
     base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
 ) -> None:
     config, physics = base
@@ -341,7 +339,7 @@ def test_a_pattern_that_a_frame_hides_and_a_clip_shows_is_called_for_in_the_clip
     assert found.statistic.startswith("clip's")
 
 
-def test_what_is_new_in_every_frame_shows_no_better_in_a_clip(base: tuple[Config, Physics]) -> None:
+def test_temporal_noise_is_no_stronger_in_a_clip(base: tuple[Config, Physics]) -> None:
     config, physics = base
     physics = replace(physics, row_std_dn=0.01, dark_e=0.01)
     for one, many in zip(
@@ -368,7 +366,7 @@ STRONG = {
 
 @pytest.mark.parametrize("scene", ["daylight", "night"])
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_strong_effect_is_on_in_the_plan_of_every_camera(settings: Settings, profile: str, scene: str) -> None:
+def test_strong_effect_is_in_the_plan_of_every_camera(settings: Settings, profile: str, scene: str) -> None:
     for effect, numbers in STRONG.items():
         config = configured(settings, f"noise={profile}", f"scene={scene}", "noise.assumed=[]")
         for key, value in numbers.items():
@@ -391,7 +389,7 @@ def expected_hot(physics: Physics, facts: Facts, dark_dn: float) -> float:
 
 
 @given(share=st.floats(-9, -4), electrons=st.floats(-2, 3), side=st.integers(10, 4000), dark=st.floats(0, 100))
-def test_hot_pixels_are_called_for_where_a_tenth_of_one_stands_out(
+def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
     base: tuple[Config, Physics], share: float, electrons: float, side: int, dark: float
 ) -> None:
     config, physics = base
@@ -406,7 +404,7 @@ def test_hot_pixels_are_called_for_where_a_tenth_of_one_stands_out(
 
 
 @pytest.mark.parametrize("mean_e", [0.05, 2.0, 40.0])
-def test_hot_pixels_stand_out_as_often_as_predicted(mean_e: float) -> None:
+def test_hot_pixel_outliers_are_as_frequent_as_predicted(mean_e: float) -> None:
     """The counts that the sampler makes of exponential means, against the geometric law."""
     rng = np.random.default_rng(1)
     words = rng.integers(0, 2**32, 10**5, dtype=np.uint32)
@@ -418,7 +416,7 @@ def test_hot_pixels_stand_out_as_often_as_predicted(mean_e: float) -> None:
 
 
 @given(share=st.floats(-12, -4), side=st.integers(10, 4000))
-def test_dead_pixels_are_called_for_where_a_tenth_of_one_is_expected(
+def test_dead_pixels_are_simulated_from_a_tenth_of_an_outlier(
     base: tuple[Config, Physics], share: float, side: int
 ) -> None:
     config, physics = base
@@ -426,7 +424,7 @@ def test_dead_pixels_are_called_for_where_a_tenth_of_one_is_expected(
     assert ("dead_pixels" in chosen(config, physics, facts, LIGHT)) == (side * side * 10**share >= 0.1)
 
 
-def test_dead_pixels_of_a_black_picture_show_by_the_pedestal_alone(base: tuple[Config, Physics]) -> None:
+def test_dead_pixels_of_black_images_differ_by_the_black_level(base: tuple[Config, Physics]) -> None:
     config, physics = base
     physics = replace(physics, dead_pixel_share=1e-4)
     dark = SignalRange(0.0, 0.0)
@@ -436,13 +434,13 @@ def test_dead_pixels_of_a_black_picture_show_by_the_pedestal_alone(base: tuple[C
 
 
 @given(rate=st.floats(0, 1e6))
-def test_no_count_is_beyond_the_reach_that_a_full_well_is_judged_by(rate: float) -> None:
+def test_no_poisson_count_exceeds_the_limit_used_for_full_wells(rate: float) -> None:
     """The greatest word that there is."""
     most = poisson(np.array([0, 2**31], dtype=np.uint32), np.full(2, rate)).max()
     assert most <= (rate + 7 * math.sqrt(rate) + 12 if rate else 0)
 
 
-def test_offsets_that_are_left_out_add_up_as_they_are(base: tuple[Config, Physics]) -> None:
+def test_omitted_offsets_add_linearly(base: tuple[Config, Physics]) -> None:
     """0.07 and 0.07 of the noise would pass in quadrature."""
     config, physics = base
     plane_dn = math.sqrt((9 + 10 + 1 / 12) / (384 * 256))
@@ -466,14 +464,14 @@ def test_facts_of_a_single_pixel() -> None:
     assert facts_of(np.array([[[1, 2, 65535]]], dtype=np.uint16)) == Facts(1, 1, 65536, 1, 65535)
 
 
-def test_facts_see_a_single_bright_pixel_wherever_it_is() -> None:
+def test_facts_include_a_single_bright_pixel_at_any_place() -> None:
     srgb = flat(10, 10, 10)
     srgb[3, 5, 2] = 255
     assert (facts_of(srgb).dark_code, facts_of(srgb).bright_code) == (10, 255)
 
 
 @given(seed=st.integers(0, 10**6), more=st.integers(0, 55))
-def test_facts_rise_with_the_codes(seed: int, more: int) -> None:
+def test_facts_increase_with_the_codes(seed: int, more: int) -> None:
     srgb = np.random.default_rng(seed).integers(0, 200, (9, 11, 3)).astype(np.uint8)
     before, after = facts_of(srgb), facts_of(srgb + np.uint8(more))
     assert (after.dark_code, after.bright_code) == (before.dark_code + more, before.bright_code + more)
@@ -481,9 +479,7 @@ def test_facts_rise_with_the_codes(seed: int, more: int) -> None:
 
 @pytest.mark.parametrize("highlight", ["per_channel", "gray_mean", "none"])
 @pytest.mark.parametrize("camera", ["nexus_6p", "sony_a7r", "convex"])
-def test_no_site_is_darker_or_brighter_than_the_light_that_is_judged(
-    settings: Settings, highlight: str, camera: str
-) -> None:
+def test_all_sites_are_within_the_signal_range(settings: Settings, highlight: str, camera: str) -> None:
     """Of light up to white; what highlights come to above it is cut."""
     config = configured(settings, "noise=sony_a7s2", "scene=night", f"camera={camera}", f"gains.highlight={highlight}")
     for number, (low, high) in enumerate([(0, 255), (40, 255), (40, 200), (3, 60)]):
@@ -498,15 +494,13 @@ def test_no_site_is_darker_or_brighter_than_the_light_that_is_judged(
         assert found.max() <= light.bright_dn * (1 + 1e-12)
 
 
-def test_light_of_gray_by_hand() -> None:
+def test_signal_range_of_gray_by_hand() -> None:
     curve = linear_table("none", 1, 256)
     light = signal_range(Facts(4, 4, 256, 51, 102), "none", 1, (0.5, 2.0, 0.25), 0.5, 1000.0, IDENTITY)
     assert light == SignalRange(curve[51] * 0.25 * 0.5 * 1000, curve[102] * 2.0 * 0.5 * 1000)
 
 
-def test_the_same_picture_in_8_and_in_16_bits_has_the_same_effects(
-    settings: Settings, pictures: dict[str, Srgb]
-) -> None:
+def test_equal_images_of_8_and_16_bits_have_equal_effects(settings: Settings, pictures: dict[str, Srgb]) -> None:
     config = configured(settings, "noise=nikon_d850", "scene=indoor", "noise.assumed=[]", "noise.full_well_e=20000")
     for srgb in pictures.values():
         deep = srgb.astype(np.uint16) * np.uint16(257)
@@ -514,14 +508,14 @@ def test_the_same_picture_in_8_and_in_16_bits_has_the_same_effects(
         assert (narrow.effects, narrow.skipped) == (wide.effects, wide.skipped)
 
 
-def test_a_decision_is_the_same_in_any_order_of_pixels(settings: Settings) -> None:
+def test_selection_does_not_depend_on_order_of_pixels(settings: Settings) -> None:
     """Facts alone decide; of all but the green middle, which nothing depends on."""
     config = configured(settings, "noise=sony_a7s2", "scene=low_light", "noise.assumed=[]")
     srgb = cut("gradients-0", 40, 56)
     assert switched(config, "auto", srgb, 0) == switched(config, "auto", np.ascontiguousarray(srgb[::-1, ::-1]), 0)
 
 
-def test_the_number_of_workers_decides_nothing(
+def test_number_of_workers_does_not_change_the_selection(
     make: Callable[..., runner.Summary], tree_hash: Callable[[Path], str], tmp_path: Path
 ) -> None:
     photos = fill(tmp_path / "photos", 4)
@@ -533,7 +527,7 @@ def test_the_number_of_workers_decides_nothing(
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (3, 3), (1, 500)])
 @pytest.mark.parametrize("code", [0, 255])
-def test_the_smallest_pictures_have_a_plan(settings: Settings, shape: tuple[int, int], code: int) -> None:
+def test_smallest_images_have_a_plan(settings: Settings, shape: tuple[int, int], code: int) -> None:
     config = configured(settings, "noise=canon_70d", "scene=night", "noise.assumed=[]", "noise.full_well_e=3000")
     srgb = np.full((*shape, 3), code, dtype=np.uint8)
     _, predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(srgb))
@@ -557,7 +551,7 @@ tolerances = st.floats(-6, 1).map(lambda power: 10.0**power)
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), one=tolerances, other=tolerances)
-def test_a_greater_tolerance_never_simulates_more(
+def test_larger_tolerance_never_simulates_more(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, one: float, other: float
 ) -> None:
     config, physics = base
@@ -567,7 +561,7 @@ def test_a_greater_tolerance_never_simulates_more(
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(1, 3000))
-def test_a_tiny_tolerance_simulates_all_that_has_a_size(
+def test_tiny_tolerance_simulates_every_contribution(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float
 ) -> None:
     config, physics = base
@@ -577,7 +571,7 @@ def test_a_tiny_tolerance_simulates_all_that_has_a_size(
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)
-def test_what_shows_on_its_own_is_always_simulated(
+def test_effect_above_tolerance_alone_is_always_simulated(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
 ) -> None:
     config, physics = base
@@ -597,14 +591,14 @@ def told(settings: Settings, *overrides: str) -> dict[str, Prediction]:
 
 @pytest.mark.parametrize("switch", ["auto", "on", "off"])
 @pytest.mark.parametrize("effect", ["read", "prnu", "dark_current"])
-def test_an_effect_named_wins_over_all(settings: Settings, effect: str, switch: str) -> None:
+def test_switch_of_an_effect_takes_precedence_over_all(settings: Settings, effect: str, switch: str) -> None:
     named = told(settings, f"effects.all={switch}", f"effects.{effect}=on")[effect]
     assert (named.simulated, named.reason) == (True, "switched on")
     named = told(settings, f"effects.all={switch}", f"effects.{effect}=off")[effect]
     assert (named.simulated, named.reason) == (False, "switched off")
 
 
-def test_all_off_leaves_the_rounding(settings: Settings) -> None:
+def test_all_off_keeps_rounding(settings: Settings) -> None:
     predictions = told(settings, "effects.all=off")
     assert [name for name, one in predictions.items() if one.simulated] == ["quantise"]
     assert {one.reason for name, one in predictions.items() if name != "quantise"} == {"switched off"}
@@ -615,7 +609,7 @@ def test_auto_by_name_lets_the_image_decide(settings: Settings) -> None:
     assert not told(settings, "effects.all=on", "effects.prnu=auto")["prnu"].simulated
 
 
-def test_assumed_numbers_are_off_under_auto_and_say_so(settings: Settings) -> None:
+def test_assumed_numbers_are_off_under_auto_with_reason(settings: Settings) -> None:
     predictions = told(settings)
     for effect in ASSUMED:
         assert not predictions[effect].simulated
@@ -623,7 +617,7 @@ def test_assumed_numbers_are_off_under_auto_and_say_so(settings: Settings) -> No
         assert told(settings, f"effects.{effect}=on")[effect].simulated
 
 
-def test_all_on_simulates_what_has_a_number_and_says_what_has_none(settings: Settings) -> None:
+def test_all_on_simulates_known_numbers_and_lists_missing_ones(settings: Settings) -> None:
     predictions = told(settings, "effects.all=on")
     lacking = {name: one.reason for name, one in predictions.items() if not one.simulated}
     assert lacking == {
@@ -634,13 +628,13 @@ def test_all_on_simulates_what_has_a_number_and_says_what_has_none(settings: Set
 
 
 @pytest.mark.parametrize("effect", ["full_well", "column", "black_error"])
-def test_an_effect_without_a_number_cannot_be_switched_on_by_name(settings: Settings, effect: str) -> None:
+def test_effect_without_a_number_cannot_be_switched_on(settings: Settings, effect: str) -> None:
     with pytest.raises(ConfigError, match=rf"effects.{effect}=on: noise=sony_a7s2 gives no {effect}_"):
         validate_config(settings("noise=sony_a7s2", "scene=indoor", f"effects.{effect}=on"))
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)
-def test_reasons_are_words_with_numbers_and_fit_a_row(
+def test_reasons_contain_numbers_and_fit_a_row(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
 ) -> None:
     config, physics = base
@@ -651,14 +645,14 @@ def test_reasons_are_words_with_numbers_and_fit_a_row(
         assert one.forced or (" DN in the " in one.reason and f"tolerance {tolerance:g}" in one.reason)
 
 
-def test_reasons_of_settings_fit_a_row(settings: Settings) -> None:
+def test_reasons_of_the_config_fit_a_row(settings: Settings) -> None:
     for switch in ("auto", "on", "off"):
         for one in told(settings, f"effects.all={switch}").values():
             assert one.reason
             assert not {";", "\n"} & set(one.reason)
 
 
-def test_skipped_effects_stand_in_the_plan_with_their_reasons(settings: Settings) -> None:
+def test_plan_lists_skipped_effects_with_reasons(settings: Settings) -> None:
     config = configured(settings, "noise=nikon_d850", "scene=daylight", "noise.assumed=[]")
     plan, predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(flat(200, 200, 200)))
     assert plan.effects == tuple(one.effect for one in predictions if one.simulated)
@@ -683,7 +677,7 @@ def test_skipped_effects_stand_in_the_plan_with_their_reasons(settings: Settings
         ("black_error", {"black_error_dn": (0.3, 0.3, 0.3, 0.3)}, 1.0),
     ],
 )
-def test_a_prediction_is_what_is_measured(
+def test_predictions_match_measurements(
     base: tuple[Config, Physics], effect: str, numbers: dict[str, float], slack: float
 ) -> None:
     """On a gray frame: in the statistic where it shows best, within 5 standard errors of a mean square."""
@@ -713,7 +707,7 @@ def test_a_prediction_is_what_is_measured(
     assert measured >= predicted.ratio / slack - error - 1e-9
 
 
-def test_what_hides_is_the_noise_of_the_plan(base: tuple[Config, Physics]) -> None:
+def test_masking_noise_is_the_noise_of_the_plan(base: tuple[Config, Physics]) -> None:
     """The variance that a pixel is said to have in the dark is that of the effects that stay on."""
     config, physics = base
     plan = replace(switched(config, "auto", flat(0, 0, 0), 0), physics=physics, a_dn=1.0, b_dn2=9.0)
@@ -727,7 +721,7 @@ def test_what_hides_is_the_noise_of_the_plan(base: tuple[Config, Physics]) -> No
 # The table ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_plan_is_told_as_a_table_of_all_effects(door: Door, tmp_path: Path) -> None:
+def test_plan_prints_a_table_of_all_effects(door: Door, tmp_path: Path) -> None:
     fill(tmp_path / "photos", 3)
     done = door("plan", "source.root=photos", "noise=nikon_d850", "scene=video_night", "noise.assumed=[prnu_std]")
     assert (done.code, done.err) == (0, "")
@@ -749,7 +743,7 @@ def test_a_plan_is_told_as_a_table_of_all_effects(door: Door, tmp_path: Path) ->
     assert "outliers" in words["hot_pixels"]
 
 
-def test_a_table_says_in_how_many_photographs_an_effect_is_simulated(door: Door, tmp_path: Path) -> None:
+def test_table_counts_images_in_which_effects_are_simulated(door: Door, tmp_path: Path) -> None:
     """A black photograph has no shot noise."""
     import cv2
 
@@ -762,7 +756,7 @@ def test_a_table_says_in_how_many_photographs_an_effect_is_simulated(door: Door,
     assert "2 of 3" in shot
 
 
-def test_a_table_keeps_within_160_columns_at_its_longest(door: Door, tmp_path: Path) -> None:
+def test_longest_table_fits_160_columns(door: Door, tmp_path: Path) -> None:
     fill(tmp_path / "photos", 1)
     for overrides in (
         ("effects.all=auto",),
@@ -775,7 +769,7 @@ def test_a_table_keeps_within_160_columns_at_its_longest(door: Door, tmp_path: P
         assert max(map(len, done.out.splitlines())) <= 160
 
 
-def test_a_two_parameter_profile_is_told_without_a_table(door: Door, tmp_path: Path) -> None:
+def test_profile_with_two_numbers_is_printed_without_table(door: Door, tmp_path: Path) -> None:
     fill(tmp_path / "photos", 1)
     done = door("plan", "source.root=photos", "noise=imx385_iso3200")
     assert done.code == 0

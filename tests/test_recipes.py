@@ -33,7 +33,7 @@ NO_CLIPS = {"crvd_like": ("source.clips=false",)}
     ],
     ids=["noise", "groups"],
 )
-def test_a_recipe_passes_the_checks_whatever_options_are_chosen(
+def test_experiment_is_valid_with_all_compatible_options(
     recipe: str, overrides: tuple[str, ...], settings: Settings
 ) -> None:
     config = settings(f"+{RECIPE}={recipe}", *overrides, *NO_CLIPS.get(recipe, ()))
@@ -55,20 +55,20 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_a_recipe_runs_as_it_is(recipe: str, clip: Path, door: Door, tmp_path: Path) -> None:
+def test_experiment_runs_unmodified(recipe: str, clip: Path, door: Door, tmp_path: Path) -> None:
     assert door(f"+{RECIPE}={recipe}", f"source.root={clip}", "n_jobs=1", "out=ds").code == 0
     assert len(RawPairs(tmp_path / "ds")) == (16 if recipe == "brooks2019_training" else 1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_the_noise_of_a_recipe_is_what_its_rows_say(recipe: str, door: Door) -> None:
+def test_noise_of_an_experiment_matches_its_rows(recipe: str, door: Door) -> None:
     overrides = (f"+{RECIPE}={recipe}", "source.limit=2", "n_jobs=1", *NO_CLIPS.get(recipe, ()))
     assert door(*overrides, "out=ds").code == 0
     assert "noise of" in door("verify", "ds", "--noise").out
 
 
-def test_a_dataset_of_a_recipe_is_made_again_without_it(clip: Path, door: Door, tmp_path: Path) -> None:
+def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(clip: Path, door: Door, tmp_path: Path) -> None:
     """Its ``config.yaml`` says all settings, wherever they came from."""
     source = (f"source.root={clip}", "n_jobs=1")
     assert door(f"+{RECIPE}=brooks2019_training", "source.patch=[random,64,2]", "out=ds", *source).code == 0
@@ -77,7 +77,7 @@ def test_a_dataset_of_a_recipe_is_made_again_without_it(clip: Path, door: Door, 
     assert "the same as ds" in door("again", "ds", "out=again", *source).out
 
 
-def test_recipes_can_be_swept(clip: Path, door: Door, tmp_path: Path) -> None:
+def test_experiments_can_be_swept(clip: Path, door: Door, tmp_path: Path) -> None:
     done = door("-m", f"+{RECIPE}=ipol_demo,eld_low_light", f"source.root={clip}", "out=sweep", "n_jobs=1")
     assert done.code == 0
     assert (tmp_path / f"sweep/+{RECIPE}=eld_low_light/manifest.csv").exists()
@@ -92,9 +92,7 @@ def test_recipes_can_be_swept(clip: Path, door: Door, tmp_path: Path) -> None:
         (f"+{RECIPE}=crvd_like", "source.clips=true: the built-in scenes are no clips; give source.root"),
     ],
 )
-def test_a_recipe_that_cannot_be_meant_costs_one_line(
-    argument: str, complaint: str, door: Door, tmp_path: Path
-) -> None:
+def test_invalid_experiment_is_refused_in_one_line(argument: str, complaint: str, door: Door, tmp_path: Path) -> None:
     done = door(argument)
     assert (done.code, len(done.err.splitlines()), list(tmp_path.iterdir())) == (2, 1, [])
     assert complaint in done.err
@@ -103,7 +101,7 @@ def test_a_recipe_that_cannot_be_meant_costs_one_line(
 # The demo -------------------------------------------------------------------------------------------------------------
 
 
-def test_the_demos_defaults_are_those_of_the_article(settings: Settings) -> None:
+def test_ipol_demo_has_the_defaults_of_the_article(settings: Settings) -> None:
     """Section 5: the average values of Brooks et al., gamma 2.2, the convex camera, RGGB, IMX385 at ISO 3200."""
     config = settings(f"+{RECIPE}=ipol_demo")
     gains = config.gains
@@ -120,7 +118,7 @@ def test_the_demos_defaults_are_those_of_the_article(settings: Settings) -> None
 # Brooks et al. --------------------------------------------------------------------------------------------------------
 
 
-def test_brooks_laws_are_those_of_his_script(settings: Settings) -> None:
+def test_brooks_distributions_are_those_of_the_script(settings: Settings) -> None:
     """unprocess.py: random_gains(), random_noise_levels(), safe_invert_gains(), mosaic(); train.py: image_size."""
     config = settings(f"+{RECIPE}=brooks2019_training")
     gains, noise = config.gains, config.noise
@@ -155,7 +153,7 @@ def brooks(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_clean_planes_are_those_of_brooks_formulas(brooks: Path) -> None:
+def test_clean_planes_match_the_formulas_of_brooks(brooks: Path) -> None:
     """To what a cast to float32 rounds, half a unit in the last place of 1, and ten times that for his constants."""
     scenes = {row["source"]: downscaled(synthetic.scene(row["source"]), 2) for *_, row in RawPairs(brooks)}
     for clean, _, row in RawPairs(brooks):
@@ -164,7 +162,7 @@ def test_clean_planes_are_those_of_brooks_formulas(brooks: Path) -> None:
         assert np.abs(clean - clean_planes_of_brooks(srgb, row)).max() < 2**-25 * 10
 
 
-def test_noise_is_that_of_brooks_law_and_reaches_beyond_both_ends(brooks: Path) -> None:
+def test_noise_follows_brooks_and_exceeds_both_limits(brooks: Path) -> None:
     """Residuals over √(shot·x + read) are standard normals: mean and variance within five standard errors."""
     lowest = highest = 0.5
     for clean, noisy, row in RawPairs(brooks):
@@ -182,7 +180,7 @@ def test_noise_is_that_of_brooks_law_and_reaches_beyond_both_ends(brooks: Path) 
 # CRVD and ELD ---------------------------------------------------------------------------------------------------------
 
 
-def test_crvd_like_clips_keep_one_of_its_five_isos_each(door: Door, tmp_path: Path) -> None:
+def test_each_crvd_like_clip_has_one_of_five_isos(door: Door, tmp_path: Path) -> None:
     for clip in range(4):
         fill(tmp_path / f"photos/clip{clip}", 2, first=2 * clip)
     assert door(f"+{RECIPE}=crvd_like", f"source.root={tmp_path / 'photos'}", "out=ds", "n_jobs=1").code == 0
@@ -197,14 +195,14 @@ def test_crvd_like_clips_keep_one_of_its_five_isos_each(door: Door, tmp_path: Pa
     assert len(set.union(*isos.values())) > 1
 
 
-def test_crvd_like_draws_from_its_five_isos(settings: Settings) -> None:
+def test_crvd_like_draws_from_five_isos(settings: Settings) -> None:
     config = settings(f"+{RECIPE}=crvd_like")
     assert config.scene.iso == ["choice", *CRVD]
     assert [branch.iso for branch in config.noise.branches] == [[iso, iso] for iso in CRVD]
     assert (config.sensor.pattern, config.source.clips, config.noise.name) == ("GBRG", True, "imx385")
 
 
-def test_crvd_like_can_be_had_at_every_iso_twice(make: Make, tmp_path: Path) -> None:
+def test_crvd_like_supports_every_iso_twice(make: Make, tmp_path: Path) -> None:
     """As synthesize_noise.py makes it."""
     (tmp_path / "photos/clip").mkdir(parents=True)
     Image.fromarray(pixels(0, 16, 16)).save(tmp_path / "photos/clip/0.png")
@@ -213,7 +211,7 @@ def test_crvd_like_can_be_had_at_every_iso_twice(make: Make, tmp_path: Path) -> 
     assert [row["iso"] for *_, row in RawPairs(tmp_path / "ds")] == [iso for iso in CRVD for _ in range(2)]
 
 
-def test_eld_low_light_has_the_isos_and_light_factors_of_its_dataset(make: Make, tmp_path: Path) -> None:
+def test_eld_low_light_has_isos_and_factors_of_its_dataset(make: Make, tmp_path: Path) -> None:
     """Section 5 of the paper: ISO 800, 1600, 3200; factors 100 and 200. K of the release: Kmin 0.415039 at ISO 100."""
     fill(tmp_path / "photos", 10)
     make(tmp_path / "photos", tmp_path / "ds", f"+{RECIPE}=eld_low_light")
@@ -228,5 +226,5 @@ def test_eld_low_light_has_the_isos_and_light_factors_of_its_dataset(make: Make,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", ["nikon_d850", "sony_a7s2", "canon_5d4", "canon_70d", "canon_700d"])
-def test_eld_low_light_holds_for_each_of_its_cameras(camera: str, settings: Settings) -> None:
+def test_eld_low_light_is_valid_for_each_camera(camera: str, settings: Settings) -> None:
     validate_config(settings(f"+{RECIPE}=eld_low_light", f"noise={camera}"))
