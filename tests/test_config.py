@@ -1,15 +1,17 @@
-"""Settings: the values of ``conf/`` against their sources, what is refused and in which words, config.yaml."""
+"""Configuration: values of ``conf/`` against their sources, refused values and their messages, ``config.yaml``."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from conftest import CRVD
+from conftest import CRVD, Door
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -30,8 +32,8 @@ from unprocess_gen.config.serialization import (
 from unprocess_gen.config.validation import HIGHLIGHTS, validate_config
 from unprocess_gen.core import tone_curves
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Distribution
-from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.core.types import Distribution, Facts
+from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.simulation.reference import unprocess
 
 Settings = Callable[..., Config]
@@ -42,17 +44,17 @@ MATRIX = "[0.7, 0.1, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]"
 NEEDS = {
     "camera/custom.yaml": [f"camera.xyz2cam={MATRIX}"],
     "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
-    "noise/imx385.yaml": ["noise.iso=3200"],  # no scene has one of the five ISOs it was calibrated at in daylight
+    "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
 }
 NOISE_KEYS = {"name", "units", "black", "bits", "black_level_dn", "white_level_dn"}
 TWO_NUMBERS = {"a", "b", "negative_variance"}
 PHYSICAL = {"branches", "assumed", *(key for key, _, _ in PROFILE_RANGES)}
 CHOSEN = {"iso", "law", "levels", "draws"}
-"""What a user says of a profile; no profile says it of itself."""
+"""Keys that users set and no profile does."""
 SHA256 = "0" * 64
 
 
-# What stands in conf/ -------------------------------------------------------------------------------------------------
+# Options in conf/ -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
@@ -217,7 +219,7 @@ def test_isps_are_those_of_the_contract(name: str, settings: Settings) -> None:
     assert (isp.tone, isp.gamma) == ISPS[name]
 
 
-# What is refused ------------------------------------------------------------------------------------------------------
+# Refused values -------------------------------------------------------------------------------------------------------
 
 REFUSED = [
     ("seed=-1", r"seed=-1: expected 0 to 9223372036854775807"),
@@ -500,6 +502,103 @@ def test_invalid_config_yaml_is_refused_in_one_line(content: bytes, tmp_path: Pa
     with pytest.raises(ConfigError, match=r"config.yaml: not the config.yaml of a dataset \(") as error:
         read_dataset_yaml(tmp_path / "config.yaml")
     assert "\n" not in str(error.value)
+
+
+HOSTILE = [
+    *(None, True, -1, 0, 3, 2**63, -(2**63), math.nan, math.inf, -math.inf, 1e300, -1e300, 1e-300, 2.5),
+    *("x", "", "../../etc", "a\nb", "${oc.env:HOME}", [], {}, [1], ["x"], [["x"]], {"a": 1}, [{"a": -1, "b": 2}]),
+    *(["uniform", 1, 2], ["uniform", -1e300, 1e300], ["choice", 1e300], ["choice", 1, math.nan], [100, 200]),
+    *(["truncated_normal", 0, 1e-300, -1e-300, 1e-300], ["log_uniform", 1e-320, 1e308]),
+    *(["log_linear_in_a", 10, 50, 10], ["per_iso", 1e9], ["root", 0, 0, 1e9], ["line", 1e9, 1e9, 1e9]),
+    ["by_log_iso", [1e300] * 4],
+]
+"""Values that a careless or hostile editor could write anywhere in a ``config.yaml``."""
+
+
+def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from paths_of(value, (*path, key))
+
+
+@pytest.mark.parametrize("overrides", [(), ("noise=sony_a7s2", "scene=low_light")], ids=str)
+@hypothesis_settings(deadline=None, max_examples=150)
+@given(data=st.data())
+def test_edited_config_yaml_is_refused_in_one_line_or_can_be_planned(
+    overrides: tuple[str, ...], data: st.DataObject, settings: Settings, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    tree = yaml.safe_load(dataset_yaml(settings(*overrides)))
+    *parents, key = data.draw(st.sampled_from(list(paths_of(tree))))
+    group = reduce(lambda node, name: node[name], parents, tree)
+    if data.draw(st.booleans()):
+        group[key] = data.draw(st.sampled_from(HOSTILE))
+    elif isinstance(group, dict):
+        del group[key]
+    path = tmp_path_factory.mktemp("hostile") / "config.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    try:
+        config, _ = read_dataset_yaml(path)
+    except ConfigError as error:
+        assert "\n" not in str(error)
+    else:
+        plan_pairs(config, SHA256, facts=Facts(64, 48, 256, 3, 250))
+
+
+EDITED = [
+    ("isp", "gamma", None, "isp.gamma=null: expected a number from 0.1 to 10, or srgb"),
+    ("gains", "red", math.nan, "gains.red=nan: expected a finite number"),
+    ("gains", "red", math.inf, "gains.red=inf: expected a finite number"),
+    ("source", "max_pixels", -1, "source.max_pixels=-1: expected 1 to"),
+    ("source", "max_pixels", 2**63, "source.max_pixels=9223372036854775808: expected 1 to"),
+    ("sensor", "bits", "twelve", "sensor.bits=twelve: expected a value of type int"),
+    ("sensor", "bits", True, "sensor.bits=True: expected a value of type int"),
+    ("source", "include", "*.jpg", r"source.include=\*.jpg: expected a value of type list"),
+    ("source", "root", "/etc", "unknown key source.root"),
+    ("noise", "gain", 1, "unknown key noise.gain"),
+    ("source", "kind", "web", "source.kind=web: expected one of folder, synthetic"),
+]
+
+
+@pytest.mark.parametrize(("group", "key", "value", "problem"), EDITED)
+def test_config_yaml_with_bad_value_is_refused_with_its_key(
+    group: str, key: str, value: Any, problem: str, settings: Settings, tmp_path: Path
+) -> None:
+    tree = yaml.safe_load(dataset_yaml(settings()))
+    tree[group][key] = value
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    with pytest.raises(ConfigError, match=problem) as error:
+        read_dataset_yaml(tmp_path / "config.yaml")
+    assert "\n" not in str(error.value)
+
+
+def test_config_yaml_with_missing_key_is_refused_with_its_name(settings: Settings, tmp_path: Path) -> None:
+    tree = yaml.safe_load(dataset_yaml(settings()))
+    del tree["gains"]["threshold"]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"missing key gains\.threshold"):
+        read_dataset_yaml(tmp_path / "config.yaml")
+
+
+def test_again_refuses_hostile_config_yaml_with_exit_2(door: Door, tmp_path: Path) -> None:
+    folder = tmp_path / "ds"
+    folder.mkdir()
+    for text in ("a: " + "[" * 200_000, "seed: 0", "", "source: {kind: folder}\nseed: -1"):
+        (folder / "config.yaml").write_text(text, encoding="utf-8")
+        done = door("again", "ds", "out=new")
+        assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
+
+
+def test_dollar_signs_in_config_yaml_are_literal(settings: Settings) -> None:
+    config = settings()
+    config.source.include = ["${oc.env:HOME}/*.jpg"]
+    assert parse_dataset_yaml(dataset_yaml(config))[0].source.include == ["${oc.env:HOME}/*.jpg"]
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**5000)], ids=["large", "larger"])
+def test_integers_that_no_float_holds_are_refused(number: int) -> None:
+    with pytest.raises(ConfigError, match=r"gains.red=an integer of \d+ bits: expected a finite number"):
+        parse_distribution("gains.red", number, ("uniform",))
 
 
 def test_choices_match_their_implementations() -> None:

@@ -1,10 +1,10 @@
-"""Flat fields and gradients: the noisy frame has exactly the law that DESIGN section 4 promises, at every level.
+"""Flat fields and gradients: noisy frames have exactly the documented distribution, at every level.
 
     noisy = clip(rint(x + sqrt(max(0, a·(x - black) + b))·n), low, high)      x: the clean value, not rounded
 
-Every option of ``conf/noise`` on 64 flat levels, from black over hundredths of a DN to white: mean and variance against
-the exact moments of the rounded, clipped Gaussian (`moments`), within Bernstein's bounds for as many pixels. Wrong laws
-that others have used, or might, are held against the same frames and must not fit.
+Every option of ``conf/noise`` is simulated on 64 flat levels, from black over hundredths of a DN to white. Mean and
+variance are compared with the exact moments of the rounded, clipped Gaussian (`moments`), within Bernstein's bounds for
+the number of pixels. Wrong distributions that others have used are compared with the same frames and must not fit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 Settings = Callable[..., Config]
 Law = Callable[[Plan, float], tuple[float, float]]
-"""Centre and standard deviation of what is rounded and clipped, at the clean value x."""
+"""Mean and standard deviation before rounding and clipping, at the clean value x."""
 
 BELOW_WHITE = (0, 1, 2, 5, 17, 100, 400, 1000)
 CODES = sorted({0, *np.geomspace(1, 65535, 62).astype(int).tolist(), *(65535 - code for code in BELOW_WHITE)})
@@ -54,13 +54,13 @@ def plan_of(settings: Settings, noise: str, *overrides: str, image: int = 0) -> 
 
 @functools.lru_cache(maxsize=1)
 def flats() -> np.ndarray:
-    """All levels below each other, `ROWS` rows each."""
+    """Return a frame of all levels, `ROWS` rows each."""
     levels = np.repeat(np.array(CODES, dtype=np.uint16), ROWS)
     return np.ascontiguousarray(np.broadcast_to(levels[:, None, None], (len(levels), WIDTH, 3)))
 
 
 def with_noise(plan: Plan, a: float, b: float) -> Plan:
-    """The plan with noise of variance a·(x - black) + b."""
+    """Return the plan with noise of variance a·(x - black) + b."""
     return dataclasses.replace(plan, a_dn=a, b_dn2=b, effects=("heteroscedastic", "quantise"))
 
 
@@ -69,7 +69,7 @@ def clean_value(plan: Plan, code: int) -> float:
 
 
 def histograms(plan: Plan, frames: int) -> np.ndarray:
-    """How often each DN occurs at each level, ``[levels, 2**bits]``; frames lie below each other, so no word recurs."""
+    """Count each DN at each level, ``[levels, 2**bits]``; frames are stacked, so no random word occurs twice."""
     found = np.zeros((len(CODES), 2**plan.bits), dtype=np.int64)
     for frame in range(frames):
         noisy = make_pair(flats(), plan, origin=(frame * len(CODES) * ROWS, 0)).noisy
@@ -89,10 +89,10 @@ def exact_moments(plan: Plan, x: float, law: Law) -> Moments:
 
 
 def misfits(plan: Plan, found: np.ndarray, law: Law = promised) -> list[str]:
-    """Levels whose mean or variance (about the exact mean) is not what the law says.
+    """Return the levels whose mean, or variance about the exact mean, does not follow the distribution.
 
-    The table of normals is off by 1.5e-7: each of the thresholds between two DN moves by as much of a standard
-    deviation, so the mean by 1.5e-7 of std + 1, the mean square by twice the distance times that.
+    The table of normals has an error of 1.5e-7: it moves each threshold between two DN by that part of a standard
+    deviation, the mean by 1.5e-7 of std + 1, and the mean square by twice the distance times that.
     """
     complaints = []
     dn = np.arange(2**plan.bits)
@@ -113,7 +113,7 @@ def misfits(plan: Plan, found: np.ndarray, law: Law = promised) -> list[str]:
     return complaints
 
 
-# The helper itself ----------------------------------------------------------------------------------------------------
+# The helper -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("std", [0.0, 0.05, 0.3, 1.0, 20.0])
@@ -125,7 +125,7 @@ def test_exact_probabilities_sum_to_1(mean: float, std: float) -> None:
 
 
 def test_exact_moments_of_wide_gaussian_include_rounding() -> None:
-    """Sheppard's corrections: variance + 1/12, fourth moment 3s⁴ + s²/2 + 1/80; what they leave out is e^(-2pi²s²)."""
+    """Sheppard's corrections: variance + 1/12, fourth moment 3s⁴ + s²/2 + 1/80; their error is e^(-2pi²s²)."""
     found = moments(500.3, 2.0, 0, 1000)
     slack = 1e-12 * 500
     assert abs(found.mean - 500.3) <= slack
@@ -135,7 +135,7 @@ def test_exact_moments_of_wide_gaussian_include_rounding() -> None:
 
 
 def test_exact_moments_at_a_clip_are_half_normal() -> None:
-    """Clipped at its own mean a Gaussian has mean s/√(2pi); in steps of s/1000 rounding matters by 1e-6."""
+    """Clipped at its mean, a Gaussian has mean s/√(2pi); rounding in steps of s/1000 changes it by 1e-6."""
     found = moments(0.0, 1000.0, 0, 10**5)
     assert abs(found.mean / 1000 - 1 / math.sqrt(2 * math.pi)) <= 1e-6
     assert abs(found.variance / 1e6 - (1 / 2 - 1 / (2 * math.pi))) <= 1e-6
@@ -146,7 +146,7 @@ def test_exact_moments_without_noise_have_no_variance() -> None:
     assert moments(300.0, 0.0, 0, 255).mean == 255
 
 
-# The law --------------------------------------------------------------------------------------------------------------
+# Mean and variance ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("clip", ["sensor", "black"])
@@ -190,7 +190,7 @@ def test_clean_flat_is_rounded_once(settings: Settings, noise: str) -> None:
         assert (pair.clean == round(clean_value(plan, code))).all()
 
 
-# Wrong laws -----------------------------------------------------------------------------------------------------------
+# Wrong distributions are detected -------------------------------------------------------------------------------------
 
 
 def scaled(by: float) -> Law:
@@ -227,7 +227,7 @@ def test_mirrored_negative_variance_is_detected(settings: Settings) -> None:
     assert misfits(plan, histograms(plan, 1), mirrored) != []
 
 
-# The whole distribution -----------------------------------------------------------------------------------------------
+# Tails and frequencies ------------------------------------------------------------------------------------------------
 
 DEEP_CODE = 65535 // 2
 DEEP = 2**22
@@ -235,7 +235,7 @@ DEEP = 2**22
 
 @functools.lru_cache(maxsize=1)
 def deep_flat(plan: Plan) -> np.ndarray:
-    """Pixels of one level in the middle, where no clip is in reach."""
+    """Return pixels of one level in the middle of the range, far from clipping."""
     return make_pair(np.full((2048, 2048, 3), DEEP_CODE, dtype=np.uint16), plan).noisy
 
 
@@ -267,7 +267,7 @@ def test_tails_have_the_expected_number_of_pixels(settings: Settings, side: int,
     ("noise", "code"), [("imx385_iso3200", DEEP_CODE), ("imx385_iso1600", 100), ("imx385_iso25600", 65000)]
 )
 def test_every_dn_has_its_expected_frequency(settings: Settings, noise: str, code: int) -> None:
-    """Near black and near white too, the clip's own DN included."""
+    """Near black and near white too, including the DN at which values are clipped."""
     plan = plan_of(settings, noise)
     x, std = promised(plan, clean_value(plan, code))
     noisy = make_pair(np.full((1024, 1024, 3), code, dtype=np.uint16), plan).noisy
@@ -285,11 +285,11 @@ def test_no_pixel_exceeds_the_range_of_the_sampler(settings: Settings) -> None:
     assert np.abs(deep_flat(plan) - x).max() <= REACH * std + 0.5
 
 
-# Where there is no variance -------------------------------------------------------------------------------------------
+# No variance ----------------------------------------------------------------------------------------------------------
 
 
 def test_negative_variance_leaves_shadows_without_noise(settings: Settings) -> None:
-    """RVDD's line: none up to 122.69544 / 8.0034 = 15.33 DN above black, some at once above it."""
+    """RVDD: no noise up to 122.69544 / 8.0034 = 15.33 DN above black, noise above it."""
     plan = plan_of(settings, "imx385_iso3200_rvdd")
     for code in CODES:
         pair = make_pair(np.full((64, 64, 3), code, dtype=np.uint16), plan)
@@ -309,15 +309,15 @@ def test_noise_none_gives_the_clean_frame(settings: Settings) -> None:
 
 
 SPAN, STRIP = 255, 15
-"""65535 = 255 · 257: each DN of a gradient over all codes holds 257 evenly spread fractions; strips of 15 DN."""
+"""65535 = 255 · 257: each DN of a gradient over all codes has 257 evenly spaced fractions; strips have 15 DN."""
 
 
 def transfer(settings: Settings, a: float, b: float, rounding: float) -> list[float]:
-    """By how many bounds the strips of a gradient miss var(noisy - clean) = a·u + b + rounding.
+    """Return the error of var(noisy - clean) = a·u + b + rounding in strips of a gradient, in units of its limit.
 
-    The difference is the noise and two roundings: its fourth moment is below a Gaussian's of the same variance (both
-    roundings have a negative excess), so the variance of its square is below 2·variance². What the roundings are not
-    uniform and independent by is below e^(-2pi²s²)·(2/pi² + 4s²), with s the least deviation, and 1/12/257².
+    The difference consists of noise and two roundings. Both roundings have negative excess, so its fourth moment is
+    below that of a Gaussian of equal variance, and the variance of its square is below 2·variance². The roundings are
+    uniform and independent up to e^(-2pi²s²)·(2/pi² + 4s²), with s the smallest standard deviation, and 1/12/257².
     """
     plan = dataclasses.replace(plan_of(settings, "none"), black_level_dn=256, white_level_dn=256 + SPAN)
     plan = with_noise(plan, a, b)

@@ -1,4 +1,4 @@
-"""How a budget of accuracy becomes methods, and what is refused; the statements of each method are proved elsewhere."""
+"""Choice of methods by a budget of errors. The error statements of the methods are tested with their kernels."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def scene() -> np.ndarray:
     return np.ascontiguousarray(synthetic.scene("gradients-0")[300:324, 400:431])
 
 
-# What is chosen -------------------------------------------------------------------------------------------------------
+# Chosen methods -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("tier", ["reference", "exact", "fast"])
@@ -150,7 +150,7 @@ def test_reference_and_exact_give_equal_pairs(settings: Settings, noise: str, sc
 def test_reference_tier_uses_the_exact_table_of_the_curve(
     settings: Settings, scene: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The formulas' last bit differs between machines."""
+    """The last bit of the formulas differs between machines."""
     plan = plan_image(settings("accuracy=reference"), "ab" * 32)
     monkeypatch.setattr("unprocess_gen.simulation.reference.unprocess.linear_light", None)
 
@@ -159,7 +159,7 @@ def test_reference_tier_uses_the_exact_table_of_the_curve(
         reference_pair(scene[:4, :4], plan)
 
 
-# Gauss for Poisson ----------------------------------------------------------------------------------------------------
+# Normal instead of Poisson distribution -------------------------------------------------------------------------------
 
 
 @given(read_std_e=st.floats(0.0, 30.0), law_distance=st.floats(1e-4, 0.05), rate_e=st.floats(0.0, 1e6))
@@ -183,7 +183,7 @@ def test_strong_read_noise_allows_normals_everywhere() -> None:
 
 @pytest.mark.parametrize(("rate_e", "read_std_e"), [(20.0, 1.0), (50.0, 3.0), (200.0, 2.0), (30.0, 6.0)])
 def test_distance_is_largest_difference_of_the_two_cdfs(rate_e: float, read_std_e: float) -> None:
-    """Against numerical integration of the densities: counts under a normal each, and one normal of their variance."""
+    """Compare with numerical integration: a normal density for each count, and one normal density of equal variance."""
     grid = np.linspace(rate_e - 12 * math.sqrt(rate_e + 36), rate_e + 14 * math.sqrt(rate_e + 36), 40001)
     counts = np.arange(0, int(rate_e + 20 * math.sqrt(rate_e) + 20))
     log_shares = counts * math.log(rate_e) - rate_e - np.array([math.lgamma(k + 1) for k in counts])
@@ -202,7 +202,7 @@ def test_distance_is_largest_difference_of_the_two_cdfs(rate_e: float, read_std_
 
 
 def test_methods_of_each_stage_are_in_order_of_cost() -> None:
-    """Cheapest first; the readable form last, and there is one."""
+    """Cheapest first; the NumPy reference is last and always exists."""
     for stage in STAGES:
         forms = [IMPLEMENTATIONS.index(one.implementation) for one in methods_of_stage(stage)]
         assert forms == sorted(forms)

@@ -1,4 +1,4 @@
-"""The numbers of a physical profile on the sensor in use, against mpmath and the sources' own formulas."""
+"""Numbers of physical noise profiles on the sensor in use, against mpmath and the formulas of their sources."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SAME_SENSOR = {
     "canon_700d": (14, 2048, 15000),
     "oppo_reno10x": (10, 64, 1023),
 }
-"""Bits, black and white level that each profile was calibrated at: there its DN are the sensor's."""
+"""Bits, black and white level of each calibration; on this sensor DN need no conversion."""
 
 
 def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: str) -> Config:
@@ -55,7 +55,7 @@ def close(value: float, expected: Any, rel: float = 1e-15) -> bool:
 
 
 def tukey_std(shape: float) -> Any:
-    """The deviation of Tukey's law of scale 1, by integrating its squared quantiles."""
+    """Return the standard deviation of the Tukey-lambda distribution at scale 1, by integration."""
     with mpmath.workdps(40):
         if shape == 0:
             return mpmath.pi / mpmath.sqrt(3)
@@ -63,7 +63,7 @@ def tukey_std(shape: float) -> Any:
         return mpmath.sqrt(2 / power**2 * (1 / (1 + 2 * power) - mpmath.beta(power + 1, power + 1)))
 
 
-# The forms ------------------------------------------------------------------------------------------------------------
+# Forms ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [0, 3, 2.5])
@@ -111,7 +111,7 @@ def test_scale_line_is_line_times_standard_deviation_at_scale_1(gain: float, sha
 
 
 def test_scatter_of_a_line_is_lognormal() -> None:
-    """Equal steps of probability; the logarithm is the normal quantile times the deviation."""
+    """At equal steps of probability, the logarithm is the normal quantile times the standard deviation."""
     for k in range(1, 200):
         value = number(["line", 0, 1, 0.3], iso=100, gain=5.0, uniform=k / 200)
         assert math.isclose((math.log(value) - 1) / 0.3, NormalDist().inv_cdf(k / 200), abs_tol=1e-9)
@@ -135,11 +135,11 @@ def test_table_for_a_single_iso_gives_its_first_row(settings: Settings) -> None:
     assert physics(config).black_error_dn == (1.0, 2.0, 3.0, 4.0)
 
 
-# The profiles that are shipped ----------------------------------------------------------------------------------------
+# Profiles in conf/ ----------------------------------------------------------------------------------------------------
 
 
 def line_of(form: list[Any], gain: Any, shape: float | None = None) -> Any:
-    """What a line comes to at the middle of its scatter."""
+    """Return the value of a line without scatter."""
     with mpmath.workdps(40):
         value = mpmath.exp(mpmath.mpf(form[1]) * mpmath.log(gain) + form[2])
         return value if shape is None else value * tukey_std(shape)
@@ -154,7 +154,7 @@ def line_of(form: list[Any], gain: Any, shape: float | None = None) -> Any:
         (12800, 9.563e-4, (0.749, -0.123), (0.629, -1.510)),
     ],
 )
-def test_sony_a7s2_has_published_numbers_on_both_sides_of_dual_gain(
+def test_sony_a7s2_has_published_numbers_for_both_gains(
     settings: Settings, iso: int, slope: float, read: tuple[float, float], row: tuple[float, float]
 ) -> None:
     made = physics(on_its_own_sensor(settings, "sony_a7s2", iso))
@@ -178,7 +178,7 @@ def test_dual_gain_of_sony_a7s2_lowers_the_read_noise(settings: Settings) -> Non
 )
 @pytest.mark.parametrize("iso", [100, 400, 1234, 6400])
 def test_profiles_of_eld_have_published_numbers(settings: Settings, noise: str, least_gain: float, iso: int) -> None:
-    """K = Kmin · ISO / 100, Kmin in DN per electron at ISO 1 here; each line at the middle of its scatter."""
+    """K = Kmin · ISO / 100, here Kmin is in DN per electron at ISO 1; lines have no scatter."""
     config = on_its_own_sensor(settings, noise, iso)
     branch, made = config.noise.branches[0], physics(config)
     with mpmath.workdps(40):
@@ -247,7 +247,7 @@ def test_profile_is_converted_by_the_ratio_of_ranges(settings: Settings, noise: 
     assert all(getattr(here, name) == getattr(own, name) for name in electrons)
 
 
-# What is drawn --------------------------------------------------------------------------------------------------------
+# Draws ----------------------------------------------------------------------------------------------------------------
 
 
 def test_each_number_is_drawn_from_its_own_uniform(settings: Settings) -> None:
@@ -342,7 +342,7 @@ def test_body_depends_on_seed_and_camera_but_not_on_iso(settings: Settings) -> N
     assert physics(settings("noise=canon_700d", "noise.iso=1600", "sensor.units=1")).body_key != body
 
 
-# What is refused ------------------------------------------------------------------------------------------------------
+# Refused profiles -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The plan: every draw from its own law, none moved by another, and the same ones every time."""
+"""Plans: each parameter follows its distribution, moves no other, and is reproducible."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Settings = Callable[..., Config]
 
 SHA = hashlib.sha256(b"a photograph").hexdigest()
 FIRST, LAST = 2.0**-53, 1 - 2.0**-53
-"""The least and the greatest uniform that a stream gives."""
+"""Smallest and largest uniform of a stream."""
 
 UNIFORMS = [FIRST, 1e-9, 0.25, 0.5, LAST, *parameter_uniforms(12345, 200)]
 uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) / 2**52)
@@ -45,14 +45,14 @@ def named(uniform: float = 0.5, **chosen: float) -> dict[str, float]:
 
 
 def images(count: int) -> list[dict[str, float]]:
-    """The draws of so many images, without their plans."""
+    """Return the draws of a number of images, without plans."""
     return [
         dict(zip(PARAMETERS, parameter_uniforms(stream_key(0, f"{image:064x}"), len(PARAMETERS)), strict=True))
         for image in range(count)
     ]
 
 
-# Laws -----------------------------------------------------------------------------------------------------------------
+# Distributions --------------------------------------------------------------------------------------------------------
 
 GAIN = Distribution("truncated_normal", (0.8, 0.1, 0.5, 1.1))
 LITERAL = Distribution("inverse_truncated_normal", (0.8, 0.1, 0.5, 1.1))
@@ -69,7 +69,7 @@ def normal_quantile(p: mpmath.mpf) -> mpmath.mpf:
 
 
 def by_mpmath(law: Distribution, uniform: float, a: float) -> mpmath.mpf:
-    """The law by another library, in 40 digits."""
+    """Evaluate a distribution with mpmath, to 40 digits."""
     u = mpmath.mpf(uniform)
     numbers = [mpmath.mpf(number) for number in law.numbers]
     if law.kind == "log_uniform":
@@ -100,7 +100,7 @@ def by_mpmath(law: Distribution, uniform: float, a: float) -> mpmath.mpf:
     ids=lambda law: f"{law.kind} {law.numbers}",
 )
 def test_draw_is_correctly_rounded_quantile_of_its_distribution(law: Distribution) -> None:
-    """Half a unit in the last place; both sides hold 24 digits or more, so only a tie to 1e-8 of it could go astray."""
+    """Half a unit in the last place; both sides have 24 digits or more, so only near ties could differ."""
     with mpmath.workdps(40):
         for uniform in UNIFORMS:
             exact = by_mpmath(law, uniform, a=0.0037)
@@ -144,7 +144,7 @@ def test_draw_is_within_limits_for_any_uniform(law: Distribution, low: float, hi
 
 @given(uniforms)
 def test_paper_literal_gain_is_inverse_of_brooks_gain(uniform: float) -> None:
-    """Each rounded once, so the product of the two is within two half units of 1."""
+    """Both are rounded once, so their product is within two half units in the last place of 1."""
     product = Fraction(draw(GAIN, uniform)) * Fraction(draw(LITERAL, uniform))
     assert abs(product - 1) <= Fraction(2, 2**53) * (1 + Fraction(1, 10**6))
 
@@ -156,7 +156,7 @@ def test_draw_increases_with_its_uniform(law: Distribution) -> None:
 
 
 def test_median_of_brooks_read_noise_is_the_published_line() -> None:
-    """At u = ½ there is no scatter: e^1.2 · 0.01^2.18."""
+    """At u = ½ the scatter is 0: e^1.2 · 0.01^2.18."""
     with mpmath.workdps(40):
         exact = mpmath.exp(mpmath.mpf(1.2)) * mpmath.mpf(0.01) ** mpmath.mpf(2.18)
         assert draw(READ, 0.5, 0.01) == float(exact)
@@ -178,7 +178,7 @@ def test_weights_are_four_uniforms_divided_by_their_sum(drawn: tuple[float, ...]
 
 
 def test_every_camera_is_equally_likely_to_have_largest_weight() -> None:
-    """The law is symmetric: a quarter each, of 4000 images."""
+    """The distribution is symmetric: a quarter of 4000 images each."""
     heaviest = Counter(int(np.argmax(plan_camera(Config().camera, drawn)[1])) for drawn in images(4000))
     for camera in range(4):
         assert abs(heaviest[camera] / 4000 - 1 / 4) <= bernstein(3 / 16, 1, 4000)
@@ -337,7 +337,7 @@ def test_profile_is_unchanged_on_its_own_sensor(settings: Settings) -> None:
 
 
 def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
-    """Slope times s, intercept times s², s = 15359/3855; twice would be s² and s⁴."""
+    """Slope times s, intercept times s², s = 15359/3855; two conversions would give s² and s⁴."""
     config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
     s = Fraction(15359, 3855)
     a, b = plan_noise(config, named())
@@ -359,7 +359,7 @@ def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> 
         assert (plan.a_dn, plan.b_dn2) == (1.25, 7.5)
 
 
-# What is recorded -----------------------------------------------------------------------------------------------------
+# Recorded values ------------------------------------------------------------------------------------------------------
 
 
 def test_simulated_noise_is_listed_among_effects(settings: Settings) -> None:

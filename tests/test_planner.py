@@ -1,4 +1,4 @@
-"""The planner's promise: what is left out stays within the tolerance of the noise that hides it, in every statistic."""
+"""Selection of effects: omitted effects stay within the tolerance of the masking noise, in every statistic."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TOLERANCE = 0.1
 
 
 def limit(tolerance: float, count: int) -> float:
-    """What the RMS of ``count`` normals of deviation ``tolerance`` stays below, but for one time in 5e8.
+    """Return an upper limit of the RMS of ``count`` normals of standard deviation ``tolerance``; exceeded once in 5e8.
 
     Laurent and Massart's inequality (Annals of Statistics 2000, lemma 1).
     """
@@ -48,9 +48,9 @@ def limit(tolerance: float, count: int) -> float:
 
 
 def independent(statistic: str, count: int, srgb: Srgb) -> int:
-    """How many of ``count`` values of a statistic are independent of each other: all pixels of a row can go together.
+    """Return how many of ``count`` values of a statistic are independent: all pixels of a row can be correlated.
 
-    So can the means of all columns, or of two planes, where rows have offsets, and of all rows where columns have.
+    Row offsets correlate the means of all columns, or of two planes; column offsets those of all rows.
     """
     per_frame = {"pixel": min(srgb.shape[:2]), "row mean": 1, "column mean": 1, "plane mean": 1}[statistic]
     sites = {"pixel": srgb.shape[0] * srgb.shape[1], "row mean": srgb.shape[0], "column mean": srgb.shape[1]}
@@ -68,14 +68,14 @@ def flat(*colour: int, height: int = 40, width: int = 56) -> Srgb:
 
 @pytest.fixture(scope="module")
 def pictures() -> dict[str, Srgb]:
-    """Cut-outs of scenes, and flats: gray ones, and colours of which a channel is dark."""
+    """Return crops of scenes, gray flats, and flats of colours with a dark channel."""
     cuts = {name: cut(name, 40, 56) for name in ("highlights-0", "night_lamps-0", "gradients-0")}
     grays = {f"gray {code}": flat(code, code, code, height=30, width=40) for code in (0, 255)}
     return cuts | grays | {"cyan": flat(0, 200, 200, height=31, width=41)}
 
 
 def configured(settings: Settings, *overrides: str) -> Config:
-    """Settings, at an ISO that the profile has where the scene's own is not among them."""
+    """Return a config; if the profile lacks the ISO of the scene, at an ISO that it has."""
     config = settings(*overrides)
     for iso in (None, 1600, 3200):
         config.noise.iso = config.noise.iso if iso is None else iso
@@ -93,7 +93,7 @@ def switched(config: Config, switch: str, srgb: Srgb, number: int) -> Plan:
 
 
 def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset[str]) -> int:
-    """Look that what auto leaves out, of the effects it is free to decide about, is hidden; return in how many."""
+    """Assert that the noise masks the effects that ``auto`` omits; return the number of images with such effects."""
     held = 0
     for name, srgb in pictures.items():
         found: dict[str, list[np.ndarray]] = {}
@@ -115,7 +115,7 @@ def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset
     return held
 
 
-# The promise ----------------------------------------------------------------------------------------------------------
+# Omitted effects are masked -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_omitted_effects_are_masked_by_the_noise(
 def test_omitted_effects_are_masked_if_auto_decides_about_all(
     settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
 ) -> None:
-    """The numbers that no source gives count as if one did, and a full well that cuts the daylight is among them."""
+    """No number is marked as assumed, and a full well cuts bright signals."""
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
     some = {name: pictures[name] for name in ("night_lamps-0", "gradients-0", "gray 255", "cyan")}
     assert hold(config, some, 1, frozenset(EFFECTS)) > 0
@@ -143,7 +143,7 @@ def test_omitted_effects_are_masked_if_auto_decides_about_all(
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("noise", PROFILES)
 def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: str, scene: str) -> None:
-    """Means over more sites show more."""
+    """Means over more sites reveal smaller effects."""
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
     names = ("highlights-0", "night_lamps-0", "gradients-0", "dead_leaves-0")
     pictures = {name: cut(name, 380, 440) for name in names} | {"cyan": flat(0, 200, 200, height=381, width=441)}
@@ -151,7 +151,7 @@ def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: 
 
 
 def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
-    """A sensor whose numbers lie within a few powers of ten of where the tolerance decides."""
+    """Return a sensor whose effects are within a few powers of ten of the tolerance."""
 
     def around(middle: float, decades: float = 1.5) -> float:
         return float(middle * 10 ** rng.uniform(-decades, decades))
@@ -177,7 +177,7 @@ def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
 
 @pytest.mark.parametrize("frames", [1, 12])
 def test_omitted_effects_are_masked_for_any_sensor(settings: Settings, pictures: dict[str, Srgb], frames: int) -> None:
-    """Of single frames, and of the mean over a clip's."""
+    """For single frames, and for the mean over the frames of a clip."""
     config = configured(settings, "noise=nikon_d850", "scene=night", "noise.assumed=[]", "noise.full_well_e=1000")
     rng = np.random.default_rng(5)
     left_out: set[str] = set()
@@ -205,13 +205,13 @@ def test_omitted_effects_are_masked_for_any_sensor(settings: Settings, pictures:
 
 
 def of_sensor(plan: Plan, physics: Physics) -> Plan:
-    """The plan with another sensor's numbers and every effect."""
+    """Return the plan with the numbers of another sensor and every effect."""
     b_dn2 = physics.read_std_dn * physics.read_std_dn
     return replace(plan, physics=physics, a_dn=physics.dn_per_e, b_dn2=b_dn2, effects=EFFECTS)
 
 
 def decided(config: Config, plan: Plan, srgb: Srgb, frames: int = 1) -> tuple[str, ...]:
-    """Which effects auto simulates with the numbers of a plan."""
+    """Return the effects that ``auto`` simulates with the numbers of a plan."""
     assert plan.physics is not None
     facts, span_dn = facts_of(srgb, frames), float(plan.white_level_dn - plan.black_level_dn)
     light = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
@@ -219,7 +219,7 @@ def decided(config: Config, plan: Plan, srgb: Srgb, frames: int = 1) -> tuple[st
 
 
 def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
-    """The settings with every effect left to auto, a number for each."""
+    """Return the config with every effect on ``auto`` and a number for each."""
     effects = replace(config.effects, all="auto", tolerance=tolerance)
     branches = [
         replace(branch, column_std_dn=0.1, row_std_dn=0.1, black_error_dn=0.1) for branch in config.noise.branches
@@ -233,7 +233,7 @@ def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -
 
 
 def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, pictures: dict[str, Srgb]) -> None:
-    """An average of many frames has no other noise."""
+    """The mean of many frames has no other noise."""
     overrides = ("scene=night", "noise=nikon_d850", "noise.assumed=[]", "clean.includes_fixed_pattern=true")
     fixed = ("prnu", "black_error")
     left_out = 0
@@ -265,7 +265,7 @@ def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, 
 
 @pytest.fixture(scope="module")
 def base(settings: Settings) -> tuple[Config, Physics]:
-    """Settings that leave every effect to auto, and a sensor on which it leaves out all but shot and read noise."""
+    """Return a config with every effect on ``auto``, and a sensor on which only shot and read noise are simulated."""
     config = configured(settings, "noise=nikon_d850", "scene=daylight", "noise.assumed=[]", "noise.full_well_e=1000")
     plan = switched(config, "on", flat(9, 9, 9), 0)
     assert plan.physics is not None
@@ -311,7 +311,7 @@ def test_weak_effects_are_omitted(base: tuple[Config, Physics]) -> None:
 def test_only_the_strong_effect_is_simulated(
     base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
 ) -> None:
-    """Even read noise need not be, where that much dark current hides it."""
+    """Strong dark current can mask even read noise."""
     config, physics = base
     on = set(chosen(config, replace(physics, **numbers), FACTS, LIGHT))
     assert effect in on
@@ -361,7 +361,7 @@ STRONG = {
     "black_error": {"black_error_dn": [0, 0, 50, 0]},
     "dead_pixels": {"dead_pixel_share": 0.01},
 }
-"""For each effect numbers at which no picture hides it."""
+"""For each effect, numbers at which no image masks it."""
 
 
 @pytest.mark.parametrize("scene", ["daylight", "night"])
@@ -381,7 +381,7 @@ def test_strong_effect_is_in_the_plan_of_every_camera(settings: Settings, profil
 
 
 def expected_hot(physics: Physics, facts: Facts, dark_dn: float) -> float:
-    """How many hot pixels exceed one standard deviation: counts of exponentially distributed mean are geometric."""
+    """Return the share of hot pixels above one standard deviation: their counts are geometrically distributed."""
     variance_dn2 = 1 / 12 + physics.read_std_dn**2 + physics.dn_per_e * dark_dn
     least = math.floor(math.sqrt(variance_dn2) / physics.dn_per_e) + 1
     ratio = physics.hot_pixel_e / (1 + physics.hot_pixel_e)
@@ -405,7 +405,7 @@ def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
 
 @pytest.mark.parametrize("mean_e", [0.05, 2.0, 40.0])
 def test_hot_pixel_outliers_are_as_frequent_as_predicted(mean_e: float) -> None:
-    """The counts that the sampler makes of exponential means, against the geometric law."""
+    """Counts that the sampler draws from exponential means, against the geometric distribution."""
     rng = np.random.default_rng(1)
     words = rng.integers(0, 2**32, 10**5, dtype=np.uint32)
     counts = poisson(words, rng.exponential(mean_e, 10**5))
@@ -435,13 +435,13 @@ def test_dead_pixels_of_black_images_differ_by_the_black_level(base: tuple[Confi
 
 @given(rate=st.floats(0, 1e6))
 def test_no_poisson_count_exceeds_the_limit_used_for_full_wells(rate: float) -> None:
-    """The greatest word that there is."""
+    """For the largest random word."""
     most = poisson(np.array([0, 2**31], dtype=np.uint32), np.full(2, rate)).max()
     assert most <= (rate + 7 * math.sqrt(rate) + 12 if rate else 0)
 
 
 def test_omitted_offsets_add_linearly(base: tuple[Config, Physics]) -> None:
-    """0.07 and 0.07 of the noise would pass in quadrature."""
+    """0.07 and 0.07 of the noise would stay within the tolerance in quadrature."""
     config, physics = base
     plane_dn = math.sqrt((9 + 10 + 1 / 12) / (384 * 256))
     one = {"black_error_dn": (0.07 * plane_dn,) * 4}
@@ -452,7 +452,7 @@ def test_omitted_offsets_add_linearly(base: tuple[Config, Physics]) -> None:
     assert len({"black_error", "dark_current"} & set(both)) == 1
 
 
-# What a decision depends on -------------------------------------------------------------------------------------------
+# Facts and signal range -----------------------------------------------------------------------------------------------
 
 
 def test_facts_are_the_extremes_of_all_codes() -> None:
@@ -480,7 +480,7 @@ def test_facts_increase_with_the_codes(seed: int, more: int) -> None:
 @pytest.mark.parametrize("highlight", ["per_channel", "gray_mean", "none"])
 @pytest.mark.parametrize("camera", ["nexus_6p", "sony_a7r", "convex"])
 def test_all_sites_are_within_the_signal_range(settings: Settings, highlight: str, camera: str) -> None:
-    """Of light up to white; what highlights come to above it is cut."""
+    """For light up to white; highlights above it are clipped."""
     config = configured(settings, "noise=sony_a7s2", "scene=night", f"camera={camera}", f"gains.highlight={highlight}")
     for number, (low, high) in enumerate([(0, 255), (40, 255), (40, 200), (3, 60)]):
         srgb = np.random.default_rng(number).integers(low, high + 1, (40, 40, 3)).astype(np.uint8)
@@ -509,7 +509,7 @@ def test_equal_images_of_8_and_16_bits_have_equal_effects(settings: Settings, pi
 
 
 def test_selection_does_not_depend_on_order_of_pixels(settings: Settings) -> None:
-    """Facts alone decide; of all but the green middle, which nothing depends on."""
+    """Only facts enter the selection, and they do not depend on order."""
     config = configured(settings, "noise=sony_a7s2", "scene=low_light", "noise.assumed=[]")
     srgb = cut("gradients-0", 40, 56)
     assert switched(config, "auto", srgb, 0) == switched(config, "auto", np.ascontiguousarray(srgb[::-1, ::-1]), 0)
@@ -580,7 +580,7 @@ def test_effect_above_tolerance_alone_is_always_simulated(
         assert one.simulated or (one.ratio <= tolerance * (1 + 1e-9) and one.outliers < 0.1)
 
 
-# What the settings decide ---------------------------------------------------------------------------------------------
+# Decisions of the config ----------------------------------------------------------------------------------------------
 
 
 def told(settings: Settings, *overrides: str) -> dict[str, Prediction]:
@@ -661,13 +661,13 @@ def test_plan_lists_skipped_effects_with_reasons(settings: Settings) -> None:
     assert "of the noise there (tolerance 0.1)" in dark
 
 
-# A prediction is what is measured -------------------------------------------------------------------------------------
+# Predictions against measurements -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("effect", "numbers", "slack"),
     [
-        ("prnu", {"prnu_std": 0.01}, 1.2),  # a bound on what coupled counts come to
+        ("prnu", {"prnu_std": 0.01}, 1.2),  # an upper limit for counts of equal uniforms
         ("shot", {}, 1.0),
         ("dark_current", {"dark_e": 4.0}, 1.0),
         ("hot_pixels", {"hot_pixel_share": 0.05, "hot_pixel_e": 0.2}, 1.0),
@@ -680,7 +680,7 @@ def test_plan_lists_skipped_effects_with_reasons(settings: Settings) -> None:
 def test_predictions_match_measurements(
     base: tuple[Config, Physics], effect: str, numbers: dict[str, float], slack: float
 ) -> None:
-    """On a gray frame: in the statistic where it shows best, within 5 standard errors of a mean square."""
+    """On a gray frame, in the statistic where the effect is strongest, within 5 standard errors of a mean square."""
     config, physics = base
     physics = replace(physics, **numbers)
     srgb = flat(120, 120, 120, height=64, width=96)
@@ -708,7 +708,7 @@ def test_predictions_match_measurements(
 
 
 def test_masking_noise_is_the_noise_of_the_plan(base: tuple[Config, Physics]) -> None:
-    """The variance that a pixel is said to have in the dark is that of the effects that stay on."""
+    """The predicted variance of a dark pixel is that of the effects that stay on."""
     config, physics = base
     plan = replace(switched(config, "auto", flat(0, 0, 0), 0), physics=physics, a_dn=1.0, b_dn2=9.0)
     column = next(
@@ -744,7 +744,7 @@ def test_plan_prints_a_table_of_all_effects(door: Door, tmp_path: Path) -> None:
 
 
 def test_table_counts_images_in_which_effects_are_simulated(door: Door, tmp_path: Path) -> None:
-    """A black photograph has no shot noise."""
+    """A black image has no shot noise."""
     import cv2
 
     (tmp_path / "photos").mkdir()

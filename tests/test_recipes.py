@@ -1,4 +1,4 @@
-"""The recipes of ``+experiment=``: what they resolve to, with sources, and that they run and can be overridden."""
+"""Experiment configs of ``+experiment=``: their values against the sources; they run and can be overridden."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from unprocess_gen.sources.scenes import synthetic
 RECIPE = "experiment"
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml"))
 NO_CLIPS = {"crvd_like": ("source.clips=false",)}
-"""What the built-in scenes, which are no clips, ask of a recipe."""
+"""Overrides that an experiment needs with the built-in scenes, which are no clips."""
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -47,7 +47,7 @@ def test_experiment_is_valid_with_all_compatible_options(
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a folder of one photograph, just large enough for a patch of 256 after downscaling."""
+    """Return a folder with a folder of one image, just large enough for a patch of 256 after downscaling."""
     folder = tmp_path_factory.mktemp("photos")
     (folder / "clip").mkdir()
     Image.fromarray(pixels(1, 512, 512)).save(folder / "clip/0.png")
@@ -69,7 +69,7 @@ def test_noise_of_an_experiment_matches_its_rows(recipe: str, door: Door) -> Non
 
 
 def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(clip: Path, door: Door, tmp_path: Path) -> None:
-    """Its ``config.yaml`` says all settings, wherever they came from."""
+    """``config.yaml`` contains all values, whatever they came from."""
     source = (f"source.root={clip}", "n_jobs=1")
     assert door(f"+{RECIPE}=brooks2019_training", "source.patch=[random,64,2]", "out=ds", *source).code == 0
     config, kind = read_dataset_yaml(tmp_path / "ds/config.yaml")
@@ -98,7 +98,7 @@ def test_invalid_experiment_is_refused_in_one_line(argument: str, complaint: str
     assert complaint in done.err
 
 
-# The demo -------------------------------------------------------------------------------------------------------------
+# Demo of the article --------------------------------------------------------------------------------------------------
 
 
 def test_ipol_demo_has_the_defaults_of_the_article(settings: Settings) -> None:
@@ -134,7 +134,7 @@ def test_brooks_distributions_are_those_of_the_script(settings: Settings) -> Non
 
 
 def clean_planes_of_brooks(srgb: Srgb, row: dict[str, Any]) -> np.ndarray:
-    """What his script makes of pixels and of what a row says was drawn, by his formulas, float64 ``[4, H/2, W/2]``."""
+    """Apply the formulas of the script to pixels and the parameters of a row; float64 ``[4, H/2, W/2]``."""
     x = srgb / np.iinfo(srgb.dtype).max
     light = np.maximum(0.5 - np.sin(np.arcsin(1 - 2 * x) / 3), 1e-8) ** 2.2
     rgb2cam = np.array([[row[f"rgb2cam_{i}{j}"] for j in range(3)] for i in range(3)])
@@ -154,7 +154,7 @@ def brooks(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_clean_planes_match_the_formulas_of_brooks(brooks: Path) -> None:
-    """To what a cast to float32 rounds, half a unit in the last place of 1, and ten times that for his constants."""
+    """Within float32 rounding: half a unit in the last place of 1, ten times that for the constants of the script."""
     scenes = {row["source"]: downscaled(synthetic.scene(row["source"]), 2) for *_, row in RawPairs(brooks)}
     for clean, _, row in RawPairs(brooks):
         y, x = row["patch_y"], row["patch_x"]
@@ -203,7 +203,7 @@ def test_crvd_like_draws_from_five_isos(settings: Settings) -> None:
 
 
 def test_crvd_like_supports_every_iso_twice(make: Make, tmp_path: Path) -> None:
-    """As synthesize_noise.py makes it."""
+    """Reproduces what synthesize_noise.py generates."""
     (tmp_path / "photos/clip").mkdir(parents=True)
     Image.fromarray(pixels(0, 16, 16)).save(tmp_path / "photos/clip/0.png")
     levels = "noise.levels=[1600,3200,6400,12800,25600]"

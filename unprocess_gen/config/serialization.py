@@ -1,4 +1,7 @@
-"""Write the configuration to ``config.yaml`` and read it back."""
+"""Write the configuration of a dataset to ``config.yaml``, read it back and compare two of them.
+
+`dataset_yaml` decides bytes: its text is part of every dataset and of its fingerprint.
+"""
 
 from __future__ import annotations
 
@@ -19,35 +22,57 @@ Option = TypeVar("Option")
 
 
 NOT_DATA = {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
-"""Keys that do not decide a dataset's bytes, by group; its ``config.yaml`` leaves them out."""
+"""Keys that do not decide the bytes of a dataset, by group; ``config.yaml`` omits them."""
 
 
-NUMBERS_OR_LAWS = {
+DISTRIBUTION_KEYS = {
     "gains": ("red", "blue", "inverse_rgb"),
     "noise": ("a", "b", "iso"),
     "isp": ("gamma",),
     "scene": ("iso", "exposure_s", "temperature_c", "exposure_ratio"),
 }
-"""Keys whose numbers can be spelled in two ways, 1 and 1.0."""
+"""Keys whose numbers are written as floats, because users may write 1 or 1.0."""
 
 
 SOURCE_KINDS = ("folder", "synthetic")
 
 
 def source_kind(config: Config) -> str:
-    """Return ``folder`` or ``synthetic``: derived, so that a dataset remembers which it was."""
+    """Return the kind of source that ``config.yaml`` records.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+
+    Returns
+    -------
+    str
+        ``folder``, or ``synthetic`` if ``source.root`` is None.
+    """
     return "synthetic" if config.source.root is None else "folder"
 
 
 def dataset_yaml(config: Config) -> str:
-    """Return the text of a dataset's ``config.yaml``: all that decides its bytes, in one spelling."""
+    """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling.
+
+    Parameters
+    ----------
+    config : Config
+        A configuration that `validate_config` accepts.
+
+    Returns
+    -------
+    str
+        YAML. Equal data have equal texts.
+    """
     groups = dataclasses.asdict(config)
     settings = {key: value for key, value in groups.items() if key not in NOT_DATA[""]}
     settings["source"] = {"kind": source_kind(config)} | {
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
     settings["source"]["patch"] = canonical_patch(config.source)
-    for group, keys in NUMBERS_OR_LAWS.items():
+    for group, keys in DISTRIBUTION_KEYS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 
@@ -159,7 +184,20 @@ def _convert(kind: Any, value: Any, key: str) -> Any:
 
 
 def read_option(path: Path, group: type[Option]) -> Option:
-    """Return an option of a group as its file in ``conf/`` has it; ``group`` is the dataclass of the folder."""
+    """Read one option file of ``conf/``.
+
+    Parameters
+    ----------
+    path : Path
+        A file that belongs to the package.
+    group : type
+        Dataclass of the config group.
+
+    Returns
+    -------
+    object
+        Instance of ``group``; keys that the file lacks have their defaults.
+    """
     from omegaconf import OmegaConf
 
     option = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(group), OmegaConf.load(path)))
@@ -167,13 +205,13 @@ def read_option(path: Path, group: type[Option]) -> Option:
     return option
 
 
-def differences(ours: str, theirs: str) -> list[str]:
+def differences(config_yaml: str, other_yaml: str) -> list[str]:
     """List the differences between two ``config.yaml`` texts.
 
     Parameters
     ----------
-    ours, theirs : str
-        The texts; ``theirs`` may have been edited by hand.
+    config_yaml, other_yaml : str
+        The texts; either may have been edited by hand.
 
     Returns
     -------
@@ -185,7 +223,7 @@ def differences(ours: str, theirs: str) -> list[str]:
     ValueError
         If a text breaks a rule of `parse_yaml_mapping`.
     """
-    here, there = _flat(parse_yaml_mapping(ours)), _flat(parse_yaml_mapping(theirs))
+    here, there = _flat(parse_yaml_mapping(config_yaml)), _flat(parse_yaml_mapping(other_yaml))
     return [
         f"{key}={value_text(here.get(key))} (there: {value_text(there.get(key))})"
         for key in sorted(here.keys() | there.keys())
