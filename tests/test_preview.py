@@ -265,6 +265,12 @@ def test_overview_has_one_strip_per_pair_in_manifest_order(few: Path) -> None:
     np.testing.assert_array_equal(contact_sheet.contact_sheet(few, ["00000003", "00000000"]), np.vstack(strips[::2]))
 
 
+def test_indices_and_ranges_select_pairs(few: Path) -> None:
+    strips = [contact_sheet.contact_sheet(few, [key]) for key in ("00000000", "00000003")]
+
+    np.testing.assert_array_equal(contact_sheet.contact_sheet(few, ["0", "2-3"]), np.vstack(strips))
+
+
 def test_overview_without_photographs_shows_the_reason_and_the_frames(few: Path, tmp_path: Path) -> None:
     with_source = contact_sheet.contact_sheet(few, ["00000000"])
     without = contact_sheet.contact_sheet(few, ["00000000"], source=tmp_path)
@@ -441,7 +447,7 @@ def test_wrong_argument_gives_one_line_and_writes_nothing(
 
 
 def test_error_for_unknown_key_explains_keys(few: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"has keys from 00000000 to 00000003; .* 00000003-p0007 .* 00000003-l01d02"):
+    with pytest.raises(ConfigError, match=r"has no such key; it has keys from 00000000 to 00000003; .* 00000003-p0007 .* 00000003-l01d02"):
         list(contact_sheet.write_sheets(few, tmp_path, ["12"]))
 
 

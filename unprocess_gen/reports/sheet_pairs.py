@@ -9,18 +9,15 @@ from pathlib import Path
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Plan, Row, Srgb
-from unprocess_gen.dataset.keys import image_key, sample_key
-from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
+from unprocess_gen.dataset.keys import image_key
+from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
+from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.reports.panels import DetailWindow, Mosaic
 from unprocess_gen.sources.patches import crop_patch
 
 PAIRS_SHOWN = 8
 """Number of pairs shown if no keys are given."""
-
-KEY_FORMS = (
-    "00000003 selects all pairs of an image, 00000003-p0007 those of a patch, 00000003-l01d02 a noise level and draw"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +46,7 @@ def selected_pairs(folder: Path, keys: Sequence[str], source: Path | None) -> It
         raise ConfigError(f"--source {source}: is not a folder; expected the folder of the photographs")
     pairs = RawPairs(folder)
     manifest = folder / "manifest.csv"
-    numbers = _numbers_of_keys(manifest, keys) if keys else _spaced_numbers(folder, len(pairs))
+    numbers = list(select_pairs(manifest, ",".join(keys)).rows) if keys else _spaced_numbers(folder, len(pairs))
     root = source_root(manifest, None if source is None else str(source))
     image, photograph, missing = "", None, ""
     for number in numbers:
@@ -75,24 +72,6 @@ def _spaced_numbers(folder: Path, pairs: int) -> list[int]:
     if not pairs:
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
     return evenly_spaced(range(pairs), PAIRS_SHOWN)
-
-
-def _numbers_of_keys(manifest: Path, keys: Sequence[str]) -> list[int]:
-    """Return the positions, among the pairs, of those with the keys; ConfigError for a key without a pair."""
-    wanted, found, numbers = set(keys), set[str](), list[int]()
-    pairs, first, last = 0, "", ""
-    for row in read_rows(manifest):
-        named = {str(row["key"]), sample_key(row), image_key(row)} & wanted
-        if named and row["status"] != "ok":
-            raise ConfigError(f"--keys {min(named)}: {row['source']} failed ({row['reason']}) and has no pair")
-        first, last = first or str(row["key"]), str(row["key"])
-        found |= named
-        numbers += [pairs] if named else []
-        pairs += row["status"] == "ok"
-    if wanted - found:
-        known = f"keys from {first} to {last}" if first else "no keys"
-        raise ConfigError(f"--keys {min(wanted - found)}: no such key; {manifest} has {known}; {KEY_FORMS}")
-    return numbers
 
 
 def sheet_heading(pair: SheetPair, window: DetailWindow) -> list[str]:
