@@ -1,7 +1,7 @@
-"""Measure what accuracy costs, and put table and figure into the README: python .readme/draw_accuracy.py [overrides].
+"""Measure the cost of accuracy and update docs/accuracy.md: python .readme/draw_accuracy.py [overrides].
 
-`gen-dataset accuracy` with the overrides (source.root=photos), its figure as accuracy.png beside this file, its table
-between the two marks in the README. Takes about a minute; best where nothing else runs.
+Run `gen-dataset accuracy` with the overrides (source.root=photos). Save its figure as accuracy.png in this folder, and
+its table between the two marks in docs/accuracy.md. It takes about a minute; stop other programs meanwhile.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import tempfile
 from pathlib import Path
 
 from unprocess_gen.reports.benchmark.measure import Measurement
-from unprocess_gen.reports.benchmark.report import markdown_table
+from unprocess_gen.reports.benchmark.tables import markdown_table
 
 HERE = Path(__file__).parent
-README = HERE.parent / "docs" / "accuracy.md"
+PAGE = HERE.parent / "docs" / "accuracy.md"
 TABLE = re.compile(r"(<!-- accuracy: [^>]*-->\n).*?(<!-- end of accuracy -->)", re.DOTALL)
 TEXTS = ("stage", "method", "tier", "error_unit")
 
 
-def row(line: dict[str, str]) -> Measurement:
-    """Read a line of accuracy.csv back."""
+def read_measurement(line: dict[str, str]) -> Measurement:
+    """Return the measurement of a line of accuracy.csv."""
     return Measurement(
         **{name: text if name in TEXTS else float(text) if text else None for name, text in line.items()}
     )
@@ -38,9 +38,9 @@ def main() -> None:
         report = Path(folder) / "report"
         shutil.copy(report / "accuracy.png", HERE / "accuracy.png")
         with (report / "accuracy.csv").open(newline="", encoding="utf-8") as lines:
-            table = markdown_table([row(line) for line in csv.DictReader(lines)])
-    text = README.read_text(encoding="utf-8")
-    README.write_text(TABLE.sub(lambda found: found[1] + table + "\n" + found[2], text), encoding="utf-8")
+            table = markdown_table([read_measurement(line) for line in csv.DictReader(lines)])
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(TABLE.sub(lambda found: found[1] + table + "\n" + found[2], text), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Draw the README's look at a dataset's page, at the article's figures and at a DNG file: python .readme/draw_pages.py.
+"""Draw page.png, figure6.png and dng.png for the documentation: python .readme/draw_pages.py.
 
-Everything is of built-in scenes, in a temporary folder. Needs the extras figures and dng, rawpy, and chromium.
+They show the report of a dataset, a figure of the article and DNG files, made from built-in scenes in a temporary
+folder. Requires the extras figures and dng, rawpy, and Chromium.
 """
 
 from __future__ import annotations
@@ -20,32 +21,32 @@ CHART = "00000001"
 
 
 def gen_dataset(*arguments: str) -> None:
-    """Run the tool."""
+    """Run gen-dataset."""
     subprocess.run([sys.executable, "-m", "unprocess_gen", *arguments], check=True)
 
 
 def save(picture: np.ndarray, name: str) -> None:
-    """Save RGB codes as small as PNG can."""
+    """Save RGB codes as PNG with the highest compression."""
     cv2.imwrite(str(HERE / name), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def developed(path: Path) -> np.ndarray:
-    """Return what LibRaw makes of a DNG file with the camera's white balance and the tag's brightening."""
+    """Return a DNG file developed by LibRaw with the white balance in the file, brightened by 2."""
     with rawpy.imread(str(path)) as raw:
         return raw.postprocess(use_camera_wb=True, no_auto_bright=True, bright=2.0, adjust_maximum_thr=0)
 
 
 def main() -> None:
-    """Make a dataset, its page, its DNG files and the figures; write page.png, dng.png and figure6.png."""
+    """Generate a dataset, its report, DNG files and figures; write the three pictures."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         gen_dataset(f"out={folder}/ds", "noise=imx385_iso12800", "gains=fixed")
         gen_dataset("report", f"{folder}/ds")
         gen_dataset("dng", f"{folder}/ds", "--keys", CHART, "--to", f"{folder}/dng")
         gen_dataset("figures", f"out={folder}/figures")
-        place = f"file://{folder}/ds/report.html"
+        address = f"file://{folder}/ds/report.html"
         shot = ("--window-size=1220,2100", f"--screenshot={folder}/page.png", f"--user-data-dir={folder}/profile")
-        subprocess.run([*BROWSER, *shot, place], check=True, capture_output=True)
+        subprocess.run([*BROWSER, *shot, address], check=True, capture_output=True)
         page = cv2.imread(f"{folder}/page.png", cv2.IMREAD_COLOR_RGB)
         save(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), "page.png")
         frames = [developed(folder / "dng" / f"{CHART}.{frame}.dng") for frame in ("clean", "noisy")]

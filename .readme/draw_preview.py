@@ -1,4 +1,4 @@
-"""Draw the README's overview of two pairs: python .readme/draw_preview.py (its dataset is in a temporary folder)."""
+"""Draw preview.png, an overview of two pairs: python .readme/draw_preview.py. Its dataset is temporary."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KEYS = ["00000001", "00000004"]
 
 
 def main() -> None:
-    """Make the dataset, write preview.png."""
+    """Generate the dataset and write preview.png."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "unprocess_gen", f"out={folder}/ds", "noise=imx385_iso12800"]
         subprocess.run(command, check=True)

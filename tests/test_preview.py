@@ -447,7 +447,10 @@ def test_wrong_argument_gives_one_line_and_writes_nothing(
 
 
 def test_error_for_unknown_key_explains_keys(few: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"has no such key; it has keys from 00000000 to 00000003; .* 00000003-p0007 .* 00000003-l01d02"):
+    with pytest.raises(
+        ConfigError,
+        match=r"has no such key; it has keys from 00000000 to 00000003; .* 00000003-p0007 .* 00000003-l01d02",
+    ):
         list(contact_sheet.write_sheets(few, tmp_path, ["12"]))
 
 
