@@ -16,13 +16,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from PIL import Image
 
 from unprocess_gen.cli import main as door_room
+from unprocess_gen.config.composition import compose_node
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
@@ -106,13 +105,14 @@ Settings = Callable[..., Config]
 
 @pytest.fixture(scope="session")
 def settings() -> Settings:
-    """Return a function that composes settings from overrides, as the command line does, without checking them."""
+    """Return a function that composes a config from overrides, without validating it."""
 
     @functools.cache
     def groups(*choices: str) -> DictConfig:
-        ConfigStore.instance().store(name="gen_dataset_schema", node=Config)
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return compose("config", overrides=list(choices))
+        node = compose_node(choices)
+        with open_dict(node):
+            del node["hydra"]
+        return node
 
     def composed(*overrides: str) -> Config:
         keys = {override: override.lstrip("+").split("=")[0] for override in overrides}
@@ -176,7 +176,7 @@ Cli = Callable[..., "subprocess.CompletedProcess[str]"]
 
 @pytest.fixture
 def cli(tmp_path: Path) -> Cli:
-    """Return a function that runs ``gen-dataset`` in a process of its own, in ``tmp_path`` unless told otherwise."""
+    """Return a function that runs ``gen-dataset`` in its own process, in ``tmp_path`` by default."""
 
     def called(*arguments: object, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
         command = [str(COMMAND), *map(str, arguments)]
@@ -194,7 +194,7 @@ def cli(tmp_path: Path) -> Cli:
 
 
 class Done(NamedTuple):
-    """How a call ended: its exit code and what it said."""
+    """Exit code, stdout and stderr of a call."""
 
     code: int
     out: str

@@ -115,6 +115,13 @@ def test_mistakes_are_explained_in_one_sentence(override: str, sentence: str) ->
     assert "\n" not in str(caught.value)
 
 
+def test_sweeps_are_refused() -> None:
+    with pytest.raises(ConfigError, match="the overrides describe a sweep; expected one config"):
+        load_config(["+sweep=cameras"])
+    with pytest.raises(ConfigError, match=r"seed=1,2: several values; expected one; .*write seed=\[1,2\]"):
+        load_config(["seed=1,2"])
+
+
 def test_a_missing_config_dir_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"--config-dir: folder '.*nowhere' not found"):
         load_config(config_dir=tmp_path / "nowhere")

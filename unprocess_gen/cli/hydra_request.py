@@ -68,12 +68,12 @@ class Request:
 
     @property
     def prints_config(self) -> bool:
-        """Whether the composed config is printed instead of used."""
+        """Return whether the composed config is printed instead of used."""
         return any(flag in CFG_FLAGS for flag in self.flags)
 
     @property
     def prints_without_config(self) -> bool:
-        """Whether Hydra prints something that needs no valid config: help, completion, information."""
+        """Return whether Hydra prints something that needs no valid config: help, completion, information."""
         return any(flag in PRINT_FLAGS for flag in self.flags)
 
     def folders(self) -> OptionFolders:

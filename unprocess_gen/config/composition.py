@@ -75,7 +75,7 @@ class OptionFolders:
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str] | None = None) -> Config:
-    """Compose and validate the config of one dataset.
+    r"""Compose and validate the config of one dataset.
 
     Works inside a running Hydra application and without one; the application's own config is left unchanged.
 
@@ -83,7 +83,7 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
     ----------
     overrides : sequence of str
         Hydra overrides, as on the command line: ``["camera=sony_a7r", "noise.draws=2"]``. Values of ``source.root``
-        and ``out`` may contain any character; a literal ``${`` is written ``\\${``.
+        and ``out`` may contain any character; a literal ``${`` is written ``\${``.
     config_dir : path-like, optional
         Folder of additional option files, as with ``--config-dir``.
 
@@ -102,6 +102,8 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
         if re.match(r"\+*hydra\b", override) and not override.startswith("hydra.searchpath="):
             raise ConfigError(f"{override}: settings of Hydra belong to the command line; expected keys of a dataset")
     node = compose_node(overrides, OptionFolders(own=None if config_dir is None else Path(config_dir)))
+    if is_multirun(node) or OmegaConf.select(node, "hydra.sweeper.params"):
+        raise ConfigError("hydra.sweeper.params: the overrides describe a sweep; expected one config; run gen-dataset")
     return validated_config(node, overrides)
 
 
@@ -169,11 +171,28 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
     return config
 
 
+def is_multirun(node: DictConfig) -> bool:
+    """Return whether option files request a sweep.
+
+    Parameters
+    ----------
+    node : DictConfig
+        Result of `compose_node`.
+
+    Returns
+    -------
+    bool
+        Whether ``hydra.mode`` is ``MULTIRUN``.
+    """
+    mode = OmegaConf.select(node, "hydra.mode")
+    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
 def quoted_path(override: str) -> str:
-    """Quote the value of a path for Hydra's grammar, and expand ``~``.
+    r"""Quote the value of a path for Hydra's grammar, and expand ``~``.
 
     An unquoted path with an umlaut, an apostrophe or a bracket is not a word of that grammar. Interpolations stay
-    active; ``\\${`` is a literal ``${``.
+    active; ``\${`` is a literal ``${``.
 
     Parameters
     ----------

@@ -41,7 +41,20 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
             if isinstance(link, ConfigAttributeError | ConfigKeyError):
                 return unknown_key(key, overrides)
             return f"{assignment(key, overrides)}: {str(link.msg or link).splitlines()[0]}"
-    return error_in_one_line(error)
+    text = error_in_one_line(error)
+    ambiguous = next((one for one in overrides if text.startswith(f"Ambiguous value for argument '{one}'")), None)
+    if ambiguous:
+        return several_values(ambiguous)
+    return text
+
+
+def several_values(override: str) -> str:
+    """Return the sentence about an override with several values where one is expected."""
+    key, _, values = override.partition("=")
+    return (
+        f"{override}: several values; expected one; to sweep over them, add --multirun; for a list, write "
+        f"{key}=[{values}]"
+    )
 
 
 def unknown_key(key: str, overrides: Sequence[str]) -> str:

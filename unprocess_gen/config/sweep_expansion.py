@@ -16,8 +16,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from unprocess_gen.config.composition import OptionFolders, compose_node, quoted_path
-from unprocess_gen.config.composition_errors import explain
+from unprocess_gen.config.composition import OptionFolders, compose_node, is_multirun, quoted_path
+from unprocess_gen.config.composition_errors import explain, several_values
 from unprocess_gen.config.option_files import check_override, conf_dir, group_options
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
@@ -62,7 +62,7 @@ class SweepJob:
 
 @dataclass(frozen=True, slots=True)
 class Expansion:
-    """What a list of overrides describes: one config, or a sweep.
+    """Hold what a list of overrides describes: one config, or a sweep.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class _Choice:
 
     @property
     def adds_group(self) -> bool:
-        """Whether it chooses option files that can contain settings of Hydra."""
+        """Return whether it chooses option files that can contain settings of Hydra."""
         return self.key.startswith("+") and "." not in self.key and not hasattr(Config(), self.name)
 
     def overrides(self) -> list[str]:
@@ -162,7 +162,7 @@ def expand(
         _check_hydra_settings(node)
         plugins = plugins or _plugins(node)
         out = out or str(OmegaConf.select(node, "out"))
-        if not multirun and not _is_multirun(node):
+        if not multirun and not is_multirun(node):
             _refuse_values_without_sweep(choices, node)
             return Expansion(node)
         params = _params(node, choices, folders)
@@ -247,11 +247,6 @@ def _job(own: dict[str, str], added: dict[str, str], choices: list[_Choice], ori
     return SweepJob(tuple(overrides.values()), tuple(named), swept)
 
 
-def _is_multirun(node: DictConfig) -> bool:
-    mode = OmegaConf.select(node, "hydra.mode")
-    return str(getattr(mode, "name", mode)) == "MULTIRUN"
-
-
 def _raw_params(node: DictConfig) -> dict[str, Any]:
     """Return ``hydra.sweeper.params`` with interpolations resolved."""
     try:
@@ -324,10 +319,7 @@ def _check_hydra_settings(node: DictConfig) -> None:
 def _refuse_values_without_sweep(choices: Sequence[_Choice], node: DictConfig) -> None:
     for choice in choices:
         if choice.swept:
-            raise ConfigError(
-                f"{choice.name}={','.join(choice.values[:20])}: several values; expected one; to sweep over them, add "
-                f"--multirun; for a list, write {choice.name}=[{','.join(choice.values[:20])}]"
-            )
+            raise ConfigError(several_values(choice.text))
     params = _raw_params(node)
     if params:
         raise ConfigError(
