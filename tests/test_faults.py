@@ -404,7 +404,7 @@ def fulls(request: pytest.FixtureRequest, disk: Disk, six: Path, make: Make, tre
         out.mkdir()
         disk.remount(f"size={kilobytes}k")
         try:
-            make(six, out, ONE, n_jobs=request.param)
+            make(six, out, ONE, "check_disk=false", n_jobs=request.param)
         except UnprocessGenError as raised:
             error = raised
             place, whole = place_of(out), intact(out)
@@ -444,7 +444,9 @@ def test_full_disk_ends_with_5_within_five_seconds(
 ) -> None:
     out = empty_disk.folder / "ds"
     empty_disk.remount("size=320k")  # space for most shards
-    with running(f"source.root={photographs}", f"out={out}", ONE, f"n_jobs={n_jobs}", cwd=tmp_path) as process:
+    with running(
+        f"source.root={photographs}", f"out={out}", ONE, f"n_jobs={n_jobs}", "check_disk=false", cwd=tmp_path
+    ) as process:
         said, err = process.communicate(timeout=30)
         seconds = time.time() - (out / "shards").stat().st_mtime  # since the last commit
         wait_for_the_end(process.pid)

@@ -108,7 +108,9 @@ def logging_to(quiet: bool = False, verbose: bool = False, log_file: str | None 
         for handler in handlers:
             LOGGER.removeHandler(handler)
             handler.close()
-        LOGGER.level, LOGGER.propagate, RESULTS.level = before
+        level, LOGGER.propagate, results_level = before
+        LOGGER.setLevel(level)  # assigning the attribute would leave logging's cache of enabled levels stale
+        RESULTS.setLevel(results_level)
 
 
 class _StderrHandler(logging.Handler):

@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from unprocess_gen.config.interpretation import patch_rule
@@ -44,6 +44,11 @@ KEPT_BYTES = 2**29
 def make_shard(context: RunContext, task: ShardTask) -> ShardResult:
     """Write one shard to a temporary file and return its rows; raise MachineError if disk, memory or self-test fail."""
     _prepare_process(context.coordinator_pid)
+    with _one_opencv_thread():
+        return _make_shard(context, task)
+
+
+def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
     failures: dict[str, None] = {}
     path = Path(context.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     busy = task.busy_path(context)
@@ -142,14 +147,24 @@ def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
 
 
 def _prepare_process(coordinator_pid: int) -> None:
-    """Limit OpenCV to one thread and keep freed memory; in a worker, also ignore Ctrl-C and start the watchdog."""
-    import cv2
-
-    cv2.setNumThreads(1)
+    """Keep freed memory; in a worker process also ignore Ctrl-C and start the watchdog."""
     keep_memory()
     if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=_exit_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    """Limit OpenCV to one thread: workers use all cores already."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def keep_memory() -> None:
