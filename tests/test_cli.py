@@ -1,4 +1,4 @@
-"""The command line: exit codes, one line for every mistake, nothing written by a refusal, verbs."""
+"""Command line: exit codes, one line for every mistake, help, and each verb."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from conftest import COMMAND, fill
+from PIL import Image
 
 from unprocess_gen import RawPairs, __version__
 from unprocess_gen.cli.arguments import STANDARD, Verb
@@ -58,7 +60,24 @@ REFUSED = [
     (["--flag"], r"--flag: no such flag; expected --source, --quiet, .*--multirun, "),
     (["-x"], r"-x: no such flag"),
     (["-j2"], r"-j2: no such flag"),
-    (["--multirun=2"], r"--multirun=2: no such flag"),
+    (["--multirun=2"], r"--multirun=2: "),
+    (["verfy", "ds"], r"verfy: no such verb; expected generate, plan, .*; did you mean verify\?"),
+    (["--multrun", "seed=1,2"], r"--multrun: no such flag; .*; did you mean --multirun\?"),
+    (["plan", "--al"], r"--al: no such flag; expected --all, .*; did you mean --all\?"),
+    (["camera=sony_a7"], r"camera=sony_a7: no such option; .*; did you mean sony_a7r\?"),
+    (["nois=none"], r"nois=none: no such key; .*; did you mean noise\?"),
+    (["verify", "ds", "--regenrate", "2"], r"verify: --regenrate: no such flag; .*; did you mean --regenerate\?"),
+    (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
+    (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
+    (["verify", "ds", "--regenerate", "two"], r"verify: --regenerate two: expected an integer of 0 or more"),
+    (["verify", "ds", "sorce.root=x"], r"verify: sorce.root=x: unknown argument; .*; did you mean source.root\?"),
+    (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
+    (["replay", "ds", "other"], r"replay: other: unknown argument"),
+    (["verify"], r"verify: expected the folder of a dataset or of a sweep"),
+    (["replay", "source.root=x"], r"replay: expected a manifest.csv, or the folder of a dataset"),
+    (["--source", "a", "source.root=b"], r"--source a: the source is also given by source.root=b"),
+    (["plan", "--quiet", "--verbose"], r"--quiet and --verbose exclude each other"),
+    (["plan", "--log-file", "/no/such/file"], r"--log-file /no/such/file: cannot be written"),
     (["plan", "--any"], r"--any: no such flag"),
     (["plan", "camera=nope"], r"camera=nope: no such option"),
     (["plan", "seed=-1"], r"seed=-1: expected 0 to "),
@@ -79,7 +98,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
-def test_a_mistake_costs_one_line_exit_code_2_and_writes_nothing(
+def test_mistake_gives_one_line_and_exit_code_2_and_writes_nothing(
     arguments: list[str], sentence: str, door: Door, tmp_path: Path
 ) -> None:
     done = door(*arguments)
@@ -93,28 +112,28 @@ GROUP_VALUES = ["camera=null", "noise=3200", "sensor=12", "gains=2.0", "isp=true
 
 
 @pytest.mark.parametrize("argument", GROUP_VALUES)
-def test_a_group_that_is_given_a_number_is_refused_in_one_line(argument: str, door: Door) -> None:
+def test_number_instead_of_an_option_is_refused_in_one_line(argument: str, door: Door) -> None:
     done = door(argument)
     assert (done.code, done.err.count("\n")) == (2, 1)
 
 
 @pytest.mark.parametrize("arguments", [("--cfg", "nope"), ("--cfg",), ("--info", "nope"), ("--config-name",)])
-def test_a_flag_with_a_wrong_value_costs_one_line(arguments: tuple[str, ...], door: Door) -> None:
+def test_flag_with_a_wrong_value_is_refused_in_one_line(arguments: tuple[str, ...], door: Door) -> None:
     done = door(*arguments)
     assert (done.code, done.err.count("\n")) == (2, 1)
 
 
-def test_a_refusal_by_a_process_is_one_line_on_stderr_and_exit_code_2(cli: Cli, tmp_path: Path) -> None:
+def test_process_reports_a_mistake_in_one_line_with_exit_code_2(cli: Cli, tmp_path: Path) -> None:
     done = cli("camera=nope", "out=there")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_error_is_one_line_even_where_the_user_set_hydra_full_error(cli: Cli) -> None:
+def test_error_is_one_line_with_hydra_full_error_set(cli: Cli) -> None:
     assert cli("seed=abc", HYDRA_FULL_ERROR="1").stderr.count("\n") == 1
 
 
-def test_an_empty_folder_is_refused_and_nothing_written(door: Door, tmp_path: Path) -> None:
+def test_empty_folder_is_refused_and_nothing_written(door: Door, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     done = door("source.root=empty")
     assert (done.code, done.err.count("\n")) == (2, 1)
@@ -122,21 +141,21 @@ def test_an_empty_folder_is_refused_and_nothing_written(door: Door, tmp_path: Pa
     assert os.listdir(tmp_path) == ["empty"]
 
 
-def test_an_out_below_a_file_is_refused(door: Door, tmp_path: Path, photos: Path) -> None:
+def test_out_below_a_file_is_refused(door: Door, tmp_path: Path, photos: Path) -> None:
     (tmp_path / "file").touch()
     done = door(f"source.root={photos}", "out=file/ds")
     assert (done.code, done.err) == (2, "gen-dataset: out=file/ds: cannot be written (Not a directory)\n")
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_an_out_that_is_a_file_is_refused(door: Door, tmp_path: Path, photos: Path) -> None:
+def test_out_that_is_a_file_is_refused(door: Door, tmp_path: Path, photos: Path) -> None:
     (tmp_path / "file").write_text("mine")
     done = door(f"source.root={photos}", "out=file")
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_users_own_options_are_checked_like_ours(door: Door, tmp_path: Path) -> None:
+def test_own_options_are_validated(door: Door, tmp_path: Path) -> None:
     (tmp_path / "mine/noise").mkdir(parents=True)
     (tmp_path / "mine/noise/bad.yaml").write_text("name: bad\nblak: 3\n")
     done = door("--config-dir", "mine", "noise=bad")
@@ -144,21 +163,21 @@ def test_users_own_options_are_checked_like_ours(door: Door, tmp_path: Path) -> 
     assert "blak" in done.err
 
 
-def test_a_profile_without_units_is_refused(door: Door, tmp_path: Path) -> None:
+def test_profile_without_units_is_refused(door: Door, tmp_path: Path) -> None:
     (tmp_path / "mine/noise").mkdir(parents=True)
     (tmp_path / "mine/noise/bare.yaml").write_text("name: bare\nunits: null\na: 1\nb: 1\n")
     done = door("--config-dir=mine", "noise=bare", "noise.black=subtracted")
     assert (done.code, done.err) == (2, "gen-dataset: noise.units=null: expected one of dn, normalized\n")
 
 
-def test_an_option_that_is_no_yaml_is_refused_in_one_line(door: Door, tmp_path: Path) -> None:
+def test_invalid_yaml_is_refused_in_one_line(door: Door, tmp_path: Path) -> None:
     (tmp_path / "mine/noise").mkdir(parents=True)
     (tmp_path / "mine/noise/broken.yaml").write_text("name: [")
     done = door("--config-dir", "mine", "noise=broken")
     assert (done.code, done.err.count("\n")) == (2, 1)
 
 
-def test_users_own_options_are_found_and_used(door: Door, tmp_path: Path, photos: Path) -> None:
+def test_own_options_are_used(door: Door, tmp_path: Path, photos: Path) -> None:
     (tmp_path / "mine/noise").mkdir(parents=True)
     (tmp_path / "mine/noise/quiet.yaml").write_text(
         "name: quiet\nunits: normalized\nblack: subtracted\na: 0.001\nb: 0\n"
@@ -169,7 +188,7 @@ def test_users_own_options_are_found_and_used(door: Door, tmp_path: Path, photos
     assert (done.code, yaml.safe_load(done.out)["noise"]["name"]) == (0, "quiet")
 
 
-# Answers that write nothing -------------------------------------------------------------------------------------------
+# Help and printed settings --------------------------------------------------------------------------------------------
 
 
 HELP = global_help(VERBS, conf_dir())
@@ -214,7 +233,7 @@ def test_help_fits_a_hundred_columns() -> None:
     assert max(map(len, HELP.splitlines())) <= 100
 
 
-def test_help_imports_nothing_heavy() -> None:
+def test_help_imports_nothing_slow() -> None:
     code = (
         "import sys; sys.argv = ['gen-dataset', '--help']; from unprocess_gen.cli import main as cli; "
         "assert cli.main() == 0; "
@@ -226,7 +245,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("flag", [("--config-dir", "mine"), ("--config-dir=mine",), ("-cd", "mine")])
-def test_a_flag_may_stand_anywhere(flag: tuple[str, ...], door: Door, tmp_path: Path) -> None:
+def test_flags_are_accepted_at_any_position(flag: tuple[str, ...], door: Door, tmp_path: Path) -> None:
     (tmp_path / "mine/noise").mkdir(parents=True)
     own = (Path(__file__).parents[1] / "conf/noise/none.yaml").read_text().replace("name: none", "name: own")
     (tmp_path / "mine/noise/own.yaml").write_text(own)
@@ -235,26 +254,26 @@ def test_a_flag_may_stand_anywhere(flag: tuple[str, ...], door: Door, tmp_path: 
     assert [sample.row["noise"] for sample in RawPairs(tmp_path / "ds")] == ["own"]
 
 
-def test_version_is_that_of_the_package(door: Door) -> None:
+def test_version_is_the_package_version(door: Door) -> None:
     assert door("--version") == (0, f"unprocess_gen {__version__}\n", "")
 
 
-def test_help_is_shown_on_a_terminal_that_is_not_utf8(cli: Cli) -> None:
+def test_help_is_shown_on_an_ascii_terminal(cli: Cli) -> None:
     assert cli("--help", PYTHONIOENCODING="ascii").returncode == 0
 
 
-def test_cfg_job_prints_the_settings_and_writes_nothing(door: Door, tmp_path: Path) -> None:
+def test_cfg_job_prints_settings_and_writes_nothing(door: Door, tmp_path: Path) -> None:
     done = door("--cfg", "job", "seed=7", "camera=sony_a7r")
     loaded = yaml.safe_load(done.out)
     assert (done.code, loaded["seed"], loaded["camera"]["name"]) == (0, 7, "sony_a7r")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cfg_job_shows_no_settings_of_hydra(door: Door) -> None:
+def test_cfg_job_omits_hydra_settings(door: Door) -> None:
     assert "hydra" not in yaml.safe_load(door("--cfg", "job").out)
 
 
-def test_completion_of_an_option_works_and_writes_nothing(cli: Cli, tmp_path: Path) -> None:
+def test_hydra_completes_options_and_writes_nothing(cli: Cli, tmp_path: Path) -> None:
     line = "gen-dataset camera=s"
     done = cli("-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
     assert (done.returncode, done.stdout.split()) == (0, ["camera=sony_a7r", "camera=sony_rx100"])
@@ -262,7 +281,7 @@ def test_completion_of_an_option_works_and_writes_nothing(cli: Cli, tmp_path: Pa
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_scripts_name_the_command(shell: str, door: Door) -> None:
+def test_hydra_completion_scripts_name_the_command(shell: str, door: Door) -> None:
     done = door("-sc", f"install={shell}")
     assert done.code == 0
     assert "gen-dataset" in done.out
@@ -271,7 +290,7 @@ def test_completion_scripts_name_the_command(shell: str, door: Door) -> None:
 # generate -------------------------------------------------------------------------------------------------------------
 
 
-def test_the_bare_command_makes_ds_from_the_scenes_and_nothing_else(cli: Cli, tmp_path: Path) -> None:
+def test_command_without_arguments_writes_ds_only(cli: Cli, tmp_path: Path) -> None:
     done = cli()
     assert done.returncode == 0, done.stderr
     made, limits = done.stdout.splitlines()
@@ -283,7 +302,7 @@ def test_the_bare_command_makes_ds_from_the_scenes_and_nothing_else(cli: Cli, tm
     ]  # fmt: skip
 
 
-def test_failed_photographs_end_with_exit_code_3_and_are_counted(door: Door, tmp_path: Path) -> None:
+def test_failed_photographs_give_exit_code_3_and_are_counted(door: Door, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 2) / "empty.png").touch()
     done = door("source.root=p", "n_jobs=1")
     assert done.code == 3
@@ -291,19 +310,19 @@ def test_failed_photographs_end_with_exit_code_3_and_are_counted(door: Door, tmp
     assert "1 failed (1 empty; see ds/manifest.csv)" in done.out
 
 
-def test_as_many_failed_photographs_as_allowed_end_with_exit_code_0(door: Door, tmp_path: Path) -> None:
+def test_allowed_number_of_failures_gives_exit_code_0(door: Door, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 2) / "empty.png").touch()
     assert door("source.root=p", "n_jobs=1", "source.max_failed=1").code == 0
 
 
-def test_a_finished_dataset_with_failed_photographs_still_ends_with_3(door: Door, tmp_path: Path) -> None:
+def test_rerun_with_failed_photographs_gives_exit_code_3(door: Door, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 2) / "empty.png").touch()
     door("source.root=p", "n_jobs=1")
     done = door("source.root=p", "n_jobs=1")
     assert (done.code, "ds is complete: 2 pairs" in done.out) == (3, True)
 
 
-def test_an_absent_value_of_max_failed_allows_none(door: Door, tmp_path: Path) -> None:
+def test_more_failures_than_allowed_give_exit_code_3(door: Door, tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         fill(tmp_path / "p", 1).joinpath(name).touch()
     assert door("source.root=p", "n_jobs=1", "source.max_failed=1").code == 3
@@ -318,53 +337,53 @@ def test_plan_writes_nothing(door: Door, tmp_path: Path, photos: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def told_bytes(text: str) -> int:
+def bytes_in(text: str) -> int:
     return int(re.search(r"^bytes +([\d,]+) in shards$", text, re.MULTILINE)[1].replace(",", ""))  # type: ignore[index]
 
 
 @pytest.mark.parametrize("shard", [1, 5, 8])
-def test_plan_all_tells_the_exact_bytes_of_the_shards(
+def test_plan_all_reports_exact_bytes_of_shards(
     shard: int, door: Door, make: Make, photos: Path, tmp_path: Path
 ) -> None:
-    told = door("plan", "--all", f"source.root={photos}", f"output.pairs_per_shard={shard}")
+    done = door("plan", "--all", f"source.root={photos}", f"output.pairs_per_shard={shard}")
     make(photos, tmp_path / "ds", f"output.pairs_per_shard={shard}")
-    assert told_bytes(told.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+    assert bytes_in(done.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
 
 
-def test_plan_all_tells_the_exact_bytes_where_photographs_fail(door: Door, make: Make, tmp_path: Path) -> None:
+def test_plan_all_reports_exact_bytes_with_failing_photographs(door: Door, make: Make, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 5)
     for name in ("000.png", "002.png", "003.png"):
         (source / name).write_bytes(b"")
-    told = door("plan", "--all", "source.root=p", "output.pairs_per_shard=2")
+    done = door("plan", "--all", "source.root=p", "output.pairs_per_shard=2")
     make(source, tmp_path / "ds", "output.pairs_per_shard=2")
-    assert told_bytes(told.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+    assert bytes_in(done.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
 
 
-def test_plan_tells_about_how_many_bytes_where_it_read_a_sample(door: Door, make: Make, tmp_path: Path) -> None:
+def test_plan_estimates_bytes_from_a_sample(door: Door, make: Make, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 40)
-    told = door("plan", "source.root=p")
+    done = door("plan", "source.root=p")
     make(source, tmp_path / "ds")
-    about = re.search(r"^bytes +about ([\d,]+)", told.out, re.MULTILINE)
-    assert about is not None, told.out
+    about = re.search(r"^bytes +about ([\d,]+)", done.out, re.MULTILINE)
+    assert about is not None, done.out
     real = sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
     assert int(about[1].replace(",", "")) == pytest.approx(real, rel=0.1)
 
 
-def test_plan_names_what_would_fail_and_why(door: Door, tmp_path: Path) -> None:
+def test_plan_names_failing_photographs_and_reasons(door: Door, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 1) / "empty.png").touch()
     assert re.search(r"^fails +empty.png: empty$", door("plan", "source.root=p").out, re.MULTILINE)
 
 
-def test_plan_prints_the_conversion_of_the_noise(door: Door, photos: Path) -> None:
-    told = door("plan", f"source.root={photos}", "sensor=generic_14bit", "noise=imx385_iso1600").out
+def test_plan_prints_converted_noise_parameters(door: Door, photos: Path) -> None:
+    text = door("plan", f"source.root={photos}", "sensor=generic_14bit", "noise=imx385_iso1600").out
     scale = (16383 - 1024) / (4095 - 240)
-    assert f"a_dn {3.513262 * scale:.6g}, b_dn2 {11.917691 * scale**2:.6g}" in told
+    assert f"a_dn {3.513262 * scale:.6g}, b_dn2 {11.917691 * scale**2:.6g}" in text
 
 
 # again ----------------------------------------------------------------------------------------------------------------
 
 
-def test_again_makes_the_same_dataset_from_its_config_yaml(
+def test_again_regenerates_the_same_dataset(
     door: Door, dataset: Path, photos: Path, tree_hash: Callable[[Path], str], tmp_path: Path
 ) -> None:
     done = door("again", dataset, f"source.root={photos}", "out=new", "n_jobs=1")
@@ -381,13 +400,13 @@ def test_again_of_scenes_needs_no_source(
     assert tree_hash(tmp_path / "new") == tree_hash(tmp_path / "old")
 
 
-def test_again_says_where_the_new_dataset_differs(door: Door, make: Make, tmp_path: Path) -> None:
+def test_again_reports_a_different_dataset(door: Door, make: Make, tmp_path: Path) -> None:
     make(fill(tmp_path / "p", 2), tmp_path / "old")
     fill(tmp_path / "other", 2, first=7)
     done = door("again", "old", "source.root=other", "out=new", "n_jobs=1")
     assert (done.code, done.err.splitlines()[-1]) == (
         4,
-        "gen-dataset: new/manifest.csv: differs from that of old; check that the sources are the same",
+        "gen-dataset: new/manifest.csv: differs from old/manifest.csv; check that the sources are the same",
     )
 
 
@@ -405,7 +424,7 @@ AGAIN_REFUSED = [
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), AGAIN_REFUSED)
-def test_again_refuses_what_it_cannot_mean(
+def test_again_refuses_wrong_arguments(
     arguments: list[str], sentence: str, door: Door, dataset: Path, tmp_path: Path
 ) -> None:
     fill(tmp_path / "p", 1)
@@ -423,14 +442,102 @@ def test_again_of_scenes_refuses_a_source_root(door: Door, make: Make, tmp_path:
     assert not (tmp_path / "new").exists()
 
 
-# Where it runs --------------------------------------------------------------------------------------------------------
+# One spelling in every verb -------------------------------------------------------------------------------------------
 
 
-def test_the_console_script_is_installed_beside_python() -> None:
+@pytest.fixture
+def moved(make: Make, tmp_path: Path) -> Path:
+    """Return the folder ``ds`` of a dataset; its photographs, two good ones and a bad one, are in ``moved``.
+
+    ``dataset.json`` records another folder, which does not exist.
+    """
+    fill(tmp_path / "photos", 1)
+    (tmp_path / "photos/001.png").touch()
+    Image.fromarray(np.arange(32 * 32 * 3, dtype=np.uint8).reshape(32, 32, 3)).save(tmp_path / "photos/002.png")
+    make(tmp_path / "photos", tmp_path / "ds")
+    (tmp_path / "photos").rename(tmp_path / "moved")
+    return Path("ds")
+
+
+SPELLINGS = [("--source", "moved"), ("--source=moved",), ("source.root=moved",)]
+TAKES_SOURCE = {
+    "verify": ("--regenerate", "9"),
+    "replay": (),
+    "report": ("--to", "page.html"),
+    "preview": ("--to", "sheets"),
+    "again": ("out=copy", "n_jobs=1", "source.max_failed=1"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS, ids=" ".join)
+@pytest.mark.parametrize("verb", TAKES_SOURCE)
+def test_source_has_two_spellings_in_every_verb(verb: str, spelling: tuple[str, ...], moved: Path, door: Door) -> None:
+    done = door(verb, moved, *TAKES_SOURCE[verb], *spelling)
+    assert (done.code, "left out" in done.err) == (0, False), done.err
+    assert door(verb, *spelling, moved, *(word.replace("copy", "copy2") for word in TAKES_SOURCE[verb])).code == 0
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS, ids=" ".join)
+@pytest.mark.parametrize("verb", ["generate", "plan"])
+def test_source_has_two_spellings_with_settings(verb: str, spelling: tuple[str, ...], moved: Path, door: Door) -> None:
+    assert door(verb, *spelling, "n_jobs=1", "out=new", "source.max_failed=1").code == 0
+
+
+@pytest.mark.parametrize("verb", TAKES_SOURCE)
+def test_recorded_source_is_the_default(verb: str, moved: Path, door: Door, tmp_path: Path) -> None:
+    (tmp_path / "moved").rename(tmp_path / "photos")
+    done = door(verb, moved, *TAKES_SOURCE[verb])
+    assert (done.code, "left out" in done.err) == (0, False), done.err
+
+
+def test_again_needs_a_source_if_none_is_recorded(moved: Path, door: Door, tmp_path: Path) -> None:
+    (tmp_path / "ds/dataset.json").unlink()
+    done = door("again", moved, "out=new")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "kind folder and does not record which; give source.root=" in done.err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("keys", ["2", "1-2", "00000002,2", "0-2"])
+@pytest.mark.parametrize("verb", ["replay", "preview", "dng"])
+def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, moved: Path, door: Door) -> None:
+    if verb == "dng" and keys == "0-2":
+        keys = "1-2"  # LibRaw opens no picture of 12 x 16 pixels
+    done = door(verb, moved, "--keys", keys, "--to", "there", *(["--source=moved"] if verb != "dng" else []))
+    assert done.code == 0, done.err
+    assert ("; 1 failed rows skipped" in done.out) == ("-" in keys)
+
+
+def test_folder_of_a_sweep_is_refused_where_one_dataset_is_needed(moved: Path, door: Door, tmp_path: Path) -> None:
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "ds").rename(tmp_path / "sweep/seed=1")
+    (tmp_path / "sweep/sweep.csv").touch()
+    for verb in ("replay", "report", "preview", "dng", "again"):
+        done = door(verb, "sweep", *(["out=new"] if verb == "again" else []))
+        expected = (
+            f"gen-dataset: {verb}: sweep: is the folder of a sweep; expected one of its datasets, such as sweep/seed=1"
+        )
+        assert (done.code, done.err) == (2, f"{expected}\n")
+
+
+def test_verify_of_a_sweep_verifies_every_dataset(door: Door, tmp_path: Path) -> None:
+    assert door("-m", "seed=1,2", "source.limit=1", "n_jobs=1", "out=sweep").code == 0
+    lines = [f"sweep/seed={seed},source.limit=1 is intact" for seed in (1, 2)]
+    assert door("verify", "sweep") == (0, "\n".join([*lines, "sweep: 2 of 2 datasets are intact", ""]), "")
+    (tmp_path / "sweep/seed=1,source.limit=1/manifest.csv").write_text("")
+    done = door("verify", "sweep", "--regenerate", "1")
+    assert (done.code, "sweep: 1 of 2 datasets are intact" in done.out) == (4, True)
+    assert done.err.startswith("gen-dataset: sweep/seed=1,source.limit=1: ")
+
+
+# Installation ---------------------------------------------------------------------------------------------------------
+
+
+def test_console_script_is_installed_next_to_python() -> None:
     assert COMMAND.is_file()
 
 
-def test_dataset_json_says_which_folder_a_relative_source_was(door: Door, tmp_path: Path) -> None:
+def test_dataset_json_records_absolute_source_root(door: Door, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
     door("source.root=p", "n_jobs=1")
     facts = json.loads((tmp_path / "ds/dataset.json").read_text())

@@ -213,7 +213,7 @@ def run_again(call: Call) -> int:
     if not old.exists():
         print_result(f"{folder} has no manifest.csv to compare with")
     elif not have_same_rows(old, new):
-        raise DamageError(f"{new}: differs from that of {folder}; check that the sources are the same")
+        raise DamageError(f"{new}: differs from {old}; check that the sources are the same")
     else:
         print_result(f"the same as {folder}, bit for bit")
     return code
