@@ -128,6 +128,11 @@ class _FileHandler(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (the name is logging's)
         """Drop a message that cannot be written."""
 
+    def close(self) -> None:
+        """Close the file; what cannot be written is dropped."""
+        with suppress(OSError):
+            super().close()
+
 
 # ---------------------------------------------------------------------------------------------------- stdout, stderr
 
