@@ -3,13 +3,13 @@
 A shard is the unit of work, retry and commit:
 
 * `tasks`: the records that travel between coordinator and workers.
-* `executors.local`: starts worker processes, and retries shards whose worker died.
+* `executors.local`: starts worker processes; its docstring says what happens when one dies.
 * `worker`: makes one shard in a temporary file and returns its rows.
 * `workspace`: locks the output folder, renames finished shards into place and writes ``manifest.csv`` and
   ``dataset.json``.
 
 The coordinator (this module) commits shards in index order, except retried ones; the finished dataset does not depend
-on completion order.
+on completion order. Design: ``docs/design/pipeline.md``.
 """
 
 from __future__ import annotations
