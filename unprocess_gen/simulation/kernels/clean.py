@@ -182,12 +182,12 @@ def _fill_clean_frame(
 ) -> None:
     """Fill the clean frame, before and after rounding, and its counts."""
     height, width = clean.shape
-    segment, plan = buffer_pointers(buffers), parameter_pointers(parameters)
+    segment, pointers = buffer_pointers(buffers), parameter_pointers(parameters)
     for y in range(height):
         for start in range(0, width, SEGMENT):
             length, at = min(SEGMENT, width - start), y * width + start
             codes, target = pointer_to(srgb, 3 * at), pointer_to(clean, at)
-            fill_clean(codes, srgb.itemsize == 1, y, 0, length, plan, segment, target, pointer_to(counts, 0))
+            fill_clean(codes, srgb.itemsize == 1, y, 0, length, pointers, segment, target, pointer_to(counts, 0))
             copy_values(length, segment.unrounded_dn, pointer_to(unrounded_dn, at))
 
 

@@ -141,7 +141,7 @@ def _fill_pairs(
 ) -> None:
     """Fill the frames and counts of all pairs, segment by segment."""
     height, width = clean.shape
-    segment, scene = buffer_pointers(buffers), parameter_pointers(parameters)
+    segment, pointers = buffer_pointers(buffers), parameter_pointers(parameters)
     quadratics = _quadratic_pointers(quantiles)
     for y in range(height):
         for start in range(0, width, SEGMENT):
@@ -150,9 +150,9 @@ def _fill_pairs(
             at = y * width + start
             fills_blocks = length == blocks * BLOCK
             codes, target = pointer_to(srgb, 3 * at), pointer_to(clean, at)
-            fill_clean(codes, srgb.itemsize == 1, y, first, length, scene, segment, target, pointer_to(counts, 0))
+            fill_clean(codes, srgb.itemsize == 1, y, first, length, pointers, segment, target, pointer_to(counts, 0))
             for plan in range(noisy.shape[0]):
-                key, of_plan = load_key(keys, plan), _load_noise_parameters(noise, plan, scene.levels_dn[0])
+                key, of_plan = load_key(keys, plan), _load_noise_parameters(noise, plan, parameters.levels_dn[0])
                 fill_word_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, segment.words)
                 to = plan * height * width + at
                 target = pointer_to(noisy, to) if fills_blocks else segment.noisy

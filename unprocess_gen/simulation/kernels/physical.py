@@ -3,9 +3,8 @@
 Contract: the same DN as `pair.reference_pair` on every CPU, by the means described in `gaussian`. Counts and read noise
 use approximate normals; sites near a rounding boundary are recomputed with exact ones.
 
-Two kernels: `_fill_shot_read_pair` for shot and read noise with row and black-level errors, which most frames need, and
-`_fill_physical_pair` for all effects, which takes about 1.5 times as long. The PRNU of a sensor unit is cached between
-its frames.
+Most frames need only shot and read noise with row and black-level errors: `_fill_shot_read_pair`. For all effects,
+`_fill_physical_pair` takes about 1.5 times as long. The PRNU of a sensor unit is cached between its frames.
 
 Timings and rejected alternatives: ``docs/design/kernels.md``.
 """
@@ -438,7 +437,7 @@ def _fill_shot_read_pair(
 ) -> None:
     """Fill both frames and the counts; with a non-empty ``unrounded_frame``, only the noisy frame and its counts."""
     height, width = noisy.shape
-    segment, scene, of_clean = buffer_pointers(buffers.clean), parameter_pointers(parameters), pointer_to(counts, 0)
+    segment, pointers, of_clean = buffer_pointers(buffers.clean), parameter_pointers(parameters), pointer_to(counts, 0)
     unrounded_dn, rates, count_buffers = buffers.clean.unrounded_dn, buffers.rates, buffers.counts
     rounded, residual, root, inverse = buffers.rounded, buffers.residual, buffers.root, buffers.inverse
     excess, read, base_dn = buffers.excess, buffers.read, buffers.base_dn
@@ -459,7 +458,7 @@ def _fill_shot_read_pair(
                 copy_values(n, pointer_to(unrounded_frame, at), pointer_to(segment.unrounded_dn, first))
             else:
                 codes, target = pointer_to(srgb, 3 * at), pointer_to(clean, at)
-                fill_clean(codes, srgb.itemsize == 1, y, first, n, scene, segment, target, of_clean)
+                fill_clean(codes, srgb.itemsize == 1, y, first, n, pointers, segment, target, of_clean)
             _fill_words_and_rates(
                 key, block, blocks, np.uint64(origin[0] + y), purposes, black, dn_per_e, unrounded_dn,
                 rates, rounded, residual, root, inverse, shot_words, read_words,
@@ -621,13 +620,13 @@ def _fill_physical_pair(
 ) -> None:
     """Fill both frames and the counts of a pair with any effects."""
     height, width = clean.shape
-    light, unrounded_dn, scene = buffers.light, buffers.unrounded_dn, parameter_pointers(parameters)
+    light, unrounded_dn, pointers = buffers.light, buffers.unrounded_dn, parameter_pointers(parameters)
     for y in range(height):
         gains, headroom = parameters.site_gains[y & 1], parameters.site_headroom[y & 1]
         for start in range(0, width, LONG_SEGMENT):
             n = min(LONG_SEGMENT, width - start)
             codes, target = pointer_to(srgb, 3 * (y * width + start)), clean[y, start : start + n]
-            fill_signal(codes, srgb.itemsize == 1, y, n, scene, pointer_to(light, 0))
+            fill_signal(codes, srgb.itemsize == 1, y, n, pointers, pointer_to(light, 0))
             fill_scene_light(light[:n], gains, headroom, parameters, light)
             if sensor.has_prnu and sensor.averaged:
                 for x in range(n):

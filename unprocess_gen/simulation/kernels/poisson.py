@@ -1,8 +1,8 @@
 """Draw Poisson counts by inversion: one 32-bit random word, one count, coupled to the normal of the same word.
 
 A count is the quantile of its word's probability u: the least k with P(K <= k) >= u. So it rises with the normal that
-`reference.noise.normals` gives for the word. For every rate from 0 to 1e9 and every k, the fraction of all 2**32 words
-with counts up to k equals P(K <= k) within 2**-32.
+`reference.noise.normals` gives for the word. The rate is 0 to 1e9. For every k, the fraction of all 2**32 words with
+counts up to k equals P(K <= k) within 2**-32.
 
 From rate 64 up (`LIMIT`), the count is floor(x), where x > 0 solves Gamma(x, rate) / Gamma(x) = Phi(w) (Giles,
 "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM TOMS 42(1), 2016). With

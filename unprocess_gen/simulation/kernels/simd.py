@@ -4,9 +4,9 @@ For loops that LLVM does not vectorise by itself. Kernels load vectors, compute 
 support ``+ - * / & | ^ >> <<`` per lane, also with a scalar operand, and the functions of this module. Every operation
 rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused.
 
-Each function has two implementations: on NumPy arrays of eight elements, used when kernels run uncompiled (tests
-compare both), and as LLVM instructions on ``<8 x type>``, which LLVM maps to the registers of the processor. Bytes and
-bits are numbered from the low end, as on every platform that Numba supports.
+Each function has two implementations, which tests compare. Uncompiled kernels use the one on NumPy arrays of eight
+elements. Compiled kernels use LLVM instructions on ``<8 x type>``, which LLVM maps to the registers of the processor.
+Bytes and bits are numbered from the low end, as on every platform that Numba supports.
 """
 
 from __future__ import annotations
