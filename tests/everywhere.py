@@ -1,12 +1,12 @@
-r"""``gen-dataset`` in a process that also tells what it computed with; `test_everywhere` runs it under many settings.
+r"""Run ``gen-dataset`` and report the libraries and kernels that it used, for the tests in `test_everywhere`.
 
     python tests/everywhere.py FACTS.json [gen-dataset's arguments]    make a dataset, then write the facts
     python tests/everywhere.py FACTS.json --code                       compile the kernels and run none of them
 
-The facts come from the process that did the work, so that a setting which a library ignores is not taken for a proof.
+The facts come from the process that did the work, so that a setting which a library ignores proves nothing.
 
-**Another processor, by emulation**: an optional job. QEMU's user mode computes in software, as IEEE 754 says. On a
-Debian machine of another kind, beside this package's wheel, a folder of photographs and this script, for 64-bit Arm:
+**Another processor, emulated** (optional): QEMU's user mode computes in software according to IEEE 754. On a Debian
+machine with another processor, in a folder with this package's wheel, photographs and this script, for 64-bit Arm:
 
     apt-get download qemu-user-static; dpkg -x qemu-user-static_*.deb host
     mkdir -p apt/lists/partial apt/archives/partial; touch apt/status
@@ -21,9 +21,9 @@ Debian machine of another kind, beside this package's wheel, a folder of photogr
     host/usr/bin/qemu-aarch64-static -L arm -E PYTHONPATH="$PWD/site" -E NUMBA_CACHE_DIR="$PWD/kernels" \
         arm/usr/bin/python3.11 everywhere.py arm.json source.root=photos n_jobs=1 out=ds-arm
 
-Shards, manifest.csv, config.yaml and ``doubles`` in the facts come out as here. With eleven small photographs that took
-85 seconds, most of them for compiling (20 under ``NUMBA_DISABLE_JIT=1``). An old x86-64, to every library at once, is
-one line: ``host/usr/bin/qemu-x86_64-static -cpu Nehalem .venv/bin/python everywhere.py …``, 70 seconds.
+Shards, manifest.csv, config.yaml and ``doubles`` in the facts must equal those of this machine. With eleven small
+photographs this took 85 seconds, most of them for compiling (20 with ``NUMBA_DISABLE_JIT=1``). To emulate an old x86-64
+for all libraries: ``host/usr/bin/qemu-x86_64-static -cpu Nehalem .venv/bin/python everywhere.py …`` (70 seconds).
 """
 
 from __future__ import annotations
@@ -65,13 +65,13 @@ from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.simulation.reference.poisson import poisson_tables
 
 KERNELS = {
-    f"{room}.{name}": value
-    for room, module in sorted(sys.modules.items())
-    if room.startswith("unprocess_gen.")
+    f"{module_name}.{name}": value
+    for module_name, module in sorted(sys.modules.items())
+    if module_name.startswith("unprocess_gen.")
     for name, value in vars(module).items()
-    if hasattr(value, "targetoptions") and value.__module__ == room
+    if hasattr(value, "targetoptions") and value.__module__ == module_name
 }
-"""Every compiled function of the package."""
+"""All compiled functions of the package."""
 
 FUSED = re.compile(r"\b(?:v?fn?m(?:add|sub|acc|sac|la|ls|ad|sb)|x[sv]n?m(?:add|sub))\w*")
 """Instructions that multiply and add with one rounding: x86, Arm, RISC-V, Power."""
@@ -86,11 +86,11 @@ TARGETS = {
 """Processors that can fuse, as LLVM names them."""
 
 
-# What a process computes with -----------------------------------------------------------------------------------------
+# Facts about the process ----------------------------------------------------------------------------------------------
 
 
 def facts(given: str) -> dict[str, Any]:
-    import cv2  # reads its settings when it is first imported, which is up to the run
+    import cv2  # imported late: it reads its settings at import, and the run decides when
 
     from unprocess_gen.pipeline import generate as runner
 
@@ -109,18 +109,18 @@ def facts(given: str) -> dict[str, Any]:
     }
 
 
-def listen() -> Any:
-    """Have whatever the outer kernel is given from now on hashed, to the last bit; what it fills comes last."""
-    kernel, heard = gaussian._fill_pairs, hashlib.sha256()
+def hash_kernel_arguments() -> Any:
+    """Hash all arguments of later calls of the outer kernel, except the last three, which it fills."""
+    kernel, arguments_digest = gaussian._fill_pairs, hashlib.sha256()
 
-    def told(*arguments: Any) -> None:
+    def hash_and_call(*arguments: Any) -> None:
         for argument in arguments[:-3]:
             for one in argument if isinstance(argument, tuple) else (argument,):
-                heard.update(np.asarray(one).tobytes())
+                arguments_digest.update(np.asarray(one).tobytes())
         kernel(*arguments)
 
-    gaussian._fill_pairs = told
-    return heard
+    gaussian._fill_pairs = hash_and_call
+    return arguments_digest
 
 
 LIBM: tuple[Callable[[float], float], ...] = (math.sin, math.asin, math.exp, math.log, lambda x: x**2.2)
@@ -134,13 +134,13 @@ def digest(*parts: Any) -> str:
 
 
 def product() -> str:
-    """A matrix product, which is nobody's promise: it tells libraries for linear algebra apart."""
+    """Return the digest of a matrix product, which differs between libraries for linear algebra."""
     matrix = np.random.default_rng(0).random((50, 50))
     return digest(matrix @ matrix)
 
 
 def kernels() -> dict[str, Any]:
-    """How the kernels came to be, and a digest of their machine code where they were compiled just now."""
+    """Return how many kernels were loaded and compiled, and the digest of their machine code if none was loaded."""
     loaded = sum(sum(one.stats.cache_hits.values()) for one in KERNELS.values())
     code = "" if loaded else "".join(asm for one in KERNELS.values() for asm in one.inspect_asm().values())
     return {
@@ -155,28 +155,28 @@ def kernels() -> dict[str, Any]:
 
 
 @kernel
-def _draw(words: Any, rates: Any, normal: Any, tables: Any, room: Any, out: Any) -> None:
-    poisson.fill_counts(words, rates, normal, tables, room, out)
+def _draw(words: Any, rates: Any, normal: Any, tables: Any, buffers: Any, out: Any) -> None:
+    poisson.fill_counts(words, rates, normal, tables, buffers, out)
 
 
 @kernel
-def _digitise(counts: Any, words: Any, body: Any, room: Any, out: Any) -> None:
-    physical._convert_to_dn(counts, words, body, (0, 0), 64.0, room, out)
+def _digitise(counts: Any, words: Any, body: Any, buffers: Any, out: Any) -> None:
+    physical._convert_to_dn(counts, words, body, (0, 0), 64.0, buffers, out)
 
 
 @kernel
 def _light(
-    codes: Any, scene: Any, room: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean_dn: Any,
+    codes: Any, scene: Any, buffers: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean_dn: Any,
     tally: Any,
 ) -> None:  # fmt: skip
-    count, of_photograph, run = clean_dn.shape[0], clean.parameter_pointers(scene), segments.buffer_pointers(room)
+    count, of_photograph, run = clean_dn.shape[0], clean.parameter_pointers(scene), segments.buffer_pointers(buffers)
     gains, headroom = load(pointer_to(scene.site_gains, 0), 0), load(pointer_to(scene.site_headroom, 0), 0)
     clean.fill_signal(pointer_to(codes, 0), True, 0, count, of_photograph, pointer_to(camera, 0))
     clean._fill_gray_mean_signal(pointer_to(codes, 0), 0, count, of_photograph, pointer_to(gray, 0))
     clean.fill_linear(count // BLOCK, gains, of_photograph, run, run.clean)
     segments.copy_values(count, run.unrounded_dn, dim)
     clean.recompute_bright(count // BLOCK, gains, headroom, of_photograph, run, run.clean)
-    clean.fill_scene_light(room.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
+    clean.fill_scene_light(buffers.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
     clean.fill_clean_from_light(lit, scene, unrounded, clean_dn, tally)
 
 
@@ -191,10 +191,10 @@ def _round(dn: Any, noisy: Any, tally: Any) -> None:
 
 
 def doubles() -> str:
-    """A digest of what the kernels compute before anything is rounded to a DN, where one bit in the last place shows.
+    """Return the digest of the kernels' values before rounding to DN, which shows a change of one bit.
 
-    A frame would show it once in 10^12 sites. The noisy frame is not seen before it is rounded, so it gets signals that
-    make it end half-way between two DN.
+    Frames would show such a change once in 10^12 sites. Kernels return the noisy frame rounded only, so its signals end
+    half-way between two DN.
     """
     count = segments.LONG_SEGMENT
     n = np.arange(count)
@@ -204,11 +204,11 @@ def doubles() -> str:
     words = np.empty(count, dtype=np.uint32)
     clean_dn, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
 
-    room, of_counts = segments.allocate_buffers(count), poisson.allocate_count_buffers(count)
-    room.signal[:count] = n / 999.0
+    buffers, of_counts = segments.allocate_buffers(count), poisson.allocate_count_buffers(count)
+    buffers.signal[:count] = n / 999.0
     plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
     scene = clean.pair_parameters(plan, np.arange(256) / 255.0, (1, count), (0, 0))
-    _light(codes, scene, room, camera, gray, dim, lit, unrounded, clean_dn, tally)
+    _light(codes, scene, buffers, camera, gray, dim, lit, unrounded, clean_dn, tally)
     key = philox.philox_key(2**33 + 1, 5, 6, 7)
     _draws(key, words)
     normals = float_draws.by_inverse_cdf(words[None], normal_table())[0]
@@ -221,7 +221,7 @@ def doubles() -> str:
     fill_coarse_normals(words, deep, coarse)
     return digest(
         camera, gray, lit, unrounded, clean_dn, normals, counts, digitised, body.response, dim, words, fine, coarse,
-        noisy, tally, room.unrounded_dn[:count], room.bright_light[:count],
+        noisy, tally, buffers.unrounded_dn[:count], buffers.bright_light[:count],
     )  # fmt: skip
 
 
@@ -229,10 +229,10 @@ def doubles() -> str:
 
 
 def code() -> dict[str, Any]:
-    """What stands in the kernels' code: as Numba made it for this target, and as LLVM makes it for others.
+    """Return facts about the kernels' code, compiled by Numba for this target and by LLVM for others.
 
-    Beside each stands the same about a loop that is free to fuse, to show that the target can and that it would be
-    seen. Nothing of it runs, so a target may be a processor that this machine is not.
+    Each entry is paired with that of a loop compiled with fast-math, which proves that the target can fuse operations
+    and that this is detected. Nothing is executed, so that targets can be other processors.
     """
     free = numba.njit(fastmath=True)(multiply_and_add)
     free.compile((numba.float64[::1],) * 3)
@@ -251,13 +251,13 @@ def code() -> dict[str, Any]:
                 for name, target in TARGETS.items()
             },
         },
-        "liberties": [liberties("".join(one)) for one in (ir, free_ir)],
+        "fast-math flags": [fast_math_flags("".join(one)) for one in (ir, free_ir)],
         "called": sorted(set(re.findall(r"call [^@\n]*double>? @([\w.]+)", "".join(ir)))),
     }
 
 
 def compile_kernels() -> None:
-    """Compile the outer kernels, and with them all others, for what they are called with; call none."""
+    """Compile the outer kernels, and with them all others, for the arguments of their calls; execute none."""
     black = np.zeros((2, 2, 3), dtype=np.uint8)
     outer = ((gaussian, "_fill_pairs"), (clean, "_fill_clean_frame"), (gaussian_float32, "_fill_pairs32"))
     of_counts = (
@@ -267,8 +267,12 @@ def compile_kernels() -> None:
         "_fill_prnu_response",
     )
     of_floats = ("_fill_words", "_fill_by_inverse_cdf", "_fill_poisson")
-    for room, name in (*outer, *((physical, name) for name in of_counts), *((float_draws, name) for name in of_floats)):
-        setattr(room, name, compiler(getattr(room, name)))
+    for module, name in (
+        *outer,
+        *((physical, name) for name in of_counts),
+        *((float_draws, name) for name in of_floats),
+    ):
+        setattr(module, name, compiler(getattr(module, name)))
     for plan in selftest.GOLDEN_PLANS.values():
         make_pair(black, plan)
     for name in ("per_channel", "plain", "physical"):
@@ -285,7 +289,7 @@ def compile_kernels() -> None:
 
 
 def compiler(kernel: Any) -> Callable[..., None]:
-    """What compiles a kernel for the arguments that it is called with, and does not run it."""
+    """Return a function that compiles a kernel for its arguments without executing it."""
     return lambda *arguments: kernel.compile(tuple(map(numba.typeof, arguments))) and None
 
 
@@ -295,7 +299,7 @@ def multiply_and_add(x: Any, y: Any, out: Any) -> None:
 
 
 def assembly(modules: list[str], triple: str, cpu: str) -> str | None:
-    """LLVM's code for another processor; None where this LLVM was built without it."""
+    """Return LLVM's code for another processor; None if this LLVM was built without it."""
     try:
         machine = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, opt=3)
     except RuntimeError:
@@ -313,25 +317,25 @@ def instructions(asm: str | None) -> dict[str, list[str]] | None:
     return {"fused": sorted(set(FUSED.findall(asm))), "guessed": sorted(set(GUESSED.findall(asm)))}
 
 
-def liberties(ir: str) -> list[str]:
-    """The flags on arithmetic that allow another result than IEEE 754's."""
+def fast_math_flags(ir: str) -> list[str]:
+    """Return the flags on arithmetic that allow other results than those of IEEE 754."""
     operations = re.findall(r"= (?:\w+ )?(?:f(?:add|sub|mul|div|neg|rem)|call) (.*)", ir)
-    return sorted({word for rest in operations for word in rest.split(" ")[:9] if word in LIBERTIES})
+    return sorted({word for rest in operations for word in rest.split(" ")[:9] if word in FAST_MATH_FLAGS})
 
 
-LIBERTIES = {"fast", "nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
+FAST_MATH_FLAGS = {"fast", "nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 
 def main(facts_path: str, *arguments: str) -> int:
-    told: dict[str, Any]
+    report: dict[str, Any]
     if arguments == ("--code",):
-        exit_code, told = 0, code()
+        exit_code, report = 0, code()
     else:
         sys.argv[1:] = arguments
-        heard = listen()
+        arguments_digest = hash_kernel_arguments()
         exit_code = cli.main()
-        told = facts(heard.hexdigest())
-    Path(facts_path).write_text(json.dumps(told), encoding="utf-8")
+        report = facts(arguments_digest.hexdigest())
+    Path(facts_path).write_text(json.dumps(report), encoding="utf-8")
     return exit_code
 
 

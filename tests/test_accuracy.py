@@ -166,8 +166,8 @@ def test_gaussian_approximation_has_the_stated_cdf_difference(
     bench = session.open_session(config, profiles, LITTLE)
     plans = [plan for _, plan in bench.flat_plans(TIERS[REFERENCE])]
     counted = bench.flat_frames(TIERS[REFERENCE])
-    near = noise.READABLE_DRAWS._replace(poisson=lambda words, rate: rate + np.sqrt(rate) * noise.normals(words))
-    monkeypatch.setattr(noise, "READABLE_DRAWS", near)
+    near = noise.REFERENCE_DRAWS._replace(poisson=lambda words, rate: rate + np.sqrt(rate) * noise.normals(words))
+    monkeypatch.setattr(noise, "REFERENCE_DRAWS", near)
     bench.clear()
     drawn = bench.flat_frames(TIERS[REFERENCE])
 

@@ -76,7 +76,7 @@ def assert_clean_frames_agree(root: Path, dataset: Path) -> int:
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_every_clean_dn_follows_from_the_row_and_the_source(photographs: Path, tmp_path: Path, name: str) -> None:
+def test_every_clean_dn_follows_from_row_and_source(photographs: Path, tmp_path: Path, name: str) -> None:
     given = {"gains": GainsConfig(*BROOKS), "noise": NOISE, **SETTINGS[name]}
     source = SourceConfig(str(photographs), ["*.jpg", "*.png"])
 

@@ -26,7 +26,7 @@ def coloured(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pattern", TILES)
-def test_a_tile_is_its_pattern_read_row_by_row(pattern: str) -> None:
+def test_a_tile_contains_its_pattern_row_by_row(pattern: str) -> None:
     assert tile(pattern) == TILES[pattern]
 
 
@@ -45,13 +45,13 @@ def test_an_origin_shifts_the_tile(origin: tuple[int, int], expected: tuple[tupl
     assert tile("RGGB", origin) == expected
 
 
-def test_the_patterns_are_those_four() -> None:
+def test_there_are_four_patterns() -> None:
     assert set(PATTERNS) == set(TILES)
 
 
 @pytest.mark.parametrize("pattern", ["RGBG", "rggb", "", "XTRANS"])
-def test_another_pattern_is_refused_with_those_that_exist(pattern: str) -> None:
-    with pytest.raises(ValueError, match=f"pattern is '{pattern}', expected one of RGGB, BGGR, GRBG, GBRG"):
+def test_an_unknown_pattern_is_refused_with_the_known_ones(pattern: str) -> None:
+    with pytest.raises(ValueError, match=rf"pattern={pattern}: .*expected one of RGGB, BGGR, GRBG, GBRG"):
         tile(pattern)
 
 
@@ -63,9 +63,7 @@ def test_a_mosaic_by_hand(pattern: str) -> None:
 
 
 @given(st.sampled_from(PATTERNS), st.integers(1, 9), st.integers(1, 9))
-def test_every_site_keeps_its_own_place_and_the_filters_channel_at_any_size(
-    pattern: str, height: int, width: int
-) -> None:
+def test_every_site_records_its_filters_channel_at_any_size(pattern: str, height: int, width: int) -> None:
     raw = mosaic(coloured(height, width), pattern)
     assert raw.shape == (height, width)
     for y in range(height):
@@ -79,7 +77,7 @@ def test_a_single_pixel_is_the_first_site(pattern: str, channel: int) -> None:
 
 
 @given(st.sampled_from(PATTERNS), st.data())
-def test_the_mosaic_of_a_cut_out_is_the_cut_out_of_the_mosaic(pattern: str, data: st.DataObject) -> None:
+def test_the_mosaic_of_a_crop_is_the_crop_of_the_mosaic(pattern: str, data: st.DataObject) -> None:
     colours = coloured(11, 12)
     top, left = data.draw(st.integers(0, 10)), data.draw(st.integers(0, 11))
     bottom, right = data.draw(st.integers(top + 1, 11)), data.draw(st.integers(left + 1, 12))

@@ -56,12 +56,12 @@ def test_rows_of_a_camera_sum_to_exactly_1_in_any_order(camera: str) -> None:
 
 
 @given(weights())
-def test_rows_of_a_mix_sum_to_exactly_1_in_any_order(mix: tuple[float, ...]) -> None:
+def test_rows_of_a_mixture_sum_to_exactly_1_in_any_order(mix: tuple[float, ...]) -> None:
     for row in rows(colour.rgb2cam(colour.mix(tuple(CAMERAS.values()), mix))):
         assert sums(row) == {1.0}
 
 
-def test_rows_of_many_mixes_sum_to_exactly_1_in_any_order() -> None:
+def test_rows_of_many_mixtures_sum_to_exactly_1_in_any_order() -> None:
     """Denser than examples: 5,000 draws of the law itself; without the grid a quarter of the rows would miss."""
     uniforms = np.random.Generator(np.random.Philox(key=0)).random((5000, 4))
     for mix in uniforms / uniforms.sum(axis=1, keepdims=True):
@@ -76,7 +76,7 @@ def test_a_row_with_great_cancellation_sums_to_exactly_1_in_any_order(row: tuple
     assert sums(normalised[:3]) == {1.0}
 
 
-def test_rows_of_matrices_of_ones_own_sum_to_exactly_1_in_any_order() -> None:
+def test_rows_of_custom_matrices_sum_to_exactly_1_in_any_order() -> None:
     """Any matrix that `camera=custom` takes: 20,000 rows with entries up to 4, cancellation and all."""
     random_rows = np.random.Generator(np.random.Philox(key=1)).uniform(-4, 4, (20_000, 3))
     taken = [row for row in random_rows.tolist() if abs(sum(row)) > 0.01]
@@ -114,7 +114,7 @@ def test_a_camera_is_the_exactly_normalised_product(camera: str) -> None:
 
 
 @given(weights())
-def test_a_mix_is_the_exactly_normalised_product_of_the_exact_mix(mix: tuple[float, ...]) -> None:
+def test_a_mixture_is_the_exactly_normalised_product_of_the_exact_mixture(mix: tuple[float, ...]) -> None:
     """Positive weights: what a mix may be off is relative to matrices of which some entries cancel between cameras."""
     mixed = colour.mix(tuple(CAMERAS.values()), mix)
     exact = [sum(Fraction(w) * Fraction(m[i]) for w, m in zip(mix, CAMERAS.values(), strict=True)) for i in range(9)]
@@ -149,7 +149,7 @@ def test_a_mix_needs_a_weight_for_every_matrix() -> None:
         colour.mix((IDENTITY, IDENTITY), (1.0,))
 
 
-def test_rows_that_sum_to_1_already_stay_as_they_are() -> None:
+def test_rows_that_sum_to_1_are_not_changed() -> None:
     assert colour.normalise_rows(IDENTITY) == IDENTITY
 
 
@@ -211,7 +211,7 @@ def nearly_singular(condition: float) -> Matrix:
 
 
 @pytest.mark.parametrize("condition", [1e3, 1e8, 9e9])
-def test_a_matrix_that_keeps_some_digits_is_taken_and_white_stays_white(condition: float) -> None:
+def test_an_ill_conditioned_matrix_is_accepted_and_keeps_white(condition: float) -> None:
     own = nearly_singular(condition)
     assert colour.condition(own) == pytest.approx(condition, rel=5 / condition + condition / 2**53)
     for row in rows(colour.normalise_rows(own)):
@@ -219,7 +219,7 @@ def test_a_matrix_that_keeps_some_digits_is_taken_and_white_stays_white(conditio
 
 
 @pytest.mark.parametrize("condition", [1.1e10, 1e14])
-def test_a_matrix_that_keeps_too_few_digits_is_refused(condition: float) -> None:
+def test_a_nearly_singular_matrix_is_refused(condition: float) -> None:
     with pytest.raises(ValueError, match=r"not invertible \(condition number above 1e\+10\)"):
         colour.normalise_rows(nearly_singular(condition))
 
@@ -235,12 +235,12 @@ def test_a_row_that_sums_to_zero_is_refused() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_an_entry_that_is_no_number_is_refused(bad: float) -> None:
+def test_an_entry_that_is_not_finite_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match="finite"):
         colour.normalise_rows((bad, *IDENTITY[1:]))
 
 
-def test_entries_too_great_for_a_double_are_refused() -> None:
+def test_entries_that_overflow_float64_are_refused() -> None:
     with pytest.raises(ValueError, match=r"finite|not invertible"):
         colour.rgb2cam((1e308,) * 4 + (-1e308,) * 5)
 
@@ -261,7 +261,7 @@ def as_array(camera: Matrix) -> np.ndarray:
         ("sony_rx100", 2.027, 0.325),
     ],
 )
-def test_a_camera_is_as_well_conditioned_as_research_measured(
+def test_condition_numbers_of_cameras_equal_the_measured_ones(
     camera: str, condition: float, determinant: float
 ) -> None:
     """To the digits it gives."""
@@ -271,7 +271,7 @@ def test_a_camera_is_as_well_conditioned_as_research_measured(
 
 
 @given(weights())
-def test_no_mix_is_worse_conditioned_than_the_worst_camera(mix: tuple[float, ...]) -> None:
+def test_no_mixture_is_worse_conditioned_than_the_worst_camera(mix: tuple[float, ...]) -> None:
     found = as_array(colour.rgb2cam(colour.mix(tuple(CAMERAS.values()), mix)))
     assert 1.835 <= np.linalg.cond(found, 2) <= 2.7245
     assert 0.243 <= np.linalg.det(found) <= 0.530
@@ -286,13 +286,11 @@ def test_no_mix_is_worse_conditioned_than_the_worst_camera(mix: tuple[float, ...
         ("sony_rx100", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
     ],
 )
-def test_a_camera_sees_the_rgb_cube_within_the_range_research_measured(
-    camera: str, low: tuple[float, ...], high: tuple[float, ...]
-) -> None:
+def test_the_rgb_cube_maps_to_the_measured_range(camera: str, low: tuple[float, ...], high: tuple[float, ...]) -> None:
     found = as_array(colour.rgb2cam(CAMERAS[camera]))
     assert np.abs(np.minimum(found, 0).sum(axis=1) - low).max() <= 0.00005
     assert np.abs(np.maximum(found, 0).sum(axis=1) - high).max() <= 0.00005
 
 
-def test_the_cameras_stand_in_the_order_of_the_manifests_weights() -> None:
+def test_cameras_are_in_the_order_of_the_manifests_weights() -> None:
     assert list(CAMERAS) == ["nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100"]

@@ -49,18 +49,18 @@ def test_a_normal_is_the_quantile_of_its_tail_probability(index: int) -> None:
 
 
 @pytest.mark.parametrize("octave", range(32))
-def test_a_normal_is_right_on_both_sides_of_every_octaves_edge(octave: int) -> None:
+def test_normals_are_right_at_every_octave_edge(octave: int) -> None:
     for index in {max(2**octave // 2 - 1, 0), 2**octave // 2}:
         assert abs(normal(index) - exact(index)) <= SAMPLER_ERROR
 
 
 @given(st.integers(0, LAST))
-def test_the_top_bit_is_the_sign_and_nothing_else(index: int) -> None:
+def test_the_top_bit_is_the_sign_only(index: int) -> None:
     assert normal(index | 1 << 31) == -normal(index)
     assert normal(index) > 0
 
 
-def test_no_normal_is_farther_out_than_the_first_index() -> None:
+def test_the_first_index_gives_the_largest_normal() -> None:
     """Phi^-1(2**-33) = -6.3379...: the least tail probability there is."""
     farthest = -NormalDist().inv_cdf(2.0**-33)
     assert 6.33 < farthest < 6.34 < REACH
@@ -69,7 +69,7 @@ def test_no_normal_is_farther_out_than_the_first_index() -> None:
     assert normals(edges.astype(np.uint32)).max() == normal(0)
 
 
-def test_normals_fall_from_index_to_index_but_for_the_tables_error() -> None:
+def test_normals_decrease_with_the_index_within_the_table_error() -> None:
     """So that a greater uniform never gives a notably smaller normal: runs through every octave, edges included."""
     starts = [2**octave // 2 * (32 + segment) // 32 for octave in range(32) for segment in range(32)]
     for start in sorted(set(starts)):
@@ -78,7 +78,7 @@ def test_normals_fall_from_index_to_index_but_for_the_tables_error() -> None:
 
 
 @pytest.mark.parametrize("z", [0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 6.3])
-def test_the_share_of_all_words_beyond_z_is_exact_to_the_tables_error(z: float) -> None:
+def test_tail_fractions_are_exact_within_the_table_error(z: float) -> None:
     """2**31 · 2·(1 - Phi(z)) indices lie beyond z; an error e of the table moves the last by 2**32·phi(z)·e."""
     beyond = math.erfc(z / math.sqrt(2)) / 2 * 2**32  # i + ½ below this
     slack = 2**32 * math.exp(-z * z / 2) / math.sqrt(2 * math.pi) * SAMPLER_ERROR * 1.001 + 1
@@ -130,12 +130,12 @@ def test_moments_are_those_of_a_standard_normal(z: np.ndarray, order: int) -> No
 
 @pytest.mark.parametrize("limit", [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_as_many_lie_beyond_each_limit_as_the_law_says(z: np.ndarray, limit: float, side: int) -> None:
+def test_tail_counts_follow_the_normal_distribution(z: np.ndarray, limit: float, side: int) -> None:
     share = math.erfc(limit / math.sqrt(2)) / 2
     assert abs(float((side * z > limit).mean()) - share) <= bernstein(share * (1 - share), 1, COUNT) + SAMPLER_ERROR
 
 
-def test_the_distribution_is_the_normal_one_throughout(z: np.ndarray) -> None:
+def test_the_distribution_is_normal(z: np.ndarray) -> None:
     """Kolmogorov's distance by the inequality of Dvoretzky, Kiefer, Wolfowitz and Massart."""
     ordered = np.sort(z)
     at = np.linspace(0, COUNT - 1, 10_001).astype(np.int64)
@@ -147,17 +147,17 @@ def test_the_distribution_is_the_normal_one_throughout(z: np.ndarray) -> None:
 # Noise ----------------------------------------------------------------------------------------------------------------
 
 
-def test_variance_is_a_line_above_black(plan: Plan) -> None:
+def test_variance_is_linear_above_black(plan: Plan) -> None:
     made = replace(plan, a_dn=2.0, b_dn2=3.0, black_level_dn=240)
     assert noise_variance(np.array([[240.0, 240.5, 241.0, 4095.0]]), made).tolist() == [[3, 4, 5, 7713]]
 
 
-def test_a_variance_below_zero_is_none(plan: Plan) -> None:
+def test_negative_variance_becomes_zero(plan: Plan) -> None:
     made = replace(plan, a_dn=8.0, b_dn2=-120.0, black_level_dn=240)
     assert noise_variance(np.array([[240.0, 254.0, 255.0, 256.0]]), made).tolist() == [[0, 0, 0, 8]]
 
 
-def test_noise_is_the_clean_frame_plus_its_deviation_times_the_streams_normals(plan: Plan) -> None:
+def test_noise_is_the_standard_deviation_times_the_streams_normals(plan: Plan) -> None:
     clean = np.linspace(240, 4095, 12 * 70).reshape(12, 70)
     n = normals(words(plan.stream_key, "heteroscedastic", (12, 70)))
     expected = clean + np.sqrt(plan.a_dn * (clean - 240) + plan.b_dn2) * n
@@ -165,7 +165,7 @@ def test_noise_is_the_clean_frame_plus_its_deviation_times_the_streams_normals(p
 
 
 @given(top=st.integers(0, 11), left=st.integers(0, 69))
-def test_noise_of_a_cut_out_is_the_cut_out_of_the_noise(plan: Plan, top: int, left: int) -> None:
+def test_noise_of_a_crop_is_the_crop_of_the_noise(plan: Plan, top: int, left: int) -> None:
     clean = np.linspace(240, 4095, 12 * 70).reshape(12, 70)
     cut = heteroscedastic(clean[top:, left:], plan, (top, left))
     assert (cut == heteroscedastic(clean, plan)[top:, left:]).all()

@@ -22,7 +22,7 @@ from unprocess_gen.config.accuracy import Budget, choose_methods
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.lookup_tables import tukey_table
-from unprocess_gen.core.types import READABLE, Frame, Plan
+from unprocess_gen.core.types import REFERENCE_METHOD, Frame, Plan
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.effect_selection import facts_for
@@ -67,7 +67,7 @@ def dn(frame: Frame, plan: Plan) -> np.ndarray:
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 63), (2, 65), (1, 1024), (2, 2100)])
 @pytest.mark.parametrize("origin", [(0, 0), (7, 1), (300, 63), (1, 5000)])
-def test_compiled_words_are_those_of_the_streams(shape: tuple[int, int], origin: tuple[int, int]) -> None:
+def test_compiled_words_equal_the_streams(shape: tuple[int, int], origin: tuple[int, int]) -> None:
     key = 0xFEDCBA9876543210
     found = floats.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1)
     assert np.array_equal(found, streams.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1))
@@ -84,11 +84,11 @@ WORDS = np.concatenate(
 
 
 @pytest.mark.parametrize("table", [effects.normal_table(), tukey_table(-0.2), tukey_table(0.0)], ids=["n", "t", "l"])
-def test_compiled_quantiles_are_the_readable_ones_to_the_last_bit(table: np.ndarray) -> None:
+def test_compiled_quantiles_equal_the_reference_bit_for_bit(table: np.ndarray) -> None:
     assert floats.by_inverse_cdf(WORDS, table).tobytes() == effects.by_inverse_cdf(WORDS, table).tobytes()
 
 
-def test_compiled_counts_are_the_readable_ones() -> None:
+def test_compiled_counts_equal_the_reference() -> None:
     rate = np.geomspace(1e-3, 1e6, WORDS.size).reshape(WORDS.shape)
     rate[:, ::7] = 0.0
     assert np.array_equal(floats.poisson(WORDS, rate), reference_poisson.poisson(WORDS, rate))
@@ -99,18 +99,18 @@ def test_compiled_counts_are_the_readable_ones() -> None:
 
 @pytest.mark.parametrize("clip", ["none", "sensor", "black"])
 @pytest.mark.parametrize("name", PLANS)
-def test_the_quick_form_is_the_readable_one_to_the_byte(name: str, clip: str) -> None:
-    plan, picture = normalised(PLANS[name], clip), selftest.golden_picture()
-    ours, theirs = (make_pair(picture, one, ORIGIN) for one in (plan, replace(plan, methods=(READABLE,))))
+def test_kernels_equal_the_reference_byte_for_byte(name: str, clip: str) -> None:
+    plan, picture = normalised(PLANS[name], clip), selftest.golden_image()
+    ours, theirs = (make_pair(picture, one, ORIGIN) for one in (plan, replace(plan, methods=(REFERENCE_METHOD,))))
     assert ours.clean.tobytes() == theirs.clean.tobytes()
     assert ours.noisy.tobytes() == theirs.noisy.tobytes()
     assert ours.counts == theirs.counts
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_a_frame_of_whole_dn_is_the_float_one_rounded(name: str) -> None:
+def test_an_integer_frame_is_the_rounded_float_frame(name: str) -> None:
     """But where a value lies so near the middle of two DN that the cast to float32 may move it: 6e-5 DN at 10 bits."""
-    plan, picture = PLANS[name], selftest.golden_picture()
+    plan, picture = PLANS[name], selftest.golden_image()
     whole, exact = make_pair(picture, plan, ORIGIN), make_pair(picture, normalised(plan), ORIGIN)
     for rounded, frame in ((whole.clean, exact.clean), (whole.noisy, exact.noisy)):
         assert frame.dtype == np.float32
@@ -121,10 +121,10 @@ def test_a_frame_of_whole_dn_is_the_float_one_rounded(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["per_channel", "physical"])
-def test_the_same_sites_are_beyond_the_ends_however_noise_is_clipped(name: str) -> None:
+def test_clipped_counts_do_not_depend_on_the_clipping_mode(name: str) -> None:
     """Levels 64 and 1023 of 10 bits: what lies below DN 0 or above 1023 in the frame that is not clipped is counted."""
     free, sensor, black = (
-        make_pair(selftest.golden_picture(), normalised(PLANS[name], clip), ORIGIN)
+        make_pair(selftest.golden_image(), normalised(PLANS[name], clip), ORIGIN)
         for clip in ("none", "sensor", "black")
     )
     value = free.noisy
@@ -141,12 +141,12 @@ def test_the_same_sites_are_beyond_the_ends_however_noise_is_clipped(name: str) 
 
 def test_the_clean_frame_is_clipped_and_saturated_at_one() -> None:
     """However the noisy one is clipped: step 8 of Algorithm 1 clips the light, and Brooks' code does."""
-    pair = make_pair(selftest.golden_picture(), normalised(PLANS["per_channel"]), ORIGIN)
+    pair = make_pair(selftest.golden_image(), normalised(PLANS["per_channel"]), ORIGIN)
     assert (pair.clean.min(), pair.clean.max()) == (0, 1)
     assert pair.counts.saturated == int((pair.clean == 1).sum()) > 0
 
 
-def test_noise_that_is_not_clipped_has_mean_zero_in_black() -> None:
+def test_unclipped_noise_has_mean_zero_in_black() -> None:
     """Within five standard errors; clipped at black, its mean is that of a normal's upper half, σ/√(2π)."""
     black = np.zeros((512, 512, 3), dtype=np.uint8)
     plan = PLANS["per_channel"]
@@ -158,8 +158,8 @@ def test_noise_that_is_not_clipped_has_mean_zero_in_black() -> None:
 
 
 @pytest.mark.parametrize("name", ["per_channel", "physical", "averaged"])
-def test_bands_and_pieces_leave_no_trace(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan, picture = normalised(PLANS[name]), selftest.golden_picture()
+def test_the_result_does_not_depend_on_bands(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan, picture = normalised(PLANS[name]), selftest.golden_image()
     whole = make_pair(picture, plan, ORIGIN)
     monkeypatch.setattr(floats, "BAND_SITES", 5 * picture.shape[1])
     monkeypatch.setattr(floats, "PIECE_SITES", 2 * picture.shape[1])
@@ -170,8 +170,8 @@ def test_bands_and_pieces_leave_no_trace(name: str, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("name", ["per_channel", "physical"])
-def test_a_cut_out_is_the_cut_out_of_the_full_pair(name: str) -> None:
-    plan, picture = normalised(PLANS[name]), selftest.golden_picture()
+def test_a_crop_is_the_crop_of_the_full_pair(name: str) -> None:
+    plan, picture = normalised(PLANS[name]), selftest.golden_image()
     whole, part = make_pair(picture, plan), make_pair(picture[3:12, 5:70], plan, (3, 5))
     assert np.array_equal(part.clean, whole.clean[3:12, 5:70])
     assert np.array_equal(part.noisy, whole.noisy[3:12, 5:70])
@@ -179,10 +179,10 @@ def test_a_cut_out_is_the_cut_out_of_the_full_pair(name: str) -> None:
 
 @pytest.mark.parametrize("overrides", [FLOATS, FLOATS[1:2]], ids=["both", "packed"])
 @pytest.mark.parametrize("noise", ["imx385_iso3200", "imx385"])
-def test_levels_and_draws_are_those_made_one_by_one(noise: str, overrides: tuple[str, ...], settings: Settings) -> None:
+def test_levels_and_draws_equal_separate_pairs(noise: str, overrides: tuple[str, ...], settings: Settings) -> None:
     levels = "noise.levels=[1600,6400]" if noise == "imx385" else "noise.levels=[{a: 2, b: 3},{a: 4, b: 5}]"
     config = settings(f"noise={noise}", levels, "noise.draws=2", *overrides)
-    picture = selftest.golden_picture()[:18, :82]
+    picture = selftest.golden_image()[:18, :82]
     plans = plan_pairs(config, "0" * 64, facts=facts_for(config, picture))
     assert len(plans) == 4
     for plan, ours in zip(plans, make_pairs(picture, plans), strict=True):
@@ -192,7 +192,7 @@ def test_levels_and_draws_are_those_made_one_by_one(noise: str, overrides: tuple
         assert (ours.noisy.shape, ours.counts) == (alone.noisy.shape, alone.counts)
 
 
-def test_the_instructions_numpy_chooses_move_no_byte() -> None:
+def test_numpys_instruction_sets_change_no_byte() -> None:
     """The golden pairs in float32, whose formulas NumPy computes, in a process of their own."""
     code = (
         "import numpy as np; from unprocess_gen.simulation import self_test as selftest; "
@@ -211,9 +211,7 @@ def test_the_instructions_numpy_chooses_move_no_byte() -> None:
 
 @pytest.mark.parametrize("origin", [(0, 0), (0, 1), (1, 0), (1, 1)])
 @pytest.mark.parametrize("pattern", bayer.PATTERNS)
-def test_planes_are_red_its_green_the_other_green_blue_whatever_the_pattern(
-    pattern: str, origin: tuple[int, int]
-) -> None:
+def test_planes_are_ordered_r_gr_gb_b_for_every_pattern(pattern: str, origin: tuple[int, int]) -> None:
     y, x = np.mgrid[0:6, 0:8]
     sites = np.array(bayer.tile(pattern, origin))
     channel = bayer.pack(sites[y % 2, x % 2].astype(np.uint16), pattern, origin)
@@ -240,8 +238,8 @@ def test_an_odd_side_cannot_be_packed(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("name", PLANS)
-def test_packed_frames_are_mosaics_in_another_order(name: str) -> None:
-    picture = selftest.golden_picture()[:18, :82]
+def test_packed_frames_contain_the_values_of_mosaics(name: str) -> None:
+    picture = selftest.golden_image()[:18, :82]
     for plan in (PLANS[name], normalised(PLANS[name])):
         mosaics, planes = make_pair(picture, plan, ORIGIN), make_pair(picture, replace(plan, layout="packed"), ORIGIN)
         assert planes.noisy.shape == (4, 9, 41)
@@ -253,15 +251,15 @@ def test_packed_frames_are_mosaics_in_another_order(name: str) -> None:
 
 
 @pytest.mark.parametrize("counts", [False, True])
-def test_every_budget_but_the_readable_one_takes_the_same_methods(counts: bool) -> None:
+def test_all_budgets_except_reference_select_the_same_methods(counts: bool) -> None:
     exact, fast = Budget("e", False, 0, 0, 1e-6, 0), Budget("f", False, 1, 1e-3, 1e-3, 5e-3)
     assert choose_methods(exact, counts, normalised=True) == choose_methods(fast, counts, normalised=True)
     assert not any(one.startswith("quantise:") for one in choose_methods(exact, counts, normalised=True))
 
 
 @pytest.mark.parametrize("noise", ["brooks2019", "none", "oppo_reno10x"])
-def test_floats_say_that_they_are_not_rounded(noise: str, settings: Settings) -> None:
-    picture = selftest.golden_picture()
+def test_float_frames_skip_quantisation(noise: str, settings: Settings) -> None:
+    picture = selftest.golden_image()
     for overrides, rounded in ((FLOATS, False), ((), True)):
         config = settings(f"noise={noise}", *overrides)
         validate_config(config)
@@ -270,24 +268,24 @@ def test_floats_say_that_they_are_not_rounded(noise: str, settings: Settings) ->
         assert ("quantise: float output is not rounded" in plan.skipped) != rounded
 
 
-def test_rounding_hides_nothing_where_nothing_is_rounded(settings: Settings) -> None:
+def test_rounding_noise_masks_nothing_in_float_frames(settings: Settings) -> None:
     """A column pattern of 0.01 DN in a clean frame that has it is hidden by its rounding alone."""
     noise = ("noise=nikon_d850", "clean.includes_fixed_pattern=true")
     effects_of = {}
     for dtype in ("uint16", "float32"):
         config = settings(*noise, f"output.dtype={dtype}")
         config.noise.branches[0].column_std_dn = 1e-4
-        effects_of[dtype] = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_picture())).effects
+        effects_of[dtype] = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image())).effects
     assert "column" not in effects_of["uint16"]
     assert "column" in effects_of["float32"]
 
 
-def test_an_effect_that_no_noise_hides_is_decided_without_a_division_by_it(settings: Settings) -> None:
+def test_an_effect_without_masking_noise_is_decided(settings: Settings) -> None:
     config = settings(
         "noise=nikon_d850", "noise.full_well_e=1000", "noise.assumed=[]", "effects.shot=off", "effects.read=off",
         "effects.dark_current=off", "output.dtype=float32",
     )  # fmt: skip
-    plan = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_picture()))
+    plan = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image()))
     assert "full_well" in plan.effects
 
 
@@ -302,7 +300,7 @@ def packed(photos: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
-def test_items_are_typed_arrays_of_the_rows_form(packed: Path) -> None:
+def test_items_have_the_dtype_and_layout_of_their_rows(packed: Path) -> None:
     pairs = RawPairs(packed)
     assert len(pairs) == 12
     for clean, noisy, row in pairs:
@@ -313,18 +311,18 @@ def test_items_are_typed_arrays_of_the_rows_form(packed: Path) -> None:
         assert clean.max() <= 1
 
 
-def test_an_odd_side_loses_its_last_row_or_column_and_the_row_says_which_size_is_left(packed: Path) -> None:
+def test_an_odd_side_loses_its_last_row_or_column(packed: Path) -> None:
     sizes = {str(row["source"]): (row["height"], row["width"]) for _, _, row in RawPairs(packed)}
     assert sizes["comma, and space.jpg"] == (22, 36)  # 23 x 37
     assert sizes["strip.bmp"] == (2, 40)  # 3 x 40
 
 
-def test_an_image_that_holds_no_tile_fails_as_unsupported(packed: Path) -> None:
+def test_an_image_without_a_complete_tile_is_unsupported(packed: Path) -> None:
     rows = (packed / "manifest.csv").read_text(encoding="utf-8").splitlines()
     assert [line for line in rows if ",unsupported," in line] == [line for line in rows if ",one.png," in line] != []
 
 
-def test_cropped_planes_are_the_cut_out_of_the_whole_mosaic(packed: Path, photos: Path, make: Make) -> None:
+def test_cropped_planes_equal_the_cropped_mosaic(packed: Path, photos: Path, make: Make) -> None:
     mosaics = packed.parent / "mosaics"
     make(photos, mosaics, "noise=brooks2019", FLOATS[0], FLOATS[2])
     whole = {row["source"]: (noisy, row) for _, noisy, row in RawPairs(mosaics)}
@@ -334,7 +332,7 @@ def test_cropped_planes_are_the_cut_out_of_the_whole_mosaic(packed: Path, photos
         assert row["stream_key"] == of_mosaic["stream_key"]
 
 
-def test_every_byte_is_checked_and_every_pair_made_again(packed: Path, photos: Path) -> None:
+def test_every_byte_is_verified_and_every_pair_regenerated(packed: Path, photos: Path) -> None:
     from unprocess_gen.dataset.manifest import read_rows
 
     assert verify(packed) == []
@@ -343,7 +341,7 @@ def test_every_byte_is_checked_and_every_pair_made_again(packed: Path, photos: P
     assert not any(one.complaint for one in again)
 
 
-def test_a_flipped_bit_is_found_and_mended(packed: Path, photos: Path, door: Door, tmp_path: Path) -> None:
+def test_a_flipped_bit_is_found_and_repaired(packed: Path, photos: Path, door: Door, tmp_path: Path) -> None:
     shutil.copytree(packed, tmp_path / "ds")
     shard = tmp_path / "ds/shards/shard-00000.tar"
     content = bytearray(shard.read_bytes())
@@ -356,7 +354,7 @@ def test_a_flipped_bit_is_found_and_mended(packed: Path, photos: Path, door: Doo
 
 
 @pytest.mark.parametrize("overrides", [FLOATS, FLOATS[:1], FLOATS[1:2]], ids=["both", "float32", "packed"])
-def test_the_bytes_are_told_exactly(
+def test_the_estimated_bytes_are_exact(
     overrides: tuple[str, ...], photos: Path, make: Make, settings: Settings, tmp_path: Path
 ) -> None:
     """Whole images and, in 13 photographs, odd sides and one that fails."""
@@ -367,7 +365,7 @@ def test_the_bytes_are_told_exactly(
     assert told.bytes == summary.bytes == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
 
 
-def test_the_plan_says_what_odd_sides_lose(photos: Path, door: Door) -> None:
+def test_plan_reports_the_loss_of_odd_sides(photos: Path, door: Door) -> None:
     done = door("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
     assert done.code == 0
     assert "packed    8 of 12 images have an odd side, whose last row or column is left out: " in done.out
@@ -382,7 +380,7 @@ def test_arrays_are_the_same_in_every_tier(accuracy: str, packed: Path, photos: 
     assert digests[0] == digests[1]
 
 
-def test_a_second_run_has_nothing_to_do_and_another_dtype_is_refused(
+def test_rerun_does_nothing_and_another_dtype_is_refused(
     packed: Path, photos: Path, door: Door, tree_hash: Callable[[Path], str]
 ) -> None:
     before = tree_hash(packed)
@@ -402,13 +400,13 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(
     assert tree_hash(tmp_path / "ds") == tree_hash(packed)
 
 
-def test_a_dataset_is_made_again_from_its_settings(packed: Path, photos: Path, door: Door) -> None:
+def test_a_dataset_is_regenerated_from_its_config(packed: Path, photos: Path, door: Door) -> None:
     done = door("again", packed, f"source.root={photos}", "out=again", "n_jobs=1", "source.max_failed=1")
     assert done.code == 0
     assert "the same as" in done.out
 
 
-def test_bytes_are_little_endian_and_digests_are_theirs(packed: Path) -> None:
+def test_bytes_are_little_endian_and_match_the_digests(packed: Path) -> None:
     import xxhash
 
     clean, noisy, row = RawPairs(packed)[0]
@@ -428,7 +426,7 @@ def test_bytes_are_little_endian_and_digests_are_theirs(packed: Path) -> None:
         pytest.param(("noise=sony_a7s2", "scene=low_light", "sensor=generic_14bit", FLOATS[0]), marks=pytest.mark.slow),
     ],
 )
-def test_the_noise_in_the_arrays_is_the_rows(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
+def test_the_noise_of_the_arrays_fits_the_rows(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1", *overrides)
     found = list(transfer.iterate_fits(tmp_path / "ds"))
     assert len(found) == 1
@@ -449,7 +447,7 @@ def test_the_noise_in_the_arrays_is_the_rows(overrides: tuple[str, ...], make: M
         (("output.dtype=float32", "effects.quantise=on"), "effects.quantise=on: output.dtype=float32 is not rounded"),
     ],
 )
-def test_what_cannot_be_meant_costs_one_line(
+def test_contradictory_output_settings_give_one_line(
     arguments: tuple[str, ...], complaint: str, door: Door, tmp_path: Path
 ) -> None:
     done = door(*arguments)
@@ -457,7 +455,7 @@ def test_what_cannot_be_meant_costs_one_line(
     assert complaint in done.err
 
 
-def test_accuracy_is_measured_in_whole_dn(door: Door, tmp_path: Path) -> None:
+def test_accuracy_requires_integer_frames(door: Door, tmp_path: Path) -> None:
     done = door("accuracy", "output.dtype=float32")
     assert (done.code, list(tmp_path.iterdir())) == (2, [])
     assert "errors are measured in whole DN; say output.dtype=uint16" in done.err

@@ -54,7 +54,7 @@ def residuals(out: Path, source: str) -> dict[str, np.ndarray]:
     }
 
 
-def test_there_is_a_row_for_every_pair_and_one_for_a_failure(many: Path) -> None:
+def test_there_is_one_row_per_pair_and_per_failure(many: Path) -> None:
     keys = [row["key"] for row in rows(many)]
     pairs = [f"-l{level:02d}d{draw:02d}" for level, draw in itertools.product(range(3), range(2))]
     assert keys == [
@@ -64,7 +64,7 @@ def test_there_is_a_row_for_every_pair_and_one_for_a_failure(many: Path) -> None
     ]
 
 
-def test_a_sample_holds_the_clean_frame_once_and_every_noisy_one(many: Path) -> None:
+def test_a_sample_has_one_clean_frame_and_all_noisy_ones(many: Path) -> None:
     with tarfile.open(many / "shards" / "shard-00000.tar") as shard:
         names = [name.partition(".")[2] for name in shard.getnames() if name.startswith("00000001.")]
     assert names == [
@@ -73,7 +73,7 @@ def test_a_sample_holds_the_clean_frame_once_and_every_noisy_one(many: Path) -> 
     ]
 
 
-def test_the_pairs_of_an_image_share_all_but_the_noise(many: Path) -> None:
+def test_the_pairs_of_an_image_differ_in_noise_only(many: Path) -> None:
     own = {"key", "level", "draw", "a_dn", "b_dn2", "noisy_xxh3", "noisy_clipped_low", "noisy_clipped_high"}
     for _, some in itertools.groupby(rows(many), key=lambda row: row["key"][:8]):
         shared = [{name: value for name, value in row.items() if name not in own} for row in some]
@@ -86,7 +86,7 @@ def test_the_end_of_a_run_counts_pairs(door: Door) -> None:
     assert "; 4 of 4 made now, " in said
 
 
-def test_each_level_draws_its_own_noise_and_the_draws_of_a_level_share_it(many: Path) -> None:
+def test_levels_draw_their_own_profile_and_draws_share_it(many: Path) -> None:
     levels = {(row["level"], row["a_dn"], row["b_dn2"]) for row in rows(many) if row["source"] == "large.png"}
     assert len(levels) == 3
     assert len({a for _, a, _ in levels}) == 3
@@ -99,7 +99,7 @@ def test_noise_of_levels_and_draws_is_independent(many: Path) -> None:
     assert np.abs(found - np.eye(6)).max() < 6 / np.sqrt(32_000)
 
 
-def test_the_first_level_and_draw_is_the_pair_that_would_be_made_alone(
+def test_the_first_level_and_draw_equals_a_single_pair(
     many: Path, photographs: Path, make: Make, tmp_path: Path
 ) -> None:
     make(photographs, tmp_path / "one", "noise=brooks2019")
@@ -107,14 +107,14 @@ def test_the_first_level_and_draw_is_the_pair_that_would_be_made_alone(
     assert {row["source"]: row["noisy_xxh3"] for row in rows(tmp_path / "one")} == first
 
 
-def test_every_pair_can_be_made_again_from_its_row(many: Path, photographs: Path) -> None:
+def test_every_pair_is_regenerated_from_its_row(many: Path, photographs: Path) -> None:
     assert verify(many) == []
     replayed = list(replay(read_rows(many / "manifest.csv"), str(photographs)))
     assert len(replayed) == 24
     assert [one for one in replayed if one.complaint] == []
 
 
-def test_a_damaged_draw_is_named_and_mended_alone(
+def test_a_damaged_draw_is_named_and_repaired(
     many: Path, photographs: Path, make: Make, door: Door, tmp_path: Path
 ) -> None:
     make(
@@ -131,7 +131,7 @@ def test_a_damaged_draw_is_named_and_mended_alone(
     assert path.read_bytes() == (many / "shards" / "shard-00000.tar").read_bytes()
 
 
-def test_a_manifest_is_written_again_from_the_rows_in_the_shards(many: Path, door: Door, tmp_path: Path) -> None:
+def test_a_manifest_is_regenerated_from_the_shards(many: Path, door: Door, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(many, tmp_path / "ds"))
     (copy / "manifest.csv").unlink()
     done = door("verify", copy, "--repair")
@@ -139,7 +139,7 @@ def test_a_manifest_is_written_again_from_the_rows_in_the_shards(many: Path, doo
     assert (copy / "manifest.csv").read_bytes() == (many / "manifest.csv").read_bytes()
 
 
-def test_an_images_key_chooses_all_of_its_pairs(many: Path, photographs: Path, door: Door) -> None:
+def test_an_images_key_selects_all_of_its_pairs(many: Path, photographs: Path, door: Door) -> None:
     assert door("replay", many, "--keys", "00000001").out.startswith("6 pairs are the same")
     assert door("replay", many, "--keys", "00000001-l02d01").out.startswith("1 pairs are the same")
 
@@ -177,7 +177,7 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
         (("source.dequantize=yes",), r"source.dequantize=yes: expected one of off, dither"),
     ],
 )
-def test_what_cannot_be_meant_is_refused(settings: Settings, overrides: tuple[str, ...], complaint: str) -> None:
+def test_contradictory_levels_are_refused(settings: Settings, overrides: tuple[str, ...], complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         validate_config(settings(*overrides))
 
@@ -218,7 +218,7 @@ def test_each_folder_is_a_clip_whose_frames_are_in_order(filmed: Path) -> None:
 DRAWN = ("stream_key", "rgb2cam_00", "red_gain", "inverse_rgb_gain", "b_dn2", "row_std_dn", "body_key")
 
 
-def test_frames_of_a_clip_share_their_draws_and_clips_do_not(filmed: Path) -> None:
+def test_frames_of_a_clip_share_drawn_parameters(filmed: Path) -> None:
     drawn = {clip: {tuple(row[name] for name in DRAWN) for row in some} for clip, some in by_clip(filmed).items()}
     assert {clip: len(found) for clip, found in drawn.items()} == {".": 1, "one": 1, "two/deep": 1}
     for position in range(len(DRAWN)):
@@ -239,7 +239,7 @@ def test_noise_of_frames_is_independent(filmed: Path) -> None:
     assert np.abs(found - np.eye(4)).max() < 6 / np.sqrt(12_288)
 
 
-def test_another_clip_moves_nothing(clips: Path, filmed: Path, make: Make, tmp_path: Path) -> None:
+def test_another_clip_changes_nothing(clips: Path, filmed: Path, make: Make, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(clips, tmp_path / "clips"))
     shutil.rmtree(copy / "one")
     make(copy, tmp_path / "ds", *PHYSICAL)
@@ -247,7 +247,7 @@ def test_another_clip_moves_nothing(clips: Path, filmed: Path, make: Make, tmp_p
     assert {row["source"]: row["noisy_xxh3"] for row in rows(tmp_path / "ds")} == kept
 
 
-def test_a_copy_of_a_clip_has_draws_of_its_own(clips: Path, make: Make, tmp_path: Path) -> None:
+def test_a_copied_clip_has_its_own_parameters(clips: Path, make: Make, tmp_path: Path) -> None:
     copy = tmp_path / "clips"
     shutil.copytree(clips / "one", copy / "a")
     shutil.copytree(clips / "one", copy / "b")
@@ -255,5 +255,5 @@ def test_a_copy_of_a_clip_has_draws_of_its_own(clips: Path, make: Make, tmp_path
     assert len({row["stream_key"] for row in rows(tmp_path / "ds")}) == 2
 
 
-def test_frames_can_be_made_again_from_their_rows_alone(filmed: Path, clips: Path) -> None:
+def test_frames_are_regenerated_from_their_rows(filmed: Path, clips: Path) -> None:
     assert [one for one in replay(read_rows(filmed / "manifest.csv"), str(clips)) if one.complaint] == []

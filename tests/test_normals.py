@@ -67,7 +67,7 @@ LAWS = {"normal": normal_table(), **{f"tukey {shape}": tukey_table(shape) for sh
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_quick_values_are_within_the_error_that_is_claimed(law: str) -> None:
+def test_approximate_values_are_within_their_error_bound(law: str) -> None:
     table, words = LAWS[law], telling_words()
     form = build_quantile_tables(table)
     off = np.abs(quick(words, form) - effects.by_inverse_cdf(words, table))
@@ -76,17 +76,17 @@ def test_quick_values_are_within_the_error_that_is_claimed(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_the_exact_value_of_a_word_is_the_reference_s(law: str) -> None:
+def test_the_exact_value_of_a_word_equals_the_reference(law: str) -> None:
     words = telling_words()
     assert (exact(words, build_quantile_tables(LAWS[law])) == effects.by_inverse_cdf(words, LAWS[law])).all()
 
 
-def test_normals_are_known_to_a_hundred_thousandth() -> None:
+def test_approximate_normals_are_within_1e_5() -> None:
     assert normal_quantile_tables().error < 1e-5
 
 
 @pytest.mark.slow
-def test_quick_normals_are_within_their_error_for_every_word() -> None:
+def test_approximate_normals_are_within_their_error_for_every_word() -> None:
     form = normal_quantile_tables()
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
@@ -109,14 +109,14 @@ def by_polynomial(words: np.ndarray, which: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("which", POLYNOMIALS)
-def test_normals_by_polynomials_are_as_near_as_they_say(which: str) -> None:
+def test_polynomial_normals_are_within_their_error(which: str) -> None:
     words, error = telling_words(), POLYNOMIALS[which][1]
     off = np.abs(by_polynomial(words, which) - effects.normals(words))
     assert 0.9 * error < off.max() <= error
 
 
 @pytest.mark.parametrize("which", POLYNOMIALS)
-def test_normals_by_polynomials_have_their_word_s_sign(which: str) -> None:
+def test_polynomial_normals_have_the_sign_of_their_word(which: str) -> None:
     words = telling_words()
     half = words.size // 2
     made = by_polynomial(words, which)
@@ -125,7 +125,7 @@ def test_normals_by_polynomials_have_their_word_s_sign(which: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", POLYNOMIALS)
-def test_normals_by_polynomials_are_as_near_as_they_say_for_every_word(which: str) -> None:
+def test_polynomial_normals_are_within_their_error_for_every_word(which: str) -> None:
     form, worst = normal_quantile_tables(), 0.0
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)

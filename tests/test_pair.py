@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL, is_steep, method
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import IN_FLOAT32, Pair, Plan
+from unprocess_gen.core.types import FLOAT32_METHOD, Pair, Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.kernels import gaussian_float32 as single
-from unprocess_gen.simulation.pair import AT_ONCE, make_pair, make_pairs, reference_pair
+from unprocess_gen.simulation.pair import FRAMES_PER_PASS, make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS
 from unprocess_gen.simulation.reference.noise import EFFECTS
@@ -55,7 +55,7 @@ def assert_same(srgb: np.ndarray, plan: Plan) -> None:
 
 @pytest.mark.parametrize("highlight", HIGHLIGHTS)
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_fast_form_equals_the_reference_for_every_gain_and_sensor(
+def test_kernels_equal_the_reference_for_every_gain_and_sensor(
     scene: np.ndarray, plan: Plan, highlight: str, pattern: str
 ) -> None:
     for inverse, bits in itertools.product(INVERSE_GAINS, SENSORS):
@@ -66,7 +66,7 @@ def test_fast_form_equals_the_reference_for_every_gain_and_sensor(
 
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 @pytest.mark.parametrize(("tone", "gamma"), [("smoothstep", 2.2), ("none", 2.2), ("none", "srgb"), ("none", 1.0)])
-def test_fast_form_equals_the_reference_for_every_camera_and_curve(
+def test_kernels_equal_the_reference_for_every_camera_and_curve(
     scene: np.ndarray, plan: Plan, camera: str, tone: str, gamma: float | str
 ) -> None:
     matrix = colour.rgb2cam(colour.CAMERAS[camera])
@@ -76,13 +76,13 @@ def test_fast_form_equals_the_reference_for_every_camera_and_curve(
 
 @pytest.mark.parametrize("clip", ["sensor", "black"])
 @pytest.mark.parametrize(("a_dn", "b_dn2"), [(0.0, 0.0), (0.0, 30.0), (8.0, 0.0), (8.0034, -122.69544), (80.0, 2e4)])
-def test_fast_form_equals_the_reference_for_every_noise(
+def test_kernels_equal_the_reference_for_every_noise(
     scene: np.ndarray, plan: Plan, clip: str, a_dn: float, b_dn2: float
 ) -> None:
     assert_same(scene, replace(plan, a_dn=a_dn, b_dn2=b_dn2, sensor_clip=clip))
 
 
-def test_fast_form_equals_the_reference_on_sixteen_bits(plan: Plan) -> None:
+def test_kernels_equal_the_reference_on_16_bit_sources(plan: Plan) -> None:
     codes = np.random.Generator(np.random.Philox(key=1)).integers(0, 65536, (67, 93, 3)).astype(np.uint16)
 
     for bits in SENSORS:
@@ -90,7 +90,7 @@ def test_fast_form_equals_the_reference_on_sixteen_bits(plan: Plan) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (1, 1025), (3, 1024), (2, 2049), (513, 1)])
-def test_fast_form_equals_the_reference_for_every_shape(plan: Plan, shape: tuple[int, int]) -> None:
+def test_kernels_equal_the_reference_for_every_shape(plan: Plan, shape: tuple[int, int]) -> None:
     srgb = np.random.Generator(np.random.Philox(key=2)).integers(0, 256, (*shape, 3)).astype(np.uint8)
 
     assert_same(srgb, plan)
@@ -98,7 +98,7 @@ def test_fast_form_equals_the_reference_for_every_shape(plan: Plan, shape: tuple
 
 @settings(max_examples=60, deadline=None)
 @given(top=st.integers(0, 210), left=st.integers(0, 296), height=st.integers(1, 90), width=st.integers(1, 200))
-def test_a_tile_is_the_same_cut_out_of_the_frame(top: int, left: int, height: int, width: int) -> None:
+def test_the_pair_of_a_crop_is_the_crop_of_the_pair(top: int, left: int, height: int, width: int) -> None:
     noise = NoiseConfig("n", "dn", "subtracted", 12, 240, 4095, 6.955588, 38.117816)
     plan = plan_image(Config(gains=GainsConfig(2.1, 1.7, 0.8), noise=noise), "5" * 64)
     scene = np.ascontiguousarray(synthetic.scene("highlights-0")[150:361, 300:597])
@@ -110,7 +110,7 @@ def test_a_tile_is_the_same_cut_out_of_the_frame(top: int, left: int, height: in
     np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
 
 
-def test_a_frame_comes_out_pixel_by_pixel(plan: Plan, scene: np.ndarray) -> None:
+def test_single_pixels_equal_those_of_the_frame(plan: Plan, scene: np.ndarray) -> None:
     whole = make_pair(scene, plan)
 
     for y, x in [(0, 0), (0, 15), (0, 16), (7, 63), (8, 64), (210, 296)]:
@@ -122,7 +122,7 @@ def test_a_frame_comes_out_pixel_by_pixel(plan: Plan, scene: np.ndarray) -> None
 # Several noise levels of one clean frame ------------------------------------------------------------------------------
 
 NOISES = ((0.5, 2.0), (8.0034, -122.69544), (0.0, 0.0), (80.0, 2e4), (3.0, 0.0), (9.0, 0.25), (2.0, 64.0))
-assert len(NOISES) > AT_ONCE
+assert len(NOISES) > FRAMES_PER_PASS
 
 
 def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
@@ -138,16 +138,16 @@ def levels_of(plan: Plan, **of_every_one: object) -> list[Plan]:
         {"highlight": "gray_mean", "sensor_clip": "black"},
         {"dequantize": "dither"},
         {"exposure_ratio": 3.0, "frame": 5},
-        {"methods": (IN_FLOAT32,)},
-        {"methods": (IN_FLOAT32,), "highlight": "gray_mean", "saturated": "pinned"},
+        {"methods": (FLOAT32_METHOD,)},
+        {"methods": (FLOAT32_METHOD,), "highlight": "gray_mean", "saturated": "pinned"},
         {"noise_law": "poisson", "b_dn2": 3.0},
-        {"noise_law": "poisson", "b_dn2": 3.0, "methods": (IN_FLOAT32,)},
+        {"noise_law": "poisson", "b_dn2": 3.0, "methods": (FLOAT32_METHOD,)},
         {"physics": GOLDEN_PHYSICS, "effects": EFFECTS},
         {"physics": replace(GOLDEN_PHYSICS, fixed_pattern_in_clean=True), "effects": EFFECTS},
     ],
     ids=lambda options: ",".join(options) or "as it is",
 )
-def test_levels_of_one_clean_frame_are_the_pairs_that_are_made_alone(
+def test_levels_of_one_clean_frame_equal_separate_pairs(
     scene: np.ndarray, plan: Plan, options: dict[str, object]
 ) -> None:
     plans = levels_of(plan, **options)
@@ -162,9 +162,7 @@ def test_levels_of_one_clean_frame_are_the_pairs_that_are_made_alone(
         assert pair.counts == alone.counts
 
 
-def test_levels_that_differ_in_more_than_the_line_are_the_pairs_that_are_made_alone(
-    scene: np.ndarray, plan: Plan
-) -> None:
+def test_levels_with_different_noise_models_equal_separate_pairs(scene: np.ndarray, plan: Plan) -> None:
     others = ({"saturated": "pinned"}, {"sensor_clip": "black"}, {"noise_law": "poisson", "b_dn2": 3.0}, {})
     for kinds in (others[:2], others):
         plans = [replace(plan, level=n, **other) for n, other in enumerate(kinds)]  # type: ignore[arg-type]
@@ -176,7 +174,7 @@ def test_levels_that_differ_in_more_than_the_line_are_the_pairs_that_are_made_al
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 1025), (3, 1024), (513, 1)])
-def test_levels_are_the_same_for_every_shape_and_sixteen_bits(plan: Plan, shape: tuple[int, int]) -> None:
+def test_levels_are_equal_for_every_shape_and_16_bit_sources(plan: Plan, shape: tuple[int, int]) -> None:
     srgb = np.random.Generator(np.random.Philox(key=3)).integers(0, 65536, (*shape, 3)).astype(np.uint16)
 
     for one, pair in zip(levels_of(plan), make_pairs(srgb, levels_of(plan)), strict=True):
@@ -189,7 +187,7 @@ def test_the_clean_frame_of_several_levels_is_one_array(scene: np.ndarray, plan:
     assert all(other.clean is first.clean for other in others)
 
 
-def test_one_plan_gives_one_pair_and_none_gives_none(scene: np.ndarray, plan: Plan) -> None:
+def test_one_plan_gives_one_pair_and_no_plan_none(scene: np.ndarray, plan: Plan) -> None:
     (pair,) = make_pairs(scene, [plan])
 
     np.testing.assert_array_equal(pair.noisy, make_pair(scene, plan).noisy)
@@ -209,10 +207,8 @@ def test_one_plan_gives_one_pair_and_none_gives_none(scene: np.ndarray, plan: Pl
     ],
     ids=lambda other: next(iter(other)),
 )
-def test_plans_of_different_clean_frames_are_refused_at_once(
-    scene: np.ndarray, plan: Plan, other: dict[str, object]
-) -> None:
-    with pytest.raises(ValueError, match="do not share the clean frame"):
+def test_plans_of_different_clean_frames_are_refused(scene: np.ndarray, plan: Plan, other: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="clean frames of the plans differ"):
         make_pairs(scene, [plan, replace(plan, **other)])  # type: ignore[arg-type]
 
 
@@ -234,9 +230,7 @@ def assert_within(differing: int, worst: int, sites: int) -> None:
 
 @pytest.mark.parametrize("highlight", HIGHLIGHTS)
 @pytest.mark.parametrize("camera", colour.CAMERAS)
-def test_float32_is_as_near_the_reference_as_it_says_on_a_sample_of_colours(
-    plan: Plan, camera: str, highlight: str
-) -> None:
+def test_float32_is_within_its_error_on_sampled_colours(plan: Plan, camera: str, highlight: str) -> None:
     codes = np.random.Generator(np.random.Philox(key=4)).integers(0, 256, (512, 1024, 3)).astype(np.uint8)
     made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]), highlight=highlight)
 
@@ -246,7 +240,7 @@ def test_float32_is_as_near_the_reference_as_it_says_on_a_sample_of_colours(
 
 
 @pytest.mark.parametrize("camera", colour.CAMERAS)
-def test_float32_is_as_near_the_reference_as_it_says_on_all_grays_of_16_bits(plan: Plan, camera: str) -> None:
+def test_float32_is_within_its_error_on_16_bit_grays(plan: Plan, camera: str) -> None:
     """Each gray on each of the four sites."""
     made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
     grays = np.arange(2**16, dtype=np.uint16).repeat(2)
@@ -259,7 +253,7 @@ def test_float32_is_as_near_the_reference_as_it_says_on_all_grays_of_16_bits(pla
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", colour.CAMERAS)
-def test_float32_is_as_near_the_reference_as_it_says_on_all_colours(plan: Plan, camera: str) -> None:
+def test_float32_is_within_its_error_on_all_colours(plan: Plan, camera: str) -> None:
     """Each colour on each of the four sites."""
     made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
     green, blue = np.mgrid[:256, :256]
@@ -286,7 +280,7 @@ def test_float32_is_as_near_the_reference_as_it_says_on_all_colours(plan: Plan, 
     ids=lambda options: ",".join(options) or "as it is",
 )
 @pytest.mark.parametrize("bits", SENSORS)
-def test_the_noisy_frame_in_float32_is_near_the_reference_and_counts_alike(
+def test_float32_noisy_frames_and_counts_are_near_the_reference(
     scene: np.ndarray, plan: Plan, options: dict[str, object], bits: int
 ) -> None:
     made = replace(with_sensor(plan, bits), **options)  # type: ignore[arg-type]
@@ -310,7 +304,7 @@ def test_the_noisy_frame_in_float32_is_near_the_reference_and_counts_alike(
     highlight=st.sampled_from(HIGHLIGHTS),
     bits=st.sampled_from([14, 16]),
 )
-def test_float32_holds_what_it_states_wherever_it_is_chosen(
+def test_float32_is_within_its_error_wherever_it_is_chosen(
     plan: Plan,
     threshold: float,
     entries: list[float],
@@ -349,7 +343,7 @@ def test_white_is_white_and_black_is_black_in_float32(plan: Plan, bits: int) -> 
         assert (pair.counts.saturated, pair.counts.clean_clipped_low, pair.counts.clean_clipped_high) == (2, 0, 0)
 
 
-def test_a_tile_in_float32_is_the_same_cut_out_of_the_frame(plan: Plan, scene: np.ndarray) -> None:
+def test_a_float32_crop_is_the_crop_of_the_frame(plan: Plan, scene: np.ndarray) -> None:
     whole = in_float32(scene, plan)
 
     for top, left, height, width in [(0, 0, 1, 1), (7, 63, 5, 2), (8, 64, 90, 65), (11, 1, 200, 296)]:
@@ -358,7 +352,7 @@ def test_a_tile_in_float32_is_the_same_cut_out_of_the_frame(plan: Plan, scene: n
         np.testing.assert_array_equal(tile.noisy, whole.noisy[top : top + height, left : left + width])
 
 
-def test_noise_far_beyond_16_bits_is_clipped_in_float32(plan: Plan) -> None:
+def test_large_noise_is_clipped_in_float32(plan: Plan) -> None:
     gray = np.full((32, 64, 3), 128, dtype=np.uint8)
     wide = replace(with_sensor(plan, 16), a_dn=0.0, b_dn2=1e15)
 
@@ -387,7 +381,7 @@ def test_white_is_white_and_black_is_black(plan: Plan, camera: str, highlight: s
         assert pair.counts.clean_clipped_low == 0
 
 
-def test_white_that_no_gain_lifts_is_not_counted_as_clipped(plan: Plan) -> None:
+def test_white_without_gain_is_not_counted_as_clipped(plan: Plan) -> None:
     white = np.full((64, 64, 3), 255, dtype=np.uint8)
 
     for camera in colour.CAMERAS.values():
@@ -401,14 +395,14 @@ def test_without_noise_the_noisy_frame_is_the_clean_one(plan: Plan, scene: np.nd
     assert pair.counts.zero_variance == scene.shape[0] * scene.shape[1]
 
 
-def test_noise_keeps_the_pedestal_unless_told_otherwise(plan: Plan) -> None:
+def test_noise_keeps_the_pedestal_by_default(plan: Plan) -> None:
     dark = np.zeros((128, 128, 3), dtype=np.uint8)
 
     assert make_pair(dark, plan).noisy.min() < 240
     assert make_pair(dark, replace(plan, sensor_clip="black")).noisy.min() == 240
 
 
-def test_the_pixels_are_left_untouched(plan: Plan, scene: np.ndarray) -> None:
+def test_the_input_is_not_modified(plan: Plan, scene: np.ndarray) -> None:
     before = scene.copy()
 
     make_pair(scene, plan)
@@ -433,9 +427,7 @@ def test_other_arrays_are_refused(plan: Plan, form: object, wrong: np.ndarray) -
 
 @pytest.mark.parametrize(("black", "white", "rounded"), [(240, 4095, 2168), (241, 4092, 2166)])
 @pytest.mark.parametrize("make", [make_pair, reference_pair])
-def test_a_value_half_way_between_two_dn_goes_to_the_even_one(
-    plan: Plan, make: object, black: int, white: int, rounded: int
-) -> None:
+def test_halves_are_rounded_to_the_even_dn(plan: Plan, make: object, black: int, white: int, rounded: int) -> None:
     """White at half the light: 240 + 3855 / 2 = 2167.5 and 241 + 3851 / 2 = 2166.5."""
     half = replace(plan, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=0.5, highlight="none", a_dn=0.0, b_dn2=0.0)
     white_patch = np.full((4, 6, 3), 255, dtype=np.uint8)
@@ -446,7 +438,7 @@ def test_a_value_half_way_between_two_dn_goes_to_the_even_one(
 
 
 @pytest.mark.parametrize("make", [make_pair, reference_pair])
-def test_noise_far_beyond_16_bits_is_clipped_and_never_wraps(plan: Plan, make: object) -> None:
+def test_large_noise_is_clipped_and_never_wraps(plan: Plan, make: object) -> None:
     """The greatest variance that settings allow: a deviation of 3e7 DN, half of it below and half above the sensor."""
     gray = np.full((32, 64, 3), 128, dtype=np.uint8)
     wide = replace(plan, bits=16, black_level_dn=4096, white_level_dn=65535, a_dn=0.0, b_dn2=1e15)

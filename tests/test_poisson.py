@@ -86,7 +86,7 @@ def law(rate: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("rate", [1e-6, 0.3, 3.7, 63.99, 100.0, 12345.678])
-def test_the_law_the_tests_compare_with_is_that_of_an_independent_library(rate: float) -> None:
+def test_the_tests_distribution_function_equals_mpmath(rate: float) -> None:
     counts, cdf = law(rate)
     with mpmath.workdps(40):
         for k, share in list(zip(counts, cdf, strict=True))[:: max(len(counts) // 12, 1)]:
@@ -117,42 +117,44 @@ LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
 
 
 @pytest.mark.parametrize("rate", PROFILE_RANGES)
-def test_the_share_of_all_words_up_to_every_count_is_the_law_to_one_word(rate: float) -> None:
+def test_counts_follow_the_distribution_to_one_word(rate: float) -> None:
     """The promise is one word in 2**32; what is kept is little more than half of one, the least there can be."""
     assert np.abs(error_in_words(rate)).max() <= LEAST_ERROR + COMPUTED_ERROR
 
 
 @pytest.mark.parametrize("rate", [0.3, 12.5, LIMIT, 12345.678, 1e9])
-def test_the_reference_keeps_the_law_too(rate: float) -> None:
+def test_reference_counts_follow_the_distribution(rate: float) -> None:
     assert np.abs(error_in_words(rate, poisson, most=60)).max() <= LEAST_ERROR + COMPUTED_ERROR
 
 
-def test_the_law_holds_at_rates_nobody_chose() -> None:
+def test_the_distribution_holds_at_random_rates() -> None:
     for rate in random_rates(180, seed=1):
         assert np.abs(error_in_words(min(float(rate), 1e7), most=120)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
 
 
 @pytest.mark.parametrize("cell", range(80))
-def test_the_law_holds_at_both_ends_of_every_cell_of_the_tables(cell: int) -> None:
+def test_the_distribution_holds_at_the_ends_of_every_cell(cell: int) -> None:
     for inside in (1e-9, 1 - 1e-9):
         rate = ((cell + inside) / 10) ** 2
         assert np.abs(error_in_words(rate, most=150)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
 
 
 @pytest.mark.slow
-def test_the_law_holds_at_thousands_of_rates() -> None:
+def test_the_distribution_holds_at_thousands_of_rates() -> None:
     for rate in random_rates(6000, seed=2):
         assert np.abs(error_in_words(min(float(rate), 1e7), most=150)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
 
 
 @pytest.mark.parametrize("rate", [1e-12, 1e-6, 0.01, 0.3, 1.0, 3.7, 12.5, 20.0])
-def test_the_probability_of_none_is_exp_of_minus_the_rate(rate: float) -> None:
+def test_the_probability_of_zero_is_exp_of_minus_the_rate(rate: float) -> None:
     none = int(words_up_to(np.zeros(1), np.array([rate]), fast)[0])
     assert abs(none - math.exp(-rate) * WORDS) <= 1
 
 
 @pytest.mark.parametrize(("coefficients", "factor"), [("A", 1.001), ("B", 1.001), ("C", 1.001), ("D", 1.1), ("E", 2)])
-def test_a_wrong_coefficient_breaks_the_law(coefficients: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_coefficient_breaks_the_distribution(
+    coefficients: str, factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The first of each; the last two count for so little that a thousandth of them is no error at all."""
     first, *others = getattr(poissons, coefficients)
     monkeypatch.setattr(poissons, coefficients, (first * factor, *others))
@@ -160,7 +162,7 @@ def test_a_wrong_coefficient_breaks_the_law(coefficients: str, factor: float, mo
 
 
 @pytest.mark.parametrize("n", range(8))
-def test_a_wrong_entry_of_the_tables_breaks_the_law(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_table_entry_breaks_the_distribution(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Coefficient n of the middle row of a cell, off by the more the less it counts for."""
     right = poisson_tables()
     cell = 55
@@ -176,7 +178,7 @@ def test_a_wrong_entry_of_the_tables_breaks_the_law(n: int, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("rate", PROFILE_RANGES)
-def test_counts_rise_with_the_normal_of_the_word(rate: float) -> None:
+def test_counts_increase_with_the_words_normal(rate: float) -> None:
     """Around the words where the count changes, in both tails, and at random."""
     counts, _ = law(rate)
     chosen = counts[np.unique(np.linspace(0, len(counts) - 1, 100).astype(np.int64))]
@@ -199,7 +201,7 @@ def test_a_count_follows_the_normal_of_its_word(rate: float) -> None:
     assert below.max() <= 1 + slack
 
 
-def test_a_greater_rate_never_gives_a_smaller_count() -> None:
+def test_a_larger_rate_never_gives_a_smaller_count() -> None:
     words = np.repeat(np.random.default_rng(5).integers(0, WORDS, 300, dtype=np.uint32), 400)
     rates = np.tile(np.sort(random_rates(400 // 3 * 3 + 3, seed=6)[:400]), 300)
     assert (np.diff(fast(words, rates).reshape(300, 400), axis=1) >= 0).all()
@@ -217,7 +219,7 @@ def pairs(words: list[int], rates: list[float]) -> tuple[np.ndarray, np.ndarray]
     return np.repeat(np.array(words, dtype=np.uint32), len(rates)), np.tile(np.array(rates), len(words))
 
 
-def test_the_fast_form_gives_what_the_reference_gives_for_words_and_rates_of_all_magnitudes() -> None:
+def test_kernels_equal_the_reference_for_all_magnitudes() -> None:
     rng = np.random.default_rng(7)
     rates = random_rates(999_999, seed=8)
     words = rng.integers(0, WORDS, len(rates), dtype=np.uint32)
@@ -225,7 +227,7 @@ def test_the_fast_form_gives_what_the_reference_gives_for_words_and_rates_of_all
     assert (fast(words, rates) == poisson(words, rates)).all()
 
 
-def test_the_fast_form_gives_what_the_reference_gives_at_the_edges() -> None:
+def test_kernels_equal_the_reference_at_the_edges() -> None:
     rates = [
         *NO_RATES,
         *TINY_RATES,
@@ -240,7 +242,7 @@ def test_the_fast_form_gives_what_the_reference_gives_at_the_edges() -> None:
     assert (counts == np.rint(counts)).all()
 
 
-def test_the_fast_form_gives_what_the_reference_gives_where_counts_change() -> None:
+def test_kernels_equal_the_reference_where_counts_change() -> None:
     rates = np.repeat(random_rates(1200, seed=9), 12)
     counts = np.floor(rates + np.sqrt(rates) * np.tile(np.linspace(-5, 6, 12), 1200))
     edges = words_up_to(counts, rates, fast)
@@ -316,7 +318,7 @@ def test_rows_of_any_length(count: int) -> None:
     assert fast(words, rates).tolist() == poisson(words, rates).tolist()
 
 
-def test_the_reference_keeps_the_shape() -> None:
+def test_reference_counts_have_the_shape_of_the_words() -> None:
     words = np.arange(24, dtype=np.uint32).reshape(2, 3, 4)
     counts = poisson(words, np.full((2, 3, 4), 70.0))
     assert counts.shape == (2, 3, 4)
@@ -344,7 +346,7 @@ COUNT = 2**20
 
 
 @pytest.mark.parametrize("rate", [0.01, 0.3, 3.7, 30.0, 64.0, 1e3, 1e6])
-def test_moments_are_those_of_the_law(rate: float) -> None:
+def test_moments_are_those_of_the_distribution(rate: float) -> None:
     """Mean, variance and third central moment are all the rate; bounds from those up to the sixth.
 
     No count is farther out than the law's 2**-33; half a word at each of its counts moves a moment by that much less.
@@ -366,7 +368,7 @@ def test_the_tables_have_the_published_hash() -> None:
     assert poissons.digest(poisson_tables()) == poissons.TABLES_SHA256
 
 
-def test_tables_that_come_out_otherwise_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_with_another_hash_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     poisson_tables.cache_clear()
     monkeypatch.setattr(poissons, "TABLES_SHA256", "0" * 64)
     with pytest.raises(MachineError, match="expected 0000"):
@@ -374,11 +376,11 @@ def test_tables_that_come_out_otherwise_are_refused(monkeypatch: pytest.MonkeyPa
     poisson_tables.cache_clear()
 
 
-def test_the_tables_cannot_be_written_to() -> None:
+def test_poisson_tables_are_read_only() -> None:
     assert not any(table.flags.writeable for table in poisson_tables())
 
 
-def test_the_hash_sees_every_table() -> None:
+def test_the_hash_covers_every_table() -> None:
     right = poisson_tables()
     for name, table in right._asdict().items():
         wrong = table.copy()
@@ -386,7 +388,7 @@ def test_the_hash_sees_every_table() -> None:
         assert poissons.digest(right._replace(**{name: wrong})) != poissons.TABLES_SHA256
 
 
-def test_the_sharpened_normal_is_the_quantile_to_1e_12_of_the_distribution() -> None:
+def test_the_refined_normal_has_a_cdf_error_below_1e_12() -> None:
     """Where the normal of the table was off by 1.5e-7; at the word's tail probability, with an independent library."""
     rng = np.random.default_rng(11)
     indices = [0, 1, 5, SIGN - 1, SIGN - 2, *rng.integers(0, SIGN, 60), *(2 ** (31 * rng.random(60))).astype(np.int64)]
@@ -398,7 +400,7 @@ def test_the_sharpened_normal_is_the_quantile_to_1e_12_of_the_distribution() -> 
             assert abs(mpmath.erfc(mpmath.mpf(w) / mpmath.sqrt(2)) / 2 - tail) < 1e-12
 
 
-def test_only_the_reference_order_and_no_fast_math() -> None:
+def test_poisson_kernels_are_compiled_without_fast_math() -> None:
     compiled = [value for value in vars(kernels).values() if hasattr(value, "targetoptions")]
     assert len(compiled) >= 5
     assert not any(kernel.targetoptions.get("fastmath") for kernel in compiled)
@@ -494,7 +496,7 @@ def test_the_expansion_solves_its_equation(rate: float) -> None:
             assert abs(share - mpmath.ncdf(mpmath.mpf(normal))) < 5e-12
 
 
-def test_the_table_of_distribution_functions_is_right_at_both_ends_of_every_cell() -> None:
+def test_the_cdf_table_is_right_at_the_ends_of_every_cell() -> None:
     found = poisson_tables()
     for cell in range(80):
         for rate in ((cell / 10) ** 2 or 1e-12, ((cell + 1) / 10) ** 2):
@@ -505,7 +507,7 @@ def test_the_table_of_distribution_functions_is_right_at_both_ends_of_every_cell
             assert np.abs(tabulated - cdf[k - counts[0]]).max() < 1e-11
 
 
-def test_the_tail_table_shares_the_normals_of_the_words() -> None:
+def test_the_tail_table_and_the_normal_table_share_cells() -> None:
     """The reference makes the normal of a word as `effects.normals` does, bit for bit."""
     words = np.random.default_rng(12).integers(0, SIGN, 100_000, dtype=np.uint32)
     assert (poissons._quantile(poissons._tail(words)) == normals(words)).all()

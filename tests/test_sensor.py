@@ -40,7 +40,7 @@ def test_light_outside_0_and_1_is_clipped() -> None:
     assert to_dn(light, 240, 4095).tolist() == [[240, 240, 4095, 4095, 4095]]
 
 
-def test_light_in_between_is_a_line_and_not_rounded() -> None:
+def test_light_between_black_and_white_is_linear_and_unrounded() -> None:
     assert to_dn(np.array([[0.25, 0.5, 2.0**-12]]), 100, 4196).tolist() == [[1124, 2148, 101]]
     assert to_dn(np.array([[2.0**-13]]), 100, 4196).tolist() == [[100.5]]
 
@@ -52,7 +52,7 @@ def test_halves_are_rounded_to_even() -> None:
     assert quantise(np.array([0.5, 1.5, 2.5, 3.5, 4094.5]), 0, 4095).tolist() == [0, 2, 2, 4, 4094]
 
 
-def test_all_else_is_rounded_to_the_nearest() -> None:
+def test_other_values_are_rounded_to_the_nearest() -> None:
     below, above = math.nextafter(2.5, 0), math.nextafter(2.5, 9)
     assert quantise(np.array([0.49, 0.51, below, above, 7.0]), 0, 4095).tolist() == [0, 1, 2, 3, 7]
 
@@ -63,7 +63,7 @@ def test_values_are_clipped_before_they_are_cast() -> None:
     assert quantise(values, 0, 65535).tolist() == [0, 0, 65535, 65535, 65535, 65535, 0]
 
 
-def test_the_limits_are_the_callers() -> None:
+def test_limits_are_those_of_the_caller() -> None:
     assert quantise(np.array([-5.0, 239.6, 240.4, 4095.6]), 240, 4095).tolist() == [240, 240, 240, 4095]
 
 
@@ -73,7 +73,7 @@ def test_rounding_comes_before_the_clip() -> None:
 
 
 @given(st.integers(0, 65535))
-def test_whole_numbers_pass_unchanged(dn: int) -> None:
+def test_integers_are_unchanged(dn: int) -> None:
     assert quantise(np.array([float(dn)]), 0, 65535).tolist() == [dn]
 
 
@@ -86,7 +86,7 @@ def test_quantised_frames_are_uint16() -> None:
     [(12, 240, "sensor", (0, 4095)), (12, 240, "black", (240, 4095)), (16, 4096, "sensor", (0, 65535)),
      (10, 64, "black", (64, 1023)), (14, 0, "black", (0, 16383))],
 )  # fmt: skip
-def test_noisy_frames_keep_the_pedestal_unless_told_to_clip_at_black(
+def test_noisy_frames_keep_the_pedestal_unless_clipped_at_black(
     bits: int, black: int, clip: str, limits: tuple[int, int]
 ) -> None:
     assert noisy_limits(bits, black, clip) == limits
@@ -96,11 +96,11 @@ def test_noisy_frames_keep_the_pedestal_unless_told_to_clip_at_black(
 
 
 @given(st.floats(0, 1e4), st.floats(-1e6, 1e6))
-def test_a_profile_on_its_own_sensor_stays_as_it_is_to_the_last_bit(a: float, b: float) -> None:
+def test_a_profile_on_its_own_sensor_is_unchanged(a: float, b: float) -> None:
     assert convert(a, b) == (a, b)
 
 
-def test_a_line_with_the_black_level_in_it_moves_to_black() -> None:
+def test_an_included_black_level_is_subtracted() -> None:
     """RVDD: -2043.51144 + 8.0034 · 240 = -122.69544; the sum's own size, 2043, decides its rounding."""
     a, b = convert(8.0034, -2043.51144, black="included")
     assert a == 8.0034
@@ -109,7 +109,7 @@ def test_a_line_with_the_black_level_in_it_moves_to_black() -> None:
     assert abs(Fraction(b) - exact) <= slack
 
 
-def test_a_line_with_the_black_level_in_it_gives_the_same_variance_at_every_level() -> None:
+def test_subtracting_black_preserves_the_variance_at_every_level() -> None:
     """Zero at 255.33 DN, as its author's line is: 2043.51144 / 8.0034."""
     a, b = convert(8.0034, -2043.51144, black="included")
     for raw in (240, 255.33, 300, 4095):
@@ -117,7 +117,7 @@ def test_a_line_with_the_black_level_in_it_gives_the_same_variance_at_every_leve
         assert abs(Fraction(a) * (Fraction(str(raw)) - 240) + Fraction(b) - published) <= Fraction(1, 10**11)
 
 
-def test_a_profile_meets_more_bits_through_the_scale_of_the_levels() -> None:
+def test_a_profile_is_scaled_by_the_ratio_of_level_ranges() -> None:
     """s = 15359 / 3855: slope times s, intercept times s²."""
     s = Fraction(16383 - 1024, 4095 - 240)
     a, b = convert(6.955588, 38.117816, sensor_levels_dn=GENERIC_14)
@@ -125,13 +125,13 @@ def test_a_profile_meets_more_bits_through_the_scale_of_the_levels() -> None:
     hold_close(b, Fraction(38.117816) * s * s, 4)
 
 
-def test_the_profiles_black_level_is_taken_out_before_the_scale() -> None:
+def test_the_profiles_black_level_is_subtracted_before_scaling() -> None:
     s = Fraction(16383 - 1024, 4095 - 240)
     _, b = convert(1.0, 10.0, black="included", sensor_levels_dn=GENERIC_14)
     hold_close(b, 250 * s * s, 4)
 
 
-def test_normalized_units_take_the_sensors_own_range() -> None:
+def test_normalized_units_use_the_sensors_range() -> None:
     """Brooks et al.: a · 3855, b · 3855²; the profile has no levels of its own."""
     a, b = convert(0.01, 0.001, units="normalized", profile_levels_dn=(0, 0))
     hold_close(a, Fraction(0.01) * 3855, 1)
@@ -139,7 +139,7 @@ def test_normalized_units_take_the_sensors_own_range() -> None:
 
 
 @given(st.floats(1e-4, 50), st.floats(0, 2000), st.floats(0, 1))
-def test_the_noise_to_signal_ratio_does_not_know_the_sensors_bits(a: float, b: float, light: float) -> None:
+def test_the_noise_to_signal_ratio_does_not_depend_on_bits(a: float, b: float, light: float) -> None:
     """The variance over the range squared is the same on both sensors, to the rounding of four operations."""
     other_a, other_b = convert(a, b, sensor_levels_dn=GENERIC_14)
     here = (Fraction(a) * Fraction(light) * 3855 + Fraction(b)) / 3855**2

@@ -63,7 +63,9 @@ def test_philox_gives_the_answers_published_with_random123(counter: str, key: st
 
 
 @given(st.tuples(*[st.integers(0, 2**32 - 1)] * 4), keys)
-def test_philox_is_the_published_recipe_for_any_counter_and_key(counter: tuple[int, int, int, int], key: int) -> None:
+def test_philox_equals_the_published_algorithm_for_any_counter_and_key(
+    counter: tuple[int, int, int, int], key: int
+) -> None:
     assert philox(counter, key) == philox_by_hand(counter, key)
 
 
@@ -75,7 +77,7 @@ def word_by_hand(key: int, y: int, x: int, purpose_word: int, frame: int) -> int
 
 
 @given(keys, places, places, st.integers(0, 4095), st.integers(0, 4095), st.integers(0, 2**32 - 1))
-def test_a_pixels_word_is_the_one_its_place_and_purpose_name(
+def test_a_pixels_word_depends_on_position_and_purpose(
     key: int, y: int, x: int, level: int, draw: int, frame: int
 ) -> None:
     found = words(key, "heteroscedastic", (1, 1), origin=(y, x), frame=frame, level=level, draw=draw)
@@ -84,7 +86,7 @@ def test_a_pixels_word_is_the_one_its_place_and_purpose_name(
 
 
 @given(keys, places, places, st.integers(1, 5), st.integers(1, 200))
-def test_a_tile_is_its_pixels_one_by_one(key: int, y: int, x: int, height: int, width: int) -> None:
+def test_a_tile_contains_the_words_of_its_pixels(key: int, y: int, x: int, height: int, width: int) -> None:
     tile = words(key, "heteroscedastic", (height, width), origin=(y, x))
     for row, column in itertools.product(range(height), {0, width // 3, width // 2, width - 1}):
         assert tile[row, column] == word_by_hand(key, y + row, x + column, 1 << 24, 0)
@@ -94,14 +96,14 @@ WHOLE = words(KEY, "heteroscedastic", (48, 400))
 
 
 @given(st.data())
-def test_any_tile_is_the_cut_out_of_the_whole(data: st.DataObject) -> None:
+def test_any_tile_is_a_crop_of_the_full_frame(data: st.DataObject) -> None:
     top, left = data.draw(st.integers(0, 47)), data.draw(st.integers(0, 399))
     height, width = data.draw(st.integers(1, 48 - top)), data.draw(st.integers(1, 400 - left))
     tile = words(KEY, "heteroscedastic", (height, width), origin=(top, left))
     assert (tile == WHOLE[top : top + height, left : left + width]).all()
 
 
-def test_the_layout_does_not_know_the_width() -> None:
+def test_the_layout_does_not_depend_on_the_width() -> None:
     for width in (1, 15, 16, 63, 64, 65, 129):
         assert (words(KEY, "heteroscedastic", (3, width)) == WHOLE[:3, :width]).all()
 
@@ -110,7 +112,7 @@ def test_an_empty_tile_has_no_words() -> None:
     assert words(KEY, "heteroscedastic", (0, 5)).shape == (0, 5)
 
 
-def test_the_streams_numbers_are_those_of_every_dataset_ever_made() -> None:
+def test_stream_numbers_never_change() -> None:
     assert streams.STREAMS == {
         "parameters": 0, "heteroscedastic": 1, "prnu": 2, "shot": 3, "dark_current": 4, "hot_pixels": 5, "read": 6,
         "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10, "patch": 11,
@@ -144,7 +146,7 @@ def test_another_purpose_or_key_gives_other_words(other: np.ndarray) -> None:
     assert int(equal.sum()) <= 1
 
 
-def test_every_stream_level_and_draw_is_a_purpose_of_its_own() -> None:
+def test_streams_levels_and_draws_have_distinct_purposes() -> None:
     corners = (0, 1, 255, 256, 4094, 4095)
     found = [purpose(*which) for which in itertools.product(streams.STREAMS, corners, corners)]
     assert len(set(found)) == len(found)
@@ -152,7 +154,7 @@ def test_every_stream_level_and_draw_is_a_purpose_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(("level", "draw"), [(-1, 0), (4096, 0), (0, -1), (0, 4096)])
-def test_a_level_or_draw_that_would_spill_into_its_neighbour_is_refused(level: int, draw: int) -> None:
+def test_a_level_or_draw_out_of_range_is_refused(level: int, draw: int) -> None:
     with pytest.raises(ValueError, match="expected 0 to 4095"):
         purpose("heteroscedastic", level, draw)
 
@@ -165,12 +167,12 @@ def test_an_unknown_stream_is_refused() -> None:
 # Keys -----------------------------------------------------------------------------------------------------------------
 
 
-def test_a_key_is_what_it_was_in_every_dataset_ever_made() -> None:
+def test_image_keys_never_change() -> None:
     name = f"unprocess_gen stream 1\0{7}\0{SHA}\0{2}".encode()
     assert stream_key(7, SHA, 2) == int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "big")
 
 
-def test_a_bodys_key_is_what_it_was_in_every_dataset_ever_made() -> None:
+def test_body_keys_never_change() -> None:
     name = f"unprocess_gen body 1\0{7}\0sony_a7s2\0{2}".encode()
     assert body_key(7, "sony_a7s2", "2") == int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "big")
 
@@ -193,7 +195,7 @@ def test_a_key_changes_with_the_seed_the_photograph_and_the_occurrence(seed: int
     assert all(0 <= key < 2**64 for key in found)
 
 
-def test_no_seed_and_occurrence_can_be_mistaken_for_others() -> None:
+def test_distinct_seeds_and_occurrences_have_distinct_keys() -> None:
     found = {stream_key(seed, SHA, occurrence) for seed in range(64) for occurrence in range(64)}
     assert len(found) == 64 * 64
 
@@ -213,7 +215,7 @@ def test_parameters_are_odd_multiples_of_2_to_the_minus_53_between_0_and_1(key: 
 
 
 @given(keys, st.integers(0, 20))
-def test_appending_parameters_moves_none(key: int, count: int) -> None:
+def test_appending_parameters_changes_none(key: int, count: int) -> None:
     assert parameter_uniforms(key, count) == parameter_uniforms(key, 21)[:count]
 
 
@@ -224,7 +226,7 @@ def test_parameter_n_is_the_first_52_bits_of_counter_n(key: int, number: int) ->
 
 
 @given(keys, st.integers(0, 50))
-def test_places_of_patch_n_are_the_first_two_words_of_its_counter(key: int, number: int) -> None:
+def test_patch_n_uses_the_first_two_words_of_its_counter(key: int, number: int) -> None:
     first, second, _, _ = philox_by_hand((0, number, STREAMS["patch"] << 24, 0), key)
     assert patch_words(key, number + 1)[number] == (first, second)
 
@@ -250,7 +252,7 @@ def chi_square_bounds(freedom: int) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("position", [0, 8, 16, 24])
-def test_all_byte_values_are_as_frequent(position: int) -> None:
+def test_byte_values_are_equally_frequent(position: int) -> None:
     """Pearson's statistic, 4096 expected in each of 256 cells."""
     byte = (words(KEY, "heteroscedastic", (SIDE, SIDE)) >> np.uint32(position)) & np.uint32(255)
     expected = SIDE * SIDE / 256
@@ -266,7 +268,7 @@ def hold_uncorrelated(a: np.ndarray, b: np.ndarray) -> None:
 
 @pytest.mark.parametrize("axis", [0, 1], ids=["y", "x"])
 @pytest.mark.parametrize("lag", [1, 2, 16, 32, 64, 512])
-def test_pixels_do_not_lean_on_their_neighbours(axis: int, lag: int) -> None:
+def test_lagged_random_words_are_uncorrelated(axis: int, lag: int) -> None:
     u = np.moveaxis(CENTRED["here"], axis, 0)
     for start in (0, lag):  # runs of `lag` rows, alternately first and second of a pair
         blocks = u[start : SIDE - (SIDE - start) % (2 * lag)].reshape(-1, 2, lag, SIDE)
@@ -278,11 +280,11 @@ def test_pixels_do_not_lean_on_their_neighbours(axis: int, lag: int) -> None:
     ("one", "other"),
     [("here", other) for other in ("next frame", "next level", "next draw", "next key")] + [("seed", "next seed")],
 )
-def test_streams_do_not_lean_on_each_other(one: str, other: str) -> None:
+def test_streams_are_uncorrelated(one: str, other: str) -> None:
     hold_uncorrelated(CENTRED[one], CENTRED[other])
 
 
-def test_a_correlation_of_a_hundredth_would_be_noticed() -> None:
+def test_a_correlation_of_a_hundredth_is_detected() -> None:
     """The bound above has teeth: (u + 0.01 v)·v has a mean product of 0.01 / 12."""
     leaning = CENTRED["here"] + 0.01 * CENTRED["next key"]
     assert abs(float((leaning * CENTRED["next key"]).mean())) > bernstein(1 / 144, 1 / 4, SIDE * SIDE)

@@ -83,12 +83,12 @@ def test_every_16_bit_entry_is_correctly_rounded(tone: str, gamma: str) -> None:
 
 
 @pytest.mark.parametrize("gamma", ["1.8", "2.4", "0.45", "10", "3.3333333333333335"])
-def test_a_gamma_of_ones_own_is_correctly_rounded(gamma: str) -> None:
+def test_a_custom_gamma_is_correctly_rounded(gamma: str) -> None:
     assert wrongly_rounded("smoothstep", gamma, 256) == []
 
 
 @pytest.mark.parametrize(("tone", "gamma", "codes"), [*CURVES, ("smoothstep", "10", 256), ("none", "0.1", 256)])
-def test_a_curve_starts_at_0_ends_at_1_and_rises_all_the_way(tone: str, gamma: str, codes: int) -> None:
+def test_curves_increase_from_0_to_1(tone: str, gamma: str, codes: int) -> None:
     table = tone_curves.linear_table(tone, gamma, codes)
     assert table.shape == (codes,)
     assert (table[0], table[-1]) == (0.0, 1.0)
@@ -100,31 +100,31 @@ def test_a_curve_has_the_published_hash(tone: str, gamma: str, codes: int) -> No
     assert lookup_tables.sha256(tone_curves.linear_table(tone, gamma, codes)) == PUBLISHED_SHA256[tone, gamma, codes]
 
 
-def test_the_default_curve_has_the_hash_that_research_found_independently() -> None:
+def test_the_default_curve_has_an_independently_computed_hash() -> None:
     digest = "d358dd03d38f763306ef83a982403114f2ff8e5397025f2c68dbe50e85503bfa"
     assert lookup_tables.sha256(tone_curves.linear_table("smoothstep", 2.2, 256)) == digest
 
 
-def test_the_default_curve_has_the_spot_values_that_research_found_independently() -> None:
+def test_the_default_curve_has_independently_computed_values() -> None:
     table = tone_curves.linear_table("smoothstep", 2.2, 256)
     assert table[1] == float.fromhex("0x1.6a87dde8e4622p-11")
     assert table[127] == float.fromhex("0x1.bb298acba41f1p-3")
     assert table[254] == float.fromhex("0x1.d7ac0bca1d3e3p-1")
 
 
-def test_a_curve_that_comes_out_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch, no_cached_curves: None) -> None:
+def test_a_curve_with_another_hash_is_refused(monkeypatch: pytest.MonkeyPatch, no_cached_curves: None) -> None:
     monkeypatch.setitem(PUBLISHED_SHA256, ("none", "2.2", 256), "0" * 64)
     with pytest.raises(MachineError, match="expected 0000"):
         tone_curves.linear_table("none", 2.2, 256)
 
 
-def test_a_table_cannot_be_written_to() -> None:
+def test_tables_are_read_only() -> None:
     for table in (tone_curves.linear_table("none", 1, 256), lookup_tables.normal_table()):
         with pytest.raises(ValueError, match="read-only"):
             table[0] = 1
 
 
-def test_an_unknown_tone_is_named_with_those_that_exist() -> None:
+def test_an_unknown_tone_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"tone=filmic: .*expected one of smoothstep, none"):
         tone_curves.linear_table("filmic", 2.2, 256)
 
@@ -137,7 +137,7 @@ def test_gamma_is_spelled_as_the_shortest_number(gamma: float | str, text: str) 
     assert types.gamma_text(gamma) == text
 
 
-def test_whole_gammas_are_one_curve_however_they_are_written() -> None:
+def test_integer_gammas_share_one_curve() -> None:
     assert tone_curves.linear_table("none", 1, 256) is tone_curves.linear_table("none", 1.0, 256)
 
 
@@ -297,13 +297,13 @@ def test_the_normal_table_has_the_published_hash() -> None:
     assert lookup_tables.sha256(lookup_tables.normal_table()) == lookup_tables.NORMAL_SHA256 == digest
 
 
-def test_the_table_is_within_its_error_on_both_sides_of_every_edge() -> None:
+def test_the_error_bound_holds_at_every_edge() -> None:
     j = np.array([*SMALL_J, *EDGES, 2**32 - 1])
     exact = np.array([-float(exact_distributions.normal_quantile(Decimal(int(value)) / 2**33)) for value in j])
     assert np.abs(by_table(j) - exact).max() <= 1.5e-7
 
 
-def test_the_table_is_within_its_error_all_through_every_segment() -> None:
+def test_the_error_bound_holds_within_every_segment() -> None:
     within = np.linspace(0, 1, 97)[:-1]
     j = np.concatenate([2.0**octave * (1 + (segment + within) / 32) for octave in range(32) for segment in range(32)])
     quantile = NormalDist().inv_cdf
@@ -312,7 +312,7 @@ def test_the_table_is_within_its_error_all_through_every_segment() -> None:
 
 
 @pytest.mark.parametrize("index", [0, 1, 2**16, 2**30, 2**31 - 1])
-def test_the_table_is_within_its_error_against_an_independent_library(index: int) -> None:
+def test_the_error_bound_holds_against_mpmath(index: int) -> None:
     with mpmath.workdps(30):
         exact = mpmath.sqrt(2) * mpmath.erfinv(1 - (2 * index + 1) / mpmath.mpf(2) ** 32)
         assert abs(by_table(np.array(2 * index + 1)) - exact) <= 1.5e-7
@@ -322,13 +322,13 @@ def test_the_last_index_is_next_to_the_middle() -> None:
     assert 0 < by_table(np.array(2**32 - 1)) < 1.5e-7
 
 
-def test_the_quantile_falls_within_every_segment() -> None:
+def test_the_quantile_decreases_within_every_segment() -> None:
     _, c1, c2 = lookup_tables.normal_table().T
     assert (c1 < 0).all()
     assert (c1 + 2 * c2 / lookup_tables.SEGMENTS < 0).all()
 
 
-def test_quantiles_to_25_digits_of_what_the_table_needs() -> None:
+def test_quantiles_of_the_table_have_25_digits() -> None:
     """Against erfinv of another library, the whole range of the table and its mirror."""
     ks = [1, 3, 2**10 + 1, 2**20 + 1, 2**28 - 1, 2**31, 2**32 - 1, 2**32 + 1, 2**33 - 2**20, 2**33 - 3, 2**33 - 1]
     with localcontext(prec=60), mpmath.workdps(60):
@@ -340,7 +340,7 @@ def test_quantiles_to_25_digits_of_what_the_table_needs() -> None:
 
 
 @pytest.mark.parametrize("k", [1, 2, 2**20 + 1, 2**40 + 1, 2**52 - 1, 2**52 + 1, 2**53 - 2**40, 2**53 - 1])
-def test_quantiles_of_every_drawn_uniform_have_digits_to_spare(k: int) -> None:
+def test_quantiles_of_drawn_uniforms_have_enough_digits(k: int) -> None:
     """Some 200 terms of the series, each sum rounded to 40 digits of at most ½: 1e-38 of p; the density makes it z."""
     with localcontext(prec=60), mpmath.workdps(60):
         p = mpmath.mpf(k) / 2**53
@@ -374,7 +374,7 @@ def at_nodes(inv_cdf) -> np.ndarray:
 SIGNS = list(itertools.product((-1, 1), repeat=3))
 
 
-def test_four_units_of_noise_in_the_last_place_of_every_quantile_give_the_same_table() -> None:
+def test_quantiles_four_units_off_give_the_same_table() -> None:
     """A coefficient is linear in its three quantiles, so the eight corners are the worst there is."""
     z = at_nodes(NormalDist().inv_cdf)
     assert (rows_from(z) == lookup_tables.normal_table()).all()
@@ -394,7 +394,7 @@ def python_statistics() -> ModuleType:
     return module
 
 
-def test_logarithms_up_to_two_units_off_at_any_node_give_the_same_table() -> None:
+def test_logarithms_two_units_off_give_the_same_table() -> None:
     """The logarithm is all that a quantile takes from libm; none in use is off by more than one unit."""
     module = python_statistics()
     log = module.log

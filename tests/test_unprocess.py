@@ -81,14 +81,14 @@ def test_tone_and_gamma_together_are_within_12_units_in_the_last_place(top: int,
 
 
 @pytest.mark.parametrize("top", [255, 65535])
-def test_the_tone_curve_keeps_black_white_and_the_middle(top: int) -> None:
+def test_the_tone_curve_preserves_black_white_and_the_centre(top: int) -> None:
     assert tone_of(np.array([0, top]), top).tolist() == [0.0, 1.0]
     middle = unprocess.inverse_smoothstep(np.array(0.5), np.array(0.5))
     assert abs(middle - 0.5) <= 5 * EPS / 2
 
 
 @pytest.mark.parametrize("top", [255, 65535])
-def test_the_tone_curve_rises_from_code_to_code(top: int) -> None:
+def test_the_tone_curve_increases_with_the_code(top: int) -> None:
     assert (np.diff(tone_of(codes(top), top)) > 0).all()
 
 
@@ -99,7 +99,7 @@ def test_the_tone_curve_inverts_the_cubic(top: int) -> None:
     assert np.abs(y * y * (3 - 2 * y) - codes(top) / top).max() <= (1.5 * 5 + 5) * EPS
 
 
-def test_no_tone_leaves_the_image_as_it_is() -> None:
+def test_no_tone_does_not_change_the_image() -> None:
     x = codes(255) / 255
     assert unprocess.no_tone(x, 1 - x) is x
 
@@ -114,7 +114,7 @@ def test_a_gamma_of_1_changes_nothing() -> None:
     assert (unprocess.expand_gamma(v, 1.0) == v).all()
 
 
-def test_srgb_is_the_standards_curve() -> None:
+def test_srgb_equals_the_standard() -> None:
     """Within 8 units: a sum and a quotient, 1 unit each at the most, to the power of 2.4, and the power's own 4."""
     inner = codes(65535, 37)[1:]
     with mpmath.workdps(60):
@@ -128,7 +128,7 @@ def test_srgb_is_the_standards_curve() -> None:
         assert worst_units(unprocess.expand_gamma(inner / 65535, "srgb"), exact) <= 2 * 2.4 + 4
 
 
-def test_srgb_has_no_step_at_its_joint_beyond_the_standards_own() -> None:
+def test_srgb_has_only_the_standards_step() -> None:
     """IEC 61966-2-1 rounds its constants, so the pieces meet to 2.4e-9: a millionth of the light there."""
     joint = 0.04045
     below, above = unprocess.expand_gamma(np.array([joint, math.nextafter(joint, 1)]), "srgb")
@@ -192,14 +192,14 @@ def test_highlights_by_hand(highlight: str, rgb: tuple[str, ...], expected: tupl
         assert abs(value - float(Fraction(exact))) <= (80 + 10) * EPS / 2
 
 
-def test_brooks_mask_by_hand_in_numbers_that_do_not_round() -> None:
+def test_brooks_mask_in_exactly_representable_numbers() -> None:
     """Threshold ¾, mean ⅞: mask ¼. A gain k below 1 becomes ¼ + ¾k; one above 1 stays."""
     image = np.array([[[1.0, 0.875, 0.75]]])
     found = unprocess.invert_gains(image, (0.25, 0.5, 2.0), "gray_mean", 0.75)
     assert found.tolist() == [[[0.4375, 0.875 * 0.625, 1.5]]]
 
 
-def test_the_articles_mask_by_hand_in_numbers_that_do_not_round() -> None:
+def test_the_articles_mask_in_exactly_representable_numbers() -> None:
     """Threshold ½: masks 1, ¼ and 0; i·k + i·mask·(1 - k), and a gain above 1 stays."""
     image = np.array([[[1.0, 0.75, 0.5]]])
     assert unprocess.invert_gains(image, (0.25, 0.5, 0.5), "per_channel", 0.5).tolist() == [[[1.0, 0.46875, 0.25]]]
@@ -218,12 +218,12 @@ def test_per_channel_is_the_articles_function(k: float) -> None:
 
 
 @pytest.mark.parametrize("k", GAINS)
-def test_per_channel_rises_all_the_way(k: float) -> None:
+def test_per_channel_is_increasing(k: float) -> None:
     assert (np.diff(unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9)) > 0).all()
 
 
 @pytest.mark.parametrize("k", GAINS)
-def test_per_channel_has_no_step(k: float) -> None:
+def test_per_channel_is_continuous(k: float) -> None:
     """Its slope is k up to the threshold and nowhere above 21 - 20k (at white); a step would show as more."""
     slope = k if k >= 1 else 21 - 20 * k
     steps = np.diff(unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9))
@@ -257,7 +257,7 @@ def test_a_mask_is_0_up_to_its_threshold_and_exactly_1_at_white(threshold: float
 
 
 @pytest.mark.parametrize("k", GAINS)
-def test_both_ways_to_keep_highlights_are_one_on_gray(k: float) -> None:
+def test_both_highlight_methods_agree_on_gray(k: float) -> None:
     """The mean of three equal values may be off by three half units, which the mask's width makes thirty, squaring
     sixty; ten more for the rest.
     """
@@ -268,7 +268,7 @@ def test_both_ways_to_keep_highlights_are_one_on_gray(k: float) -> None:
     assert np.abs(one - other).max() <= (60 + 10) * EPS / 2 * max(k, 1)
 
 
-def test_both_ways_to_keep_highlights_part_on_saturated_colours() -> None:
+def test_highlight_methods_differ_on_saturated_colours() -> None:
     red = np.array([[[1.0, 0.2, 0.2]]])
     one, other = (unprocess.invert_gains(red, BROOKS, way, 0.9)[0, 0, 0] for way in ("per_channel", "gray_mean"))
     assert one == 1.0
@@ -276,11 +276,11 @@ def test_both_ways_to_keep_highlights_part_on_saturated_colours() -> None:
 
 
 @given(numbers(-0.2, 1.2), st.floats(0.1, 3))
-def test_none_is_the_gain_and_nothing_else(i: float, k: float) -> None:
+def test_none_applies_the_gain_only(i: float, k: float) -> None:
     assert unprocess.invert_gains(np.full((1, 1, 3), i), (k, k, k), "none", 0.9).tolist() == [[[i * k] * 3]]
 
 
-def test_each_channel_has_its_own_gain() -> None:
+def test_each_channel_uses_its_own_gain() -> None:
     found = unprocess.invert_gains(np.full((2, 2, 3), 0.5), (0.25, 0.5, 1.5), "per_channel", 0.9)
     assert found.tolist() == [[[0.125, 0.25, 0.75]] * 2] * 2
 
@@ -319,7 +319,7 @@ def test_without_highlights_white_is_the_inverse_gain(plan: Plan, camera: str) -
     assert unprocess.unprocess(white, made).tolist() == [[0.4, 0.8], [0.8, 0.5]]
 
 
-def test_grays_stay_gray_whatever_the_camera(plan: Plan) -> None:
+def test_grays_stay_gray_for_any_camera(plan: Plan) -> None:
     """The three products' sizes add up to below 2, so their roundings to below 3 units."""
     gray = np.repeat(np.arange(256, dtype=np.uint8), 12).reshape(-1, 2, 2, 3)
     expected = unprocess.expand_gamma(tone_of(codes(255), 255), 2.2)

@@ -1,4 +1,4 @@
-"""``python -m unprocess_gen`` is ``gen-dataset``."""
+"""Run ``gen-dataset`` as ``python -m unprocess_gen``."""
 
 import sys
 

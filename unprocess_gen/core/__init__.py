@@ -1,1 +1,1 @@
-"""Types, errors, random streams, lookup tables, compilation and files: what every other package uses."""
+"""Provide types, errors, random streams, lookup tables, compilation and files to all other packages."""

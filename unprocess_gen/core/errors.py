@@ -1,15 +1,15 @@
-"""Our exceptions, and when to raise which.
+"""Define the exceptions of the package and when to raise each.
 
-* UnprocessGenError
-  x ConfigError    the settings or the command line are wrong; raised before the first image; names the key, the
-                   value and what is allowed (exit 2)
-  x SourceError    one photograph cannot be used; carries a reason class; the runner turns it into a row and goes on
-  x DamageError    a dataset is not what its manifest says (exit 4)
-  x MachineError   the machine failed us: a full disk, an output folder that vanished (exit 5)
-  x LockedError    another run holds this output (exit 11)
+* `UnprocessGenError`: base class
 
-A wrong argument to a kernel is a plain ValueError. Anything else is a bug: let it rise (exit 1, with a traceback).
-Every exception here takes one sentence, so that it survives the pickling between processes.
+  * `ConfigError`: the config or the command line is wrong. It is raised before the first image (exit code 2).
+  * `SourceError`: one source cannot be used. The run records its reason in a manifest row and continues.
+  * `DamageError`: a dataset differs from its manifest (exit code 4).
+  * `MachineError`: a system error, for example a full disk, or a source that changed (exit code 5).
+  * `LockedError`: another run holds the output folder (exit code 11).
+
+A wrong argument of a simulation function raises ValueError. Any other exception is a bug and ends the command line with
+a traceback (exit code 1). Each exception here takes strings only, so that it can be pickled between processes.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ REASONS = (
     "icc",
     "worker_died",
 )
-"""Why a photograph failed: the values of the manifest column ``reason``."""
+"""Reasons for which a source fails: the values of the manifest column ``reason``."""
 
 
 class UnprocessGenError(Exception):
-    """The root of the tree; ``exit_code`` is what the command line ends with."""
+    """Base class; the command line ends with ``exit_code``."""
 
     exit_code = 1
 
 
 class ConfigError(UnprocessGenError):
-    """The settings are wrong: one sentence with the key, the value and what is allowed."""
+    """Wrong config or command line: one sentence with the key, the value and the allowed values."""
 
     exit_code = 2
 
 
 class DamageError(UnprocessGenError):
-    """A dataset on disk differs from what it says of itself."""
+    """Damaged dataset: its files differ from its manifest."""
 
     exit_code = 4
 
 
 class MachineError(UnprocessGenError):
-    """The machine failed: disk full, output vanished. One sentence with the path."""
+    """System error, such as a full disk or a deleted file: one sentence with the path."""
 
     exit_code = 5
 
@@ -60,22 +60,22 @@ class SourceChangedError(MachineError):
 
 
 class LockedError(UnprocessGenError):
-    """Another run holds the output folder."""
+    """Output folder that another run holds."""
 
     exit_code = 11
 
 
 class SourceError(UnprocessGenError):
-    """One photograph cannot be used.
+    """Source that cannot be used.
 
     Parameters
     ----------
-    reason
+    reason : str
         One of `REASONS`.
-    text
-        What was found, for people.
-    sha256
-        Digest of the bytes, where they could be read.
+    text : str
+        Explanation for the user.
+    sha256 : str, optional
+        SHA-256 of the file, if it could be read.
     """
 
     def __init__(self, reason: str, text: str, sha256: str | None = None) -> None:

@@ -40,7 +40,18 @@ def normal_quantile(p: Decimal) -> Decimal:
 
 
 def normal_density(z: Decimal) -> Decimal:
-    """Return the standard normal density at ``z``, in the precision of the current decimal context."""
+    """Return the standard normal density.
+
+    Parameters
+    ----------
+    z : Decimal
+        Position.
+
+    Returns
+    -------
+    Decimal
+        φ(z), in the precision of the current decimal context.
+    """
     return (-z * z / 2).exp() / (2 * PI).sqrt()
 
 

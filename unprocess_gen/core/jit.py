@@ -52,6 +52,16 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel that only other kernels call, without the entry point for Python.
 
     Omitting the entry point saves a third of the compilation time.
+
+    Parameters
+    ----------
+    function : callable
+        Function in the subset of Python that Numba compiles.
+
+    Returns
+    -------
+    callable
+        Numba dispatcher, for use in kernels only.
     """
     return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 

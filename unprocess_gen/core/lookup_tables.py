@@ -38,7 +38,18 @@ NODES = (0.5 - math.sqrt(3) / 4, 0.5, 0.5 + math.sqrt(3) / 4)
 
 
 def sha256(table: Float) -> str:
-    """Return the SHA-256 of a table's little-endian float64 values, as hex digits."""
+    """Return the SHA-256 of a table.
+
+    Parameters
+    ----------
+    table : ndarray of float64
+        Any shape.
+
+    Returns
+    -------
+    str
+        64 hex digits: the digest of the little-endian values.
+    """
     return hashlib.sha256(table.astype("<f8").tobytes()).hexdigest()
 
 

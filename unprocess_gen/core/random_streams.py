@@ -1,21 +1,20 @@
-"""Named, counted random streams: a random value is a pure function of what it is for.
+"""Random numbers as pure functions of their purpose: counter-based streams with Philox4x32-10.
 
-Every noise value depends on (seed, image, effect, frame, draw, level, y, x) and on nothing else (a fixed pattern on
-(seed, profile, sensor unit, effect, y, x)), so no worker, order, crop, tile or skipped effect can move another one.
-Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) makes that cheap: it is a keyed
-scrambling of a 128-bit counter. Its 64-bit key is hashed from the seed and the image, or the camera body; the rest
-stands in the four 32-bit words of the counter:
+A noise value depends only on (seed, image, effect, frame, draw, level, y, x). A fixed pattern depends only on (seed,
+profile, sensor unit, effect, y, x). Therefore no worker, order, crop, tile or omitted effect can change another value.
 
-    word 0   x // 64 * 16 + x % 16      one counter serves the four pixels x, x + 16, x + 32, x + 48 of a block of 64
+Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) scrambles a 128-bit counter with a
+64-bit key. The key is a hash of the seed and the image, or of the camera body. The four words of the counter are:
+
+    word 0   x // 64 * 16 + x % 16      one counter serves the pixels x, x + 16, x + 32, x + 48 of a block of 64
     word 1   y
     word 2   effect * 2**24 + level * 2**12 + draw
     word 3   frame
 
-Pixel x takes output word x % 64 // 16. The layout does not know the width, and sixteen neighbours come from sixteen
-neighbouring counters, which is what vector units want. Tried and dropped: blocks of 1024 pixels vectorise no better
-and waste up to three quarters of the work on narrow images.
+Pixel x takes output word x % 64 // 16. The layout does not depend on the image width, and 16 neighbouring pixels use 16
+consecutive counters, which vectorises. Alternatives and timings: ``docs/design/random_numbers.md``.
 
-This room is the readable form (NumPy, about 60 ns a value); `fused` holds the fast one (0.8 ns).
+This module is the NumPy reference; `simulation.kernels.gaussian` contains the compiled form.
 """
 
 from __future__ import annotations
@@ -39,44 +38,100 @@ STREAMS = {
     "dequantize": 10,
     "patch": 11,
 }
-"""What randomness is for. The numbers are part of every dataset ever made: add, never renumber."""
+"""Stream numbers by purpose. Every existing dataset depends on them: add new ones, never renumber."""
 
 MULTIPLIERS = (0xD2511F53, 0xCD9E8D57)
 KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
 ROUNDS = 10
 BLOCK, LANES = 64, 16
-"""Pixels that share a run of counters, and the counters in that run."""
+"""Pixels per block, and counters per block."""
 
 Words = NDArray[np.uint32]
 
 
 def stream_key(seed: int, source_sha256: str, occurrence: int = 0) -> int:
-    """Return the 64-bit key of an image's streams.
+    """Return the key of the random streams of an image.
 
-    ``source_sha256`` is the hex digest of the source's bytes, ``occurrence`` the number of identical files before it
-    in the listing: adding or dropping other files moves nothing.
+    Adding or removing other files does not change it.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the dataset.
+    source_sha256 : str
+        SHA-256 of the source file, as hex digits.
+    occurrence : int
+        Number of identical files before this one in the listing.
+
+    Returns
+    -------
+    int
+        64-bit key.
     """
     name = f"unprocess_gen stream 1\0{seed}\0{source_sha256}\0{occurrence}"
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
 def body_key(seed: int, profile: str, unit: str) -> int:
-    """Return the 64-bit key of a camera body's fixed patterns: the same for every frame that this body takes."""
+    """Return the key of the fixed patterns of a camera body, shared by all frames of this body.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the dataset.
+    profile : str
+        Name of the noise profile.
+    unit : str
+        Name of the camera body (``noise.sensor_unit``).
+
+    Returns
+    -------
+    int
+        64-bit key.
+    """
     name = f"unprocess_gen body 1\0{seed}\0{profile}\0{unit}"
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
 def purpose(stream: str, level: int = 0, draw: int = 0) -> int:
-    """Return word 2 of the counter; ValueError for a level or draw outside 0 … 4095."""
+    """Return word 2 of the counter, for a stream of `STREAMS`.
+
+    Parameters
+    ----------
+    stream : str
+        Key of `STREAMS`.
+    level, draw : int
+        Numbers of the noise level and of the draw, 0 to 4095.
+
+    Returns
+    -------
+    int
+        32-bit word.
+
+    Raises
+    ------
+    ValueError
+        If ``level`` or ``draw`` is out of range.
+    """
     if not (0 <= level < 4096 and 0 <= draw < 4096):
-        raise ValueError(f"level and draw are {level} and {draw}, expected 0 to 4095")
+        raise ValueError(f"level={level}, draw={draw}: out of range; expected 0 to 4095")
     return STREAMS[stream] << 24 | level << 12 | draw
 
 
 def philox4x32(counter: tuple[NDArray[np.uint64], ...], key: int) -> tuple[Words, Words, Words, Words]:
-    """Return the four output words of Philox4x32-10 for counters given as four broadcastable arrays of 32-bit words.
+    """Compute Philox4x32-10, as in Random123 (known answers: its ``kat_vectors``).
 
-    Known answers: the vectors published with Random123 (``kat_vectors``).
+    Parameters
+    ----------
+    counter : tuple of four ndarrays of uint64
+        Words of the counters, each below 2**32; shapes that broadcast.
+    key : int
+        64-bit key.
+
+    Returns
+    -------
+    tuple of four ndarrays of uint32
+        Output words, of the broadcast shape.
     """
     low, shift = np.uint64(0xFFFFFFFF), np.uint64(32)
     m0, m1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
@@ -101,7 +156,26 @@ def words(
     level: int = 0,
     draw: int = 0,
 ) -> Words:
-    """Return one uint32 per pixel of a tile ``[H, W]`` whose top-left pixel is ``origin`` in the full frame."""
+    """Return one random word for each pixel of a tile.
+
+    Parameters
+    ----------
+    key : int
+        Key from `stream_key` or `body_key`.
+    stream : str
+        Key of `STREAMS`.
+    shape : (int, int)
+        Height and width of the tile.
+    origin : (int, int)
+        Row and column of the tile's first pixel in the full frame.
+    frame, level, draw : int
+        Numbers of the frame in its clip, of the noise level and of the draw.
+
+    Returns
+    -------
+    ndarray of uint32, [H, W]
+        Random words.
+    """
     y = np.arange(origin[0], origin[0] + shape[0], dtype=np.uint64)[:, None]
     x = np.arange(origin[1], origin[1] + shape[1], dtype=np.uint64)[None, :]
     block, lane, lanes = np.uint64(BLOCK), x % np.uint64(LANES), np.uint64(LANES)
@@ -112,9 +186,21 @@ def words(
 
 
 def patch_words(key: int, count: int) -> list[tuple[int, int]]:
-    """Return two words of 32 bits for each of the first ``count`` patches of one image.
+    """Return two random words for each of the first ``count`` patches of an image.
 
-    Patch n is counter (0, n) of the stream ``patch``, so that more patches leave the first ones where they are.
+    Patch n uses counter (0, n) of the stream ``patch``, so that a larger ``count`` does not move the first patches.
+
+    Parameters
+    ----------
+    key : int
+        Key from `stream_key`.
+    count : int
+        Number of patches.
+
+    Returns
+    -------
+    list of (int, int)
+        Two 32-bit words for each patch.
     """
     zero = np.zeros(count, dtype=np.uint64)
     counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("patch")), zero)
@@ -123,9 +209,23 @@ def patch_words(key: int, count: int) -> list[tuple[int, int]]:
 
 
 def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:
-    """Return ``count`` uniforms in (0, 1) with 52 bits each, (k + ½)·2**-52, for the parameters of one image.
+    """Return uniform deviates for the drawn parameters of an image.
 
-    Parameter n is counter (0, n) of the stream ``parameters``: its number is its name, so add, never renumber.
+    Parameter n uses counter (0, n) of the stream ``parameters``: add new parameters at the end, never renumber.
+
+    Parameters
+    ----------
+    key : int
+        Key from `stream_key`.
+    count : int
+        Number of parameters.
+    level : int
+        Number of the noise level.
+
+    Returns
+    -------
+    list of float
+        (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
     zero = np.zeros(count, dtype=np.uint64)
     counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("parameters", level)), zero)

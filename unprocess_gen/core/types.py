@@ -1,4 +1,4 @@
-"""The frozen records that travel between rooms; what each field means is said once, here."""
+"""Define the immutable records that packages exchange: sources, plans, pairs."""
 
 from __future__ import annotations
 
@@ -12,26 +12,46 @@ Srgb = NDArray[np.uint8] | NDArray[np.uint16]
 Raw = NDArray[np.uint16]
 Normalised = NDArray[np.float32]
 Frame = Raw | Normalised
-"""What a dataset holds: DN, or their share of the way from black, 0, to white, 1; mosaic or packed planes."""
+"""Frame of a dataset: DN (uint16), or normalised to 0 at black and 1 at white (float32); mosaic or packed planes."""
 Float = NDArray[np.float64]
 
 
 NO_CLIP = "none"
-"""The clip of a photograph that is part of none."""
+"""Clip name of a photograph that does not belong to a clip."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One photograph, or one frame of a video, as the listing found it.
+    """Photograph, or frame of a clip, as listed.
 
-    ``name`` is the manifest's spelling (``/``-joined, percent-encoded where needed); ``path`` the file's path relative
-    to the source folder as the operating system spells it (undecodable bytes as surrogate escapes), or the name of a
-    synthetic scene. ``size_bytes`` is None where there is no file to read (``reason`` then says why), and 0
-    for a scene. Files that share a size were hashed beforehand (``sha256``) and identical ones numbered
-    (``occurrence``). Where folders are clips, ``clip`` is the folder's name as ``name`` spells it, ``frame`` the number
-    of the frame in it, and ``clip_sha256`` with ``clip_occurrence`` stands for the whole clip: the digest of its first
-    frame, and the number of clips before it that begin with the same; ``frames`` is how many frames it has. All frames
-    of a video have its name, which is its clip's too, and its digest.
+    Attributes
+    ----------
+    index : int
+        Place in the listing, from 0.
+    name : str
+        Path below ``source.root`` as in the manifest: joined by ``/``, percent-encoded if necessary. All frames of a
+        video have the name of the video.
+    path : str
+        Path below ``source.root`` as the operating system spells it (undecodable bytes as surrogate escapes), or the
+        name of a synthetic scene.
+    size_bytes : int or None
+        Size of the file; 0 for a scene, None if there is no readable file.
+    reason : str or None
+        Reason why the source cannot be used, one of `errors.REASONS`.
+    occurrence : int
+        Number of identical files before this one.
+    sha256 : str or None
+        SHA-256 of the file if the listing hashed it, which it does for files that share a size.
+    clip : str
+        Name of the clip (its folder or video), or `NO_CLIP`.
+    frame : int
+        Number of the frame in its clip, from 0.
+    clip_sha256 : str or None
+        SHA-256 of the clip's first frame or of the video, or None without a clip.
+    clip_occurrence : int
+        Number of clips before this one with the same ``clip_sha256``.
+    frames : int
+        Number of frames in the clip; 1 for a photograph.
     """
 
     index: int
@@ -49,11 +69,22 @@ class Source:
 
     @property
     def is_video(self) -> bool:
-        """Whether it is a frame of a video file: no folder of photographs has the name of one of them."""
+        """True for a frame of a video file: only there the clip has the name of the source."""
         return self.clip == self.name != NO_CLIP
 
     def stream_identity(self, sha256: str) -> tuple[str, int]:
-        """Return the digest and the number that the streams are keyed by: the clip's, or those of the photograph."""
+        """Return the digest and occurrence number that key the random streams.
+
+        Parameters
+        ----------
+        sha256 : str
+            SHA-256 of the source's file.
+
+        Returns
+        -------
+        (str, int)
+            Digest and occurrence of the clip if there is one, else of the file.
+        """
         if self.clip_sha256 is not None:
             return self.clip_sha256, self.clip_occurrence
         return sha256, self.occurrence
@@ -61,7 +92,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """Decoded pixels: ``srgb`` uint8 or uint16 ``[H, W, 3]`` in R, G, B order, upright (``orientation`` applied)."""
+    """Decoded pixels: ``srgb`` (uint8 or uint16 [H, W, 3], R, G, B), after applying the EXIF ``orientation``."""
 
     srgb: Srgb
     orientation: int
@@ -69,10 +100,9 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True)
 class PatchRule:
-    """Which patches are cut out of each image, squares of ``side`` pixels.
+    """Rule for cutting square patches of ``side`` pixels from each image.
 
-    ``kind`` is ``grid``, whose corners are ``stride`` pixels apart, or ``random``, ``count`` of them; the number that
-    the other kind has is 0.
+    ``kind`` is ``grid`` (corners every ``stride`` pixels) or ``random`` (``count`` patches); the other number is 0.
     """
 
     kind: str
@@ -83,9 +113,9 @@ class PatchRule:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A cut-out of a full frame: its number in the image, the row and column of its corner, its size in pixels.
+    """Rectangle of a full frame: number in the image, row and column of its first pixel, size in pixels.
 
-    A whole image is patch 0 at row 0, column 0.
+    An uncut image is patch 0 at row 0, column 0.
     """
 
     number: int
@@ -96,16 +126,16 @@ class Patch:
 
     @property
     def origin(self) -> tuple[int, int]:
-        """Row and column of its corner in the full frame."""
+        """Row and column of the first pixel in the full frame."""
         return self.y, self.x
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What a plan may know of the pixels: whole numbers, the same on every machine.
+    """Facts about an image's pixels that a plan may depend on: integers, identical on every machine.
 
-    ``dark_code`` and ``bright_code`` are the lowest and the highest code (of ``codes`` possible ones) in any channel;
-    ``frames`` is how many frames the clip has, 1 for a photograph.
+    ``dark_code`` and ``bright_code`` are the lowest and highest code in any channel, of ``codes`` possible codes.
+    ``frames`` is the number of frames in the clip, 1 for a photograph.
     """
 
     width: int
@@ -118,16 +148,40 @@ class Facts:
 
 @dataclass(frozen=True, slots=True)
 class Physics:
-    """What a physical profile and a scene say of one frame, on the sensor in use; 0 where there is no such number.
+    """Numbers of a physical noise profile for one scene and sensor; 0 if the profile does not have the number.
 
-    ``dn_per_e``: the system gain K. ``prnu_std``: relative, of the
-    pixels' responses. ``dark_e``: mean dark current of the exposure, electrons. ``hot_pixel_share``, ``hot_pixel_e``:
-    share of pixels that are hot, and the mean of their exponentially distributed excess, electrons in the exposure.
-    ``full_well_e``: electrons a pixel holds. ``read_law``: ``gaussian`` or ``tukey``, of shape ``read_shape``;
-    ``read_std_dn``: its standard deviation, whatever the law. ``row_std_dn``, ``column_std_dn``: of a row's offset in a
-    frame, of a column's in a body. ``black_error_dn``: offset of the mean black in the four sites of the 2x2 pattern,
-    in reading order. ``dead_pixel_share``: share of pixels that read 0. ``body_key``: key of the fixed patterns of the
-    camera body ``sensor_unit``.
+    Attributes
+    ----------
+    iso, exposure_s, temperature_c : float
+        The scene: ISO, exposure time (s) and sensor temperature (°C).
+    dn_per_e : float
+        System gain K, DN per electron.
+    prnu_std : float
+        Standard deviation of the pixels' relative gain.
+    dark_e : float
+        Mean dark signal of the exposure, electrons.
+    dark_offset : str
+        ``"removed"`` if the camera subtracts the mean dark signal, else ``"kept"``.
+    hot_pixel_share, hot_pixel_e : float
+        Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure.
+    full_well_e : float
+        Saturation capacity, electrons.
+    read_law : str
+        Distribution of the read noise: ``"gaussian"``, or ``"tukey"`` (Tukey's lambda with shape ``read_shape``).
+    read_std_dn : float
+        Standard deviation of the read noise, DN.
+    row_std_dn, column_std_dn : float
+        Standard deviations of a row's offset per frame and of a column's offset per body, DN.
+    black_error_dn : tuple of four floats
+        Black-level errors of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, DN.
+    dead_pixel_share : float
+        Fraction of pixels that read 0.
+    sensor_unit : str
+        Name of the camera body.
+    body_key : int
+        Key of the body's fixed patterns (`random_streams.body_key`).
+    fixed_pattern_in_clean : bool
+        Whether the clean frame contains the fixed patterns too.
     """
 
     iso: float
@@ -152,31 +206,70 @@ class Physics:
     fixed_pattern_in_clean: bool
 
 
-READABLE, IN_FLOAT32 = "colour:numpy_float64", "colour:fused_float32"
-"""The methods that tell the forms of a whole pair (`methods.FORMS`) apart."""
+REFERENCE_METHOD, FLOAT32_METHOD = "colour:numpy_float64", "colour:fused_float32"
+"""Methods that select the NumPy reference and the float32 kernels; plans without them use the float64 kernels."""
 
 UINT16, FLOAT32 = "uint16", "float32"
-"""What the numbers of a frame can be."""
+"""Dtypes of frames."""
 MOSAIC, PACKED = "mosaic", "packed"
-"""How the sites of a frame can lie: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`bayer.pack`)."""
+"""Layouts of frames: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`cfa.pack`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Everything that decides a pair besides its pixels: what a manifest row holds, as numbers.
+    """All parameters of a pair; with the pixels it determines the pair completely.
 
-    Drawn once (`plan.plan_image`) or read back from a row (`manifest.plan_from_row`). ``downscale`` is the side of the
-    squares of source pixels that were averaged, ``dequantize`` says whether 8-bit codes are dithered,
-    ``exposure_ratio`` what the scene is darkened by. ``weights`` are those of the mixed cameras in the order of
-    `colour.CAMERAS`; ``rgb2cam`` is row-major and its rows sum to 1; ``red_gain`` and ``blue_gain`` are forward gains,
-    ``inverse_rgb_gain`` an inverse one; ``a_dn`` (DN) and ``b_dn2`` (DN²) are slope and intercept of the noise variance
-    above black; ``stream_key`` is the key of the image's random streams. ``noise_law`` says whether a two-parameter
-    profile's noise is ``gaussian`` or ``poisson``; ``saturated`` says what the noisy frame is where the clean one is
-    saturated: ``noisy``, or ``pinned`` to white. ``physics`` is None for the two-parameter profiles, whose one effect
-    is ``heteroscedastic``. ``accuracy`` names the budget, ``methods`` how each stage is computed (`methods`), and
-    ``law_distance`` is how far from its law counted noise may be drawn. ``level``, ``draw`` and ``frame`` number the
-    noise levels of one clean frame, the draws at one level, and the frames of a clip: each has values of its own in
-    every stream. ``dtype`` and ``layout`` say what the numbers of both frames are and how their sites lie.
+    A plan is drawn once (`planning.plan.plan_image`) or read from a manifest row.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the dataset.
+    stream_key : int
+        Key of the image's random streams (`random_streams.stream_key`).
+    downscale : int
+        Side of the squares of source pixels that were averaged.
+    dequantize : str
+        ``"off"``, or how 8-bit codes are dithered.
+    scene : str
+        Name of the scene.
+    exposure_ratio : float
+        Factor by which the scene is darkened.
+    camera : str
+        Name of the camera option.
+    weights : tuple of four floats
+        Weights of the mixed cameras, in the order of `colour.CAMERAS`.
+    rgb2cam : tuple of nine floats
+        Matrix from linear sRGB to camera RGB, row by row; each row sums to 1.
+    red_gain, blue_gain, inverse_rgb_gain : float
+        White-balance gains of red and blue, and inverse of the brightness gain.
+    tone, gamma : str, float or str
+        Tone curve and gamma that were inverted (`tone_curves.linear_table`).
+    highlight, highlight_threshold : str, float
+        Method for highlights (`unprocess.HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
+    pattern : str
+        CFA pattern, one of `cfa.PATTERNS`.
+    bits, black_level_dn, white_level_dn : int
+        Bit depth of the sensor, and its levels in DN.
+    sensor_clip : str
+        Clipping of the noisy frame (`sensor.noisy_limits`).
+    saturated : str
+        Noisy value at sites where the clean frame is saturated: ``"noisy"``, or ``"pinned"`` to white.
+    noise, noise_law : str
+        Name of the noise profile, and for two-parameter profiles its distribution: ``"gaussian"`` or ``"poisson"``.
+    a_dn, b_dn2 : float
+        Slope (DN) and intercept (DN²) of the noise variance above black.
+    effects, skipped : tuple of str
+        Simulated effects, and the omitted ones with their reasons.
+    accuracy, methods, law_distance : str, tuple of str, float
+        Name of the budget, method of each stage, and largest accepted CDF difference of shot plus read noise.
+    physics : Physics or None
+        Numbers of a physical profile. None for two-parameter profiles, whose one effect is ``heteroscedastic``.
+    level, draw, frame : int
+        Numbers of the noise level, of the draw at this level, and of the frame in its clip. Each selects other random
+        values.
+    dtype, layout : str
+        Dtype and layout of both frames.
     """
 
     seed: int
@@ -219,49 +312,49 @@ class Plan:
 
     @property
     def normalised(self) -> bool:
-        """Whether frames are float32, 0 at black and 1 at white, and not rounded to DN."""
+        """True if frames are float32, 0 at black and 1 at white, without rounding to DN."""
         return self.dtype == FLOAT32
 
     @property
-    def readable(self) -> bool:
-        """Whether the readable forms are asked for."""
-        return READABLE in self.methods
+    def uses_reference(self) -> bool:
+        """True if the NumPy reference is selected."""
+        return REFERENCE_METHOD in self.methods
 
     @property
-    def in_float32(self) -> bool:
-        """Whether the form in single precision is asked for."""
-        return IN_FLOAT32 in self.methods
+    def uses_float32(self) -> bool:
+        """True if the float32 kernels are selected."""
+        return FLOAT32_METHOD in self.methods
 
     @property
     def exposure(self) -> float:
-        """What the light of the scene is multiplied by."""
+        """Factor applied to the light of the scene."""
         return 1 / self.exposure_ratio
 
     @property
     def counts_electrons(self) -> bool:
-        """Whether the noise is made of counts of electrons, not of one normal a site."""
+        """True if the noise contains Poisson counts, not only one normal deviate per site."""
         return self.physics is not None or self.noise_law == "poisson"
 
     @property
     def averaged(self) -> bool:
-        """Whether the clean frame shares the body's fixed patterns, as an average of many frames does."""
+        """True if the clean frame contains the fixed patterns, like the average of many frames."""
         return self.physics is not None and self.physics.fixed_pattern_in_clean
 
     @property
     def variance_line(self) -> tuple[float, float]:
-        """Slope (DN) and intercept (DN²) of the variance above black, of the effects that are simulated."""
+        """Slope (DN) and intercept (DN²) of the noise variance above black, for the simulated effects."""
         if "heteroscedastic" in self.effects:
             return self.a_dn, self.b_dn2
         return self.a_dn if "shot" in self.effects else 0.0, self.b_dn2 if "read" in self.effects else 0.0
 
     @property
     def brightest_dn(self) -> float:
-        """`brightest` in DN, unrounded."""
+        """Value of `brightest` in DN, unrounded."""
         return self.brightest * float(self.white_level_dn - self.black_level_dn) + float(self.black_level_dn)
 
     @property
     def brightest(self) -> float:
-        """The light at which the clean frame saturates: white, or the full well where that is reached before."""
+        """Light at which the clean frame saturates: 1 (white), or less if the full well is reached below white."""
         if self.physics is None or "full_well" not in self.effects:
             return 1.0
         span_dn = self.white_level_dn - self.black_level_dn
@@ -269,7 +362,7 @@ class Plan:
 
     @property
     def inverse_gains(self) -> tuple[float, float, float]:
-        """What the red, green and blue channel are multiplied by (Brooks et al. 2019, random_gains())."""
+        """Factors of the red, green and blue channels (Brooks et al. 2019, random_gains())."""
         return (
             self.inverse_rgb_gain / self.red_gain,
             self.inverse_rgb_gain,
@@ -279,12 +372,18 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """How many sites met a limit.
+    """Numbers of sites at a limit.
 
-    ``clean_clipped_*``: the value before clipping lay below black or above white; ``noisy_clipped_*``: the value,
-    rounded where frames are, lay outside what the sensor can say and was clipped; ``saturated``: sites of the clean
-    frame at the white level; ``zero_variance``: sites where the noise law gives no variance (a fitted b below zero, or
-    no noise at all).
+    Attributes
+    ----------
+    clean_clipped_low, clean_clipped_high : int
+        Clean values below black and above white, before clipping.
+    noisy_clipped_low, noisy_clipped_high : int
+        Noisy values outside the sensor's range, after rounding (without rounding for float32 frames).
+    saturated : int
+        Sites of the clean frame at the white level.
+    zero_variance : int
+        Sites whose noise variance is 0, because a fitted b is negative or no noise is simulated.
     """
 
     clean_clipped_low: int
@@ -297,9 +396,9 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The clean and the noisy frame of one photograph, in the plan's dtype and layout, and what was clipped.
+    """Clean and noisy frame of one image, and counts of clipped sites.
 
-    uint16 mosaics ``[H, W]`` in DN, unless the plan says otherwise.
+    Frames are uint16 mosaics [H, W] in DN, unless the plan has another dtype or layout.
     """
 
     clean: Frame
@@ -309,18 +408,29 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """How a parameter is drawn: a kind (`draws.LAWS` says what each does) and its numbers; ``constant`` has one."""
+    """Distribution of a parameter: a kind of `config.distributions` and its numbers; ``constant`` has one number."""
 
     kind: str
     numbers: tuple[float, ...]
 
 
 DESCRIPTIONS = {UINT16: "<u2", FLOAT32: "<f4"}
-"""The dtypes of frames as NumPy spells them in a file: little-endian."""
+"""NumPy descriptions of the dtypes in files: little-endian."""
 
 
 def gamma_text(gamma: float | str) -> str:
-    """Return gamma as the manifest spells it: ``srgb``, or the shortest number (``1``, ``2.2``)."""
+    """Return the text of a gamma in the manifest.
+
+    Parameters
+    ----------
+    gamma : float or str
+        Exponent, or ``"srgb"``.
+
+    Returns
+    -------
+    str
+        ``"srgb"``, or the shortest decimal number, such as ``"1"`` or ``"2.2"``.
+    """
     if gamma == "srgb":
         return "srgb"
     number = float(gamma)

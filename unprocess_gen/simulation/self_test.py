@@ -1,11 +1,15 @@
-"""Before a process makes data, it shows that it computes what every other machine does. It takes three milliseconds.
+"""Prove before a run that this process computes the same values as every other machine; takes three milliseconds.
 
-Four proofs, from the ground up: the exact tables have their published digests; Philox gives Random123's known answers;
-a product and a sum in a kernel are rounded one after the other, not at once; and a small picture becomes the very pair
-that it became on every machine before, through the same compiled kernels that make the dataset. A compiler, a library
-or a processor that rounds otherwise shows up here, not in data that somebody trained on for a week. The golden pair
-covers the 8-bit kernel, both branches of the highlights, every pattern phase and both ends of the sensor; the 16-bit
-curves are held to their digests when they are first read.
+There are four tests:
+
+1. The exact tables have their published SHA-256.
+2. Philox gives the known answers of Random123.
+3. A kernel rounds a product and a sum separately, without a fused multiply-add.
+4. Small golden pairs, simulated by the kernels of the plan, have their published digests.
+
+A compiler, library or CPU that rounds differently fails here, before it writes a dataset. The golden pairs cover the
+8-bit kernels, both branches of the highlights, every phase of the CFA pattern and both ends of the sensor's range. The
+16-bit curves are checked when they are first read.
 """
 
 from __future__ import annotations
@@ -22,12 +26,8 @@ from unprocess_gen.core.jit import is_cached, kernel
 from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import FLOAT32, IN_FLOAT32, READABLE, Float, Physics, Plan, Srgb
-from unprocess_gen.simulation.kernels import clean
-from unprocess_gen.simulation.kernels import float_draws as floats
-from unprocess_gen.simulation.kernels import gaussian as fused
-from unprocess_gen.simulation.kernels import gaussian_float32 as single
-from unprocess_gen.simulation.kernels import physical as electrons
+from unprocess_gen.core.types import FLOAT32, FLOAT32_METHOD, REFERENCE_METHOD, Float, Physics, Plan, Srgb
+from unprocess_gen.simulation.kernels import clean, float_draws, gaussian, gaussian_float32, physical
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.noise import EFFECTS
 
@@ -99,8 +99,8 @@ GOLDEN_PHYSICS = Physics(
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
     "gray_mean": replace(GOLDEN_PLAN, highlight="gray_mean"),
-    "float32": replace(GOLDEN_PLAN, methods=(IN_FLOAT32,), bits=16, black_level_dn=4096, white_level_dn=65535),
-    "readable": replace(GOLDEN_PLAN, methods=(READABLE,)),
+    "float32": replace(GOLDEN_PLAN, methods=(FLOAT32_METHOD,), bits=16, black_level_dn=4096, white_level_dn=65535),
+    "reference": replace(GOLDEN_PLAN, methods=(REFERENCE_METHOD,)),
     "plain": replace(
         GOLDEN_PLAN,
         physics=GOLDEN_PHYSICS,
@@ -127,68 +127,115 @@ GOLDEN = {
     "per_channel": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
     "gray_mean": ("b4c0b18f1bbccbf881c82b00455253e9", "16f26b70e50c70f03babed405092f5b2"),
     "float32": ("9243174c79ef1c0b95c6fc62c480fbc8", "53fa7baa361ccd3954240d855bc1990c"),
-    "readable": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
+    "reference": ("443ea2ae03acfbab1df2b27f58ddbe39", "249b904acb59298a603502c2424e4712"),
     "plain": ("443ea2ae03acfbab1df2b27f58ddbe39", "a3ed0176ff50cf595767857da127dd39"),
     "near": ("b4c0b18f1bbccbf881c82b00455253e9", "c0308c77164902cd319646844ca0b470"),
     "normalised": ("aa19fde7d361bcc67ca6c9e52c8d8634", "4de3ab500ebd73704139d53f4f3d8ee3"),
     "normalised_counts": ("db1e51d036e01d5eaca3d0ebedbab809", "f5e3fd88d4091be074264896a692346f"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
-PROVED_BY = {
+GOLDEN_PAIRS = {
     "one_normal": ("per_channel", "gray_mean"),
     "float32": ("float32",),
     "plain": ("plain", "near"),
     "physical": ("physical",),
-    "readable": ("readable",),
+    "reference": ("readable",),
     "normalised": ("normalised",),
     "normalised_counts": ("normalised", "normalised_counts"),
 }
-"""Which golden pairs prove which kernels: those that a plan does not need would take seconds to compile."""
+"""Golden pairs for each set of kernels. A run tests only the sets that it needs, because compiling takes seconds."""
 
-OUTER = {
-    "one_normal": (fused._fill_pairs,),
-    "float32": (single._fill_pairs32,),
-    "plain": (electrons._fill_shot_read_pair,),
-    "physical": (electrons._fill_physical_pair, electrons._fill_prnu_response),
-    "readable": (),
-    "normalised": (clean._fill_clean_frame, *floats.NORMAL_KERNELS),
-    "normalised_counts": (clean._fill_clean_frame, *floats.NORMAL_KERNELS, *floats.COUNT_KERNELS),
+OUTER_KERNELS = {
+    "one_normal": (gaussian._fill_pairs,),
+    "float32": (gaussian_float32._fill_pairs32,),
+    "plain": (physical._fill_shot_read_pair,),
+    "physical": (physical._fill_physical_pair, physical._fill_prnu_response),
+    "reference": (),
+    "normalised": (clean._fill_clean_frame, *float_draws.NORMAL_KERNELS),
+    "normalised_counts": (clean._fill_clean_frame, *float_draws.NORMAL_KERNELS, *float_draws.COUNT_KERNELS),
 }
-"""The kernels that bring all others of their kind with them."""
+"""The outermost kernels of each set; compiling them compiles all kernels of the set."""
 
 
 def are_compiled(kernels: str) -> bool:
-    """Whether the machine code of some of `PROVED_BY` lies ready, so that the first pair does not wait for it."""
-    return all(is_cached(kernel) for kernel in OUTER[kernels])
+    """Return whether a set of kernels has machine code, so that the first pair does not wait for the compiler.
+
+    Parameters
+    ----------
+    kernels : str
+        Key of `GOLDEN_PAIRS`.
+
+    Returns
+    -------
+    bool
+        True if all outer kernels are compiled or cached.
+    """
+    return all(is_cached(kernel) for kernel in OUTER_KERNELS[kernels])
 
 
 def kernels(plan: Plan) -> str:
-    """Return which of `PROVED_BY` make the pair of a plan."""
-    if plan.readable:
-        return "readable"
+    """Return the set of kernels that simulates the pair of a plan.
+
+    Parameters
+    ----------
+    plan : Plan
+        Parameters of the pair.
+
+    Returns
+    -------
+    str
+        Key of `GOLDEN_PAIRS`.
+    """
+    if plan.uses_reference:
+        return "reference"
     if plan.normalised:
         return "normalised_counts" if plan.counts_electrons else "normalised"
     if plan.counts_electrons:
-        return "plain" if electrons.has_only_shot_and_read(plan) else "physical"
-    return "float32" if plan.in_float32 else "one_normal"
+        return "plain" if physical.has_only_shot_and_read(plan) else "physical"
+    return "float32" if plan.uses_float32 else "one_normal"
 
 
-def check(kernels: str, way_out: str = "") -> None:
-    """Raise MachineError, with every proof that failed, where this process computes differently."""
+def check(kernels: str, advice: str = "") -> None:
+    """Raise an error if this process computes other values than every other machine.
+
+    Parameters
+    ----------
+    kernels : str
+        Key of `GOLDEN_PAIRS`.
+    advice : str
+        Text appended to the message.
+
+    Raises
+    ------
+    MachineError
+        If a test fails; the message names every failed test.
+    """
     if failures(kernels):
         raise MachineError(
-            f"the self-test failed: {'; '.join(failures(kernels))}; this machine computes differently from others: "
-            f"try other versions of numpy and numba{way_out}"
+            f"the self-test failed: results differ ({'; '.join(failures(kernels))}); expected those of every machine; "
+            f"try other versions of numpy and numba{advice}"
         )
 
 
-@functools.lru_cache(maxsize=len(PROVED_BY))
+@functools.lru_cache(maxsize=len(GOLDEN_PAIRS))
 def failures(kernels: str) -> tuple[str, ...]:
-    """Return each proof of some of `PROVED_BY` that failed, in words; once in a process."""
+    """Run the tests for a set of kernels, once per process.
+
+    Parameters
+    ----------
+    kernels : str
+        Key of `GOLDEN_PAIRS`.
+
+    Returns
+    -------
+    tuple of str
+        One description for each failed test.
+    """
     return tuple(_failures(kernels))
 
 
 def _failures(kernels: str) -> Iterator[str]:
+    """Yield a description of each failed test."""
     try:
         _ = linear_table("smoothstep", 2.2, 256), normal_table()
     except MachineError as error:
@@ -197,31 +244,31 @@ def _failures(kernels: str) -> Iterator[str]:
     for counter, key, answer in KNOWN_ANSWERS:
         words = philox4x32(tuple(np.array([word], dtype=np.uint64) for word in counter), key[0] | key[1] << 32)
         if tuple(int(word[0]) for word in words) != answer:
-            yield f"Philox of {counter[0]:08x} is not Random123's"
-    rest = np.zeros(8)
-    _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), rest)
-    if rest.any():
-        yield "a kernel multiplies and adds in one rounding"
-    for name in PROVED_BY[kernels]:
-        wanted = GOLDEN[name]
-        pair = make_pair(golden_picture(), GOLDEN_PLANS[name], (1, 57))
-        for which, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), wanted, strict=True):
+            yield f"Philox of {counter[0]:08x} differs from Random123"
+    difference = np.zeros(8)
+    _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), difference)
+    if difference.any():
+        yield "a kernel uses a fused multiply-add"
+    for name in GOLDEN_PAIRS[kernels]:
+        expected = GOLDEN[name]
+        pair = make_pair(golden_image(), GOLDEN_PLANS[name], (1, 57))
+        for name_of_frame, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), expected, strict=True):
             if (found := array_xxh3(frame)) != digest:
-                yield f"the golden {which} frame ({name}) is {found}, expected {digest}"
+                yield f"the golden {name_of_frame} frame ({name}) is {found}, expected {digest}"
 
 
 @kernel
 def _product_and_sum(x: Float, y: Float, out: Float) -> None:
-    """Fill ``out`` with x² + y, whose last bits show whether the square was rounded before the sum."""
+    """Fill ``out`` with x² + y; its last bits show whether the square was rounded before the addition."""
     for n in range(out.shape[0]):
         out[n] = x[n] * x[n] + y[n]
 
 
-def golden_picture() -> Srgb:
-    """Return a picture of 19 x 83 pixels in integer arithmetic: ramps, every code, and stripes of black and white."""
+def golden_image() -> Srgb:
+    """Return an image of 19 x 83 pixels made with integer arithmetic: ramps, every code, black and white stripes."""
     y, x = np.mgrid[0:19, 0:83]
     ramp = (x * 255 // 82, (x * 31 + y * 83) % 256, 255 - y * 255 // 18)
-    picture = np.stack(ramp, axis=-1).astype(np.uint8)
-    picture[:, 20:40] = 255
-    picture[:, 50:70] = 0
-    return picture
+    image = np.stack(ramp, axis=-1).astype(np.uint8)
+    image[:, 20:40] = 255
+    image[:, 50:70] = 0
+    return image

@@ -1,7 +1,7 @@
-"""The colour filter array as data: which channel each site of the 2x2 tile sees, and taking the mosaic.
+"""Colour filter array: the channel of each CFA site, mosaics and packed planes.
 
-The tile is anchored at the top-left pixel of the full frame, so a part of a frame needs to know where it was cut out
-(``origin``). Any height and width works, odd ones and single pixels too; nothing is padded or cropped.
+The 2x2 tile is aligned with the first pixel of the full frame, so functions take the position (``origin``) of a crop.
+Any height and width works unless a function states otherwise; nothing is padded or cropped.
 """
 
 from __future__ import annotations
@@ -12,21 +12,38 @@ from unprocess_gen.core.types import Float, Frame
 
 CHANNELS = "RGB"
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-"""Filters of the sites (0, 0), (0, 1), (1, 0), (1, 1), as the DNG tag CFAPattern lists them."""
+"""Filters of the sites (0, 0), (0, 1), (1, 0), (1, 1), in the order of the DNG tag CFAPattern."""
 
 
 def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the channel (0 red, 1 green, 2 blue) of each site ``[y % 2][x % 2]``, seen from ``origin``.
+    """Return the channel of each site of the 2x2 tile.
 
-    Raises ValueError for a pattern that is not one of `PATTERNS`.
+    Parameters
+    ----------
+    pattern : str
+        One of `PATTERNS`.
+    origin : (int, int)
+        Row and column in the full frame of the site at [0][0].
 
+    Returns
+    -------
+    tuple of two tuples of two ints
+        Channel (0 red, 1 green, 2 blue) of the site at [y % 2][x % 2].
+
+    Raises
+    ------
+    ValueError
+        If the pattern is unknown.
+
+    Examples
+    --------
     >>> tile("RGGB")
     ((0, 1), (1, 2))
     >>> tile("RGGB", origin=(0, 1))
     ((1, 0), (2, 1))
     """
     if pattern not in PATTERNS:
-        raise ValueError(f"pattern is {pattern!r}, expected one of {', '.join(PATTERNS)}")
+        raise ValueError(f"pattern={pattern}: unknown CFA pattern; expected one of {', '.join(PATTERNS)}")
     y0, x0 = origin
 
     def channel(y: int, x: int) -> int:
@@ -36,9 +53,21 @@ def tile(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int
 
 
 def mosaic(camera_rgb: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
-    """Keep one channel per site: ``[H, W, 3]`` becomes ``[H, W]``, values unchanged.
+    """Sample one channel per CFA site.
 
-    ``origin`` is the row and column of the top-left pixel in the full frame.
+    Parameters
+    ----------
+    camera_rgb : ndarray of float64, [H, W, 3]
+        Camera RGB.
+    pattern : str
+        One of `PATTERNS`.
+    origin : (int, int)
+        Row and column of the first pixel in the full frame.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        Mosaic; values are not changed.
     """
     raw = np.empty(camera_rgb.shape[:2])
     sites = tile(pattern, origin)
@@ -49,12 +78,26 @@ def mosaic(camera_rgb: Float, pattern: str, origin: tuple[int, int] = (0, 0)) ->
 
 
 PLANES = ("R", "G of the red rows", "G of the blue rows", "B")
-"""The planes of a packed frame in their order, which is that of Brooks et al. 2019 (unprocess.py, mosaic())."""
+"""Packed planes in their order, as in Brooks et al. 2019 (unprocess.py, mosaic())."""
 
 
 def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[int, int], ...]:
-    """Return row and column in the 2x2 tile, seen from ``origin``, of each of `PLANES`: the same order for any pattern.
+    """Return the position in the 2x2 tile of the site of each packed plane.
 
+    Parameters
+    ----------
+    pattern : str
+        One of `PATTERNS`.
+    origin : (int, int)
+        Row and column in the full frame of the tile's first site.
+
+    Returns
+    -------
+    tuple of four (int, int)
+        Row and column for each of `PLANES`.
+
+    Examples
+    --------
     >>> plane_sites("GBRG")
     ((1, 0), (1, 1), (0, 0), (0, 1))
     """
@@ -65,13 +108,30 @@ def plane_sites(pattern: str, origin: tuple[int, int] = (0, 0)) -> tuple[tuple[i
 
 
 def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
-    """Return a mosaic ``[H, W]``, H and W even, as the planes ``[4, H / 2, W / 2]`` of `PLANES`; a copy.
+    """Convert a mosaic to packed planes.
 
-    Raises ValueError where a side is odd.
+    Parameters
+    ----------
+    mosaic : ndarray, [H, W]
+        Mosaic with even height and width.
+    pattern : str
+        One of `PATTERNS`.
+    origin : (int, int)
+        Row and column of the first site in the full frame.
+
+    Returns
+    -------
+    ndarray, [4, H / 2, W / 2]
+        Planes in the order of `PLANES`; a copy of the same dtype.
+
+    Raises
+    ------
+    ValueError
+        If a side is odd.
     """
     height, width = mosaic.shape
     if height % 2 or width % 2:
-        raise ValueError(f"a mosaic of {width} x {height} sites has no whole planes: packing needs even sides")
+        raise ValueError(f"mosaic={width} x {height}: odd side; expected even width and height for packed planes")
     planes: Frame = np.empty((4, height // 2, width // 2), dtype=mosaic.dtype)
     for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
         plane[:] = mosaic[y::2, x::2]
@@ -79,7 +139,22 @@ def pack(mosaic: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame
 
 
 def unpack(planes: Frame, pattern: str, origin: tuple[int, int] = (0, 0)) -> Frame:
-    """Return the mosaic ``[H, W]`` of packed planes ``[4, H / 2, W / 2]``: the inverse of `pack`."""
+    """Convert packed planes to a mosaic: the inverse of `pack`.
+
+    Parameters
+    ----------
+    planes : ndarray, [4, H / 2, W / 2]
+        Planes in the order of `PLANES`.
+    pattern : str
+        One of `PATTERNS`.
+    origin : (int, int)
+        Row and column of the mosaic's first site in the full frame.
+
+    Returns
+    -------
+    ndarray, [H, W]
+        Mosaic of the same dtype.
+    """
     mosaic: Frame = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), dtype=planes.dtype)
     for plane, (y, x) in zip(planes, plane_sites(pattern, origin), strict=True):
         mosaic[y::2, x::2] = plane

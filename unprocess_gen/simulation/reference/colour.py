@@ -1,11 +1,11 @@
-"""Camera matrices with their sources, and the way from a mix of cameras to one linear RGB -> camera matrix.
+"""Camera matrices with their sources, and the linear RGB → camera matrix of a mixture of cameras.
 
-All of it is Python floats in a fixed order of operations: nine numbers need no array library, and no library's matrix
-product gives the same last bit on every machine. Inverses are exact fractions, rounded once.
+Matrices are tuples of nine Python floats, computed in a fixed order of operations, because the matrix products of
+libraries round differently between machines. Inverses are computed with exact fractions and rounded once.
 
-White must stay white whichever order a reader adds in, so the rows of ``rgb2cam`` are put on a common power-of-two grid
-on which their sum is exactly 1 (`normalise_rows`). It moves an entry by at most two units of 2**-52 relative to the
-largest; without it 24 % of white pixels would come out one rounding below or above 1.
+White must stay exactly white in any order of additions. `normalise_rows` therefore rounds the rows of ``rgb2cam`` to a
+power-of-two grid on which they sum to exactly 1. This moves an entry by at most two units of 2**-52, relative to the
+largest entry. Without it, 24 % of white pixels differ from 1 by one rounding error.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
-"""Nine numbers, row by row."""
+"""Nine entries, row by row."""
 
 CAMERAS: dict[str, Matrix] = {
-    # XYZ (D65) -> camera. The order is that of the manifest's weights. Brooks et al. 2019, unprocess.py, random_ccm();
-    # the names by comparison with LibRaw's colordata.cpp. The first has no entry there: its values are multiples of
-    # 1/128, as in an Android DNG, so it is the Nexus 6P by elimination.
+    # XYZ (D65) -> camera, in the order of the manifest's weights. Values: Brooks et al. 2019, unprocess.py,
+    # random_ccm(). Names: LibRaw, colordata.cpp. The first matrix is not in LibRaw. Its entries are multiples of 1/128,
+    # as in an Android DNG, so by elimination it is the Nexus 6P.
     "nexus_6p": (1.0234, -0.2969, -0.2266, -0.5625, 1.6328, -0.0469, -0.0703, 0.2188, 0.6406),
     "sony_a7r": (0.4913, -0.0541, -0.0202, -0.613, 1.3513, 0.2906, -0.1564, 0.2151, 0.7183),  # LibRaw: ILCE-7R
     "olympus_em10": (0.838, -0.263, -0.0639, -0.2887, 1.0725, 0.2496, -0.0627, 0.1427, 0.5438),  # LibRaw: E-M10
@@ -38,11 +38,27 @@ RGB2XYZ: Matrix = (
 IDENTITY: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 MAX_CONDITION = 1e10
-"""Chosen: a matrix that loses more than ten decimal digits on the way back is refused as not invertible."""
+"""Largest accepted condition number; a larger one loses more than ten decimal digits when inverted (own choice)."""
 
 
 def matrix(numbers: Sequence[float]) -> Matrix:
-    """Return nine numbers as a `Matrix`; ValueError for any other count."""
+    """Convert nine numbers to a matrix.
+
+    Parameters
+    ----------
+    numbers : sequence of float
+        Entries, row by row.
+
+    Returns
+    -------
+    Matrix
+        The entries as floats.
+
+    Raises
+    ------
+    ValueError
+        If there are not nine numbers.
+    """
     if len(numbers) != 9:
         raise ValueError(f"a camera matrix has nine numbers, got {len(numbers)}")
     a, b, c, d, e, f, g, h, i = (float(number) for number in numbers)
@@ -50,7 +66,18 @@ def matrix(numbers: Sequence[float]) -> Matrix:
 
 
 def multiply(left: Matrix, right: Matrix) -> Matrix:
-    """Return the product of two matrices, each entry summed from left to right."""
+    """Multiply two matrices; each entry is summed from left to right.
+
+    Parameters
+    ----------
+    left, right : Matrix
+        Factors.
+
+    Returns
+    -------
+    Matrix
+        The product.
+    """
     return matrix(
         [
             left[3 * i] * right[j] + left[3 * i + 1] * right[3 + j] + left[3 * i + 2] * right[6 + j]
@@ -61,7 +88,20 @@ def multiply(left: Matrix, right: Matrix) -> Matrix:
 
 
 def mix(matrices: Sequence[Matrix], weights: Sequence[float]) -> Matrix:
-    """Return the weighted sum of XYZ -> camera matrices; Brooks et al. mix before they normalise."""
+    """Return the weighted sum of XYZ → camera matrices; Brooks et al. mix before they normalise.
+
+    Parameters
+    ----------
+    matrices : sequence of Matrix
+        XYZ → camera matrices.
+    weights : sequence of float
+        One weight for each matrix.
+
+    Returns
+    -------
+    Matrix
+        The sum, added in order.
+    """
     mixed = [0.0] * 9
     for weight, entries in zip(weights, matrices, strict=True):
         mixed = [sum_ + weight * entry for sum_, entry in zip(mixed, entries, strict=True)]
@@ -69,17 +109,43 @@ def mix(matrices: Sequence[Matrix], weights: Sequence[float]) -> Matrix:
 
 
 def rgb2cam(xyz2cam: Matrix) -> Matrix:
-    """Return the linear sRGB -> camera matrix with rows that sum to exactly 1, so that white stays white.
+    """Compute the linear sRGB → camera matrix whose rows sum to exactly 1, so that white stays white.
 
-    Raises ValueError where the matrix is not finite, not invertible (see `condition`) or has a row that sums to zero.
+    Parameters
+    ----------
+    xyz2cam : Matrix
+        XYZ (D65) → camera matrix.
+
+    Returns
+    -------
+    Matrix
+        Normalised product with the sRGB → XYZ matrix.
+
+    Raises
+    ------
+    ValueError
+        If the matrix is not finite, not invertible (`MAX_CONDITION`), or has a row that sums to 0.
     """
     return normalise_rows(multiply(xyz2cam, RGB2XYZ))
 
 
 def normalise_rows(entries: Matrix) -> Matrix:
-    """Divide each row by its sum, on a grid where the three entries add up to exactly 1 in any order.
+    """Divide each row by its sum, and round it to a grid on which its entries sum to exactly 1 in any order.
 
-    Raises ValueError as `rgb2cam` does.
+    Parameters
+    ----------
+    entries : Matrix
+        Any matrix.
+
+    Returns
+    -------
+    Matrix
+        The normalised matrix.
+
+    Raises
+    ------
+    ValueError
+        As `rgb2cam`.
     """
     if not all(math.isfinite(entry) for entry in entries):
         raise ValueError("a camera matrix has finite entries")
@@ -89,12 +155,13 @@ def normalise_rows(entries: Matrix) -> Matrix:
 
 
 def _unit_row(row: Sequence[float]) -> list[float]:
+    """Return one row divided by its sum, on the grid of `normalise_rows`."""
     total = row[0] + row[1] + row[2]
     if abs(total) <= 1e-9 * max(abs(entry) for entry in row):
         raise ValueError("a row of the camera matrix sums to zero, so white cannot be kept")
     unit = [entry / total for entry in row]
     largest = max(range(3), key=lambda i: abs(unit[i]))
-    # The sum of two entries is 1 less the third: the grid must have room for those too.
+    # The sum of two entries is 1 minus the third entry; the grid must represent these sums, too.
     reach = max(max(abs(entry), abs(1 - entry)) for entry in unit)
     grid = math.ldexp(1.0, max(math.frexp(reach)[1], 1) - 53)
     unit = [math.floor(entry / grid + 0.5) * grid for entry in unit]
@@ -104,7 +171,23 @@ def _unit_row(row: Sequence[float]) -> list[float]:
 
 
 def invert(entries: Matrix) -> Matrix:
-    """Return the inverse, computed exactly and rounded once per entry; ValueError where it is singular."""
+    """Invert a matrix exactly, rounding each entry once.
+
+    Parameters
+    ----------
+    entries : Matrix
+        Any matrix.
+
+    Returns
+    -------
+    Matrix
+        The inverse.
+
+    Raises
+    ------
+    ValueError
+        If the matrix is singular.
+    """
     a, b, c, d, e, f, g, h, i = (Fraction(entry) for entry in entries)
     cofactors = (
         *(e * i - f * h, c * h - b * i, b * f - c * e),
@@ -118,7 +201,7 @@ def invert(entries: Matrix) -> Matrix:
 
 
 def condition(entries: Matrix) -> float:
-    """Return the condition number in the maximum row sum norm, infinity for a singular matrix."""
+    """Return the condition number in the maximum row sum norm; infinity for a singular matrix."""
     try:
         inverse = invert(entries)
     except (ValueError, OverflowError):
@@ -127,4 +210,5 @@ def condition(entries: Matrix) -> float:
 
 
 def _norm(entries: Matrix) -> float:
+    """Return the maximum row sum norm."""
     return max(sum(abs(entry) for entry in entries[row : row + 3]) for row in (0, 3, 6))

@@ -1,19 +1,12 @@
-"""The mirror of `unprocess`: from the sensor's light back to a display-referred photograph, for eyes and for proofs.
+"""Invert `unprocess`: from the sensor's light back to a display-referred image, for display and for tests.
 
-Float64, one short function a step, in the camera's order: black level, gains, demosaic, matrix, gamma, tone. No byte of
-a dataset depends on this room, so it may call libm, LAPACK and OpenCV. It is the inverse of the settings in a manifest
-row. Where nothing was clipped, every 8-bit colour returns to its own code (the test walks all 2**24, for four cameras
-and the gains' extremes); through whole DN of 16 bits still, of 14 bits to one code at the extremes, of 12 to two, of 10
-to seven. Through the mosaic too, flat colours return so; what edges lose there is the demosaic's.
+Float64, one function per step, in the order of a camera: black level, gains, demosaicking, matrix, gamma, tone curve.
+No byte of a dataset depends on this module, so it may use libm, LAPACK and OpenCV.
 
-Tried for the highlights: Cardano's formula for the cubic, which loses half its digits where the mask begins; Newton's
-method from above keeps them and needs 4 to 9 rounds at the gains of the article.
-
-Tried for the demosaic, source to raw of 14 bits to sRGB, the middle megapixel of 37 photographs, median PSNR: OpenCV's
-bilinear one 37.2 dB, its edge-aware one 37.0 dB (both take whole numbers only, and its third but 8 bits); the filters
-of Malvar, He and Cutler, run by OpenCV, 41.0 dB where gains are applied before them, as cameras do, and 36.3 dB after
-them. They are better than the bilinear one on 34 of the 37, worse on three whose flowers and leaves have a single
-strong colour: channels that do not rise and fall together break their assumption.
+Without clipping, every 8-bit colour returns to its own code. A test checks all 2**24 colours, for four cameras and
+extreme gains. With rounding to DN in between, codes are exact at 16 bits. At the extremes they differ by at most one
+code at 14 bits, two at 12 and seven at 10. Flat colours also survive the mosaic; edges lose what the demosaicking
+loses. Comparison of methods: ``docs/design/isp.md``.
 """
 
 from __future__ import annotations
@@ -27,37 +20,63 @@ from unprocess_gen.core.types import Float, Frame, Plan
 from unprocess_gen.simulation.reference.cfa import mosaic, tile
 from unprocess_gen.simulation.reference.colour import invert
 
-ROUNDS = 200
-"""More than any search below needs: a bisection halves an interval of doubles at most 64 times until it is two
-neighbours, Newton's method halves at its slowest, at gains near 0."""
+MAX_ITERATIONS = 200
+"""Limit of the searches below, which need fewer: bisection ends after at most 64 steps, Newton's method at least halves
+the interval, even with gains near 0."""
 
 
 def process(camera_light: Float, plan: Plan) -> Float:
-    """Return display-referred values in [0, 1], ``[H, W, 3]`` float64, of camera RGB with 0 at black and 1 at white.
+    """Convert camera RGB to display-referred values: the inverse of `unprocess.camera_light`.
 
-    The inverse of `unprocess.camera_light`: colours that left [0, 1] on the way are clipped before the gamma, as
-    cameras do.
+    Parameters
+    ----------
+    camera_light : ndarray of float64, [H, W, 3]
+        Light at the sensor, 0 at black and 1 at white.
+    plan : Plan
+        Parameters of the pair.
+
+    Returns
+    -------
+    ndarray of float64, [H, W, 3]
+        Values in [0, 1]. Colours outside [0, 1] are clipped before the gamma, as cameras do.
     """
     return render(apply_gains(camera_light, plan.inverse_gains, plan.highlight, plan.highlight_threshold), plan)
 
 
 def render(camera_rgb: Float, plan: Plan) -> Float:
-    """Return display-referred values in [0, 1] of white-balanced camera RGB, ``[H, W, 3]``: matrix, gamma, tone."""
+    """Apply matrix, gamma and tone curve to white-balanced camera RGB, [H, W, 3]; returns values in [0, 1]."""
     image = camera_rgb @ np.array(invert(plan.rgb2cam)).reshape(3, 3).T
     image = compress_gamma(np.clip(image, 0, 1), plan.gamma)
     return TONES[plan.tone](image)
 
 
 def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
-    """Return the photograph that a raw frame shows, display-referred in [0, 1], ``[H, W, 3]`` float64.
+    """Develop a raw frame to a display-referred image.
 
-    ``raw`` is a mosaic ``[H, W]`` in DN, clean or noisy, of at least 2 x 2 sites; ``origin`` is the row and column of
-    its top-left site in the full frame. Noise below black and what a sensor reads above white are kept up to the colour
-    matrix; what then lies outside [0, 1] is clipped, as in `process`. Light that the clip at white or a full well took
-    does not come back; noise and fixed patterns are not undone. Raises ValueError as `demosaic` does.
+    Parameters
+    ----------
+    raw : ndarray, [H, W]
+        Clean or noisy mosaic in DN, at least 2 x 2 sites.
+    plan : Plan
+        Parameters of the pair.
+    origin : (int, int)
+        Row and column of ``raw[0, 0]`` in the full frame.
 
-    The gains are applied site by site, before the demosaic, so that a saturated highlight has no coloured rim. Where
-    highlights were kept by the mean of three channels, no site has them: there the demosaic sees the plain gains.
+    Returns
+    -------
+    ndarray of float64, [H, W, 3]
+        Display-referred values in [0, 1]. Values below black and above white are preserved up to the colour matrix and
+        clipped after it. Saturated light, noise and fixed patterns are not restored.
+
+    Raises
+    ------
+    ValueError
+        If the pattern is unknown or the frame is smaller than 2 x 2.
+
+    Notes
+    -----
+    Gains are applied before demosaicking, so that saturated highlights get no coloured rim. With
+    ``highlight="gray_mean"`` the gains depend on all three channels, so there demosaicking follows the plain gains.
     """
     light = to_light(raw, plan)
     k = np.broadcast_to(plan.inverse_gains, (*light.shape, 3))
@@ -69,13 +88,39 @@ def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) ->
 
 
 def to_light(dn: Frame | Float, plan: Plan) -> Float:
-    """Return the light of DN before the scene darkened it, any shape: 0 at black, 1 at the photograph's white."""
+    """Convert DN to light before the scene's darkening.
+
+    Parameters
+    ----------
+    dn : ndarray
+        DN, any shape.
+    plan : Plan
+        Parameters of the pair.
+
+    Returns
+    -------
+    ndarray of float64
+        Light, 0 at black and 1 at the white of the source image; same shape.
+    """
     span_dn = float(plan.white_level_dn - plan.black_level_dn)
     return np.asarray((dn - float(plan.black_level_dn)) / span_dn * plan.exposure_ratio)
 
 
 def to_codes(srgb: Float, codes: int = 256) -> Float:
-    """Return the nearest of ``codes`` evenly spaced codes, still float64; ``srgb`` in [0, 1], any shape."""
+    """Round display-referred values to codes.
+
+    Parameters
+    ----------
+    srgb : ndarray of float64
+        Values in [0, 1], any shape.
+    codes : int
+        Number of codes.
+
+    Returns
+    -------
+    ndarray of float64
+        Integers from 0 to ``codes`` - 1, same shape.
+    """
     return np.rint(srgb * (codes - 1))
 
 
@@ -85,49 +130,79 @@ KERNELS = {
     "column": ((0, 0, -2, 0, 0), (0, -2, 8, -2, 0), (1, 0, 10, 0, 1), (0, -2, 8, -2, 0), (0, 0, -2, 0, 0)),
     "diagonal": ((0, 0, -3, 0, 0), (0, 4, 0, 4, 0), (-3, 0, 12, 0, -3), (0, 4, 0, 4, 0), (0, 0, -3, 0, 0)),
 }
-"""Sixteenths (Malvar, He and Cutler, ICASSP 2004, figure 2): the mean of a site's neighbours of the channel wanted,
-which stand in a cross (green at red and blue), in its row, in its column or across (red at blue, blue at red), and a
-correction by the second difference of the channel it has. Each sums to 16 and is symmetric: flat colours and ramps are
-exact."""
+"""Filters of Malvar, He and Cutler (ICASSP 2004, figure 2), in sixteenths.
+
+A filter averages the neighbours of the wanted channel and corrects the mean by the second difference of the site's own
+channel. The neighbours are next to the site (green at red and blue), in its row, in its column, or diagonal (red at
+blue, blue at red). Each filter is symmetric and sums to 16, so that flat colours and ramps are exact.
+"""
 
 GREEN = 1
 
 
 def demosaic(values: Float, pattern: str, origin: tuple[int, int] = (0, 0)) -> Float:
-    """Return the three channels of every site of a mosaic, ``[H, W]`` to ``[H, W, 3]``; what was measured stays.
+    """Interpolate the missing channels of a mosaic (Malvar, He and Cutler, ICASSP 2004).
 
-    Linear in its input. A flat colour comes out exactly but for rounding, and so does a ramp of any slope in each
-    channel, save in the two outermost rows and columns: there the frame is mirrored about its edge sites, which keeps
-    the Bayer phase. Raises ValueError for an unknown pattern and for less than 2 x 2 sites, which do not show all
-    channels.
+    Parameters
+    ----------
+    values : ndarray of float64, [H, W]
+        Mosaic of at least 2 x 2 sites.
+    pattern : str
+        One of `cfa.PATTERNS`.
+    origin : (int, int)
+        Row and column of ``values[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    ndarray of float64, [H, W, 3]
+        All channels; recorded values are unchanged. Flat colours are exact up to rounding. Linear ramps are too, except
+        in the two outermost rows and columns, where the frame is mirrored about its edge sites (which preserves the
+        phase of the pattern).
+
+    Raises
+    ------
+    ValueError
+        If the pattern is unknown or the mosaic is smaller than 2 x 2.
     """
     if min(values.shape) < 2:
-        raise ValueError(f"the mosaic is {list(values.shape)}: less than 2 x 2 sites do not show all three colours")
-    guesses = {name: _filtered(values, kernel) for name, kernel in KERNELS.items()}
+        raise ValueError(f"mosaic={list(values.shape)}: channels are missing; expected at least 2 x 2 sites")
+    interpolated = {name: _filter(values, kernel) for name, kernel in KERNELS.items()}
     image = np.empty((*values.shape, 3))
     sites = tile(pattern, origin)
     for y in (0, 1):
         for x in (0, 1):
-            own, beside, below = sites[y][x], sites[y][1 - x], sites[1 - y][x]
-            missing = {beside: "row", below: "column"} if own == GREEN else {GREEN: "green", 2 - own: "diagonal"}
+            own, right, below = sites[y][x], sites[y][1 - x], sites[1 - y][x]
+            missing = {right: "row", below: "column"} if own == GREEN else {GREEN: "green", 2 - own: "diagonal"}
             image[y::2, x::2, own] = values[y::2, x::2]
             for channel, name in missing.items():
-                image[y::2, x::2, channel] = guesses[name][y::2, x::2]
+                image[y::2, x::2, channel] = interpolated[name][y::2, x::2]
     return image
 
 
-def _filtered(values: Float, sixteenths: tuple[tuple[int, ...], ...]) -> Float:
+def _filter(values: Float, sixteenths: tuple[tuple[int, ...], ...]) -> Float:
+    """Filter a mosaic with a kernel given in sixteenths."""
     kernel = np.array(sixteenths) / 16
     return np.asarray(cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_REFLECT_101))
 
 
 def smoothstep(y: Float) -> Float:
-    """Apply the tone curve 3y² - 2y³ (Brooks et al. 2019); y in [0, 1], any shape."""
+    """Apply the tone curve 3y² - 2y³ (Brooks et al. 2019).
+
+    Parameters
+    ----------
+    y : ndarray of float64
+        Values in [0, 1], any shape.
+
+    Returns
+    -------
+    ndarray of float64
+        Values in [0, 1], same shape.
+    """
     return np.asarray(y * y * (3 - 2 * y))
 
 
 def no_tone(y: Float) -> Float:
-    """Leave the image as it is: no tone curve."""
+    """Return ``y``: no tone curve."""
     return y
 
 
@@ -135,16 +210,29 @@ TONES: dict[str, Callable[[Float], Float]] = {"smoothstep": smoothstep, "none": 
 
 
 def compress_gamma(u: Float, gamma: float | str) -> Float:
-    """Return v = u**(1 / gamma), or sRGB's piecewise curve (IEC 61966-2-1) for ``"srgb"``; u in [0, 1]."""
+    """Apply the gamma: u**(1 / gamma), or the piecewise curve of sRGB (IEC 61966-2-1).
+
+    Parameters
+    ----------
+    u : ndarray of float64
+        Linear light in [0, 1], any shape.
+    gamma : float or str
+        Exponent, or ``"srgb"``.
+
+    Returns
+    -------
+    ndarray of float64
+        Values in [0, 1], same shape.
+    """
     if gamma == "srgb":
         return np.where(u <= 0.04045 / 12.92, u * 12.92, 1.055 * u ** (1 / 2.4) - 0.055)
     return np.asarray(u ** (1 / float(gamma)))
 
 
 def apply_gains(y: Float, inverse_gains: tuple[float, float, float], highlight: str, threshold: float) -> Float:
-    """Apply white balance and brightening, ``[H, W, 3]`` to ``[H, W, 3]``: the inverse of `unprocess.invert_gains`.
+    """Apply white balance and brightness gains, [H, W, 3] to [H, W, 3]: the inverse of `unprocess.invert_gains`.
 
-    Exact up to rounding for unclipped values, whichever way the highlights were kept.
+    For unclipped values the inverse is exact up to rounding, for each method of `HIGHLIGHTS`.
     """
     return HIGHLIGHTS[highlight](y, np.array(inverse_gains), threshold)
 
@@ -159,10 +247,13 @@ def apply_gains_per_channel(y: Float, k: Float, threshold: float) -> Float:
 
 
 def _solve_highlight(y: Float, k: Float, threshold: float) -> Float:
-    """Newton's method from above: the function rises and is convex there, so no step goes past the root."""
+    """Solve for the highlights by Newton's method from above; the function is convex, so no step passes the root.
+
+    Cardano's formula loses half the digits where the mask begins.
+    """
     i = np.maximum(y, 1)
     width = 1 - threshold
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         m = (i - threshold) / width
         slope = k + (1 - k) * m * (m + 2 * i / width)
         better = np.maximum(i - (i * (k + (1 - k) * m * m) - y) / slope, threshold)
@@ -173,17 +264,17 @@ def _solve_highlight(y: Float, k: Float, threshold: float) -> Float:
 
 
 def apply_gains_gray_mean(y: Float, k: Float, threshold: float) -> Float:
-    """Find the mean of the channels that `unprocess.invert_gains_gray_mean` must have seen, then divide by its gains.
+    """Find the channel mean s that `unprocess.invert_gains_gray_mean` used, then divide by its gains.
 
-    With s the mean, i_c = y_c / g_c(s) and s = mean(i_c): the right side falls as s rises (where light is not
-    negative), so bisection finds the only root.
+    With i_c = y_c / g_c(s), s = mean(i_c). For light that is not negative, the right side decreases with s, so
+    bisection finds the only root.
     """
     i = y / k
     kept = np.mean(i, axis=-1) > threshold
     part = y[kept]
     low = np.full(part.shape[:-1], threshold)
     high = np.mean(part / k, axis=-1)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         middle = (low + high) / 2
         if ((middle <= low) | (middle >= high)).all():
             break
@@ -194,6 +285,7 @@ def apply_gains_gray_mean(y: Float, k: Float, threshold: float) -> Float:
 
 
 def _gray_gains(gray: Float, k: Float, threshold: float) -> Float:
+    """Return the inverse gains that the highlight method ``gray_mean`` uses for a channel mean."""
     m = np.maximum(gray - threshold, 0)[..., None] / (1 - threshold)
     mask = m * m
     return np.maximum(mask + (1 - mask) * k, k)

@@ -1,4 +1,20 @@
-"""Compute Poisson counts from 32-bit words, coupled to the normal deviates of the same words."""
+"""Draw Poisson counts by inverting the distribution function of 32-bit random words (NumPy reference).
+
+A count is the smallest k with P(K <= k) >= u for the probability u of its word. It increases with the normal deviate
+that `noise.normals` computes from the same word. For all rates up to 1e9, the fraction of words that give k or less is
+P(K <= k) to within 2**-32. `kernels.poisson` computes the same counts.
+
+From rate 64 (`LIMIT`), the count is floor(x) with Γ(x, rate) / Γ(x) = Φ(w) for the normal deviate w (Giles, "Algorithm
+955: approximation of the inverse Poisson cumulative distribution function", ACM TOMS 42(1), 2016). With s = w / √rate,
+
+    x = rate + √rate·w + w²·A(s) + B(s) + C(s) / rate + D(s) / rate² + E(s) / rate³.
+
+This is the expansion of Giles and of Temme, ordered by powers of s, so that it holds in the tails. The truncation error
+is 2e-12 of the distribution function at rate 64.
+
+Below 64, the count comes from tables of P(K <= k): 81 cells of √rate, each with seven derivatives in the rate. Their
+error is at most 6e-12. Tables are computed with `decimal` and single operations + - × ÷, in 0.05 s.
+"""
 
 from __future__ import annotations
 
@@ -18,85 +34,80 @@ from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
 
 LIMIT = 64.0
-"""Rates from here on go by the expansion."""
+"""Smallest rate for which counts are computed by the expansion."""
 
 
 TABLES_SHA256 = "25207712ad68964496f19a7d00d298dfbc6c164937338e04b57489c670bacbd6"
-"""Of all tables, one after the other."""
+"""SHA-256 of all tables (`digest`)."""
 
 
-# Coefficients of the expansion, lowest power of s first (the test derives them anew).
+# Coefficients of the expansion, lowest power of s first; a test derives them independently.
 A = (
     *(1 / 6, -1 / 72, 1 / 270, -23 / 17280, 19 / 34020, -11237 / 43545600, 13 / 102060, -2482411 / 37623398400),
     *(53741 / 1515591000, -272785979 / 13905608048640, 51173 / 4605822000),
 )
-
 
 B = (
     *(1 / 3, -1 / 36, 7 / 810, -137 / 38880, 5 / 3024, -165779 / 195955200, 301 / 656100, -1219369 / 4702924800),
     *(32976641 / 218245104000, -84622554329 / 938628543283200),
 )
 
-
 C = (
     *(-8 / 405, 671 / 38880, -5189 / 408240, 2647909 / 293932800, -9683 / 1530900, 834145 / 188116992),
     *(-678871967 / 218245104000, 14645993203 / 6704489594880, -19607719333 / 12767338584000),
 )
-
 
 D = (
     *(-16 / 25515, 274867 / 146966400, -39281 / 13778100, 5006651 / 1511654400, -4372075159 / 1309470624000),
     362985384281 / 117328567910400,
 )
 
-
 E = (5408 / 3444525, -18075959 / 4232632320, 27968607743 / 3928411872000, -9969287490329 / 1055957111193600)
-
 
 SHORT_LEAST, SHORT_REACH = 6.0, 3.5
 
-
 NORMAL_ERROR, SHORT_ERROR, LOW_ERROR = 6e-6, 0.05, 18.0
-"""For rates from SHORT_LEAST up and normals within SHORT_REACH the short form of x, of quick normals and in single
-precision, is off by less than NORMAL_ERROR·(8 + √rate) + SHORT_ERROR / rate + LOW_ERROR / rate³."""
-
+"""Error of the kernels' short form of x (float32, approximate normal deviates), for rates from `SHORT_LEAST` and normal
+deviates within `SHORT_REACH`: less than NORMAL_ERROR·(8 + √rate) + SHORT_ERROR / rate + LOW_ERROR / rate³."""
 
 TAIL_CELLS = 8
-"""Cells of the normal's tail per standard deviation."""
-
+"""Cells of the normal tail table per standard deviation."""
 
 LAST_TAIL_CELL = 51
-
 
 ORDER = 7
 """Degree of the polynomials in the tables of distribution functions."""
 
-
 RATE_CELLS = 10
-"""Cells per unit of √rate. A rate lies within a tenth of its standard deviation from the middle of its cell."""
-
+"""Cells per unit of √rate; a rate is within a tenth of its standard deviation of the centre of its cell."""
 
 CELLS = int(8 * RATE_CELLS) + 1
-"""The last one is for √rate that rounds up to 8."""
-
+"""Number of cells; the last one serves √rate that rounds up to 8."""
 
 MOST = 128
-"""No count below `LIMIT` is as great."""
-
+"""Upper bound of all counts for rates below `LIMIT`."""
 
 NORMAL_CELLS, LEAST_NORMAL = 8, -6.5
-
 
 GUESS_UNIT = 0.125
 
 
 class Tables(NamedTuple):
-    """What the two forms look up, read-only.
+    """Tables for Poisson counts, read-only.
 
-    ``tails`` ``[52, 8]``: the normal's upper tail at z is the polynomial of row floor(8 z) in z minus the cell's
-    middle. ``cdf`` ``[N, 8]``: row ``first[c] + k`` is P(K <= k) in the rate minus ``middle[c]``, for cell
-    c = floor(10 √rate) and k from ``least[c]`` to ``most[c]``; beyond those lies less than 2**-34. ``guess``
-    ``[81, 104]``: what x lies above rate + √rate·z in cell c and cell floor(8 (z + 6.5)) of the normal, in eighths.
+    Attributes
+    ----------
+    tails : ndarray of float64, [52, 8]
+        Upper normal tail at z: polynomial of row floor(8 z) in z minus the centre of the cell.
+    cdf : ndarray of float64, [N, 8]
+        P(K <= k): polynomial of row ``first[c] + k`` in the rate minus ``middle[c]``, for cell c = floor(10 √rate) and
+        k from ``least[c]`` to ``most[c]``. The probability of other counts is below 2**-34.
+    first, least, most : ndarray of int64, [81]
+        Row offset, smallest k and largest k of each cell.
+    middle : ndarray of float64, [81]
+        Rate at the centre of each cell.
+    guess : ndarray of int8, [81, 104]
+        Estimate of x - (rate + √rate·z) in eighths, by cell c and cell floor(8 (z + 6.5)) of the normal deviate z.
     """
 
     tails: Float
@@ -110,7 +121,18 @@ class Tables(NamedTuple):
 
 @functools.lru_cache(maxsize=1)
 def poisson_tables() -> Tables:
-    """Return the tables; MachineError where they do not come out as published."""
+    """Compute the tables once per process.
+
+    Returns
+    -------
+    Tables
+        Read-only tables.
+
+    Raises
+    ------
+    MachineError
+        If the tables do not have the published SHA-256.
+    """
     root = (2 * np.arange(CELLS) + 1) / (2 * RATE_CELLS)
     middle = root * root
     polynomials = _cdf_polynomials(middle)
@@ -122,27 +144,27 @@ def poisson_tables() -> Tables:
     guess = np.array([_guesses(*cell) for cell in zip(middle, polynomials[..., 0], least, most, strict=True)])
     tables = Tables(_tails(), polynomials[kept], first, least, most, middle, guess)
     if (found := digest(tables)) != TABLES_SHA256:
-        raise MachineError(f"the Poisson tables came out as {found}, expected {TABLES_SHA256}")
+        raise MachineError(f"the Poisson tables have SHA-256 {found}; expected {TABLES_SHA256}; use another Python")
     for table in tables:
         table.flags.writeable = False
     return tables
 
 
 def digest(tables: Tables) -> str:
-    """Return the SHA-256 of all tables as little-endian doubles, one after the other."""
+    """Return the SHA-256 of all tables, concatenated as little-endian float64."""
     return sha256(np.concatenate([table.ravel().astype(np.float64) for table in tables]))
 
 
 def _tails() -> Float:
-    """Return `Tables.tails`, correctly rounded: the derivatives are Hermite polynomials times the density."""
+    """Return `Tables.tails`, correctly rounded; the derivatives are Hermite polynomials times the density."""
     rows = []
     with localcontext() as context:
         context.prec = DIGITS
         for cell in range(LAST_TAIL_CELL + 1):
             z = (Decimal(cell) + Decimal("0.5")) / TAIL_CELLS
-            term, before = -normal_density(z), Decimal(0)  # -phi·He_n / (n + 1)!, n = 0, but for the sign
+            term, before = -normal_density(z), Decimal(0)  # -φ·He_n / (n + 1)! for n = 0, up to the sign
             row = [1 - normal_cdf(z), term]
-            for n in range(1, ORDER):  # He_n = z·He_(n-1) - (n - 1)·He_(n-2), and each derivative turns the sign
+            for n in range(1, ORDER):  # He_n = z·He_(n-1) - (n - 1)·He_(n-2); each derivative changes the sign
                 term, before = -(z * term + before * (n - 1) / n) / (n + 1), term
                 row.append(term)
             rows.append([float(value) for value in row])
@@ -150,7 +172,7 @@ def _tails() -> Float:
 
 
 def _cdf_polynomials(middle: Float) -> Float:
-    """Return P(K <= k) and its derivatives in the rate over n! at each middle, ``[CELLS, MOST, 8]``.
+    """Return P(K <= k) and its derivatives in the rate, divided by n!, at each centre, [CELLS, MOST, 8].
 
     The derivative of P(K <= k) is -P(K = k), and that of P(K = k) is P(K = k - 1) - P(K = k).
     """
@@ -159,7 +181,7 @@ def _cdf_polynomials(middle: Float) -> Float:
         none = np.array([float((-Decimal(float(rate))).exp()) for rate in middle])
     share = np.zeros((CELLS, MOST))
     share[:, 0] = none
-    for k in range(1, MOST):  # what is negligible is dropped, since it would underflow on the way
+    for k in range(1, MOST):  # drop negligible terms, which would underflow
         share[:, k] = np.where(share[:, k - 1] > 1e-60, share[:, k - 1], 0) * middle / k
     terms = [np.cumsum(share, axis=1), -share]
     for n in range(2, ORDER + 1):
@@ -169,7 +191,7 @@ def _cdf_polynomials(middle: Float) -> Float:
 
 
 def _range(middle: Float, polynomials: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return per cell the least and the greatest k whose P(K <= k) is needed for any rate in the cell."""
+    """Return for each cell the smallest and the largest k that any rate in the cell needs."""
     root = np.arange(CELLS + 1) / RATE_CELLS
     edge = root * root
     at_lowest = _horner(polynomials, (edge[:-1] - middle)[:, None])
@@ -180,7 +202,7 @@ def _range(middle: Float, polynomials: Float) -> tuple[NDArray[np.int64], NDArra
 
 
 def _guesses(rate: float, cdf: Float, least: int, most: int) -> NDArray[np.int8]:
-    """Return a row of `Tables.guess`: x from a line between the normals where the count changes."""
+    """Return a row of `Tables.guess`: linear interpolation between normal deviates at which the count changes."""
     tail = np.minimum(cdf, 1 - cdf)
     edges = np.flatnonzero(tail > 2.0**-33)
     edges = edges[(edges >= least) & (edges <= most)]
@@ -192,9 +214,19 @@ def _guesses(rate: float, cdf: Float, least: int, most: int) -> NDArray[np.int8]
 
 
 def poisson(words: Words, rate: Float) -> Float:
-    """Return Poisson counts as float64, the shape of ``words`` (uint32) and ``rate`` (float64, equal shapes).
+    """Convert random words to Poisson counts.
 
-    ``rate`` is the mean, in counts, up to 1e9 (the caller sees to that); 0 and less, and NaN, give 0.
+    Parameters
+    ----------
+    words : ndarray of uint32
+        Random words, any shape.
+    rate : ndarray of float64
+        Means in counts, at most 1e9 (not checked), of the same shape. Rates that are 0, negative or NaN give 0.
+
+    Returns
+    -------
+    ndarray of float64
+        Counts, same shape.
     """
     tail = _tail(words)
     low = words >> np.uint32(31) == 1
@@ -207,12 +239,12 @@ def poisson(words: Words, rate: Float) -> Float:
 
 
 def _tail(words: Words) -> Float:
-    """Return the tail probability of each word: (i + ½) / 2**32, i its lower 31 bits."""
+    """Return the tail probability of each word: (i + ½) / 2**32 for its lower 31 bits i."""
     return np.asarray(((words & np.uint32(0x7FFFFFFF)).astype(np.float64) + 0.5) * 2.0**-32)
 
 
 def _quantile(tail: Float) -> Float:
-    """Return the upper normal quantile of tail probabilities in [2**-33, ½), to 1.5e-7, as `effects.normals`."""
+    """Return the upper normal quantile of tail probabilities in [2**-33, ½), with an error below 1.5e-7."""
     mantissa, exponent = np.frexp(tail * 2.0**33)
     position = (2 * mantissa - 1) * SEGMENTS
     segment = np.floor(position)
@@ -222,7 +254,7 @@ def _quantile(tail: Float) -> Float:
 
 
 def _by_expansion(tail: Float, low: NDArray[np.bool_], rate: Float) -> Float:
-    """Return floor(x) for rates from `LIMIT` up, from tail probabilities and their side."""
+    """Return floor(x) for rates from `LIMIT`, from tail probabilities and the side of the tail."""
     z = _quantile(tail)
     cell = np.floor(z * TAIL_CELLS)
     row = poisson_tables().tails[cell.astype(np.int64)]
@@ -233,7 +265,20 @@ def _by_expansion(tail: Float, low: NDArray[np.bool_], rate: Float) -> Float:
 
 
 def expansion(rate: Float, w: Float) -> Float:
-    """Return x of the head of this room, for rates from `LIMIT` up and normals w up to 6.34 on either side."""
+    """Return x of the module's docstring.
+
+    Parameters
+    ----------
+    rate : ndarray of float64
+        Rates from `LIMIT`.
+    w : ndarray of float64
+        Normal deviates, at most 6.34 in magnitude, same shape.
+
+    Returns
+    -------
+    ndarray of float64
+        x, same shape.
+    """
     root = np.sqrt(rate)
     s = w / root
     c, d, e = _powers(C, s), _powers(D, s), _powers(E, s)
@@ -242,6 +287,7 @@ def expansion(rate: Float, w: Float) -> Float:
 
 
 def _powers(coefficients: Sequence[float], s: Float) -> Float:
+    """Evaluate a polynomial in s, coefficients from the lowest power."""
     total = np.full_like(s, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = coefficient + s * total
@@ -249,7 +295,7 @@ def _powers(coefficients: Sequence[float], s: Float) -> Float:
 
 
 def _horner(rows: Float, offset: Float) -> Float:
-    """Return the polynomials whose coefficients run along the last axis, the lowest power first."""
+    """Evaluate polynomials whose coefficients are along the last axis, from the lowest power."""
     total = rows[..., -1]
     for n in range(rows.shape[-1] - 2, -1, -1):
         total = rows[..., n] + offset * total
@@ -257,7 +303,7 @@ def _horner(rows: Float, offset: Float) -> Float:
 
 
 def _by_cdf(uniform: Float, rate: Float) -> Float:
-    """Return the least k with P(K <= k) >= ``uniform`` for rates in (0, `LIMIT`), by bisection."""
+    """Return the smallest k with P(K <= k) >= ``uniform`` for rates in (0, `LIMIT`), by bisection."""
     tables = poisson_tables()
     cell = np.floor(np.sqrt(rate) * RATE_CELLS).astype(np.int64)
     low, high = tables.least[cell], tables.most[cell] + 1
@@ -269,21 +315,45 @@ def _by_cdf(uniform: Float, rate: Float) -> Float:
 
 
 def gaussian_distance(rate_e: float, read_std_e: float) -> float:
-    """Return the distance between Poisson counts of a mean plus normal read noise, and a normal of their variance.
+    """Return the CDF distance between shot plus read noise and a normal distribution of the same variance.
 
-    0.0665 · rate / (rate + read_std²)^1.5, the greatest difference of the two distribution functions by the first term
-    of the Edgeworth expansion: skewness / 6 times the greatest value of (z² - 1) φ(z), that at 0. That electrons come
-    in steps is not in it: read noise below half an electron shows them, and `electrons` keeps to counts there.
+    The first Edgeworth term gives 0.0665 · rate / (rate + read_std²)^1.5: skewness / 6 times the maximum of
+    |(z² - 1) φ(z)|, which is at 0. It ignores that electrons are integers; read noise below half an electron shows the
+    steps, and `kernels.physical` always draws counts there.
+
+    Parameters
+    ----------
+    rate_e : float
+        Mean of the Poisson counts, electrons.
+    read_std_e : float
+        Standard deviation of the read noise, electrons.
+
+    Returns
+    -------
+    float
+        Largest difference of the two distribution functions; 0 without noise.
     """
     variance = rate_e + read_std_e * read_std_e
     return 0.0665 * (rate_e / variance) / math.sqrt(variance) if variance else 0.0
 
 
 def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]:
-    """Return (r0, r1): at means up to r0 electrons and from r1 on, `gaussian_distance` is at most ``law_distance``.
+    """Return the means for which a normal distribution is accurate enough for shot plus read noise.
 
-    It rises up to twice the read noise's variance and falls after it. (0, infinity) for a budget of 0; r0 = r1 where it
-    is within the budget everywhere.
+    `gaussian_distance` increases up to a mean of twice the variance of the read noise, and decreases after it.
+
+    Parameters
+    ----------
+    read_std_e : float
+        Standard deviation of the read noise, electrons.
+    law_distance : float
+        Largest accepted `gaussian_distance`.
+
+    Returns
+    -------
+    (float, float)
+        (r0, r1): the distance is accepted for means up to r0 and from r1, in electrons. r0 = r1 if it is accepted
+        everywhere; (0, infinity) for ``law_distance`` of 0.
     """
     if law_distance <= 0:
         return 0.0, math.inf
@@ -293,12 +363,12 @@ def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]
     far = max(peak, 1.0)
     while gaussian_distance(far, read_std_e) > law_distance:
         far *= 2
-    below = _last_within(0.0, peak, read_std_e, law_distance) if peak else 0.0
-    return below, _last_within(far, peak, read_std_e, law_distance)
+    below = _last_accepted(0.0, peak, read_std_e, law_distance) if peak else 0.0
+    return below, _last_accepted(far, peak, read_std_e, law_distance)
 
 
-def _last_within(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
-    """Return a mean within the distance, next to one that is not, between one that is and one that is not."""
+def _last_accepted(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
+    """Return by bisection the accepted mean nearest to the boundary between ``inside`` and ``outside``."""
     for _ in range(60):
         middle = (inside + outside) / 2
         if gaussian_distance(middle, read_std_e) <= law_distance:

@@ -1,7 +1,7 @@
-"""From light in [0, 1] to digital numbers, and noise profiles from the units they were published in to DN.
+"""Convert normalised light to DN, and published noise profiles to the sensor's DN.
 
-Rounding is half to even, then the clip, then the cast: a cast of a value out of range is undefined and differs between
-processors, truncation would darken every frame by half a DN.
+Values are rounded half to even, clipped, then cast. Casting out-of-range values is undefined and differs between CPUs;
+truncation would lower the mean by half a DN.
 """
 
 from __future__ import annotations
@@ -12,15 +12,42 @@ from unprocess_gen.core.types import FLOAT32, Float, Frame, Normalised, Raw
 
 
 def to_dn(light: Float, black_level_dn: int, white_level_dn: int, brightest: float = 1.0) -> Float:
-    """Clip light to [0, brightest] and map 0 and 1 to black and white, unrounded, ``[H, W]`` float64."""
+    """Clip light and convert it to DN, without rounding.
+
+    Parameters
+    ----------
+    light : ndarray of float64, [H, W]
+        Normalised light, 0 at black and 1 at white.
+    black_level_dn, white_level_dn : int
+        Levels of the sensor.
+    brightest : float
+        Light at which the frame saturates, at most 1.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        DN between the levels.
+    """
     return np.clip(light, 0, brightest) * float(white_level_dn - black_level_dn) + float(black_level_dn)
 
 
 def noisy_limits(bits: int, black_level_dn: int, clip: str) -> tuple[float, float]:
     """Return the lowest and highest DN of the noisy frame.
 
-    ``clip`` is ``sensor`` (0 to 2**bits - 1, the pedestal stays), ``black`` (nothing below the black level) or
-    ``none``.
+    Parameters
+    ----------
+    bits : int
+        Bit depth of the sensor.
+    black_level_dn : int
+        Black level.
+    clip : str
+        ``"sensor"``: 0 to 2**bits - 1, which keeps the pedestal. ``"black"``: from the black level. ``"none"``: no
+        limits.
+
+    Returns
+    -------
+    (float, float)
+        Limits in DN.
     """
     if clip == "none":
         return -np.inf, np.inf
@@ -28,18 +55,59 @@ def noisy_limits(bits: int, black_level_dn: int, clip: str) -> tuple[float, floa
 
 
 def quantise(value_dn: Float, low: float, high: float) -> Raw:
-    """Round half to even, clip to [low, high], then cast to uint16."""
+    """Round half to even, clip to [low, high], then cast to uint16.
+
+    Parameters
+    ----------
+    value_dn : ndarray of float64
+        DN, any shape.
+    low, high : float
+        Limits in DN, in [0, 65535].
+
+    Returns
+    -------
+    ndarray of uint16
+        DN, same shape.
+    """
     return np.clip(np.rint(value_dn), low, high).astype(np.uint16)
 
 
 def normalise(value_dn: Float, low: float, high: float, levels_dn: tuple[int, int]) -> Normalised:
-    """Clip to [low, high], map black and white to 0 and 1 in float64, then round once, to float32."""
+    """Clip to [low, high], map black and white to 0 and 1 in float64, then round once to float32.
+
+    Parameters
+    ----------
+    value_dn : ndarray of float64
+        DN, any shape.
+    low, high : float
+        Limits in DN.
+    levels_dn : (int, int)
+        Black and white level.
+
+    Returns
+    -------
+    ndarray of float32
+        Normalised values, same shape.
+    """
     black_dn, white_dn = levels_dn
     return ((np.clip(value_dn, low, high) - float(black_dn)) / float(white_dn - black_dn)).astype(np.float32)
 
 
 def in_dn(frame: Frame, levels_dn: tuple[int, int]) -> Float:
-    """Return a frame of either dtype in DN, float64: what `normalise` maps to 0 and 1 are the levels again."""
+    """Convert a frame of either dtype to DN.
+
+    Parameters
+    ----------
+    frame : ndarray of uint16 or float32
+        DN, or values normalised by `normalise`; any shape.
+    levels_dn : (int, int)
+        Black and white level.
+
+    Returns
+    -------
+    ndarray of float64
+        DN, same shape.
+    """
     black_dn, white_dn = levels_dn
     if frame.dtype != FLOAT32:
         return frame.astype(np.float64)
@@ -55,20 +123,28 @@ def noise_in_dn(
     profile_levels_dn: tuple[int, int],
     sensor_levels_dn: tuple[int, int],
 ) -> tuple[float, float]:
-    """Return (a_dn, b_dn2) of variance = a_dn·(x - black) + b_dn2 on the sensor, from a published profile.
+    """Convert a published two-parameter noise profile to DN of the sensor.
 
     Parameters
     ----------
-    a, b
-        Slope and intercept of the variance, as published.
-    units
-        ``normalized`` (black at 0, white at 1: Brooks et al., the DNG NoiseProfile) or ``dn``.
-    black
-        ``subtracted`` where the variance is a function of DN above black, ``included`` where the black level is part of
-        the signal (the article's a·raw + b): then b is moved by a times the profile's black level.
-    profile_levels_dn, sensor_levels_dn
-        Black and white level the profile was calibrated at, and those of the sensor; used for ``dn`` as the scale
-        s = (W - B) / (W_profile - B_profile): a·s, b·s².
+    a, b : float
+        Slope and intercept of the noise variance, as published.
+    units : str
+        ``"normalized"``: black at 0, white at 1 (Brooks et al.; DNG NoiseProfile). ``"dn"``: DN of the profile's
+        sensor.
+    black : str
+        ``"subtracted"`` if the published variance is a function of DN above black. ``"included"`` if it is a function
+        of DN (the article's a·raw + b); then a times the profile's black level is added to b.
+    profile_levels_dn : (int, int)
+        Black and white level of the sensor that was calibrated.
+    sensor_levels_dn : (int, int)
+        Black and white level of the simulated sensor. For ``"dn"``, a is multiplied by
+        s = (white - black) / (profile's white - profile's black), and b by s².
+
+    Returns
+    -------
+    (float, float)
+        a_dn (DN) and b_dn2 (DN²) of variance = a_dn·(x - black) + b_dn2.
     """
     black_dn, white_dn = sensor_levels_dn
     if units == "normalized":

@@ -1,12 +1,11 @@
-"""The article's Algorithm 1, step by step: from a display-referred photograph back to what the sensor saw.
+"""Algorithm 1 of the article, step by step: from a display-referred image to the light at the sensor.
 
-This is the reference: NumPy, float64, one short function a step, in the article's order. It defines the clean frame;
-`fused` must give the same DN everywhere and is what datasets are made with. The curves below call libm, whose last bit
-differs between machines; that never reaches a file, since the fast form reads exact tables (`tables`) instead, and the
-nearest any table value comes to a rounding edge is 6.7e-4 DN (8-bit sources, all five sensors). Given such a table as
-``curve``, the reference makes datasets too (``accuracy=reference``).
+This is the reference (NumPy, float64, one function per step, in the article's order). It defines the clean frame; the
+kernels compute the same DN. About 200 ns per pixel, 50 times as slow as the kernels.
 
-Cost: about 200 ns a pixel, fifty times the fast form.
+The formulas of the tone curves use libm, whose last bit differs between machines. Datasets never depend on it: kernels,
+and ``accuracy=reference``, read exact tables (`core.tone_curves`). With 8-bit sources and all five sensors, table
+values are at least 6.7e-4 DN from a rounding boundary.
 """
 
 from __future__ import annotations
@@ -19,19 +18,48 @@ from unprocess_gen.simulation.reference.cfa import mosaic
 
 
 def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: Float | None = None) -> Float:
-    """Return the clean mosaic before clipping, ``[H, W]`` float64 with 0 at black and 1 at white.
+    """Compute the clean mosaic before clipping.
 
-    Arguments as for `camera_light`; ``origin`` places a cut-out in the full frame, for the Bayer phase.
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes, R, G, B.
+    plan : Plan
+        Parameters of the pair.
+    origin : (int, int)
+        Row and column of ``srgb[0, 0]`` in the full frame, for the phase of the CFA pattern.
+    curve : ndarray of float64, optional
+        Linear light of every code (`tone_curves.linear_table`). By default the formulas are used.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        Normalised light, 0 at black and 1 at white.
     """
     return mosaic(camera_light(srgb, plan, curve), plan.pattern, origin)
 
 
 def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
-    """Return 8-bit codes as 16-bit ones, moved by up to half a code at random, ``[H, W, 3]``.
+    """Dither 8-bit codes to 16 bits, so that 256 codes do not become 256 levels of raw.
 
-    So that 256 codes do not become 256 levels of raw. Codes 0 and 255, and those whose light (``curve``, 256 entries)
-    lies above the highlight threshold, are not moved: there half a code is hundreds of DN. The offset is one of the 257
-    whole sixteen-bit codes about the middle, from the stream ``dequantize``, channel by channel.
+    Each channel of each pixel gets an offset from the random stream ``dequantize``: one of the 257 integers within half
+    an 8-bit code. Codes 0 and 255 and highlights get no offset, because half a code is hundreds of DN there.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8, [H, W, 3]
+        Display-referred codes.
+    plan : Plan
+        Parameters of the pair.
+    curve : ndarray of float64, [256]
+        Linear light of each code; codes above ``plan.highlight_threshold`` are highlights.
+    origin : (int, int)
+        Row and column of ``srgb[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    ndarray of uint16, [H, W, 3]
+        Dithered codes.
     """
     size = (srgb.shape[0], srgb.shape[1])
     channels = [words(plan.stream_key, "dequantize", size, origin=origin, draw=channel) for channel in range(3)]
@@ -41,10 +69,21 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
 
 
 def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
-    """Return what falls on the sensor, before clipping and without the mosaic: ``[H, W, 3]`` float64, 1 at white.
+    """Compute the light at the sensor in all three channels, before clipping.
 
-    ``srgb`` is uint8 or uint16 ``[H, W, 3]``, codes k taken as k / 255 or k / 65535. ``curve`` is the linear light of
-    every code; None computes it by the formulas.
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Codes k, which mean k / 255 or k / 65535.
+    plan : Plan
+        Parameters of the pair.
+    curve : ndarray of float64, optional
+        Linear light of every code. By default the formulas are used.
+
+    Returns
+    -------
+    ndarray of float64, [H, W, 3]
+        Camera RGB, 0 at black and 1 at white.
     """
     image = linear_light(srgb, plan.tone, plan.gamma) if curve is None else curve[srgb]
     image = apply_ccm(image, plan.rgb2cam)
@@ -52,18 +91,45 @@ def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
 
 
 def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:
-    """Undo the tone curve and the gamma: codes of any shape to light in [0, 1]."""
+    """Invert the tone curve and the gamma by their formulas.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16
+        Codes, any shape.
+    tone : str
+        Key of `TONES`.
+    gamma : float or str
+        Exponent, or ``"srgb"``.
+
+    Returns
+    -------
+    ndarray of float64
+        Linear light in [0, 1], same shape.
+    """
     white = np.float64(np.iinfo(srgb.dtype).max)
     return expand_gamma(TONES[tone](srgb / white, (white - srgb) / white), gamma)
 
 
 def inverse_smoothstep(x: Float, rest: Float) -> Float:
-    """Invert the tone curve y ↦ 3y² - 2y³; x, ``rest`` = 1 - x and the result in [0, 1], any shape.
+    """Invert the tone curve x = 3y² - 2y³ without cancellation.
 
-    The article writes ½ - sin(asin(1 - 2x) / 3), which loses every digit near black. The same function without a
-    subtraction, for x up to ½, is sin t · (√3 cos t + sin t) with t = asin(√x) / 3; above ½ it is mirrored. White is
-    steep, so the distance from it is passed in, computed from the integer codes: (N - k) / N has no rounding of k / N
-    in it. Within 5 units in the last place of the true value on the 8- and 16-bit grids.
+    The article's formula ½ - sin(asin(1 - 2x) / 3) cancels near black. This function avoids the subtraction: for
+    x ≤ ½ it is sin t · (√3 cos t + sin t) with t = asin(√x) / 3, and for larger x it is mirrored. The curve is steep at
+    white, so the caller computes ``rest`` from the integer codes, as (N - k) / N. The error is at most 5 units in the
+    last place for all 8- and 16-bit codes.
+
+    Parameters
+    ----------
+    x : ndarray of float64
+        Values in [0, 1], any shape.
+    rest : ndarray of float64
+        1 - x, same shape.
+
+    Returns
+    -------
+    ndarray of float64
+        y in [0, 1], same shape.
     """
     t = np.arcsin(np.sqrt(np.minimum(x, rest))) / 3
     y = np.sin(t) * (np.sqrt(3) * np.cos(t) + np.sin(t))
@@ -71,7 +137,7 @@ def inverse_smoothstep(x: Float, rest: Float) -> Float:
 
 
 def no_tone(x: Float, rest: Float) -> Float:
-    """Leave the image as it is: no tone curve was applied."""
+    """Return ``x``: no tone curve was applied."""
     return x
 
 
@@ -79,7 +145,20 @@ TONES = {"smoothstep": inverse_smoothstep, "none": no_tone}
 
 
 def expand_gamma(v: Float, gamma: float | str) -> Float:
-    """Return linear light u = v**gamma, or sRGB's piecewise curve (IEC 61966-2-1) for ``"srgb"``; v in [0, 1]."""
+    """Invert the gamma: v**gamma, or the piecewise curve of sRGB (IEC 61966-2-1).
+
+    Parameters
+    ----------
+    v : ndarray of float64
+        Values in [0, 1], any shape.
+    gamma : float or str
+        Exponent, or ``"srgb"``.
+
+    Returns
+    -------
+    ndarray of float64
+        Linear light in [0, 1], same shape.
+    """
     if gamma == "srgb":
         return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     return np.asarray(v ** float(gamma))
@@ -88,7 +167,7 @@ def expand_gamma(v: Float, gamma: float | str) -> Float:
 def apply_ccm(linear: Float, ccm: tuple[float, ...]) -> Float:
     """Multiply each RGB triplet by the row-major 3x3 matrix; ``[H, W, 3]`` to ``[H, W, 3]``.
 
-    Written out, because libraries' matrix products round differently between machines.
+    Products are written out, because the matrix products of libraries round differently between machines.
     """
     r, g, b = linear[..., 0], linear[..., 1], linear[..., 2]
     return np.stack([(ccm[i] * r + ccm[i + 1] * g) + ccm[i + 2] * b for i in (0, 3, 6)], axis=-1)
@@ -97,33 +176,47 @@ def apply_ccm(linear: Float, ccm: tuple[float, ...]) -> Float:
 def invert_gains(
     camera_rgb: Float, inverse_gains: tuple[float, float, float], highlight: str, threshold: float
 ) -> Float:
-    """Undo white balance and brightening, ``[H, W, 3]`` to ``[H, W, 3]``, not clipped.
+    """Invert white balance and brightness gains without clipping, [H, W, 3] to [H, W, 3].
 
-    ``highlight`` says what happens to intensities above ``threshold`` (in [0, 1)) where the gain is below 1; see
-    `HIGHLIGHTS`.
+    ``highlight`` (key of `HIGHLIGHTS`) selects the method for intensities above ``threshold``, in [0, 1), of channels
+    with an inverse gain below 1.
     """
     invert = HIGHLIGHTS[highlight]
     return invert(camera_rgb, np.array(inverse_gains), threshold)
 
 
 def invert_gains_per_channel(i: Float, k: Float, threshold: float) -> Float:
-    """Keep highlights channel by channel: k·i + i·m²·max(0, 1 - k), the article's function f.
+    """Preserve highlights in each channel: k·i + i·m²·max(0, 1 - k), the article's function f.
 
-    m = max(0, i - threshold) / (1 - threshold), so at 0.9 the term is the article's 100·i·(i - 0.9)²·(1 - k). White
-    stays exactly 1 for every k below 1, which 100·(1 - 0.9)² does not give.
+    m = max(0, i - threshold) / (1 - threshold). At threshold 0.9 the second term is the article's
+    100·i·(i - 0.9)²·(1 - k). Unlike 100·(1 - 0.9)², m² is exactly 1 at white, so white stays exactly 1.
+
+    Parameters
+    ----------
+    i : ndarray of float64
+        Intensities, any shape.
+    k : ndarray of float64
+        Inverse gains; shape that broadcasts.
+    threshold : float
+        Intensity from which highlights are preserved, in [0, 1).
+
+    Returns
+    -------
+    ndarray of float64
+        Intensities before the gains, not clipped.
     """
     return i * k + i * highlight_mask(i, threshold) * np.maximum(1 - k, 0)
 
 
 def invert_gains_gray_mean(i: Float, k: Float, threshold: float) -> Float:
-    """Keep highlights by the mean of the three channels (Brooks et al. 2019, safe_invert_gains())."""
+    """Preserve highlights by the mean of the three channels (Brooks et al. 2019, safe_invert_gains())."""
     gray = ((i[..., 0] + i[..., 1]) + i[..., 2]) / 3
     mask = highlight_mask(gray, threshold)[..., None]
     return i * np.maximum(mask + (1 - mask) * k, k)
 
 
 def invert_gains_none(i: Float, k: Float, threshold: float) -> Float:
-    """Multiply by the inverse gains and nothing else: with gains below 1 no highlight reaches white."""
+    """Multiply by the inverse gains only; with gains below 1, highlights do not reach white."""
     return i * k
 
 
