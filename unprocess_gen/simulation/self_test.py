@@ -139,7 +139,7 @@ GOLDEN_PAIRS = {
     "float32": ("float32",),
     "plain": ("plain", "near"),
     "physical": ("physical",),
-    "reference": ("readable",),
+    "reference": ("reference",),
     "normalised": ("normalised",),
     "normalised_counts": ("normalised", "normalised_counts"),
 }
