@@ -1,4 +1,4 @@
-"""A dataset against Algorithm 1 by other hands: row and source in, every DN of the clean frame out."""
+"""Clean frames of a dataset, compared with an independent implementation of Algorithm 1."""
 
 from __future__ import annotations
 

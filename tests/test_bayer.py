@@ -1,4 +1,4 @@
-"""The colour filter array: four patterns, any origin, any size."""
+"""Colour filter array: four patterns, any origin, any size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TILES = {
 
 
 def coloured(height: int, width: int) -> np.ndarray:
-    """Every sample tells its own place: channel · 10⁶ + row · 10³ + column."""
+    """Return an image whose values encode their position: channel · 10⁶ + row · 10³ + column."""
     y, x, c = np.ogrid[:height, :width, :3]
     return (c * 10**6 + y * 10**3 + x).astype(np.float64)
 

@@ -1,4 +1,4 @@
-"""Camera matrices: white stays white in any order of addition, and nothing else is moved by more than rounding."""
+"""Camera matrices: white stays exactly white in any order of additions; other colours change by rounding only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The normals, their law to the last tail, and the noise that is made of them."""
+"""Normal deviates and their distribution including the tails, and the noise computed from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames in float32 and packed planes: the same pair, not rounded, not clipped where asked, the same bytes."""
+"""Frames in float32 and packed planes: the pair without rounding, clipped or not, byte for byte reproducible."""
 
 from __future__ import annotations
 
@@ -357,7 +357,7 @@ def test_a_flipped_bit_is_found_and_repaired(packed: Path, photos: Path, door: D
 def test_the_estimated_bytes_are_exact(
     overrides: tuple[str, ...], photos: Path, make: Make, settings: Settings, tmp_path: Path
 ) -> None:
-    """Whole images and, in 13 photographs, odd sides and one that fails."""
+    """Unpatched images of 13 photographs; some have odd sides and one fails."""
     config = settings(*overrides, "noise.draws=2")
     config.source.root = str(photos)
     summary = make(photos, tmp_path / "ds", *overrides, "noise.draws=2")

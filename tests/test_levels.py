@@ -1,4 +1,4 @@
-"""Several noise levels and draws of one clean frame, and frames of a clip: what they share, and what they do not."""
+"""Noise levels and draws of one clean frame, and frames of a clip: shared and separate parameters."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_contradictory_levels_are_refused(settings: Settings, overrides: tuple[s
 
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two clips of four frames, and a photograph beside them; the clips' scenes stand still."""
+    """Two clips of four frames each with static content, and a photograph."""
     folder = tmp_path_factory.mktemp("clips")
     for number, clip in enumerate(("one", "two/deep")):
         (folder / clip).mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Quick normals: within the error they claim for every law, and the exact one of a word bit for bit."""
+"""Approximate normal deviates are within their error, and exact ones equal the reference bit for bit."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def exact(words: np.ndarray, law: QuantileTables) -> np.ndarray:
 
 
 def telling_words() -> np.ndarray:
-    """The words beside every end of every line, those that single precision rounds up there, and some at random."""
+    """Return the words next to the ends of every line, words that float32 rounds up there, and random words."""
     ends = (
         (2.0 ** np.arange(-1, 31)[:, None] * (1 + np.arange(LINES_PER_OCTAVE) / LINES_PER_OCTAVE))
         .ravel()

@@ -1,4 +1,4 @@
-"""The fast form gives the reference's DN everywhere; a pair is a pure function of (pixels, plan)."""
+"""Kernels compute the DN of the reference, and a pair is a pure function of pixels and plan."""
 
 from __future__ import annotations
 

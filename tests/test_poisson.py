@@ -1,4 +1,4 @@
-"""Poisson counts: their law to one word in 2**32, at every rate; the fast form equal to the reference."""
+"""Poisson counts: their distribution to one word in 2**32 at every rate; kernels equal to the reference."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def error_in_words(rate: float, drawn: Draw = fast, most: int = 400) -> np.ndarr
 
 
 LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
-"""Whole words cannot follow the law nearer than half a word; 1e-11 of computing is another twentieth."""
+"""Integer words approximate a distribution function to half a word; the computation adds 1e-11, a twentieth of a word."""
 
 
 @pytest.mark.parametrize("rate", PROFILE_RANGES)
@@ -266,7 +266,7 @@ def test_the_guess_leaves_two_counts_in_every_cell() -> None:
 
 
 def short(words: np.ndarray, rate: float) -> np.ndarray:
-    """The short form of x as it is compiled: quick normals, single precision, the whole part of the rate kept out."""
+    """Return x by the short form as compiled: approximate normals, float32, without the integer part of the rate."""
     quick = np.empty(words.shape, dtype=np.float32)
     _quick(words, normal_quantile_tables().lines, np.empty(words.shape, dtype=np.uint64), quick)
     a, b = (np.array(one, dtype=np.float32) for one in (poissons.A, poissons.B))
@@ -406,7 +406,7 @@ def test_poisson_kernels_are_compiled_without_fast_math() -> None:
     assert not any(kernel.targetoptions.get("fastmath") for kernel in compiled)
 
 
-# The expansion, derived anew ------------------------------------------------------------------------------------------
+# Independent derivation of the expansion ------------------------------------------------------------------------------
 
 ORDERS = 12
 Polynomial = list[Fraction]
@@ -443,10 +443,10 @@ STIRLING = {2: Fraction(1, 12), 6: Fraction(-1, 360), 10: Fraction(1, 1260)}
 
 
 def gamma_quantiles() -> list[Polynomial]:
-    """y_n(v): the quantile of Gamma(a) at Phi(v) is a + √a·(y_0 + y_1·e + y_2·e² + …), e = a**-½.
+    """Return y_n(v): the quantile of Gamma(a) at Φ(v) is a + √a·(y_0 + y_1·e + y_2·e² + …) with e = a**-½.
 
-    From the equality of densities, (1/e² - 1)·log(1 + e·y) - y/e + log y' - (Stirling's rest) = -v²/2, order by order;
-    the new y_n stands in it as y_n' - v·y_n, whose polynomial solution is found from the highest power down.
+    Equal densities require (1/e² - 1)·log(1 + e·y) - y/e + log y' - (Stirling's rest) = -v²/2, order by order. Each
+    order contains the new y_n as y_n' - v·y_n; its polynomial solution is found from the highest power down.
     """
     ys: list[Polynomial] = [[Fraction(0), Fraction(1)]]
     for n in range(1, ORDERS):

@@ -1,7 +1,7 @@
-"""There and back: what `unprocess` did, `process` undoes; every colour, to its own code.
+"""Developing inverts unprocessing: every colour returns to its own code.
 
-Every test of colours here walks all 2**24 of them in the slow form, and a lattice of them with all faces of the cube in
-the quick one. Through the mosaic: flat colours and ramps to rounding, pictures to what is stated here.
+Slow tests check all 2**24 colours, fast ones a lattice with all faces of the cube. Through the mosaic, flat colours and
+ramps are exact up to rounding, and images are within the stated errors.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ GAINS = {
     "just below 1": (1.0, 1.0, 1 - EPS / 2),
     "just above 1": (1.0, 1.0, 1 + EPS),
 }
-"""The extremes of Brooks' laws, red, blue and inverse brightening, and the two doubles beside 1."""
+"""Extreme red, blue and inverse brightness gains of Brooks et al., and the two floats next to 1."""
 
 HIGHLIGHTS = ("per_channel", "gray_mean", "none")
 STEPS = [pytest.param(15, id="lattice"), pytest.param(1, id="all 2**24", marks=pytest.mark.slow)]
@@ -192,7 +192,7 @@ def test_colours_outside_the_cube_are_clipped(plan: Plan) -> None:
     assert found.tolist() == [[[0.0, 0.0, 1.0]]]
 
 
-# --------------------------------------------------------------------------------------------- through whole DN
+# --------------------------------------------------------------------------------------------- through integer DN
 
 LOST = {16: 0, 14: 1, 12: 2, 10: 7}
 """Codes by which rounding to a sensor's DN moves an 8-bit colour at most, whatever the camera and the gains."""

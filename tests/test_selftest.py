@@ -1,4 +1,4 @@
-"""A process that computes differently is found before it makes a pair, and a dataset says when it was made by one."""
+"""The self-test detects a process that computes differently, and datasets record its result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From light to digital numbers, and profiles from their own units to the sensor's."""
+"""Conversion of light to DN, and of noise profiles to the sensor's DN."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_limits_are_those_of_the_caller() -> None:
 
 
 def test_rounding_comes_before_the_clip() -> None:
-    """The same for whole limits, which is why counts can be taken of rounded values."""
+    """For integer limits, rounding first and clipping first give the same value, so counts can use rounded values."""
     assert quantise(np.array([239.5, 4095.5]), 240, 4095).tolist() == [240, 4095]
 
 

@@ -1,4 +1,4 @@
-"""Counted random streams: Philox's known answers, the layout, and nothing that leans on anything else."""
+"""Random streams: Philox's known answers, the layout, and the independence of streams."""
 
 from __future__ import annotations
 

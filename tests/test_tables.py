@@ -1,4 +1,4 @@
-"""Exact tables: curves correctly rounded, normals within their error, the cache harmless."""
+"""Exact tables: correctly rounded curves, package data, and normal quantiles within their error."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ ROOT = Path(__file__).parents[1]
 CURVES_8 = [key[:2] for key in PUBLISHED_SHA256 if key[2] == 256]
 CURVES_16 = [key[:2] for key in PUBLISHED_SHA256 if key[2] == 65536]
 QUICK = [*((*curve, 256) for curve in CURVES_8), ("smoothstep", "2.2", 65536), ("none", "1", 65536)]
-"""The small curves, and the big ones that other tests build anyway or that take no time."""
+"""Curves that are fast to test; the others are slow tests."""
 CURVES = [pytest.param(*key, marks=[] if key in QUICK else pytest.mark.slow) for key in PUBLISHED_SHA256]
 
 
 def true_value(tone: str, gamma: str, code: int, codes: int) -> mpmath.mpf:
-    """The curve by the article's own formulas, in 60 digits, which the cancellation near black cannot eat up."""
+    """Return the curve by the formulas of the article, with 60 digits because they cancel near black."""
     with mpmath.workdps(60):
         v = mpmath.mpf(code) / (codes - 1)
         if tone == "smoothstep":
@@ -46,7 +46,7 @@ def true_value(tone: str, gamma: str, code: int, codes: int) -> mpmath.mpf:
 
 
 def wrongly_rounded(tone: str, gamma: str, codes: int) -> list[int]:
-    """Codes whose entry is more than half a unit in the last place off; the ends, which are exact, left out."""
+    """Return the codes, except the ends, whose entry is more than half a unit in the last place off."""
     table = tone_curves.linear_table(tone, gamma, codes)
     with mpmath.workdps(60):
         return [
@@ -67,7 +67,7 @@ def test_every_8_bit_entry_is_correctly_rounded(tone: str, gamma: str) -> None:
 
 @pytest.mark.parametrize(("tone", "gamma"), CURVES_16)
 def test_16_bit_entries_are_correctly_rounded_at_every_97th_code(tone: str, gamma: str) -> None:
-    """Entry by entry, since a whole table takes seconds to build."""
+    """Single entries are tested, because a complete table takes seconds to compute."""
     codes = range(97, 65535, 97)
     entries = [float(tone_curves.exact_curve(tone, gamma, code, 65536)) for code in codes]
     with mpmath.workdps(60):
@@ -282,7 +282,7 @@ EDGES = [
 
 
 def by_table(j: np.ndarray) -> np.ndarray:
-    """The quantile as `normal_table` describes it: octave, segment, position in the segment."""
+    """Return the quantile by octave, segment and position in the segment, as `normal_table` documents it."""
     j = np.asarray(j, dtype=np.float64)
     octave = np.floor(np.log2(j))  # exact here: no j < 2**32 lies nearer below a power of two than 1
     position = (j / 2**octave - 1) * lookup_tables.SEGMENTS
@@ -329,7 +329,7 @@ def test_the_quantile_decreases_within_every_segment() -> None:
 
 
 def test_quantiles_of_the_table_have_25_digits() -> None:
-    """Against erfinv of another library, the whole range of the table and its mirror."""
+    """Quantiles are compared with erfinv of mpmath, over the complete range of the table and its mirror image."""
     ks = [1, 3, 2**10 + 1, 2**20 + 1, 2**28 - 1, 2**31, 2**32 - 1, 2**32 + 1, 2**33 - 2**20, 2**33 - 3, 2**33 - 1]
     with localcontext(prec=60), mpmath.workdps(60):
         for k in ks:
@@ -341,7 +341,7 @@ def test_quantiles_of_the_table_have_25_digits() -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 2**20 + 1, 2**40 + 1, 2**52 - 1, 2**52 + 1, 2**53 - 2**40, 2**53 - 1])
 def test_quantiles_of_drawn_uniforms_have_enough_digits(k: int) -> None:
-    """Some 200 terms of the series, each sum rounded to 40 digits of at most ½: 1e-38 of p; the density makes it z."""
+    """About 200 sums of at most ½ with 40 digits have an error of 1e-38 in p; dividing by the density gives that of z."""
     with localcontext(prec=60), mpmath.workdps(60):
         p = mpmath.mpf(k) / 2**53
         exact = mpmath.sqrt(2) * mpmath.erfinv(2 * p - 1)
@@ -350,7 +350,7 @@ def test_quantiles_of_drawn_uniforms_have_enough_digits(k: int) -> None:
 
 
 def rows_from(quantiles: np.ndarray) -> np.ndarray:
-    """The table's rows from the quantiles at the nodes ``[1024, 3]``: `lookup_tables._quadratic`, in its order."""
+    """Return the rows of the table from the quantiles at the nodes [1024, 3], as `lookup_tables._normal_row` does."""
     t = [node / lookup_tables.SEGMENTS for node in lookup_tables.NODES]
     z = quantiles.T
     slope01, slope12 = (z[1] - z[0]) / (t[1] - t[0]), (z[2] - z[1]) / (t[2] - t[1])
@@ -375,7 +375,7 @@ SIGNS = list(itertools.product((-1, 1), repeat=3))
 
 
 def test_quantiles_four_units_off_give_the_same_table() -> None:
-    """A coefficient is linear in its three quantiles, so the eight corners are the worst there is."""
+    """A coefficient is linear in its three quantiles, so the eight corners are the worst cases."""
     z = at_nodes(NormalDist().inv_cdf)
     assert (rows_from(z) == lookup_tables.normal_table()).all()
     for signs in SIGNS:
@@ -395,7 +395,7 @@ def python_statistics() -> ModuleType:
 
 
 def test_logarithms_two_units_off_give_the_same_table() -> None:
-    """The logarithm is all that a quantile takes from libm; none in use is off by more than one unit."""
+    """A quantile uses only the logarithm of libm, and no libm in use is off by more than one unit."""
     module = python_statistics()
     log = module.log
     z = {}

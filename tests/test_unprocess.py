@@ -1,4 +1,4 @@
-"""Algorithm 1's steps, each against other hands: mpmath, fractions, the article's formula, Brooks' numbers."""
+"""Steps of Algorithm 1, compared with mpmath, fractions, the article's formula and the numbers of Brooks et al."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ GRID = np.linspace(0, 1, 10**6 + 1)
 
 @pytest.mark.parametrize("k", GAINS)
 def test_per_channel_is_the_articles_function(k: float) -> None:
-    """k·i + 100·i·(i - 0.9)²·(1 - k), with 0.9 a double, 2.3e-17 above: 4.6e-16 in the mask; eight roundings beside."""
+    """Tolerance: the float64 nearest to 0.9 is 2.3e-17 larger, which changes the mask by 4.6e-16; plus eight roundings."""
     article = GRID * k + 100 * GRID * np.maximum(GRID - 0.9, 0) ** 2 * max(1 - k, 0)
     found = unprocess.invert_gains_per_channel(GRID, np.array(k), 0.9)
     assert np.abs(found - article).max() <= 2 * 2.3e-16 * 1.0 + 2 * 8 * EPS / 2
@@ -289,7 +289,7 @@ def test_inverse_gains_are_the_inverse_brightening_over_the_forward_gains(plan: 
     assert replace(plan, red_gain=2.0, blue_gain=1.6, inverse_rgb_gain=0.8).inverse_gains == (0.4, 0.8, 0.5)
 
 
-# The whole of it ------------------------------------------------------------------------------------------------------
+# All steps together ---------------------------------------------------------------------------------------------------
 
 CAMERAS = [*colour.CAMERAS, "identity"]
 
