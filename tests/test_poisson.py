@@ -113,7 +113,7 @@ def error_in_words(rate: float, drawn: Draw = fast, most: int = 400) -> np.ndarr
 
 
 LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
-"""Integer words approximate a distribution function to half a word; the computation adds 1e-11, a twentieth of a word."""
+"""Integer words approximate a distribution function to half a word; computing adds a twentieth, 1e-11."""
 
 
 @pytest.mark.parametrize("rate", PROFILE_RANGES)

@@ -341,7 +341,7 @@ def test_quantiles_of_the_table_have_25_digits() -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 2**20 + 1, 2**40 + 1, 2**52 - 1, 2**52 + 1, 2**53 - 2**40, 2**53 - 1])
 def test_quantiles_of_drawn_uniforms_have_enough_digits(k: int) -> None:
-    """About 200 sums of at most ½ with 40 digits have an error of 1e-38 in p; dividing by the density gives that of z."""
+    """About 200 sums of at most ½ with 40 digits err by 1e-38 in p; dividing by the density gives the error of z."""
     with localcontext(prec=60), mpmath.workdps(60):
         p = mpmath.mpf(k) / 2**53
         exact = mpmath.sqrt(2) * mpmath.erfinv(2 * p - 1)
