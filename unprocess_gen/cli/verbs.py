@@ -19,7 +19,7 @@ from unprocess_gen.cli.completion import SHELLS, print_completion
 from unprocess_gen.cli.messages import print_result, report, report_error
 from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
+from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, UnprocessGenError
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import AccuracyConfig, Config
@@ -339,6 +339,7 @@ def run_report(call: Call) -> int:
 def run_preview(call: Call) -> int:
     """Draw contact sheets of pairs."""
     from unprocess_gen.dataset.selection import select_pairs
+    from unprocess_gen.pipeline.replay import source_root
     from unprocess_gen.reports.contact_sheet import write_sheets
 
     folder = _dataset("preview", call)
@@ -348,13 +349,15 @@ def run_preview(call: Call) -> int:
     if "keys" in call.values:
         selected = select_pairs(folder / "manifest.csv", call.values["keys"])
         keys, failed = [str(row["key"]) for row in selected.rows.values()], selected.failed
+    code, has_root = 0, source_root(folder / "manifest.csv", root) is not None
     for sheet in write_sheets(folder, to, keys, None if root is None else Path(root), with_stages):
         files += len(sheet.files)
         if sheet.missing_source:
+            code = SourceChangedError.exit_code if has_root else code
             omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
             report(f"{sheet.key} ({sheet.source}): {omitted} left out: {sheet.missing_source}")
     print_result(f"{files} pictures in {to}{_skipped(failed)}")
-    return 0
+    return code
 
 
 def run_dng(call: Call) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import Row, Srgb
-from unprocess_gen.pipeline.replay import NO_LIMIT, source_of
+from unprocess_gen.pipeline.replay import ADVICE, NO_LIMIT, source_of
 from unprocess_gen.sources.loader import load_source
 
 
@@ -24,7 +24,7 @@ def load_row_source(row: Row, root: str | None) -> tuple[Srgb | None, str]:
     try:
         sha256, photograph = load_source(config, source_of(row))
     except (SourceError, MachineError, ConfigError) as error:  # the sheet is drawn without this photograph
-        return None, str(error)
+        return None, f"{str(error).partition(';')[0]}; {ADVICE}"
     if sha256 != row["source_sha256"]:
-        return None, "it has changed: its SHA-256 differs from the row's"
+        return None, f"it has changed: its SHA-256 differs from the row's; {ADVICE}"
     return photograph.srgb, ""
