@@ -115,6 +115,18 @@ def test_mistakes_are_explained_in_one_sentence(override: str, sentence: str) ->
     assert "\n" not in str(caught.value)
 
 
+def test_options_that_a_built_in_option_hides_are_refused(own: Path) -> None:
+    (own / "noise/none.yaml").write_text(OWN_PROFILE)
+    with pytest.raises(ConfigError, match=r"noise=none: .*mine/noise/none.yaml has the name of a built-in option"):
+        load_config(["noise=none"], own)
+    assert load_config(["noise=own", "noise.bits=null"], own).noise.name == "own"
+
+
+def test_long_keys_are_refused_in_one_sentence() -> None:
+    with pytest.raises(ConfigError, match="no such key; see gen-dataset --help"):
+        load_config([f"{'a' * 300}=1"])
+
+
 def test_sweeps_are_refused() -> None:
     with pytest.raises(ConfigError, match="the overrides describe a sweep; expected one config"):
         load_config(["+sweep=cameras"])

@@ -77,10 +77,21 @@ class Request:
         return any(flag in PRINT_FLAGS for flag in self.flags)
 
     def folders(self) -> OptionFolders:
-        """Return what to compose from."""
+        """Return what to compose from; ConfigError if a built-in config hides the user's."""
         from unprocess_gen.config.composition import OptionFolders
+        from unprocess_gen.config.option_files import conf_dir
 
         chosen = {PATH_FLAGS[flag]: value for flag, value in itertools.pairwise(self.flags) if flag in PATH_FLAGS}
+        own, name = chosen.get("own"), chosen.get("name")
+        if (
+            own
+            and name
+            and all(Path(folder, f"{name}.yaml").is_file() for folder in (own, chosen.get("main", conf_dir())))
+        ):
+            raise ConfigError(
+                f"--config-name {name}: {Path(own, name)}.yaml has the name of a built-in config, which would be used "
+                "instead; rename the file"
+            )
         paths = {name: Path(value) for name, value in chosen.items() if name != "name"}
         return OptionFolders(name=chosen.get("name", "config").removesuffix(".yaml"), **paths)
 

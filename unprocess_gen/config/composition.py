@@ -34,7 +34,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from unprocess_gen.config.composition_errors import explain, unknown_key
-from unprocess_gen.config.option_files import check_override, conf_dir
+from unprocess_gen.config.option_files import check_override, conf_dir, group_options
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import read_yaml_mapping
@@ -130,6 +130,7 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     folders = folders or OptionFolders()
     if folders.own is not None and not folders.own.is_dir():
         raise ConfigError(f"--config-dir: folder '{folders.own}' not found; expected a folder of option files")
+    _refuse_hidden_options(overrides, folders)
     try:
         with _hydra_for(folders):
             prepared = [_checked_searchpath(quoted_path(one)) for one in overrides]
@@ -211,6 +212,19 @@ def quoted_path(override: str) -> str:
     path = re.sub(r"(\\*)'", r"\1\1\\'", path)
     path = re.sub(r"(\\+)$", r"\1\1", path)
     return f"{key}='{path}'"
+
+
+def _refuse_hidden_options(overrides: Sequence[str], folders: OptionFolders) -> None:
+    """Refuse a chosen option of the user that has the name of a built-in one, which Hydra would use instead."""
+    if folders.own is None:
+        return
+    for override in overrides:
+        group, _, name = override.lstrip("+").partition("=")
+        if all(name in group_options(group, folder) for folder in (folders.own, folders.main or conf_dir())):
+            raise ConfigError(
+                f"{override}: {folders.own / group / name}.yaml has the name of a built-in option, which would be used "
+                "instead; rename the file"
+            )
 
 
 def _checked_searchpath(override: str) -> str:

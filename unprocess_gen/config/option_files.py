@@ -7,6 +7,9 @@ from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
 
+MAX_KEY_CHARACTERS = 100
+"""Longest key of an override; groups are looked up as folders, whose names have at most 255 bytes."""
+
 MAX_BRACKETS = 1000
 """Most opening brackets of one override; Hydra's parser recurses once for each level of nesting."""
 
@@ -74,6 +77,8 @@ def check_override(override: str) -> None:
         raise ConfigError(f"{override}: a setting cannot be taken away; choose another value or option")
     if not equals:
         raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
+    if len(key) > MAX_KEY_CHARACTERS:
+        raise ConfigError(f"{key[:60]}…: no such key; see gen-dataset --help")
     if key in ADDED_GROUPS and not override.startswith("+"):
         raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; say +{override}")
     options = group_options(key) if key.isalpha() else []
