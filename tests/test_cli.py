@@ -391,6 +391,18 @@ def test_again_regenerates_the_same_dataset(
     assert tree_hash(tmp_path / "new") == tree_hash(dataset)
 
 
+def test_again_reports_columns_of_a_later_version(door: Door, make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "old", "source.limit=2")
+    manifest = tmp_path / "old/manifest.csv"
+    *_, last = manifest.read_text().split("\n")[0].split(",")
+    lines = [line.rpartition(",") for line in manifest.read_text().splitlines()]
+    assert [value for _, _, value in lines] == [last, "", ""]
+    manifest.write_text("".join(f"{rest}\n" for rest, _, _ in lines))
+    done = door("again", "old", "out=new", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1].startswith("the same rows as old, in its columns; new/manifest.csv has columns of")
+
+
 def test_again_of_scenes_needs_no_source(
     door: Door, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
 ) -> None:
