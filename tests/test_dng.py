@@ -455,7 +455,7 @@ def test_another_file_of_the_name_is_refused_and_kept(ds: Path, door: Door, tmp_
     other.write_bytes(b"mine")
     done = door("dng", ds, "--keys", "00000000,00000002", "--to", "to")
     assert (done.code, done.out) == (2, "")
-    assert done.err.startswith("gen-dataset: --to to: 00000002.noisy.dng is there and is another file")
+    assert done.err.startswith("gen-dataset: --to to: 00000002.noisy.dng exists with other bytes")
     assert {path.name: path.read_bytes() for path in other.parent.iterdir()} == {other.name: b"mine"}
 
 
@@ -510,7 +510,7 @@ def test_packed_planes_are_written_as_the_mosaic_that_they_are(make: Make, tmp_p
 
 def test_float_frames_are_refused_and_nothing_is_written(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1", "output.dtype=float32")
-    with pytest.raises(ConfigError, match=r"--keys 00000000: is of float32 numbers, .* needs output\.dtype=uint16"):
+    with pytest.raises(ConfigError, match=r"--keys 00000000: has float32 values, .* needs output\.dtype=uint16"):
         dng.export(tmp_path / "ds", "00000000", dng.FRAMES, tmp_path / "files")
     assert not (tmp_path / "files").exists()
 
@@ -533,7 +533,7 @@ def test_a_frame_that_is_not_its_rows_is_damage(ds: Path, tmp_path: Path) -> Non
     content, noisy = bytearray(shard.read_bytes()), pair(ds)[1].tobytes()
     content[content.index(noisy) + 100] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(DamageError, match="the noisy frame of 00000000 is not the one its row tells of"):
+    with pytest.raises(DamageError, match="the noisy frame of 00000000 differs from the digest in its row"):
         dng.export(tmp_path / "ds", "00000000", ["noisy"], tmp_path / "to")
     assert not (tmp_path / "to").exists()
 

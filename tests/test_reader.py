@@ -195,14 +195,14 @@ def test_a_missing_shard_is_damage(copy: Path) -> None:
     (copy / "shards/shard-00001.tar").unlink()
     pairs = RawPairs(copy)
     assert pairs[0].clean.size
-    with pytest.raises(DamageError, match=r"shard-00001.tar: not a whole shard"):
+    with pytest.raises(DamageError, match=r"shard-00001.tar: not a complete shard"):
         pairs[5]
 
 
 def test_a_truncated_shard_is_damage(copy: Path) -> None:
     path = copy / "shards/shard-00001.tar"
     os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(DamageError, match=r"shard-00001.tar: not a whole shard"):
+    with pytest.raises(DamageError, match=r"shard-00001.tar: not a complete shard"):
         RawPairs(copy)[5]
 
 
@@ -218,3 +218,69 @@ def test_a_shard_that_goes_missing_after_its_first_use_is_damage(copy: Path) -> 
     (copy / "shards/shard-00001.tar").unlink()
     with pytest.raises(DamageError):
         pairs[6]
+
+
+# Slices and sweeps ----------------------------------------------------------------------------------------------------
+
+
+def test_slice_is_a_reader_of_its_pairs(dataset: Path) -> None:
+    part = RawPairs(dataset)[2:9:3]
+    assert isinstance(part, RawPairs)
+    assert [sample.row["key"] for sample in part] == ["00000002", "00000005", "00000008"]
+    assert [sample.row["key"] for sample in part[::-1]] == ["00000008", "00000005", "00000002"]
+    assert part[-1].row["key"] == "00000008"
+    assert len(RawPairs(dataset)[13:]) == 0
+    assert digest(pickle.loads(pickle.dumps(part)), 1) == digests(dataset)[5]
+
+
+@pytest.fixture(scope="module")
+def sweep(make: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of two datasets and a job that left none, in another order than their names."""
+    folder = tmp_path_factory.mktemp("sweep")
+    photos = fill(folder / "p", 3)
+    for name, count in (("seed=2", 2), ("seed=1", 3)):
+        make(photos, folder / "sweep" / name, name, f"source.limit={count}")
+    (folder / "sweep" / "sweep.csv").write_text(
+        "folder,overrides,seed,rows,failed,seconds,exit\nseed=2,seed=2,2,2,0,0.1,0\nseed=x,seed=x,x,,,,2\n"
+        "seed=1,seed=1,1,3,0,0.1,0\n"
+    )
+    return folder / "sweep"
+
+
+def test_sweep_is_read_in_the_order_of_its_table(sweep: Path) -> None:
+    pairs = RawPairs(sweep)
+    assert [(sample.dataset, sample.row["key"], sample.row["seed"]) for sample in pairs] == [
+        ("seed=2", "00000000", 2),
+        ("seed=2", "00000001", 2),
+        ("seed=1", "00000000", 1),
+        ("seed=1", "00000001", 1),
+        ("seed=1", "00000002", 1),
+    ]
+    assert pairs.dataset == ("seed=2", "seed=2", "seed=1", "seed=1", "seed=1")
+    assert pairs[3:].dataset == ("seed=1", "seed=1")
+    assert digest(pickle.loads(pickle.dumps(pairs)), 4) == RawPairs(sweep / "seed=1")[2].row["noisy_xxh3"]
+
+
+def test_dataset_of_a_sweep_is_read_alone(sweep: Path) -> None:
+    pairs = RawPairs(sweep / "seed=1")
+    assert (len(pairs), set(pairs.dataset)) == (3, {"seed=1"})
+
+
+def test_sample_keeps_its_dataset_when_pickled(sweep: Path) -> None:
+    sample = RawPairs(sweep)[0]
+    copy = pickle.loads(pickle.dumps(sample))
+    assert (copy.dataset, copy.row) == ("seed=2", sample.row)
+    assert len(sample) == 3
+
+
+def test_sweep_whose_dataset_was_deleted_is_damage(sweep: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweep, tmp_path / "sweep")
+    shutil.rmtree(tmp_path / "sweep" / "seed=1")
+    with pytest.raises(DamageError, match=r"seed=1/manifest\.csv: no such manifest"):
+        RawPairs(tmp_path / "sweep")
+
+
+def test_sweep_table_of_version_0_1_is_read(sweep: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweep, tmp_path / "sweep")
+    (tmp_path / "sweep" / "sweep.csv").write_text("folder,overrides,rows,failed,exit\nseed=1,seed=1,3,0,0\n")
+    assert len(RawPairs(tmp_path / "sweep")) == 3

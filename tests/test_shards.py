@@ -28,7 +28,7 @@ from unprocess_gen.core.types import Counts, Pair
 from unprocess_gen.dataset import shards
 from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.dataset.shards import (
-    Form,
+    ArrayFormat,
     Member,
     ShardWriter,
     image_bytes,
@@ -69,8 +69,8 @@ def written(path: Path, *pairs: Pair, json_bytes: int = 512) -> ShardWriter:
     return writer
 
 
-def uint16(height: int, width: int) -> Form:
-    return Form("uint16", (height, width))
+def uint16(height: int, width: int) -> ArrayFormat:
+    return ArrayFormat("uint16", (height, width))
 
 
 @pytest.fixture
@@ -185,7 +185,7 @@ def test_an_error_leaves_no_end_of_archive(tmp_path: Path) -> None:
     with pytest.raises(KeyError), ShardWriter(tmp_path / "a.tar") as writer:
         add(writer, "00000000", pair(2, 2), b"{}")
         raise KeyError
-    with pytest.raises(DamageError, match="not a whole shard"):
+    with pytest.raises(DamageError, match="not a complete shard"):
         read_index(tmp_path / "a.tar")
 
 
@@ -235,7 +235,7 @@ def test_a_thread_beside_writes_the_same_bytes(tmp_path: Path) -> None:
     alone, beside = tmp_path / "a.tar", tmp_path / "b.tar"
     writers = []
     for path, thread in ((alone, False), (beside, True)):
-        with ShardWriter(path, beside=thread) as writer:
+        with ShardWriter(path, threaded=thread) as writer:
             for key in ("00000000", "00000001", "00000002"):
                 add(writer, key, pair(300, 201), json.dumps({"key": key}).encode().ljust(512))
         writers.append(writer)
@@ -246,7 +246,7 @@ def test_a_thread_beside_writes_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_what_fails_beside_is_raised_and_leaves_no_thread(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="takes no more bytes"), ShardWriter(tmp_path / "b.tar", beside=True) as writer:
+    with pytest.raises(OSError, match="takes no more bytes"), ShardWriter(tmp_path / "b.tar", threaded=True) as writer:
         writer._file.close()
         writer._file = Slow(100)  # type: ignore[assignment]
         add(writer, "00000000", pair(5, 7), b"{}")
@@ -255,14 +255,14 @@ def test_what_fails_beside_is_raised_and_leaves_no_thread(tmp_path: Path) -> Non
 
 
 def test_no_more_than_so_much_waits_to_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "MOST_UNDERWAY", 1000)
+    monkeypatch.setattr(shards, "MAX_PENDING_BYTES", 1000)
     waited = []
-    with ShardWriter(tmp_path / "b.tar", beside=True) as writer:
+    with ShardWriter(tmp_path / "b.tar", threaded=True) as writer:
         writer._file.close()
         writer._file = Slow(10**9)  # type: ignore[assignment]
         for number in range(20):
             writer.add_frame(f"{number:08d}", "clean.npy", np.zeros((10, 20), np.uint16))
-            waited.append(writer._bytes_underway)
+            waited.append(writer._pending_bytes)
 
     assert max(waited) <= 1000 + 1024
 
@@ -290,12 +290,12 @@ def test_json_is_read_from_its_place(shard: Path) -> None:
 @pytest.mark.parametrize("kept", [0, 1, 511, 512, 700, 1024, 3000])
 def test_a_shard_cut_off_anywhere_is_damage(kept: int, shard: Path) -> None:
     os.truncate(shard, kept)
-    with pytest.raises(DamageError, match=r"a.tar: not a whole shard"):
+    with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
         read_index(shard)
 
 
 def test_a_missing_shard_is_damage(tmp_path: Path) -> None:
-    with pytest.raises(DamageError, match=r"a.tar: not a whole shard"):
+    with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
         read_index(tmp_path / "a.tar")
 
 
@@ -303,7 +303,7 @@ def test_a_header_that_changed_is_damage(shard: Path) -> None:
     content = bytearray(shard.read_bytes())
     content[0] ^= 1
     shard.write_bytes(content)
-    with pytest.raises(DamageError, match="not a whole shard"):
+    with pytest.raises(DamageError, match="not a complete shard"):
         read_index(shard)
 
 

@@ -343,7 +343,7 @@ COLUMNS = (
     Column("clip", str, "the clip", ANY_TEXT, Source),
     Column("downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan),
     Column("dequantize", str, "whether 8-bit codes were dithered: off or dither", Words(("off", "dither")), Plan),
-    Column("patch", int, "number of the patch in its image; 0 for a whole image too", COORDINATE, Patch, "number"),
+    Column("patch", int, "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
     Column("patch_y", int, "row of the full frame in which the arrays begin; even", COORDINATE, Patch, "y"),
     Column("patch_x", int, "column of the full frame in which the arrays begin; even", COORDINATE, Patch, "x"),
     Column(

@@ -1,32 +1,26 @@
-"""A dataset's frames as DNG files, for raw converters and for eyes: uint16 mosaics, uncompressed, in the row's colours.
+"""Export frames of a dataset as DNG files: uncompressed uint16 mosaics with the colours of their row.
 
-What the tags say, with span = white - black, the inverse gains (inverse_rgb / red, inverse_rgb, inverse_rgb / blue) and
-the other numbers of the row (DNG Specification 1.4; what it leaves open, from Adobe's DNG SDK 1.4):
+The tags follow the DNG Specification 1.4 and, where it is silent, Adobe's DNG SDK 1.4. With span = white - black:
 
-* ColorMatrix1 takes XYZ under D65 to the camera's native numbers: diag(1/red, 1, 1/blue) · rgb2cam · rgb2xyz⁻¹. A row
-  of rgb2cam sums to 1, so D65 becomes (1/red, 1, 1/blue), and that is AsShotNeutral: a reader that estimates the white
-  point from the two finds xy (0.3127, 0.3290). `rational` says how far a fraction is from its number.
-* BaselineExposure is what to brighten by, in stops. A reader scales a neutral so that white is reached where the first
-  channel saturates (dng_color_spec::SetWhiteXY; LibRaw too), so it shows the scene times the largest of the inverse
-  gains, over the exposure ratio. The tag undoes it: log2(exposure_ratio / largest), above 0 where the photograph was
-  darkened. LibRaw and dcraw leave it to their callers; LibRaw also takes the brightest DN for white where it lies above
-  three quarters of it, unless told adjust_maximum_thr=0.
-* NoiseProfile: variance = S·x + O with x 0 at black and 1 at white, so S = a_dn / span and O = b_dn2 / span², of those
-  of shot and read noise that were simulated. It has no place for rows, columns, dark current and unequal responses, and
-  rounding adds 1/12 DN². Readers take no S of 0 or below and no O below 0 (dng_noise_function::IsValid), so the clean
-  frame has none, nor has a noisy one whose law is not of that kind.
-* BlackLevel is what the camera believes, the same at all four sites: an error of the black level is one because no
-  camera knows it.
+* ColorMatrix1 converts XYZ under D65 to native camera values: diag(1/red, 1, 1/blue) · rgb2cam · rgb2xyz⁻¹. Rows of
+  rgb2cam sum to 1, so D65 becomes (1/red, 1, 1/blue), which is AsShotNeutral. A reader that estimates the white point
+  from both finds xy (0.3127, 0.3290).
+* BaselineExposure is the brightening in stops: log2(exposure_ratio / largest inverse gain). Readers scale a neutral so
+  that white is reached where the first channel saturates (dng_color_spec::SetWhiteXY; LibRaw too); the tag cancels this
+  scale. LibRaw and dcraw leave the tag to their callers. LibRaw also takes the brightest DN for white if it exceeds
+  three quarters of it; adjust_maximum_thr=0 switches this off.
+* NoiseProfile: variance = S·x + O, x = 0 at black and 1 at white, so S = a_dn / span and O = b_dn2 / span², of the shot
+  and read noise that were simulated. The tag cannot describe row, column and dark-current noise, PRNU and rounding.
+  Readers refuse S of 0 or less and O below 0 (dng_noise_function::IsValid). The clean frame and noisy frames with such
+  values have no NoiseProfile.
+* BlackLevel is the camera's nominal value, equal at all four sites; a black-level error is unknown to the camera.
 
-No tag says how highlights were kept: above the row's threshold a reader shows them brighter than the photograph,
-channel by channel, so that bright colours shift too; white stays white. WhiteLevel is the sensor's, also where a full
-well saturates below it.
+No tag records how highlights were kept. Above the row's threshold readers show them brighter than the photograph,
+channel by channel, so bright colours shift; white stays white. WhiteLevel is the sensor's, even if the full well
+saturates below it.
 
-The row stands as JSON in the XMP packet (properties Frame and Row of ``urn:unprocess-gen:manifest#``), which converters
-keep and show to nobody as a caption. No clock is in a file: the same row and frame are the same bytes.
-
-Not written: 12 bits packed, which some readers misread at odd widths; compression, of which LibRaw reads little for
-integers; floats, which it rounds.
+The XMP packet contains the row as JSON (properties Frame and Row of ``urn:unprocess-gen:manifest#``), which converters
+keep. Files contain no time: equal rows and frames give equal bytes. Decisions: ``docs/design/dataset_format.md``.
 """
 
 from __future__ import annotations
@@ -55,18 +49,18 @@ from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, m
 FRAMES = ("clean", "noisy")
 
 LEAST_SIDE_PX, GREATEST_SIDE_PX = 22, 64000
-"""LibRaw calls a picture with a side beyond these no raw file (identify.cpp; 0.22.2 tried at 21, 22, 64000, 64001)."""
+"""Limits of a side, beyond which LibRaw 0.22.2 does not open a file (identify.cpp)."""
 
 MOST_PIXELS = 2**31 - 2**20
-"""TIFF places its data by 32-bit offsets: 4 GB, less the tags."""
+"""TIFF has 32-bit offsets: 4 GB for pixels and tags."""
 
 MAKE = "unprocess_gen"
 D65 = 21
-"""CalibrationIlluminant1, an EXIF LightSource."""
+"""Value of CalibrationIlluminant1 (EXIF LightSource)."""
 
 
-class Exported(NamedTuple):
-    """How many files were written, how many stood there with just those bytes, and noisy ones without NoiseProfile."""
+class ExportSummary(NamedTuple):
+    """Count the files written, those that existed with the same bytes, and noisy ones without NoiseProfile."""
 
     written: int
     present: int
@@ -74,7 +68,7 @@ class Exported(NamedTuple):
 
 
 class _File(NamedTuple):
-    """A file to be: the number of its pair in the dataset, the pair's key, and which frame of it."""
+    """Identify one file to write: number of the pair in the dataset, key of the pair, and frame."""
 
     number: int
     key: str
@@ -85,32 +79,53 @@ class _File(NamedTuple):
         return f"{self.key}.{self.frame}.dng"
 
 
-def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> Exported:
-    """Write frames (of `FRAMES`) of a dataset's pairs as ``to/KEY.FRAME.dng``.
+def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> ExportSummary:
+    """Write frames of a dataset's pairs as ``to/KEY.FRAME.dng``.
 
-    ``keys`` is K,… as `verify.choose` reads it. A file that is there already stays if its bytes are those that would be
-    written. Raises ConfigError, with nothing written, where it is another file, and for keys that the dataset does not
-    have or that failed, sizes that cannot be read back, frames that are no uint16 mosaic, a folder that cannot be
-    written and want of tifffile; DamageError where a frame is not its row's; MachineError where writing fails.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the dataset.
+    keys : str
+        Pairs to write (`selection.parse_keys`).
+    frames : sequence of str
+        Names of `FRAMES`.
+    to : Path
+        Folder for the files. An existing file is kept if it has the bytes that would be written.
+
+    Returns
+    -------
+    ExportSummary
+        Numbers of files.
+
+    Raises
+    ------
+    ConfigError
+        If a key does not exist or failed, a frame is not a uint16 mosaic or too small or large for a DNG, another file
+        of that name exists, the folder cannot be written, or tifffile is missing. Nothing is written then.
+    DamageError
+        If a frame differs from its row.
+    MachineError
+        If writing fails.
     """
     if find_spec("tifffile") is None:
         raise ConfigError("dng: writing needs tifffile; pip install 'unprocess_gen[dng]'")
     if to.resolve() in (folder.resolve(), (folder / "shards").resolve()):
-        raise ConfigError(f"--to {to}: is the dataset's own folder, where foreign files would be damage")
+        raise ConfigError(f"--to {to}: is the dataset's own folder; expected a folder outside the dataset")
     numbers = _numbers(folder / "manifest.csv", keys)
     files = [_File(number, key, frame) for key, number in numbers.items() for frame in frames]
     pairs = RawPairs(folder)
     present = [file for file in files if (to / file.name).exists()]
     for file in present:
         if (to / file.name).read_bytes() != _content(pairs, file):
-            raise ConfigError(f"--to {to}: {file.name} is there and is another file; choose another folder")
+            raise ConfigError(f"--to {to}: {file.name} exists with other bytes; choose another folder")
     written = [file for file in files if file not in present]
     for file in written:
         _write(to / file.name, _content(pairs, file))
     without = sum(
         file.frame == "noisy" and noise_profile(plan_from_row(pairs[file.number].row)) is None for file in files
     )
-    return Exported(len(written), len(present), without)
+    return ExportSummary(len(written), len(present), without)
 
 
 def _numbers(manifest: Path, keys: str) -> dict[str, int]:
@@ -119,11 +134,11 @@ def _numbers(manifest: Path, keys: str) -> dict[str, int]:
 
 
 def _writable(row: Row) -> Row:
-    """Return a row whose frames can be DNG files; ConfigError says why others cannot."""
+    """Return the row if its frames can be DNG files; otherwise ConfigError gives the reason."""
     key, width, height = row["key"], int(row["width"] or 0), int(row["height"] or 0)
     if row["dtype"] != UINT16:
         raise ConfigError(
-            f"--keys {key}: is of {row['dtype']} numbers, which LibRaw would round; a DNG needs output.dtype={UINT16}"
+            f"--keys {key}: has {row['dtype']} values, which LibRaw would round; a DNG needs output.dtype={UINT16}"
         )
     if min(width, height) < LEAST_SIDE_PX:
         raise ConfigError(
@@ -143,12 +158,12 @@ def _content(pairs: RawPairs, file: _File) -> bytes:
     frame = sample.clean if file.frame == "clean" else sample.noisy
     content = encode(mosaic_dn(frame, sample.row), sample.row, file.frame)
     if array_xxh3(frame) != sample.row[f"{file.frame}_xxh3"]:
-        raise DamageError(f"{pairs.path}: the {file.frame} frame of {file.key} is not the one its row tells of")
+        raise DamageError(f"{pairs.path}: the {file.frame} frame of {file.key} differs from the digest in its row")
     return content
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write aside, then put in place, so that no moment shows half a file."""
+    """Write to a temporary file and rename it, so that no incomplete file is visible."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -169,7 +184,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 class Tag(NamedTuple):
-    """One entry of the file's directory: code, type, how many values it has (0: those of the text), the values."""
+    """Hold one entry of the TIFF directory: code, type, number of values (0: length of the text) and values."""
 
     code: int
     type: int
@@ -183,9 +198,9 @@ BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL, DOUBLE = 1, 2, 3, 4, 5, 10, 12
 
 
 def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
-    """Return the file of a frame of the pair that ``row`` tells of; ``name`` is ``clean`` or ``noisy``.
+    """Return the DNG file of the frame ``name`` (``clean`` or ``noisy``) of a row's pair.
 
-    Raises ConfigError where the frame is not a uint16 mosaic ``[H, W]``, or the row has a number beyond 2^30.
+    Raises ConfigError if the frame is not a uint16 mosaic [H, W], or a colour value of the row exceeds 2^30.
     """
     import tifffile
 
@@ -210,7 +225,7 @@ def encode(frame: Frame | Float, row: Row, name: str) -> bytes:
 
 
 def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
-    """Return what a file says of its frame besides TIFF's own tags, by rising code; ``shape`` is height, width."""
+    """Return the tags that TIFF itself does not require, by increasing code; ``shape`` is (height, width)."""
     plan, packet, (height, width) = plan_from_row(row), xmp(row, name), shape
     profile = noise_profile(plan) if name == "noisy" else None
     return [
@@ -240,23 +255,23 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
 
 
 def color_matrix(plan: Plan) -> Matrix:
-    """Return the matrix from XYZ under D65 to the camera's native numbers, row by row, with the row's gains."""
+    """Return the row-major matrix from XYZ under D65 to native camera values, white-balance gains included."""
     native = matrix([as_shot_neutral(plan)[i // 3] * entry for i, entry in enumerate(plan.rgb2cam)])
     return multiply(native, invert(RGB2XYZ))
 
 
 def as_shot_neutral(plan: Plan) -> tuple[float, float, float]:
-    """Return what a neutral is in native numbers, relative to green."""
+    """Return the native camera values of a neutral colour, relative to green."""
     return 1 / plan.red_gain, 1.0, 1 / plan.blue_gain
 
 
 def baseline_exposure_ev(plan: Plan) -> float:
-    """Return the stops by which a reader has to brighten to show the photograph as bright as it was."""
+    """Return the stops by which a reader brightens the frame to the brightness of the photograph."""
     return -math.log2(plan.exposure * max(plan.inverse_gains))
 
 
 def noise_profile(plan: Plan) -> tuple[float, float] | None:
-    """Return S and O of variance = S·x + O, x 0 at black and 1 at white; None where they are not of the tag's kind."""
+    """Return S and O of variance = S·x + O, x = 0 at black and 1 at white; None if readers would refuse them."""
     span_dn = plan.white_level_dn - plan.black_level_dn
     slope_dn, intercept_dn2 = plan.variance_line
     scale, offset = slope_dn / span_dn, intercept_dn2 / span_dn**2
@@ -264,9 +279,9 @@ def noise_profile(plan: Plan) -> tuple[float, float] | None:
 
 
 def rational(value: float) -> tuple[int, int]:
-    """Return numerator and denominator (a power of two) of the nearest fraction that 32 signed bits hold.
+    """Return the nearest fraction of two signed 32-bit integers whose denominator is a power of two.
 
-    Off by at most 2^-31, and above 1 by at most 2^-30 of the value. Raises ConfigError from 2^30 on.
+    The error is at most 2^-31, or 2^-30 of the value if it exceeds 1. Raises ConfigError from 2^30 on.
     """
     bits = 30 - max(math.frexp(value)[1], 0)
     if bits < 0:
@@ -279,7 +294,7 @@ def _rationals(values: Iterable[float]) -> tuple[int, ...]:
 
 
 def xmp(row: Row, name: str) -> bytes:
-    """Return the XMP packet (ISO 16684-1) that holds the row as JSON, and says which frame this is."""
+    """Return the XMP packet (ISO 16684-1) with the row as JSON and the name of the frame."""
     text = escape(json.dumps(dict(row), separators=(",", ":")))
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'

@@ -1,4 +1,4 @@
-"""Write, read and select the keys of manifest rows."""
+"""Build the keys of manifest rows and samples, and group rows by them."""
 
 from __future__ import annotations
 
@@ -9,38 +9,120 @@ from unprocess_gen.core.types import Patch, Plan, Row
 
 
 def key_text(index: int) -> str:
-    """Return the key of a source: eight digits (more, should there be more than 10⁸ sources)."""
+    """Return the key of a source.
+
+    Parameters
+    ----------
+    index : int
+        Position of the source in the listing, from 0.
+
+    Returns
+    -------
+    str
+        Eight digits; more from index 10^8 on.
+    """
     return f"{index:08d}"
 
 
 def patch_key(index: int, patch: Patch, several: bool) -> str:
-    """Return the key of a sample in its shard: that of its source, and the patch where images are cut in ``several``.
+    """Return the key of a sample in its shard.
 
-    Four digits, more where there are more patches.
+    Parameters
+    ----------
+    index : int
+        Position of the source in the listing.
+    patch : Patch
+        Part of the source.
+    several : bool
+        Whether images are cut into patches.
+
+    Returns
+    -------
+    str
+        ``00000003``, or ``00000003-p0007`` for a patch; more digits from patch 10000 on.
     """
     return f"{key_text(index)}-p{patch.number:04d}" if several else key_text(index)
 
 
 def pair_key(sample: str, plan: Plan, several: bool) -> str:
-    """Return the key of a row: that of its sample, and the level and draw where the sample has ``several`` pairs."""
+    """Return the key of a row.
+
+    Parameters
+    ----------
+    sample : str
+        Key of the sample (`patch_key`).
+    plan : Plan
+        Plan with level and draw.
+    several : bool
+        Whether the sample has several noisy frames.
+
+    Returns
+    -------
+    str
+        The sample's key, with for example ``-l01d02`` for level 1, draw 2.
+    """
     return f"{sample}-l{plan.level:02d}d{plan.draw:02d}" if several else sample
 
 
 def image_key(row: Row) -> str:
-    """Return the key of a row's image."""
+    """Return the key of a row's source.
+
+    Parameters
+    ----------
+    row : Row
+        Manifest row.
+
+    Returns
+    -------
+    str
+        The digits of its key.
+    """
     return str(row["key"]).partition("-")[0]
 
 
 def sample_key(row: Row) -> str:
-    """Return the key of a row's members in the shard: that of its image, or of its patch."""
+    """Return the key that a row's members have in the shard.
+
+    Parameters
+    ----------
+    row : Row
+        Manifest row.
+
+    Returns
+    -------
+    str
+        Its key without level and draw.
+    """
     return str(row["key"]).partition("-l")[0]
 
 
 def group_by_image(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield the rows of one image together, in order."""
+    """Group consecutive rows of one source.
+
+    Parameters
+    ----------
+    rows : iterable of Row
+        Rows in manifest order.
+
+    Returns
+    -------
+    iterator of list of Row
+        The rows of each source.
+    """
     return (list(some) for _, some in itertools.groupby(rows, key=image_key))
 
 
 def group_by_sample(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield the rows of one sample, a clean frame with its noisy ones, together, in order."""
+    """Group consecutive rows of one sample: a clean frame and its noisy frames.
+
+    Parameters
+    ----------
+    rows : iterable of Row
+        Rows in manifest order.
+
+    Returns
+    -------
+    iterator of list of Row
+        The rows of each sample.
+    """
     return (list(some) for _, some in itertools.groupby(rows, key=sample_key))

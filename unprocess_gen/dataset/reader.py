@@ -15,7 +15,16 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.types import PACKED, UINT16, Float, Frame, Row
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
-from unprocess_gen.dataset.shards import CLEAN, Form, Member, form_of, map_array, noisy_member, read_index, shard_name
+from unprocess_gen.dataset.shards import (
+    CLEAN,
+    ArrayFormat,
+    Member,
+    array_format,
+    map_array,
+    noisy_member,
+    read_index,
+    shard_name,
+)
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
 
@@ -163,12 +172,12 @@ class _Dataset:
         """Return the pair whose row begins at a byte."""
         row = dict(read_row(self._manifest, offset))
         shard = int(row["shard"] or 0)
-        form = form_of(str(row["dtype"]), str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0))
+        form = array_format(str(row["dtype"]), str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0))
         members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
         clean, noisy = (self._array(shard, f"{sample_key(row)}.{member}", form) for member in members)
         return Sample(clean, noisy, row, self.name)
 
-    def _array(self, shard: int, name: str, form: Form) -> Frame:
+    def _array(self, shard: int, name: str, form: ArrayFormat) -> Frame:
         path = self.path / "shards" / shard_name(shard)
         if shard not in self._indexes:
             self._indexes[shard] = read_index(path)

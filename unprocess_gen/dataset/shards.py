@@ -1,10 +1,12 @@
-"""Shards: uncompressed tar files in the WebDataset layout, whose bytes depend on nothing but their members.
+"""Write, read and check shards: uncompressed tar archives in the WebDataset layout.
 
-Members of one sample, an image or a patch of it, stand side by side: ``KEY.clean.npy``, ``KEY.noisy.npy`` (uint16 or
-float32, ``[H, W]`` or packed ``[4, H / 2, W / 2]``), the noisy frames of other levels and draws
-(``KEY.noisy.l01d02.npy``), ``KEY.json``. Headers are USTAR with time, owner and mode fixed. Writing goes straight from
-the arrays to the file while SHA-256 runs along (0.5 ns a byte together), reading maps just the bytes of one array into
-memory, found through an index of offsets that is read from the tar headers: nothing is ever unpacked.
+The members of one sample (an image, or a patch of it) are consecutive: ``KEY.clean.npy``, ``KEY.noisy.npy``, the noisy
+frames of other levels and draws (``KEY.noisy.l01d02.npy``), ``KEY.json``. Arrays are uint16 or float32, mosaics [H, W]
+or packed planes [4, H / 2, W / 2]. Headers are USTAR with fixed time, owner and mode, so the bytes depend only on the
+members.
+
+Arrays are written without a copy, and SHA-256 is computed on the way. Reading maps one array into memory; its offset
+comes from the tar headers. Timings: ``docs/design/dataset_format.md``.
 """
 
 from __future__ import annotations
@@ -39,34 +41,56 @@ MAX_JSON_BYTES = 2**27
 
 
 def noisy_member(level: int, draw: int) -> str:
-    """Return the member that holds a noisy frame: the first is ``noisy.npy``, others say their level and draw."""
+    """Return the name of a noisy frame's member, without the key.
+
+    Parameters
+    ----------
+    level, draw : int
+        Noise level and draw, 0 to 99.
+
+    Returns
+    -------
+    str
+        ``noisy.npy`` for level 0 and draw 0; otherwise for example ``noisy.l01d02.npy``.
+    """
     return f"noisy.l{level:02d}d{draw:02d}.npy" if level or draw else "noisy.npy"
 
 
 def shard_name(number: int) -> str:
-    """Return a shard's file name."""
+    """Return the file name of a shard.
+
+    Parameters
+    ----------
+    number : int
+        Number of the shard, from 0.
+
+    Returns
+    -------
+    str
+        For example ``shard-00000.tar``; more digits from shard 100000 on.
+    """
     return f"shard-{number:05d}.tar"
 
 
-class Form(NamedTuple):
-    """How the numbers of a frame lie in a file: their dtype, one of `DESCRIPTIONS`, and the array's shape."""
+class ArrayFormat(NamedTuple):
+    """Hold dtype (one of `DESCRIPTIONS`) and shape of a stored array."""
 
     dtype: str
     shape: tuple[int, ...]
 
     @property
     def description(self) -> str:
-        """The dtype as NumPy spells it in a file."""
+        """Return the dtype as the npy format spells it."""
         return DESCRIPTIONS[self.dtype]
 
     @property
     def size(self) -> int:
-        """Bytes of the numbers alone."""
+        """Return the bytes of the array without its npy header."""
         return np.dtype(self.description).itemsize * math.prod(self.shape)
 
     @property
     def header(self) -> bytes:
-        """What stands before them in the npy format."""
+        """Return the npy header."""
         stream = io.BytesIO()
         facts = {"descr": self.description, "fortran_order": False, "shape": self.shape}
         np.lib.format.write_array_header_1_0(stream, facts)
@@ -77,10 +101,25 @@ class Form(NamedTuple):
         return f"{sides} {'DN' if self.dtype == UINT16 else self.dtype}"
 
 
-def form_of(dtype: str, layout: str, height: int, width: int) -> Form:
-    """Return the form of a frame of ``height`` x ``width`` sites."""
+def array_format(dtype: str, layout: str, height: int, width: int) -> ArrayFormat:
+    """Return the format of a frame.
+
+    Parameters
+    ----------
+    dtype : str
+        ``uint16`` or ``float32``.
+    layout : str
+        ``mosaic`` or ``packed``.
+    height, width : int
+        Sides of the mosaic, pixels.
+
+    Returns
+    -------
+    ArrayFormat
+        Shape [H, W], or [4, H / 2, W / 2] for packed planes.
+    """
     shape = (4, height // 2, width // 2) if layout == PACKED else (height, width)
-    return Form(dtype, shape)
+    return ArrayFormat(dtype, shape)
 
 
 def _tar_header(name: str, size: int) -> bytes:
@@ -93,38 +132,80 @@ def _padding(size: int) -> int:
     return -size % RECORD
 
 
-def image_bytes(form: Form, json_bytes: int, pairs: int = 1) -> int:
-    """Return the bytes that one sample and its noisy frames take in a shard, tar framing included."""
-    array = len(form.header) + form.size
-    return sum(RECORD + size + _padding(size) for size in (*[array] * (1 + pairs), json_bytes))
+def image_bytes(array: ArrayFormat, json_bytes: int, pairs: int = 1) -> int:
+    """Return the bytes of one sample in a shard.
+
+    Parameters
+    ----------
+    array : ArrayFormat
+        Format of its frames.
+    json_bytes : int
+        Size of its JSON (`manifest.json_size`).
+    pairs : int
+        Number of noisy frames.
+
+    Returns
+    -------
+    int
+        Bytes with tar headers and padding.
+    """
+    size = len(array.header) + array.size
+    return sum(RECORD + member + _padding(member) for member in (*[size] * (1 + pairs), json_bytes))
 
 
 def shard_bytes(pairs: list[int]) -> int:
-    """Return the size of a shard from those of its pairs; no pair, no file."""
+    """Return the size of a shard.
+
+    Parameters
+    ----------
+    pairs : list of int
+        Bytes of each sample (`image_bytes`).
+
+    Returns
+    -------
+    int
+        Bytes of the file; 0 without samples, because such a shard has no file.
+    """
     return sum(pairs) + len(END) if pairs else 0
 
 
-_sync_data = getattr(os, "fdatasync", os.fsync)  # not everywhere is there one for the data alone
+_sync_data = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
-MOST_UNDERWAY = 2**26
+MAX_PENDING_BYTES = 2**26
+"""Bytes that wait for the thread of a `ShardWriter` before the caller waits too."""
+
 SYNC_BYTES = 2**25
-"""Synced so often beside the work, so that little is left to sync when a shard is put into place."""
+"""Bytes after which that thread syncs, so that little is left to sync when the shard is renamed into place."""
 
 
 class ShardWriter:
-    """Write one shard to ``path``, which must not exist; its size and SHA-256 are known on leaving.
+    """Write one shard, computing its size and SHA-256.
 
-    ``beside`` has a thread of its own hash, write and sync, while the caller makes the next frames: worth it where a
-    core is idle. At most `MOST_UNDERWAY` bytes and one part more wait for it; frames given to it must stay as they are.
-    Raises OSError as the file system does, then or with a later call; the caller owns the file and what becomes of it.
+    Parameters
+    ----------
+    path : Path
+        File to create; it must not exist. The caller deletes it after an error.
+    threaded : bool
+        Hash, write and sync in a second thread while the caller makes the next frames. Saves time if a core is idle. At
+        most `MAX_PENDING_BYTES` and one frame wait; the caller must not change frames that it has added.
+
+    Attributes
+    ----------
+    bytes : int
+        Size so far; the size of the file after the context was left.
+
+    Raises
+    ------
+    OSError
+        From the file system, at the failing call or a later one.
     """
 
-    def __init__(self, path: Path, beside: bool = False) -> None:
+    def __init__(self, path: Path, threaded: bool = False) -> None:
         self._file: BinaryIO = path.open("xb", buffering=0)
         self._hash = hashlib.sha256()
-        self._thread = ThreadPoolExecutor(1, "shard writer") if beside else None
-        self._underway: deque[tuple[int, Future[None]]] = deque()
-        self._bytes_underway = 0
+        self._thread = ThreadPoolExecutor(1, "shard writer") if threaded else None
+        self._pending: deque[tuple[int, Future[None]]] = deque()
+        self._pending_bytes = 0
         self._unsynced = 0
         self.bytes = 0
 
@@ -143,17 +224,17 @@ class ShardWriter:
 
     @property
     def sha256(self) -> str:
-        """Hex digest of what was written."""
+        """Return the SHA-256 of the bytes written so far, 64 hexadecimal digits."""
         self._wait(-1)
         return self._hash.hexdigest()
 
     def add_frame(self, key: str, member: str, frame: Frame) -> None:
         """Append a frame of a sample."""
-        header = Form(frame.dtype.name, frame.shape).header
+        header = ArrayFormat(frame.dtype.name, frame.shape).header
         self._member(f"{key}.{member}", len(header) + frame.nbytes, header, little_endian(frame).data)
 
     def add_rows(self, key: str, row_json: bytes) -> None:
-        """Append the rows of a sample, after its frames."""
+        """Append the JSON of a sample, after its frames."""
         self._member(f"{key}.{ROW}", len(row_json), row_json)
 
     def _member(self, name: str, size: int, *parts: bytes | memoryview) -> None:
@@ -166,15 +247,15 @@ class ShardWriter:
         if self._thread is None:
             self._put(views)
         else:
-            self._wait(MOST_UNDERWAY)
-            self._underway.append((size, self._thread.submit(self._put_and_sync, views)))
-            self._bytes_underway += size
+            self._wait(MAX_PENDING_BYTES)
+            self._pending.append((size, self._thread.submit(self._put_and_sync, views)))
+            self._pending_bytes += size
 
     def _wait(self, most: int) -> None:
-        """Wait until no more than so many bytes are underway; what failed there is raised here."""
-        while self._underway and (self._bytes_underway > most or self._underway[0][1].done()):
-            size, done = self._underway.popleft()
-            self._bytes_underway -= size
+        """Wait until at most ``most`` bytes are pending; raise what failed in the thread."""
+        while self._pending and (self._pending_bytes > most or self._pending[0][1].done()):
+            size, done = self._pending.popleft()
+            self._pending_bytes -= size
             done.result()
 
     def _put_and_sync(self, views: Sequence[memoryview]) -> None:
@@ -198,14 +279,14 @@ class ShardWriter:
 
 
 class Member(NamedTuple):
-    """Where the bytes of one tar member lie."""
+    """Hold the byte offset and the size of a tar member's content."""
 
     offset: int
     size: int
 
 
 def read_index(path: Path) -> dict[str, Member]:
-    """Return name → place of every member of a shard, from its headers; DamageError where it is not a whole tar."""
+    """Return the members of a shard by name; DamageError unless it is a complete tar archive."""
     index: dict[str, Member] = {}
     try:
         with path.open("rb") as stream:
@@ -216,36 +297,48 @@ def read_index(path: Path) -> dict[str, Member]:
                 index[info.name] = Member(stream.tell(), info.size)
                 stream.seek(info.size + _padding(info.size), io.SEEK_CUR)
     except (tarfile.HeaderError, OSError, ValueError, OverflowError) as error:
-        raise DamageError(f"{path}: not a whole shard ({error})") from error
+        raise DamageError(f"{path}: not a complete shard ({error})") from error
     return index
 
 
-def map_array(path: Path, member: Member, form: Form) -> Frame:
-    """Return an array that lies in the file: mapped, not copied, and private, so that writing to it is harmless.
+def map_array(path: Path, member: Member, array: ArrayFormat) -> Frame:
+    """Return an array of a shard, mapped copy-on-write: writing to it does not change the file.
 
-    DamageError where the member is not an array of ``form``, or the file is gone or too short.
+    Raises DamageError if the member is not an array of this format, or the file was deleted or truncated.
     """
     start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
-    skipped, header = member.offset - start, form.header
+    skipped, header = member.offset - start, array.header
     try:
         with path.open("rb") as stream:
             mapped = mmap.mmap(stream.fileno(), skipped + member.size, access=mmap.ACCESS_COPY, offset=start)
     except (OSError, ValueError) as error:
         raise DamageError(f"{path}: the member at byte {member.offset} cannot be read ({error})") from error
-    size = len(header) + form.size
+    size = len(header) + array.size
     if member.size != size or mapped[skipped : skipped + len(header)] != header:
-        raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {form}")
-    return np.ndarray(form.shape, np.dtype(form.description), mapped, skipped + len(header))
+        raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {array}")
+    return np.ndarray(array.shape, np.dtype(array.description), mapped, skipped + len(header))
 
 
 # ------------------------------------------------------------------------------------------------------- verifying
 
 
-class Expected(NamedTuple):
-    """What a shard must hold of one sample: the frames' form, members and XXH3-128, and the JSON to the byte."""
+class ExpectedSample(NamedTuple):
+    """Hold what a shard must contain of one sample.
+
+    Attributes
+    ----------
+    key : str
+        Key of the sample.
+    array : ArrayFormat
+        Format of its frames.
+    frames : tuple of (str, str)
+        Member and XXH3-128 of each frame.
+    json : bytes
+        Content of ``KEY.json``.
+    """
 
     key: str
-    form: Form
+    array: ArrayFormat
     frames: tuple[tuple[str, str], ...]
     json: bytes
 
@@ -253,43 +346,71 @@ class Expected(NamedTuple):
 PIECE = 2**20
 
 
-def check_members(path: Path, images: Sequence[Expected]) -> Iterator[tuple[str, str, str]]:
-    """Yield (key, member, what is wrong) for every member that is not as expected, and for what follows the last.
+def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tuple[str, str, str]]:
+    """Compare every byte of a shard with what its samples must be.
 
-    Tar headers, npy headers, JSON and padding are held to the byte, arrays to their digest, so that a shard without a
-    complaint has just the bytes it was written with.
+    Tar headers, npy headers, JSON and padding are compared byte by byte, arrays by digest.
+
+    Parameters
+    ----------
+    path : Path
+        The shard.
+    samples : sequence of ExpectedSample
+        All samples, in order.
+
+    Yields
+    ------
+    str
+        Key of a damaged member; empty for the end of the archive.
+    str
+        The member.
+    str
+        The difference.
     """
     with path.open("rb") as stream:
-        for image in images:
-            head = image.form.header
-            size = len(head) + image.form.size
-            for member, digest in image.frames:
-                found = [*_check_bytes(stream, _tar_header(f"{image.key}.{member}", size), "tar header")]
+        for sample in samples:
+            head = sample.array.header
+            size = len(head) + sample.array.size
+            for member, digest in sample.frames:
+                found = [*_check_bytes(stream, _tar_header(f"{sample.key}.{member}", size), "tar header")]
                 found += _check_bytes(stream, head, "npy header")
                 found += _check_digest(stream, size - len(head), digest)
                 found += _check_bytes(stream, b"\0" * _padding(size), "padding")
-                yield from ((image.key, member, what) for what in found)
-            header = _tar_header(f"{image.key}.{ROW}", len(image.json))
-            whole = header + image.json + b"\0" * _padding(len(image.json))
-            yield from ((image.key, ROW, what) for what in _check_bytes(stream, whole, "member"))
+                yield from ((sample.key, member, what) for what in found)
+            content = _tar_header(f"{sample.key}.{ROW}", len(sample.json)) + sample.json
+            content += b"\0" * _padding(len(sample.json))
+            yield from ((sample.key, ROW, what) for what in _check_bytes(stream, content, "member"))
         rest = stream.read(len(END) + 1)
         if rest != END:
             yield "", "", "the end of the archive is missing" if len(rest) < len(END) else "something follows the end"
 
 
-def salvage(path: Path, images: Sequence[Expected]) -> Iterator[dict[str, Frame]]:
-    """Yield for each image those frames, by member, that lie at their place in a damaged shard, whole."""
+def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dict[str, Frame]]:
+    """Read the frames of a damaged shard that are intact and at their place.
+
+    Parameters
+    ----------
+    path : Path
+        The shard; it may be missing, truncated or something else.
+    samples : sequence of ExpectedSample
+        All samples, in order.
+
+    Yields
+    ------
+    dict of str to ndarray
+        Intact frames of each sample, by member.
+    """
     content = np.memmap(path, np.uint8, "r") if path.is_file() and path.stat().st_size else np.empty(0, np.uint8)
     at = 0
-    for image in images:
-        size, head = image.form.size, len(image.form.header)
+    for sample in samples:
+        size, head = sample.array.size, len(sample.array.header)
         frames = {}
-        for member, digest in image.frames:
+        for member, digest in sample.frames:
             frame = content[at + RECORD + head :][:size]
             at += RECORD + head + size + _padding(head + size)
             if len(frame) == size and xxhash.xxh3_128_hexdigest(frame.data) == digest:
-                frames[member] = frame.view(image.form.description).reshape(image.form.shape)
-        at += RECORD + len(image.json) + _padding(len(image.json))
+                frames[member] = frame.view(sample.array.description).reshape(sample.array.shape)
+        at += RECORD + len(sample.json) + _padding(len(sample.json))
         yield frames
 
 

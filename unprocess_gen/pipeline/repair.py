@@ -39,7 +39,15 @@ from unprocess_gen.core.types import Frame, Row, Source
 from unprocess_gen.dataset.columns import HEADERS
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import failed_row, readable_rows, rows_of_json, write_rows
-from unprocess_gen.dataset.shards import CLEAN, Expected, ShardWriter, check_members, json_inside, salvage, shard_name
+from unprocess_gen.dataset.shards import (
+    CLEAN,
+    ExpectedSample,
+    ShardWriter,
+    check_members,
+    intact_frames,
+    json_inside,
+    shard_name,
+)
 from unprocess_gen.pipeline.generate import shard_tasks, tally
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
@@ -350,7 +358,7 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, tem
     kept, regenerator = 0, PairRegenerator(root)
     try:
         with ShardWriter(part) as writer:
-            for sample, some, frames in zip(wanted, group_by_sample(rows), salvage(path, wanted), strict=True):
+            for sample, some, frames in zip(wanted, group_by_sample(rows), intact_frames(path, wanted), strict=True):
                 kept += _repair_sample(writer, sample, some, frames, regenerator)
     except UnprocessGenError as error:
         part.unlink()
@@ -364,7 +372,11 @@ def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, tem
 
 
 def _repair_sample(
-    writer: ShardWriter, sample: Expected, rows: Sequence[Row], kept: dict[str, Frame], regenerator: PairRegenerator
+    writer: ShardWriter,
+    sample: ExpectedSample,
+    rows: Sequence[Row],
+    kept: dict[str, Frame],
+    regenerator: PairRegenerator,
 ) -> int:
     """Append a sample, with kept or regenerated frames; return how many of its pairs were kept."""
     intact = [row for row in rows if CLEAN in kept and noisy_member_of(row) in kept]

@@ -13,7 +13,7 @@ from unprocess_gen.core.files import free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import PACKED, Source
 from unprocess_gen.dataset.manifest import json_size
-from unprocess_gen.dataset.shards import form_of, image_bytes, shard_bytes
+from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.listing import read_bytes
@@ -58,7 +58,7 @@ def source_bytes(config: Config, name: str, height: int, width: int) -> int:
         return 0
     patches = list_patches(rule, 0, height, width, output.layout)
     json_bytes = json_size(name, pairs)
-    forms = (form_of(output.dtype, output.layout, patch.height, patch.width) for patch in patches)
+    forms = (array_format(output.dtype, output.layout, patch.height, patch.width) for patch in patches)
     return sum(image_bytes(form, json_bytes, pairs) for form in forms)
 
 

@@ -21,7 +21,7 @@ from unprocess_gen.core.files import file_sha256, machine_error
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_rows, row_json
-from unprocess_gen.dataset.shards import CLEAN, Expected, check_members, form_of, noisy_member, shard_name
+from unprocess_gen.dataset.shards import CLEAN, ExpectedSample, array_format, check_members, noisy_member, shard_name
 from unprocess_gen.pipeline.workspace import read_dataset
 
 SWEEP_TABLE = "sweep.csv"
@@ -230,18 +230,18 @@ def _check_sha256(path: Path, entry: dict[str, Any] | None) -> Iterator[Damage]:
         yield Damage(f"shards/{path.name}", f"its SHA-256 is {found}, dataset.json records {entry['sha256']}")
 
 
-def expected_samples(rows: Iterable[Row]) -> list[Expected]:
+def expected_samples(rows: Iterable[Row]) -> list[ExpectedSample]:
     """Return the members that a shard must contain for some rows; raise DamageError if a row lacks a value."""
     return [_expected_sample(sample) for sample in group_by_sample(row for row in rows if row["status"] == "ok")]
 
 
-def _expected_sample(rows: Sequence[Row]) -> Expected:
+def _expected_sample(rows: Sequence[Row]) -> ExpectedSample:
     width, height = rows[0]["width"], rows[0]["height"]
     if not isinstance(width, int) or not isinstance(height, int):
         raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
-    form = form_of(str(rows[0]["dtype"]), str(rows[0]["layout"]), height, width)
+    form = array_format(str(rows[0]["dtype"]), str(rows[0]["layout"]), height, width)
     noisy = tuple((noisy_member_of(row), str(row["noisy_xxh3"])) for row in rows)
-    return Expected(sample_key(rows[0]), form, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
+    return ExpectedSample(sample_key(rows[0]), form, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
 
 
 def noisy_member_of(row: Row) -> str:

@@ -53,7 +53,7 @@ def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
     path = Path(context.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     busy = task.busy_path(context)
     try:
-        with ShardWriter(path, beside=context.core_to_spare) as writer:
+        with ShardWriter(path, threaded=context.core_to_spare) as writer:
             rows = tuple(_make_rows(context, task, writer, failures))
         busy.unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
