@@ -236,7 +236,7 @@ def test_report_opens_offline(text: str) -> None:
 
 
 def test_failures_are_listed_with_reason_and_detail(made: Path, text: str) -> None:
-    rows = re.findall(r"<tr><td>(\d{8})</td><td>(.*?)</td><td>(\w+)</td><td>(.*?)</td></tr>", text)
+    rows = re.findall(r"<tr><td>(\d{8})</td><td>(.*?)</td><td>(\w+)</td><td class=\"w\">(.*?)</td></tr>", text)
     assert {(html.unescape(source), reason) for _, source, reason, _ in rows} == {
         (HOSTILE, "unsupported"),
         ("empty.png", "empty"),
@@ -304,7 +304,7 @@ def test_dataset_without_pairs_has_a_report(make: Make, tmp_path: Path) -> None:
     (tmp_path / "photos/a.png").touch()
     make(tmp_path / "photos", tmp_path / "ds", "source.max_failed=1")
     text = dataset_report.dataset_page(tmp_path / "ds")
-    assert "0 pairs" in text and "1 failed" in text
+    assert "0 pairs" in text and "failed rows: 1." in text
     assert "there is no pair to show" in text
     assert '<tr><td>empty</td><td class="n">1</td></tr>' in text
 

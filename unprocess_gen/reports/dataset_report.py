@@ -151,8 +151,8 @@ def _checked_facts(folder: Path) -> dict[str, Any]:
 def _headline(facts: Mapping[str, Any]) -> str:
     size = byte_size(sum(entry["bytes"] for entry in facts["shards"]))
     return (
-        f"{facts['pairs']:,} pairs of clean and noisy raw frames in {len(facts['shards']):,} shards, {size}; "
-        f"{sum(facts['failed'].values()):,} failed rows."
+        f"{facts['pairs']:,} pairs of clean and noisy raw frames, {size}; shards: {len(facts['shards']):,}; "
+        f"failed rows: {sum(facts['failed'].values()):,}."
     )
 
 
@@ -212,7 +212,7 @@ def _failures(facts: Mapping[str, Any], statistics: ManifestStatistics) -> Failu
         return None
     reasons = [(reason, f"{count:,}") for reason, count in facts["failed"].items()]
     more = sum(facts["failed"].values()) - len(statistics.failed)
-    rows = PageTable(("key", "source", "reason", "detail"), statistics.failed)
+    rows = PageTable(("key", "source", "reason", "detail"), statistics.failed, wrapped={3})
     return FailureTables(PageTable(("reason", "rows"), reasons, {1}), rows, more)
 
 

@@ -25,13 +25,15 @@ INVISIBLE = re.compile(
 class PageTable(NamedTuple):
     """A table of a page.
 
-    ``numeric`` holds the indices of columns aligned right, ``groups`` those of lines that begin a new group.
+    ``numeric`` holds the indices of columns aligned right, ``wrapped`` those of columns with long text, and ``groups``
+    those of lines that begin a new group.
     """
 
     headings: Sequence[str]
     lines: Iterable[Sequence[str]]
     numeric: Collection[int] = ()
     groups: Collection[int] = ()
+    wrapped: Collection[int] = ()
 
 
 def render_page(template: str, **values: Any) -> str:
