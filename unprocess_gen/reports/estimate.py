@@ -145,19 +145,30 @@ def estimate_run(
     sources = listing.sources
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
     _compile_kernels(config)
-    looks = tuple(estimate_source(config, source) for source in chosen)
+    estimates = tuple(estimate_source(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
-    per_shard = config.output.pairs_per_shard
-    shards = -(-len(sources) // per_shard)
-    if exact:
-        shard_looks = (looks[at : at + per_shard] for at in range(0, len(looks), per_shard))
-        total = sum(shard_bytes([one.bytes for one in shard if one.bytes]) for shard in shard_looks)
-    else:
-        total = sum(one.bytes for one in looks) * len(sources) // len(looks) + shards * shard_bytes([0])
-    seconds = sum(one.seconds for one in looks) / len(looks) * len(sources) / n_jobs
-    free = free_bytes(Path(config.out))
-    tier_ns = _tier_ns(config, looks, tiers or {})
-    return RunEstimate(len(sources), shards, total, exact, seconds, n_jobs, free, looks, tier_ns, listing.unmatched)
+    seconds = sum(source.seconds for source in estimates) / len(estimates) * len(sources) / n_jobs
+    return RunEstimate(
+        sources=len(sources),
+        shards=-(-len(sources) // config.output.pairs_per_shard),
+        bytes=_bytes_of_shards(estimates, len(sources), config.output.pairs_per_shard),
+        exact=exact,
+        seconds=seconds,
+        n_jobs=n_jobs,
+        free_bytes=free_bytes(Path(config.out)),
+        source_estimates=estimates,
+        tier_ns=_tier_ns(config, estimates, tiers or {}),
+        unmatched=listing.unmatched,
+    )
+
+
+def _bytes_of_shards(estimates: tuple[SourceEstimate, ...], sources: int, per_shard: int) -> int:
+    """Return the bytes of all shards, extrapolated unless every source was read."""
+    if len(estimates) == sources:
+        shards = (estimates[start : start + per_shard] for start in range(0, sources, per_shard))
+        return sum(shard_bytes([source.bytes for source in shard if source.bytes]) for shard in shards)
+    mean_total = sum(source.bytes for source in estimates) * sources // len(estimates)
+    return mean_total + -(-sources // per_shard) * shard_bytes([0])
 
 
 def estimate_source(config: Config, source: Source) -> SourceEstimate:
