@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from fractions import Fraction
@@ -402,3 +404,8 @@ def test_gamma_is_number_or_srgb(settings: Settings, isp: str, gamma: float | st
 def test_noise_with_negative_variance_at_all_signals_is_skipped(settings: Settings) -> None:
     plan = plan_of(settings, "noise=heteroscedastic", "noise.a=0.001", "noise.b=-1e6", "noise.negative_variance=clip")
     assert plan.effects == ("quantise",)
+
+
+def test_planning_imports_neither_numba_nor_opencv() -> None:
+    code = "import sys, unprocess_gen.planning.plan; print({'numba', 'cv2', 'hydra', 'omegaconf'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
