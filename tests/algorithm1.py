@@ -1,7 +1,7 @@
-"""Algorithm 1 of the article by other hands: from a manifest row and its source, without a line of the package.
+"""Compute Algorithm 1 of the article from a manifest row and its source, without using the package.
 
-Straightforward float64 NumPy, the article's own formulas (arcsine, 100·i·(i - 0.9)²). The tests hold the datasets
-against it, and the benchmark takes it as the yardstick of what one would write in an afternoon.
+Plain float64 NumPy with the formulas of the article (arcsine, 100·i·(i - 0.9)²). Tests compare datasets with it, and
+the benchmark uses it as the yardstick of a straightforward implementation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the tests of noise share: exact moments of a rounded, clipped Gaussian, and bounds that hold by theory.
+"""Exact moments of a rounded, clipped Gaussian, and proved bounds, for tests of noise.
 
 Nothing here comes from the package: the moments are sums over the digital numbers a frame can hold, each with its
 probability from erfc, and the bounds are Bernstein's inequality.
@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 REACH = 6.4
-"""Beyond this many standard deviations the sampler gives nothing (`test_effects` holds it to 6.34)."""
+"""Standard deviations that the sampler never exceeds (`test_effects` checks 6.34)."""
 
 FALSE_ALARM = 1e-12
-"""Chance that one comparison fails by bad luck alone. All tests together make fewer than 10⁵: 10⁻⁷ for the lot."""
+"""Probability that a correct comparison fails; with fewer than 10⁵ comparisons, 10⁻⁷ for all tests together."""
 
 SAMPLER_ERROR = 1.5e-7
-"""What the table of normal quantiles may be off (`test_tables` walks it)."""
+"""Error bound of the table of normal quantiles (`test_tables` checks it)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Of one random digital number: mean, central moments two to four, and how far it can lie from its mean."""
+    """Mean, second to fourth central moment and largest distance from the mean of one random DN."""
 
     mean: float
     variance: float

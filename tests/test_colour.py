@@ -15,7 +15,7 @@ from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.colour import CAMERAS, IDENTITY, RGB2XYZ, Matrix
 
 U = Fraction(1, 2**53)
-"""Half a unit in the last place of 1: what one operation may be off, relatively."""
+"""Largest relative error of one operation: half a unit in the last place of 1."""
 
 entries = st.floats(-4, 4, allow_subnormal=False)
 matrices = st.tuples(*[entries] * 9)
@@ -23,7 +23,7 @@ matrices = st.tuples(*[entries] * 9)
 
 @st.composite
 def weights(draw: st.DrawFn) -> tuple[float, ...]:
-    """Four uniforms over their sum, the corners and edges included."""
+    """Four uniform numbers divided by their sum, including corners and edges."""
     uniforms = draw(st.tuples(*[st.floats(0, 1)] * 4))
     total = sum(uniforms)
     assume(total > 1e-6)
@@ -62,7 +62,7 @@ def test_rows_of_a_mixture_sum_to_exactly_1_in_any_order(mix: tuple[float, ...])
 
 
 def test_rows_of_many_mixtures_sum_to_exactly_1_in_any_order() -> None:
-    """Denser than examples: 5,000 draws of the law itself; without the grid a quarter of the rows would miss."""
+    """Without the grid, a quarter of the rows of these 5,000 random mixtures would not sum to 1."""
     uniforms = np.random.Generator(np.random.Philox(key=0)).random((5000, 4))
     for mix in uniforms / uniforms.sum(axis=1, keepdims=True):
         for row in rows(colour.rgb2cam(colour.mix(tuple(CAMERAS.values()), [float(weight) for weight in mix]))):
@@ -71,7 +71,7 @@ def test_rows_of_many_mixtures_sum_to_exactly_1_in_any_order() -> None:
 
 @pytest.mark.parametrize("row", [(-3.2, 2.8, 1.4)])
 def test_a_row_with_great_cancellation_sums_to_exactly_1_in_any_order(row: tuple[float, float, float]) -> None:
-    """Two of its entries add up to more than the next power of two above the largest."""
+    """The sum of two entries exceeds the next power of two above the largest entry."""
     normalised = colour.normalise_rows((*row, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
     assert sums(normalised[:3]) == {1.0}
 
@@ -162,7 +162,7 @@ def test_a_matrix_has_nine_numbers() -> None:
 
 
 def exact_inverse(numbers: Matrix) -> list[Fraction] | None:
-    """Gauss and Jordan's elimination in fractions: another road than cofactors."""
+    """Invert by Gauss-Jordan elimination in fractions, independent of cofactors."""
     left = [[Fraction(entry) for entry in row] + [Fraction(int(i == j)) for j in range(3)] for i, row in
             enumerate(rows(numbers))]  # fmt: skip
     for column in range(3):
@@ -264,7 +264,7 @@ def as_array(camera: Matrix) -> np.ndarray:
 def test_condition_numbers_of_cameras_equal_the_measured_ones(
     camera: str, condition: float, determinant: float
 ) -> None:
-    """To the digits it gives."""
+    """The measured numbers are compared to their printed digits."""
     found = as_array(colour.rgb2cam(CAMERAS[camera]))
     assert abs(np.linalg.cond(found, 2) - condition) <= 0.0005
     assert abs(np.linalg.det(found) - determinant) <= 0.0005

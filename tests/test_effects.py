@@ -22,7 +22,7 @@ from unprocess_gen.simulation.reference.noise import heteroscedastic, noise_vari
 
 SIGN = np.uint32(1 << 31)
 LAST = 2**31 - 1
-"""The last index: next to the middle of the distribution. Index 0 is the farthest in the tail."""
+"""Last index, next to the centre of the distribution; index 0 is farthest in the tail."""
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def exact(index: int) -> float:
 
 @given(st.integers(0, LAST))
 def test_a_normal_is_the_quantile_of_its_tail_probability(index: int) -> None:
-    """(i + ½) / 2**32, right for any index, of whichever octave."""
+    """The tail probability of index i is (i + ½) / 2**32 in every octave."""
     assert abs(normal(index) - exact(index)) <= SAMPLER_ERROR
 
 
@@ -61,7 +61,7 @@ def test_the_top_bit_is_the_sign_only(index: int) -> None:
 
 
 def test_the_first_index_gives_the_largest_normal() -> None:
-    """Phi^-1(2**-33) = -6.3379...: the least tail probability there is."""
+    """The smallest tail probability, 2**-33, has the quantile -6.3379…."""
     farthest = -NormalDist().inv_cdf(2.0**-33)
     assert 6.33 < farthest < 6.34 < REACH
     assert abs(normal(0) - farthest) <= SAMPLER_ERROR
@@ -70,7 +70,7 @@ def test_the_first_index_gives_the_largest_normal() -> None:
 
 
 def test_normals_decrease_with_the_index_within_the_table_error() -> None:
-    """So that a greater uniform never gives a notably smaller normal: runs through every octave, edges included."""
+    """Indices of every octave are tested, including its edges."""
     starts = [2**octave // 2 * (32 + segment) // 32 for octave in range(32) for segment in range(32)]
     for start in sorted(set(starts)):
         run = np.arange(max(start - 50, 0), min(start + 50, LAST)).astype(np.uint32)
@@ -136,7 +136,7 @@ def test_tail_counts_follow_the_normal_distribution(z: np.ndarray, limit: float,
 
 
 def test_the_distribution_is_normal(z: np.ndarray) -> None:
-    """Kolmogorov's distance by the inequality of Dvoretzky, Kiefer, Wolfowitz and Massart."""
+    """The Kolmogorov distance is bounded by the inequality of Dvoretzky, Kiefer, Wolfowitz and Massart."""
     ordered = np.sort(z)
     at = np.linspace(0, COUNT - 1, 10_001).astype(np.int64)
     cdf = np.array([NormalDist().cdf(value) for value in ordered[at]])

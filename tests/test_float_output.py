@@ -47,11 +47,11 @@ PLANS = {
     "poisson": replace(GOLDEN["per_channel"], noise_law="poisson"),
     "silent": replace(GOLDEN["per_channel"], effects=()),
 }
-"""One plan of each kind."""
+"""One plan for each set of kernels."""
 DISPATCHED = [
     name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
 ]
-"""What NumPy chooses between on this machine."""
+"""Instruction sets that NumPy can use on this machine."""
 
 
 def normalised(plan: Plan, clip: str = "none", layout: str = "mosaic") -> Plan:
@@ -109,7 +109,7 @@ def test_kernels_equal_the_reference_byte_for_byte(name: str, clip: str) -> None
 
 @pytest.mark.parametrize("name", PLANS)
 def test_an_integer_frame_is_the_rounded_float_frame(name: str) -> None:
-    """But where a value lies so near the middle of two DN that the cast to float32 may move it: 6e-5 DN at 10 bits."""
+    """Values within 6e-5 DN (at 10 bits) of a rounding boundary are excluded; the cast to float32 may move them."""
     plan, picture = PLANS[name], selftest.golden_image()
     whole, exact = make_pair(picture, plan, ORIGIN), make_pair(picture, normalised(plan), ORIGIN)
     for rounded, frame in ((whole.clean, exact.clean), (whole.noisy, exact.noisy)):
@@ -122,7 +122,7 @@ def test_an_integer_frame_is_the_rounded_float_frame(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["per_channel", "physical"])
 def test_clipped_counts_do_not_depend_on_the_clipping_mode(name: str) -> None:
-    """Levels 64 and 1023 of 10 bits: what lies below DN 0 or above 1023 in the frame that is not clipped is counted."""
+    """With levels 64 and 1023 at 10 bits, values below DN 0 or above 1023 of the unclipped frame are counted."""
     free, sensor, black = (
         make_pair(selftest.golden_image(), normalised(PLANS[name], clip), ORIGIN)
         for clip in ("none", "sensor", "black")
@@ -140,14 +140,14 @@ def test_clipped_counts_do_not_depend_on_the_clipping_mode(name: str) -> None:
 
 
 def test_the_clean_frame_is_clipped_and_saturated_at_one() -> None:
-    """However the noisy one is clipped: step 8 of Algorithm 1 clips the light, and Brooks' code does."""
+    """The clipping mode of the noisy frame does not matter, as in step 8 of Algorithm 1 and in Brooks et al."""
     pair = make_pair(selftest.golden_image(), normalised(PLANS["per_channel"]), ORIGIN)
     assert (pair.clean.min(), pair.clean.max()) == (0, 1)
     assert pair.counts.saturated == int((pair.clean == 1).sum()) > 0
 
 
 def test_unclipped_noise_has_mean_zero_in_black() -> None:
-    """Within five standard errors; clipped at black, its mean is that of a normal's upper half, σ/√(2π)."""
+    """Tolerance: five standard errors. Clipped at black, the mean would be that of half a normal, σ/√(2π)."""
     black = np.zeros((512, 512, 3), dtype=np.uint8)
     plan = PLANS["per_channel"]
     std = np.sqrt(plan.b_dn2) / 959
@@ -193,7 +193,7 @@ def test_levels_and_draws_equal_separate_pairs(noise: str, overrides: tuple[str,
 
 
 def test_numpys_instruction_sets_change_no_byte() -> None:
-    """The golden pairs in float32, whose formulas NumPy computes, in a process of their own."""
+    """A new process simulates the golden float32 pairs, whose formulas NumPy computes."""
     code = (
         "import numpy as np; from unprocess_gen.simulation import self_test as selftest; "
         "print(selftest.failures('normalised_counts'), "
@@ -269,7 +269,7 @@ def test_float_frames_skip_quantisation(noise: str, settings: Settings) -> None:
 
 
 def test_rounding_noise_masks_nothing_in_float_frames(settings: Settings) -> None:
-    """A column pattern of 0.01 DN in a clean frame that has it is hidden by its rounding alone."""
+    """In a clean frame, only rounding masks a column pattern of 0.01 DN."""
     noise = ("noise=nikon_d850", "clean.includes_fixed_pattern=true")
     effects_of = {}
     for dtype in ("uint16", "float32"):
@@ -294,7 +294,7 @@ def test_an_effect_without_masking_noise_is_decided(settings: Settings) -> None:
 
 @pytest.fixture(scope="module")
 def packed(photos: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of packed planes in float32; tests read it and leave it as it is."""
+    """Dataset of packed planes in float32, which tests do not modify."""
     out = tmp_path_factory.mktemp("floats") / "ds"
     make(photos, out, "output.pairs_per_shard=5", "noise=brooks2019", *FLOATS)
     return out

@@ -93,7 +93,7 @@ def test_levels_draw_their_own_profile_and_draws_share_it(many: Path) -> None:
 
 
 def test_noise_of_levels_and_draws_is_independent(many: Path) -> None:
-    """32,000 sites: a correlation has a standard error of 0.0056; six of them."""
+    """Tolerance: six standard errors of a correlation over 32,000 sites, each 0.0056."""
     found = np.corrcoef(list(residuals(many, "large.png").values()))
     assert found.shape == (6, 6)
     assert np.abs(found - np.eye(6)).max() < 6 / np.sqrt(32_000)
@@ -233,7 +233,7 @@ def by_clip(out: Path) -> dict[str, list[dict[str, str]]]:
 
 
 def test_noise_of_frames_is_independent(filmed: Path) -> None:
-    """12,288 sites; six standard errors of a correlation."""
+    """Tolerance: six standard errors of a correlation over 12,288 sites."""
     frames = [noisy.astype(float) - clean for clean, noisy, row in RawPairs(filmed) if row["clip"] == "one"]
     found = np.corrcoef([(frame - frame.mean(axis=1, keepdims=True)).ravel() for frame in frames])
     assert np.abs(found - np.eye(4)).max() < 6 / np.sqrt(12_288)

@@ -37,7 +37,7 @@ def plan() -> Plan:
 
 @pytest.fixture(scope="module")
 def scene() -> np.ndarray:
-    """A cut-out with an odd size that holds blown highlights, deep shadows and saturated colours."""
+    """Crop of odd size with clipped highlights, deep shadows and saturated colours."""
     return np.ascontiguousarray(synthetic.scene("highlights-0")[150:361:, 300:597])
 
 
@@ -222,7 +222,7 @@ def in_float32(srgb: np.ndarray, plan: Plan, origin: tuple[int, int] = (0, 0)) -
 
 
 def assert_within(differing: int, worst: int, sites: int) -> None:
-    """As `methods` states it."""
+    """Error bounds as documented in `config.accuracy`."""
     stated = method("colour", "fused_float32")
     assert worst <= stated.clean_dn
     assert differing <= stated.clean_changed_share * sites
@@ -241,7 +241,7 @@ def test_float32_is_within_its_error_on_sampled_colours(plan: Plan, camera: str,
 
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 def test_float32_is_within_its_error_on_16_bit_grays(plan: Plan, camera: str) -> None:
-    """Each gray on each of the four sites."""
+    """Each gray is tested on each of the four CFA sites."""
     made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
     grays = np.arange(2**16, dtype=np.uint16).repeat(2)
     codes = np.broadcast_to(grays[None, :, None], (2, grays.size, 3)).copy()
@@ -254,7 +254,7 @@ def test_float32_is_within_its_error_on_16_bit_grays(plan: Plan, camera: str) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 def test_float32_is_within_its_error_on_all_colours(plan: Plan, camera: str) -> None:
-    """Each colour on each of the four sites."""
+    """Each colour is tested on each of the four CFA sites."""
     made = replace(with_sensor(plan, 14), rgb2cam=colour.rgb2cam(colour.CAMERAS[camera]))
     green, blue = np.mgrid[:256, :256]
     differing, worst = 0, 0
@@ -439,7 +439,7 @@ def test_halves_are_rounded_to_the_even_dn(plan: Plan, make: object, black: int,
 
 @pytest.mark.parametrize("make", [make_pair, reference_pair])
 def test_large_noise_is_clipped_and_never_wraps(plan: Plan, make: object) -> None:
-    """The greatest variance that settings allow: a deviation of 3e7 DN, half of it below and half above the sensor."""
+    """Largest variance that the config allows: a standard deviation of 3e7 DN, far beyond the sensor's range."""
     gray = np.full((32, 64, 3), 128, dtype=np.uint8)
     wide = replace(plan, bits=16, black_level_dn=4096, white_level_dn=65535, a_dn=0.0, b_dn2=1e15)
 

@@ -44,7 +44,7 @@ def test_the_golden_pair_equals_the_reference(name: str) -> None:
 
 
 def test_the_float32_golden_pair_differs_from_float64() -> None:
-    """Else it would prove nothing of float32."""
+    """Equal pairs could not show that the float32 kernels are tested."""
     plan = replace(selftest.GOLDEN_PLANS["float32"], methods=())
 
     assert array_xxh3(make_pair(selftest.golden_image(), plan, (1, 57)).noisy) != selftest.GOLDEN["float32"][1]
@@ -80,7 +80,7 @@ def test_only_the_kernels_of_the_plans_are_tested(
 
 
 def test_kernels_are_tested_when_a_plan_first_needs_them(door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the other levels of an image, too."""
+    """The plans of all noise levels of an image count."""
     proved: list[str] = []
     monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
     kinds = iter(["plain", "physical", "plain", "one_normal"])
@@ -91,7 +91,7 @@ def test_kernels_are_tested_when_a_plan_first_needs_them(door: Door, monkeypatch
 
 
 def test_the_golden_image_reaches_every_limit() -> None:
-    """Clipped low and high, saturated, highlights of both kinds, every code of 8 bits."""
+    """Limits: clipped low and high, saturated, both kinds of highlights, every 8-bit code."""
     picture = selftest.golden_image()
     counts = reference_pair(picture, selftest.GOLDEN_PLAN, (1, 57)).counts
 
@@ -100,7 +100,7 @@ def test_the_golden_image_reaches_every_limit() -> None:
 
 
 def last_bit(table: np.ndarray) -> np.ndarray:
-    """The table with one entry in the middle one unit in the last place greater."""
+    """Return the table with one central entry one unit in the last place larger."""
     changed = table.copy()
     changed.flat[changed.size // 2 + 1] = np.nextafter(changed.flat[changed.size // 2 + 1], np.inf)
     return changed
@@ -138,7 +138,7 @@ KERNELS = (
 
 @pytest.fixture
 def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The kernels are plain Python."""
+    """Replace the kernels by plain Python functions."""
     for module in KERNEL_MODULES:
         for name, value in list(vars(module).items()):
             if hasattr(value, "py_func"):
@@ -173,7 +173,7 @@ def test_a_fused_multiply_add_is_detected(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def nudged(kernel: Callable[..., object]) -> Callable[..., object]:
-    """The kernel, whose last output is a little greater: a bit of the words, half a DN of signal or of noise."""
+    """Return the kernel with a slightly larger last output: one bit of the words, half a DN of signal or noise."""
 
     def other(*given: object) -> object:
         found = kernel(*given)
@@ -214,7 +214,7 @@ def test_go_on_continues_and_records_the_failure(door: Door, monkeypatch: pytest
 
     facts = json.loads((tmp_path / "ds" / "dataset.json").read_text())
     assert done.code == 0
-    assert done.err.count("the self-test failed: results differ (the golden clean frame") == 1
+    assert done.err.count("the self-test failed: the golden clean frame") == 1
     assert facts["self_test"] == "failed"
     assert all("the golden clean frame" in entry["self_test"] for entry in facts["shards"])
 
@@ -253,7 +253,7 @@ def test_replay_is_refused_after_a_failed_self_test(dataset: Path, door: Door, m
 
 
 def test_the_golden_pair_depends_on_the_reference_normals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else a change of the sampler that both forms share would go by unseen."""
+    """Otherwise a change of the sampler, which reference and kernels share, would not be detected."""
     true = effects.normals
     monkeypatch.setattr(effects, "normals", lambda *given: -true(*given))
     pair = reference_pair(selftest.golden_image(), selftest.GOLDEN_PLAN, (1, 57))

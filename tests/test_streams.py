@@ -34,7 +34,7 @@ places = st.integers(0, 2**20)
 
 
 def philox_by_hand(counter: tuple[int, int, int, int], key: int) -> list[int]:
-    """Salmon et al. 2011, section 3.3, in Python's own integers."""
+    """Compute Philox with Python integers (Salmon et al. 2011, section 3.3)."""
     c, k = list(counter), [key % 2**32, key >> 32]
     for _ in range(10):
         high0, low0 = divmod(0xD2511F53 * c[0], 2**32)
@@ -246,7 +246,7 @@ CENTRED = {
 
 
 def chi_square_bounds(freedom: int) -> tuple[float, float]:
-    """Laurent and Massart 2000, lemma 1: a chi-square lies outside with a probability below `FALSE_ALARM` a side."""
+    """Return bounds that a chi-square exceeds with probability `FALSE_ALARM` per side (Laurent and Massart 2000)."""
     x = math.log(1 / FALSE_ALARM)
     return freedom - 2 * math.sqrt(freedom * x), freedom + 2 * math.sqrt(freedom * x) + 2 * x
 
@@ -285,7 +285,7 @@ def test_streams_are_uncorrelated(one: str, other: str) -> None:
 
 
 def test_a_correlation_of_a_hundredth_is_detected() -> None:
-    """The bound above has teeth: (u + 0.01 v)·v has a mean product of 0.01 / 12."""
+    """The bound detects (u + 0.01 v)·v, whose mean product is 0.01 / 12."""
     leaning = CENTRED["here"] + 0.01 * CENTRED["next key"]
     assert abs(float((leaning * CENTRED["next key"]).mean())) > bernstein(1 / 144, 1 / 4, SIDE * SIDE)
 
