@@ -185,6 +185,31 @@ def test_signal_while_settings_are_composed_ends_within_two_seconds(
         assert process.returncode in (-number, 0)
 
 
+MASKED = """
+import os, signal, sys
+from unprocess_gen.cli import main
+from unprocess_gen.core.errors import ConfigError
+
+def run(arguments):
+    try:
+        os.kill(os.getpid(), int(sys.argv[1]))
+        signal.sigtimedwait([], 5)
+    finally:
+        raise ConfigError("seed: no such key")
+
+main.run = run
+sys.exit(main.main())
+"""
+
+
+@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+def test_error_that_replaces_a_signal_is_reported_as_the_signal(number: signal.Signals) -> None:
+    command = [sys.executable, "-c", MASKED, str(int(number))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 128 + number
+    assert done.stderr.startswith(f"gen-dataset: {ENDS[number]}")
+
+
 def test_nohup_is_respected(tmp_path: Path) -> None:
     process = start(tmp_path, "source.limit=2", "n_jobs=1", "out=ds", prefix=("nohup",))
     wait_for(tmp_path / "ds/.work")

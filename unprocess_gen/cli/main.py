@@ -33,6 +33,8 @@ OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
 BROKEN_PIPE = 141
 """Exit code if stdout is a pipe whose reader ended, as for a process that SIGPIPE ends."""
 
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 KEPT = "finished shards are kept; rerun to resume"
 
 
@@ -55,18 +57,9 @@ def main() -> int:
     for limit in OPENCV_LIMITS:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
-    with checked_streams():
-        signals = _catch_signals()
-        repeater = _SignalRepeater()
-        unraisable, sys.unraisablehook = sys.unraisablehook, repeater
-        try:
-            code = _exit_code(lambda: run(arguments), arguments)
-            return _exit_code(_flush_stdout, arguments) or code
-        finally:
-            for number in signals:
-                signal.signal(number, signal.SIG_DFL)  # a late signal ends the process without a traceback
-            sys.unraisablehook = unraisable
-            repeater.cancel()
+    with checked_streams(), _SIGNALS:
+        code = _exit_code(lambda: run(arguments), arguments)
+        return _exit_code(_flush_stdout, arguments) or code
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -144,8 +137,6 @@ def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:
     """Run a step; report what ends it in one line, and return the exit code. Bugs rise."""
     try:
         return step()
-    except UnprocessGenError as error:
-        return report_error(error)
     except BrokenPipeError:
         return BROKEN_PIPE
     except KeyboardInterrupt:
@@ -153,11 +144,12 @@ def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:
     except TerminationSignal as error:
         return _report_signal(error.number, arguments)
     except Exception as error:
-        if isinstance(sys.unraisablehook, _SignalRepeater) and sys.unraisablehook.lost is not None:
-            return _report_signal(
-                sys.unraisablehook.lost, arguments
-            )  # LLVM failed because its callback was interrupted
-        RESULTS.error("unexpected error", exc_info=error)
+        if _SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
+            return _report_signal(_SIGNALS.received, arguments)
+        if isinstance(error, UnprocessGenError):
+            return report_error(error)
+        if LOGGER.handlers:
+            RESULTS.error("unexpected error", exc_info=error)
         raise
 
 
@@ -169,21 +161,60 @@ def _flush_stdout() -> int:
 # ------------------------------------------------------------------------------------------------------------ signals
 
 
-def _catch_signals() -> list[int]:
-    """Let SIGTERM and SIGHUP raise `TerminationSignal`, unless the caller ignores them (``nohup``).
+class _Signals:
+    """Turn signals into exceptions while it is entered: SIGINT, SIGTERM and SIGHUP, unless the caller ignores them.
 
-    Returns the signals that end the process.
+    Python drops exceptions that are raised while LLVM calls back into Python. Without `_repeat`, 3 of 47 SIGTERM at
+    random times of a first run with ``n_jobs=1`` were lost, or ended with a traceback and exit code 1.
+
+    Attributes
+    ----------
+    received : int or None
+        The last signal; None if there was none.
     """
-    caught = [signal.SIGINT]
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _terminate)
-            caught.append(number)
-    return [int(number) for number in caught if signal.getsignal(number) != signal.SIG_IGN]
+
+    REPEAT_S = 0.05
+    """Delay before a dropped signal is sent again; LLVM's callbacks take far less."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._caught: list[int] = []
+        self._timer: threading.Timer | None = None
+        self._hook = sys.unraisablehook
+
+    def __enter__(self) -> None:
+        self.received = None
+        self._hook, sys.unraisablehook = sys.unraisablehook, self._repeat
+        self._caught = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # nohup
+        for number in self._caught:
+            signal.signal(number, self._handle)
+
+    def __exit__(self, *_: object) -> None:
+        for number in self._caught:
+            signal.signal(number, signal.SIG_DFL)  # a late signal ends the process without a traceback
+        sys.unraisablehook = self._hook
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.received = number
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise TerminationSignal(number)
+
+    def _repeat(self, unraisable: sys.UnraisableHookArgs) -> None:
+        """Send a signal again if the exception of its handler was dropped; pass anything else on."""
+        if not isinstance(unraisable.exc_value, KeyboardInterrupt | TerminationSignal):
+            sys.__unraisablehook__(unraisable)
+        elif self.received is not None:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = threading.Timer(self.REPEAT_S, os.kill, (os.getpid(), self.received))
+            self._timer.daemon = True
+            self._timer.start()
 
 
-def _terminate(number: int, frame: FrameType | None) -> None:
-    raise TerminationSignal(number)
+_SIGNALS = _Signals()
 
 
 def _report_signal(number: int, arguments: Sequence[str]) -> int:
@@ -195,38 +226,3 @@ def _report_signal(number: int, arguments: Sequence[str]) -> int:
     what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
     report(f"{what}; {KEPT}" if resumes else what, logging.WARNING)
     return 128 + number
-
-
-class _SignalRepeater:
-    """Send a signal again if the exception of its handler was dropped; used as `sys.unraisablehook`.
-
-    Python drops exceptions that are raised while LLVM calls back into Python. Without this class, 3 of 47 SIGTERM at
-    random times of a first run with ``n_jobs=1`` were lost, or ended with a traceback and exit code 1.
-    """
-
-    DELAY_S = 0.05
-    """LLVM's callbacks take far less."""
-
-    def __init__(self) -> None:
-        self.lost: int | None = None
-        self._timer: threading.Timer | None = None
-
-    def cancel(self) -> None:
-        """Do not send a signal that is still due."""
-        if self._timer is not None:
-            self._timer.cancel()
-
-    def __call__(self, unraisable: sys.UnraisableHookArgs) -> None:
-        """Repeat the signal that ``unraisable`` belongs to; pass anything else on."""
-        error = unraisable.exc_value
-        if isinstance(error, KeyboardInterrupt):
-            self.lost = signal.SIGINT
-        elif isinstance(error, TerminationSignal):
-            self.lost = error.number
-        else:
-            sys.__unraisablehook__(unraisable)
-            return
-        self.cancel()
-        self._timer = threading.Timer(self.DELAY_S, os.kill, (os.getpid(), self.lost))
-        self._timer.daemon = True
-        self._timer.start()
