@@ -52,7 +52,7 @@ def undisturbed(photographs: Path, make: Make, tree_hash: Hash) -> str:
 
 def own_lines(err: str) -> list[str]:
     """Return the lines of stderr that are not progress."""
-    return [line for line in err.splitlines() if "images/s" not in line]
+    return [line for line in err.splitlines() if "images/s" not in line and "compiling kernels" not in line]
 
 
 def wait_for_the_end(leader: int) -> None:

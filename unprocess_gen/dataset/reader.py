@@ -211,15 +211,35 @@ def sweep_folders(table: Path) -> list[str]:
     Raises
     ------
     DamageError
+        As `read_sweep_table`.
+    """
+    return [folder for folder, exit_code in read_sweep_table(table) if exit_code in FINISHED]
+
+
+def read_sweep_table(table: Path) -> list[tuple[str, str]]:
+    """Return folder and exit code of every job of a sweep.
+
+    Parameters
+    ----------
+    table : Path
+        The ``sweep.csv``, of this or an older version.
+
+    Returns
+    -------
+    list of (str, str)
+        Names below the folder of ``table``, and exit codes, in its order.
+
+    Raises
+    ------
+    DamageError
         If the file cannot be read, lacks the columns ``folder`` and ``exit``, or names a folder elsewhere.
     """
     try:
         with table.open(encoding="utf-8", newline="") as stream:
-            rows = list(csv.DictReader(stream, strict=True))
-        folders = [row["folder"] for row in rows if row["exit"] in FINISHED]
+            jobs = [(row["folder"] or "", row["exit"] or "") for row in csv.DictReader(stream, strict=True)]
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise DamageError(f"{table}: not the table of a sweep ({error})") from error
-    for folder in folders:
+    for folder, _ in jobs:
         if folder in ("", ".", "..") or "/" in folder or "\0" in folder:
             raise DamageError(f"{table}: folder={folder[:60]!r}: expected the name of a folder next to the table")
-    return folders
+    return jobs

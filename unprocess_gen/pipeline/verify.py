@@ -21,10 +21,9 @@ from unprocess_gen.core.files import file_sha256, machine_error
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_rows, row_json
+from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 from unprocess_gen.dataset.shards import CLEAN, ExpectedSample, array_format, check_members, noisy_member, shard_name
 from unprocess_gen.pipeline.workspace import read_dataset
-
-SWEEP_TABLE = "sweep.csv"
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,17 +128,9 @@ def verify_sweep(folder: Path) -> Iterator[SweepVerification]:
     Raises
     ------
     DamageError
-        If ``sweep.csv`` cannot be read.
+        If ``sweep.csv`` cannot be read or names a folder elsewhere.
     """
-    table = folder / SWEEP_TABLE
-    try:
-        with table.open(encoding="utf-8", newline="") as stream:
-            jobs = [(row["folder"], row["exit"]) for row in csv.DictReader(stream, strict=True)]
-    except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise DamageError(f"{table}: cannot be read ({error}); expected the table of a sweep") from error
-    for name, exit_code in jobs:
-        if not name or Path(name).name != name or name == "..":
-            raise DamageError(f"{table}: {name!r} is not the name of a folder; expected a folder of the sweep")
+    for name, exit_code in read_sweep_table(folder / SWEEP_TABLE):
         dataset = folder / name
         if (dataset / "dataset.json").exists() or (dataset / "manifest.csv").exists():
             yield SweepVerification(name, tuple(verify(dataset)))

@@ -216,7 +216,7 @@ class Workspace:
     def _is_committed(self, shard: int) -> bool:
         try:
             entry = self.entry(shard)
-        except (FileNotFoundError, ValueError, KeyError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return False
         try:
             _check_size(self.out, entry)
