@@ -234,6 +234,18 @@ def source_file(root: str, path: str) -> str:
 def read_bytes(root: str, source: Source) -> bytes:
     """Read one photograph completely.
 
+    Parameters
+    ----------
+    root : str
+        Value of ``source.root``.
+    source : Source
+        One entry of the listing.
+
+    Returns
+    -------
+    bytes
+        Content of the file.
+
     Raises
     ------
     SourceError
