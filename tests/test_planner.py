@@ -733,8 +733,8 @@ def test_plan_prints_a_table_of_all_effects(door: Door, tmp_path: Path) -> None:
     assert (
         "nikon_d850: in DN of black 400, white 16383; on this sensor (black 240, white 4095) times 0.241194" in done.out
     )
-    assert "K 6.407 DN per electron, read noise of deviation" in done.out
-    assert "assumed, no source gives them: prnu_std" in done.out
+    assert "system gain 6.407 DN per electron, read noise " in done.out
+    assert "assumed, without a source: prnu_std" in done.out
     for effect in EFFECTS:
         assert " of 3 " in words[effect]
     assert "3 of 3" in words["shot"]
