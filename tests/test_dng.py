@@ -1,4 +1,4 @@
-"""DNG files as real readers see them: LibRaw (rawpy) reads and develops them, tifffile and exiftool read their tags."""
+"""LibRaw (rawpy) reads and develops DNG files correctly; tifffile and exiftool read their tags."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_libraw_opens_the_greatest_side_and_none_above(ds: Path) -> None:
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_a_reader_finds_d65_from_the_matrix_and_the_neutral(number: int, ds: Path) -> None:
+def test_matrix_and_neutral_give_d65(number: int, ds: Path) -> None:
     tags = tags_of(pair(ds, number)[2])
     assert tags["CalibrationIlluminant1"] == 21  # D65
     xyz = np.linalg.solve(numbers(tags["ColorMatrix1"]).reshape(3, 3), numbers(tags["AsShotNeutral"]))
@@ -143,16 +143,14 @@ def test_a_reader_finds_d65_from_the_matrix_and_the_neutral(number: int, ds: Pat
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_the_matrix_takes_xyz_to_native_numbers(number: int, ds: Path) -> None:
+def test_matrix_converts_xyz_to_native_values(number: int, ds: Path) -> None:
     _, _, row, plan = pair(ds, number)
     native = np.diag([1 / plan.red_gain, 1, 1 / plan.blue_gain]) @ np.array(plan.rgb2cam).reshape(3, 3)
     assert numbers(tags_of(row)["ColorMatrix1"]).reshape(3, 3) @ RGB2XYZ == pytest.approx(native, abs=1e-8)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_the_matrix_is_the_cameras_own_but_for_the_size_of_its_rows(
-    camera: str, folder: Path, make: Make, tmp_path: Path
-) -> None:
+def test_matrix_is_the_cameras_own_up_to_row_scale(camera: str, folder: Path, make: Make, tmp_path: Path) -> None:
     make(folder, tmp_path / "ds", f"camera={camera}", "source.limit=1")
     found = numbers(tags_of(pair(tmp_path / "ds")[2])["ColorMatrix1"]).reshape(3, 3)
     own = np.array(CAMERAS[camera]).reshape(3, 3)
@@ -180,13 +178,13 @@ def test_libraw_finds_the_white_balance_and_the_matrix(number: int, ds: Path) ->
         ({"inverse_rgb_gain": 1.0, "red_gain": 0.25}, -2),  # red saturates first, and readers scale by that
     ],
 )
-def test_baseline_exposure_is_what_the_row_took_away(changed: dict[str, float], stops: int, ds: Path) -> None:
+def test_baseline_exposure_restores_the_brightness(changed: dict[str, float], stops: int, ds: Path) -> None:
     tags = tags_of(pair(ds)[2] | changed)
     assert numbers(tags["BaselineExposure"]) == pytest.approx([stops], abs=1e-9)
 
 
 @given(st.floats(-(2.0**29.9), 2.0**29.9))
-def test_a_rational_is_as_near_as_it_says(value: float) -> None:
+def test_rational_has_the_documented_error(value: float) -> None:
     numerator, denominator = dng.rational(value)
     assert abs(numerator) < 2**31
     assert 0 < denominator < 2**31
@@ -339,7 +337,7 @@ def test_the_noise_profile_is_the_rows_law_in_units_of_the_range(ds: Path) -> No
         {"effects": "quantise"},  # the noise was switched off
     ],
 )
-def test_a_law_that_no_reader_takes_gets_no_noise_profile(changed: dict[str, Any], ds: Path) -> None:
+def test_noise_that_readers_refuse_gets_no_noise_profile(changed: dict[str, Any], ds: Path) -> None:
     assert "NoiseProfile" not in tags_of(pair(ds)[2] | changed)
 
 
@@ -356,7 +354,7 @@ def test_frames_without_a_noise_profile_are_counted(folder: Path, make: Make, do
 # -------------------------------------------------------------------------------------------------------------- tags
 
 
-def test_a_file_says_what_it_is(ds: Path) -> None:
+def test_file_identifies_its_frame(ds: Path) -> None:
     _, noisy, row, plan = pair(ds)
     array, tags = read(dng.encode(noisy, row, "noisy"))
     np.testing.assert_array_equal(array, noisy)
@@ -372,12 +370,12 @@ def test_a_file_says_what_it_is(ds: Path) -> None:
 
 @pytest.mark.parametrize("name", dng.FRAMES)
 @pytest.mark.parametrize("number", range(3))
-def test_the_row_stands_in_the_file(number: int, name: str, ds: Path) -> None:
+def test_file_contains_the_row(number: int, name: str, ds: Path) -> None:
     row = pair(ds, number)[2]
     assert xmp_of(tags_of(row, name)) == (name, row)
 
 
-def test_signs_of_xml_in_a_name_do_no_harm(ds: Path) -> None:
+def test_xml_characters_in_a_name_are_escaped(ds: Path) -> None:
     row = pair(ds)[2] | {"source": "a&b<c>\"'é]]>.png"}
     assert xmp_of(tags_of(row))[1] == row
 
@@ -441,7 +439,7 @@ def test_two_exports_are_the_same_bytes(ds: Path, tmp_path: Path) -> None:
         assert not {"DateTime", "DateTimeOriginal", "DateTimeDigitized"} & read(tmp_path / "one" / name)[1].keys()
 
 
-def test_a_file_that_is_there_already_is_kept(ds: Path, door: Door, tmp_path: Path) -> None:
+def test_existing_identical_file_is_kept(ds: Path, door: Door, tmp_path: Path) -> None:
     door("dng", ds, "--keys", "00000000", "--noisy", "--to", "to")
     before = (tmp_path / "to" / "00000000.noisy.dng").stat()
     done = door("dng", ds, "--keys", "00000000", "--to", "to")
@@ -476,7 +474,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED)
-def test_a_mistake_costs_one_line_and_writes_nothing(
+def test_wrong_usage_gives_one_line_and_writes_nothing(
     arguments: list[str], sentence: str, ds: Path, door: Door, tmp_path: Path
 ) -> None:
     done = door("dng", *(argument.replace("DS", str(ds)) for argument in arguments))
@@ -527,7 +525,7 @@ def test_without_tifffile_one_line_names_the_extra(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_frame_that_is_not_its_rows_is_damage(ds: Path, tmp_path: Path) -> None:
+def test_frame_that_differs_from_its_row_is_damage(ds: Path, tmp_path: Path) -> None:
     shutil.copytree(ds, tmp_path / "ds")
     shard = tmp_path / "ds" / "shards" / "shard-00000.tar"
     content, noisy = bytearray(shard.read_bytes()), pair(ds)[1].tobytes()
@@ -538,7 +536,9 @@ def test_a_frame_that_is_not_its_rows_is_damage(ds: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "to").exists()
 
 
-def test_a_full_disk_leaves_no_half_file(ds: Path, door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_full_disk_leaves_no_partial_file(
+    ds: Path, door: Door, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def full(aside: Path, path: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(aside))
 

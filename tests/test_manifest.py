@@ -1,4 +1,4 @@
-"""Manifest rows: a row is a plan, in CSV and in JSON, to the last bit."""
+"""Manifest rows hold their plans bit for bit, in CSV and in JSON."""
 
 from __future__ import annotations
 
@@ -135,14 +135,14 @@ BY_NAME = {column.name: column for column in COLUMNS}
 
 
 def number(name: str) -> st.SearchStrategy[float]:
-    """Any number that a column allows."""
+    """Return any number that a column allows."""
     allowed = BY_NAME[name].allowed
     assert isinstance(allowed, Range)
     return st.floats(allowed.low, allowed.high)
 
 
 def levels(bits: int) -> st.SearchStrategy[tuple[int, int, int]]:
-    """Bits, black level and white level that a sensor can have."""
+    """Return bits, black level and white level of a sensor."""
     black = st.integers(0, 2**bits - 2)
     return black.flatmap(lambda low: st.tuples(st.just(bits), st.just(low), st.integers(low + 1, 2**bits - 1)))
 
@@ -216,11 +216,11 @@ def test_columns_of_the_contract_are_there_in_its_order() -> None:
     assert [name for name in NAMES if name in CONTRACT] == CONTRACT
 
 
-def test_no_column_stands_twice() -> None:
+def test_column_names_are_unique() -> None:
     assert len(set(NAMES)) == len(NAMES) == len(COLUMNS)
 
 
-def test_every_column_says_what_it_means() -> None:
+def test_every_column_has_a_meaning() -> None:
     assert all(column.meaning for column in COLUMNS)
 
 
@@ -259,7 +259,7 @@ def test_a_failed_row_has_the_columns_of_any_row() -> None:
 
 
 @pytest.mark.parametrize(("index", "key"), [(0, "00000000"), (12345678, "12345678"), (123456789, "123456789")])
-def test_keys_are_eight_digits_and_more_where_needed(index: int, key: str) -> None:
+def test_keys_have_eight_digits_or_more(index: int, key: str) -> None:
     assert key_text(index) == key
 
 
@@ -272,7 +272,7 @@ def test_a_row_holds_its_plan(plan: Plan) -> None:
 
 
 @given(plan=plans, name=names)
-def test_a_row_read_back_from_csv_holds_the_same_plan_to_the_last_bit(
+def test_row_read_from_csv_holds_the_same_plan_bit_for_bit(
     plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     (row,) = through_csv([row_of(plan, dataclasses.replace(SOURCE, name=name))], tmp_path_factory.mktemp("csv"))
@@ -297,7 +297,7 @@ def test_a_failed_row_read_back_from_csv_is_the_row(reason: str, tmp_path: Path)
     assert through_csv([row], tmp_path) == [dict(row)]
 
 
-def test_real_plans_come_back(settings: Callable[..., Any], tmp_path: Path) -> None:
+def test_drawn_plans_survive_csv(settings: Callable[..., Any], tmp_path: Path) -> None:
     for noise in ("brooks2019", "imx385_iso3200_rvdd", "none"):
         for camera in ("convex", "choice", "identity"):
             plan = plan_image(settings(f"noise={noise}", f"camera={camera}", "isp=srgb"), SHA256)
@@ -305,7 +305,7 @@ def test_real_plans_come_back(settings: Callable[..., Any], tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("noise", ["sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x"])
-def test_real_physical_plans_come_back(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
+def test_drawn_physical_plans_survive_csv(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
     for scene in ("daylight", "night"):
         plan = plan_image(settings(f"noise={noise}", f"scene={scene}"), SHA256, facts=FACTS)
         assert plan.physics is not None
@@ -339,7 +339,7 @@ def test_a_row_with_a_value_of_another_type_is_damage(name: str, value: str) -> 
 
 
 @pytest.mark.parametrize("name", ["patch", "patch_y", "patch_x", "height", "width"])
-def test_a_row_without_its_place_in_the_full_frame_is_damage(name: str) -> None:
+def test_row_without_its_place_in_the_full_frame_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a patch \\({name} is empty"):
         patch_from_row({**row_of(), name: None})
 
@@ -347,12 +347,12 @@ def test_a_row_without_its_place_in_the_full_frame_is_damage(name: str) -> None:
 # CSV ------------------------------------------------------------------------------------------------------------------
 
 
-def test_lines_end_with_a_line_feed_alone() -> None:
+def test_lines_end_with_a_line_feed() -> None:
     text = csv_text([row_of(), row_of()])
     assert (text.count("\n"), text.count("\r"), text[-1]) == (3, 0, "\n")
 
 
-def test_only_what_needs_quotes_has_them() -> None:
+def test_cells_are_quoted_only_if_needed() -> None:
     text = csv_text([row_of()])
     assert text.count('"') == 2
     assert '"a, b.png"' in text
@@ -363,7 +363,7 @@ def test_floats_are_spelled_as_pythons_shortest_repr() -> None:
     assert {"0.1", "1e+22"} <= set(cells)
 
 
-def test_what_does_not_apply_is_empty() -> None:
+def test_values_that_do_not_apply_are_empty() -> None:
     cells = csv_text([failed_row(Source(0, "x", "x", None), None, 0, 0, "empty")]).splitlines()[1].split(",")
     assert [cell for cell in cells if cell] == ["00000000", "x", "failed", "empty", "0", "0"]
 
@@ -410,7 +410,7 @@ def test_a_manifest_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
 
 
 @given(plans, names)
-def test_json_takes_the_bytes_that_the_name_alone_decides(plan: Plan, name: str) -> None:
+def test_json_size_depends_on_the_source_name_only(plan: Plan, name: str) -> None:
     assert len(row_json([row_of(plan, dataclasses.replace(SOURCE, name=name))])) == json_size(name)
 
 
@@ -428,15 +428,15 @@ def test_json_is_ascii_and_one_line() -> None:
 
 
 LONGEST = -sys.float_info.min
-"""A double whose spelling takes 24 characters, the most there are."""
+"""A double with the longest spelling: 24 characters."""
 
 
 LONGEST_NAME = "n" * 100
-"""What a camera, a scene or a noise profile may be called at most (`test_config` refuses longer ones)."""
+"""Longest name of a camera, scene or noise profile (`test_config` refuses longer ones)."""
 
 
 def widened(reason: str) -> str:
-    """A prediction's reason with the widest numbers and the longest statistic in it."""
+    """Return a reason of the planner with the longest numbers and the longest statistic."""
     reason = re.sub(r"(?<![\w.])\d[\d.]*(e[+-]?\d+)?", f"{1.23456e-300:g}", reason)
     return re.sub(f"in the ({'|'.join(STATISTICS)})", f"in the {max(STATISTICS, key=len)}", reason)
 
@@ -494,33 +494,33 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         yield {**row, "width": 2**40, "height": 2**40}
 
 
-def test_the_room_for_json_suffices_for_the_longest_rows(settings: Callable[..., Any]) -> None:
+def test_json_size_suffices_for_the_longest_rows(settings: Callable[..., Any]) -> None:
     for row in longest_rows(settings):
         text = json.dumps(dict(row), separators=(",", ":"))
         assert len(text) + 64 < JSON_BYTES
         assert len(row_json([row])) == json_size("")
 
 
-def test_a_row_that_does_not_fit_its_room_is_an_error() -> None:
+def test_row_longer_than_its_json_size_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"row 00000003 takes .* bytes as JSON, more than the"):
         row_json([{**row_of(), "noise": "x" * JSON_BYTES}])
 
 
 @given(st.integers(0, 3000))
-def test_json_size_fills_whole_blocks_of_tar(length: int) -> None:
+def test_json_size_is_a_multiple_of_tar_blocks(length: int) -> None:
     assert json_size("x" * length) % 512 == 0
     assert json_size("x" * length) >= JSON_BYTES + 2 * (length + 2)
 
 
-def test_no_number_in_json_is_lost_to_nan(settings: Callable[..., Any]) -> None:
+def test_json_contains_no_nan(settings: Callable[..., Any]) -> None:
     loaded = json.loads(
         row_json([row_of(plan_image(settings(), SHA256))]), parse_constant=lambda text: pytest.fail(text)
     )
     assert all(math.isfinite(value) for value in loaded.values() if isinstance(value, float))
 
 
-def test_a_key_that_is_no_number_is_damage(dataset: Path, tmp_path: Path) -> None:
-    """It becomes part of a file's name."""
+def test_key_that_is_no_number_is_damage(dataset: Path, tmp_path: Path) -> None:
+    """Keys become part of file names."""
     text = (dataset / "manifest.csv").read_text(encoding="utf-8")
     (tmp_path / "manifest.csv").write_text(text.replace("\n00000001,", "\n../../x1,"), encoding="utf-8")
     with pytest.raises(DamageError, match=r"the key is '../../x1', expected eight digits"):

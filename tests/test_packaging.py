@@ -1,4 +1,4 @@
-"""What people install: the wheel built from the sdist carries conf/ and manifests/, and runs without a source tree."""
+"""The wheel built from the sdist contains conf/ and manifests/, and runs without a source tree."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(*command: str | Path, cwd: Path, **env: str) -> subprocess.CompletedProc
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the sdist, and the wheel made from it."""
+    """Return the folder with the sdist and the wheel built from it."""
     folder = tmp_path_factory.mktemp("dist")
     done = run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -40,7 +40,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bin folder of an environment of its own, which borrows the dependencies of this one but not the package."""
+    """Return the bin folder of a new environment with the dependencies of this one but without its package."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
@@ -71,6 +71,7 @@ def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
     assert {f"unprocess_gen/{option}" for option in OPTIONS} <= set(names)
     assert CURVES in names
     assert not any(name.startswith(("conf/", "tests/")) for name in names)
+    assert "unprocess_gen/py.typed" in names
 
 
 def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`RawPairs`: a finished dataset, read back without a copy."""
+"""`RawPairs` reads datasets and sweeps without copying."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources.loader import load_source
 
 
-def test_raw_pairs_is_the_name_of_the_package() -> None:
+def test_package_exports_raw_pairs() -> None:
     assert unprocess_gen.RawPairs.__module__ == "unprocess_gen.dataset.reader"
 
 
-def test_a_name_the_package_lacks_is_an_attribute_error() -> None:
+def test_unknown_name_of_the_package_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="'unprocess_gen' has no attribute 'RawPears'"):
         unprocess_gen.RawPears  # noqa: B018
 
@@ -44,7 +44,7 @@ def test_a_path_may_be_a_string(dataset: Path) -> None:
     assert len(RawPairs(str(dataset))) == 13
 
 
-def test_pairs_are_those_that_their_photographs_and_plans_give(
+def test_pairs_equal_those_made_from_photographs_and_plans(
     dataset: Path, photos: Path, settings: Callable[..., Any]
 ) -> None:
     config = settings(f"source.root={photos}")
@@ -80,7 +80,7 @@ def test_a_number_out_of_range_is_an_index_error(number: int, dataset: Path) -> 
         RawPairs(dataset)[number]
 
 
-def test_a_number_of_numpy_will_do(dataset: Path) -> None:
+def test_numpy_integers_are_accepted(dataset: Path) -> None:
     assert RawPairs(dataset)[np.int64(2)].row["key"] == "00000002"  # type: ignore[call-overload]
 
 
@@ -93,7 +93,7 @@ def test_failed_photographs_are_left_out(make: Callable[..., Any], tmp_path: Pat
 # Mapped, not copied ---------------------------------------------------------------------------------------------------
 
 
-def test_arrays_lie_in_the_file(dataset: Path) -> None:
+def test_arrays_are_mapped_from_the_file(dataset: Path) -> None:
     sample = RawPairs(dataset)[3]
     assert isinstance(sample.clean.base, mmap.mmap)
     assert isinstance(sample.noisy.base, mmap.mmap)
@@ -184,7 +184,7 @@ def test_a_folder_that_is_no_dataset_is_damage(tmp_path: Path) -> None:
         RawPairs(tmp_path)
 
 
-def test_a_manifest_that_goes_missing_is_damage(copy: Path) -> None:
+def test_deleted_manifest_is_damage(copy: Path) -> None:
     pairs = RawPairs(copy)
     (copy / "manifest.csv").unlink()
     with pytest.raises(DamageError, match=r"manifest.csv: no row at byte"):
@@ -212,7 +212,7 @@ def test_a_shard_of_other_images_is_damage(copy: Path) -> None:
         RawPairs(copy)[5]
 
 
-def test_a_shard_that_goes_missing_after_its_first_use_is_damage(copy: Path) -> None:
+def test_shard_deleted_after_its_first_use_is_damage(copy: Path) -> None:
     pairs = RawPairs(copy)
     assert pairs[5].clean.size
     (copy / "shards/shard-00001.tar").unlink()

@@ -82,7 +82,7 @@ def shard(tmp_path: Path) -> Path:
 NAMES = [f"{i:08d}.{name}" for i in range(2) for name in ("clean.npy", "noisy.npy", "json")]
 
 
-def test_tar_lists_the_members_of_an_image_side_by_side(shard: Path) -> None:
+def test_tar_lists_the_members_of_an_image_consecutively(shard: Path) -> None:
     done = subprocess.run(["tar", "-tf", shard], capture_output=True, text=True, check=True)
     assert (done.stdout.splitlines(), done.stderr) == (NAMES, "")
 
@@ -114,7 +114,7 @@ def test_headers_hold_no_time_owner_or_other_mode(shard: Path) -> None:
 
 def test_the_same_members_give_the_same_bytes_at_any_time(tmp_path: Path) -> None:
     written(tmp_path / "a.tar", pair(5, 7))
-    time.sleep(1.1)  # tar keeps whole seconds
+    time.sleep(1.1)  # tar stores seconds
     written(tmp_path / "b.tar", pair(5, 7))
     assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
 
@@ -138,22 +138,22 @@ SIZES = [(1, 1), (1, 2), (2, 1), (3, 5), (16, 16), (17, 31), (1, 191), (1, 193),
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_the_bytes_of_a_pair_are_told_exactly(height: int, width: int, tmp_path: Path) -> None:
+def test_size_of_a_pair_is_predicted_exactly(height: int, width: int, tmp_path: Path) -> None:
     writer = written(tmp_path / "a.tar", pair(height, width), json_bytes=700)
     assert shard_bytes([image_bytes(uint16(height, width), 700)]) == writer.bytes
 
 
-def test_the_bytes_of_a_shard_are_told_exactly(tmp_path: Path) -> None:
+def test_size_of_a_shard_is_predicted_exactly(tmp_path: Path) -> None:
     writer = written(tmp_path / "a.tar", *(pair(height, width) for height, width in SIZES))
     assert shard_bytes([image_bytes(uint16(height, width), 512) for height, width in SIZES]) == writer.bytes
 
 
-def test_no_pair_is_no_bytes() -> None:
+def test_shard_without_pairs_has_no_bytes() -> None:
     assert shard_bytes([]) == 0
 
 
 @given(width=st.integers(1, 10**6), height=st.integers(1, 10**6))
-def test_arrays_start_where_eight_bytes_do(width: int, height: int) -> None:
+def test_samples_fill_complete_tar_blocks(width: int, height: int) -> None:
     assert (image_bytes(uint16(height, width), 512) - 4 * width * height) > 0
     assert image_bytes(uint16(height, width), 512) % 512 == 0
 
@@ -174,7 +174,7 @@ def test_a_digest_is_xxh3_of_the_little_endian_bytes() -> None:
 # Writing --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_that_exists_is_not_written_over(tmp_path: Path) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "a.tar").write_text("mine")
     with pytest.raises(FileExistsError):
         ShardWriter(tmp_path / "a.tar")
@@ -194,25 +194,25 @@ class Trickle(io.RawIOBase):
 
     name = "trickle"
 
-    def __init__(self, room: int) -> None:
-        self.content, self.room = b"", room
+    def __init__(self, capacity: int) -> None:
+        self.content, self.capacity = b"", capacity
 
     def write(self, content: Any) -> int:
-        taken = bytes(content[: min(37, self.room - len(self.content))])
+        taken = bytes(content[: min(37, self.capacity - len(self.content))])
         self.content += taken
         return len(taken)
 
 
-def test_a_file_that_takes_little_at_a_time_gets_all_of_it(tmp_path: Path) -> None:
-    whole = written(tmp_path / "a.tar", pair(5, 7))
+def test_short_writes_are_continued(tmp_path: Path) -> None:
+    complete = written(tmp_path / "a.tar", pair(5, 7))
     with ShardWriter(tmp_path / "b.tar") as writer:
         writer._file.close()
         writer._file = trickle = Trickle(10**6)  # type: ignore[assignment]
         add(writer, "00000000", pair(5, 7), json.dumps({"key": 0}).encode().ljust(512))
-    assert writer.sha256 == whole.sha256 == hashlib.sha256(trickle.content).hexdigest()
+    assert writer.sha256 == complete.sha256 == hashlib.sha256(trickle.content).hexdigest()
 
 
-def test_a_file_that_takes_no_more_is_an_error(tmp_path: Path) -> None:
+def test_write_of_zero_bytes_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="takes no more bytes") as error, ShardWriter(tmp_path / "b.tar") as writer:
         writer._file.close()
         writer._file = Trickle(100)  # type: ignore[assignment]
@@ -231,21 +231,21 @@ class Slow(Trickle):
         return os.open(os.devnull, os.O_RDONLY)
 
 
-def test_a_thread_beside_writes_the_same_bytes(tmp_path: Path) -> None:
-    alone, beside = tmp_path / "a.tar", tmp_path / "b.tar"
+def test_second_thread_writes_the_same_bytes(tmp_path: Path) -> None:
+    alone, threaded = tmp_path / "a.tar", tmp_path / "b.tar"
     writers = []
-    for path, thread in ((alone, False), (beside, True)):
+    for path, thread in ((alone, False), (threaded, True)):
         with ShardWriter(path, threaded=thread) as writer:
             for key in ("00000000", "00000001", "00000002"):
                 add(writer, key, pair(300, 201), json.dumps({"key": key}).encode().ljust(512))
         writers.append(writer)
 
-    assert alone.read_bytes() == beside.read_bytes()
-    assert writers[0].bytes == writers[1].bytes == beside.stat().st_size
-    assert writers[0].sha256 == writers[1].sha256 == hashlib.sha256(beside.read_bytes()).hexdigest()
+    assert alone.read_bytes() == threaded.read_bytes()
+    assert writers[0].bytes == writers[1].bytes == threaded.stat().st_size
+    assert writers[0].sha256 == writers[1].sha256 == hashlib.sha256(threaded.read_bytes()).hexdigest()
 
 
-def test_what_fails_beside_is_raised_and_leaves_no_thread(tmp_path: Path) -> None:
+def test_error_in_the_second_thread_is_raised_and_ends_it(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="takes no more bytes"), ShardWriter(tmp_path / "b.tar", threaded=True) as writer:
         writer._file.close()
         writer._file = Slow(100)  # type: ignore[assignment]
@@ -254,7 +254,7 @@ def test_what_fails_beside_is_raised_and_leaves_no_thread(tmp_path: Path) -> Non
     assert not any(thread.name.startswith("shard writer") for thread in threading.enumerate())
 
 
-def test_no_more_than_so_much_waits_to_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pending_bytes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "MAX_PENDING_BYTES", 1000)
     waited = []
     with ShardWriter(tmp_path / "b.tar", threaded=True) as writer:
@@ -283,12 +283,12 @@ def test_mapped_arrays_are_those_written(shard: Path) -> None:
         assert np.array_equal(map_array(shard, index[f"{i:08d}.noisy.npy"], uint16(*one.clean.shape)), one.noisy)
 
 
-def test_json_is_read_from_its_place(shard: Path) -> None:
+def test_json_member_is_read_by_name(shard: Path) -> None:
     assert read_json(shard, "00000001.json") == {"key": 1}
 
 
 @pytest.mark.parametrize("kept", [0, 1, 511, 512, 700, 1024, 3000])
-def test_a_shard_cut_off_anywhere_is_damage(kept: int, shard: Path) -> None:
+def test_truncated_shard_is_damage(kept: int, shard: Path) -> None:
     os.truncate(shard, kept)
     with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
         read_index(shard)
@@ -308,7 +308,7 @@ def test_a_header_that_changed_is_damage(shard: Path) -> None:
 
 
 @pytest.mark.parametrize("at", [0, 6, 7, 20, 52, 60])
-def test_a_member_that_is_no_array_of_ours_is_damage(at: int, shard: Path) -> None:
+def test_member_that_is_not_the_expected_array_is_damage(at: int, shard: Path) -> None:
     member = read_index(shard)["00000000.clean.npy"]
     content = bytearray(shard.read_bytes())
     content[member.offset + at] ^= 0x11
@@ -317,7 +317,7 @@ def test_a_member_that_is_no_array_of_ours_is_damage(at: int, shard: Path) -> No
         map_array(shard, member, uint16(5, 7))
 
 
-def test_a_shard_cut_off_after_its_index_was_read_is_damage(shard: Path) -> None:
+def test_shard_truncated_after_its_index_was_read_is_damage(shard: Path) -> None:
     member = read_index(shard)["00000001.noisy.npy"]
     os.truncate(shard, 1024)
     with pytest.raises(DamageError):
@@ -333,12 +333,12 @@ def test_the_webdataset_library_loads_a_dataset_as_it_is(dataset: Path) -> None:
     urls = [str(path) for path in sorted((dataset / "shards").iterdir())]
     samples = list(wds.WebDataset(urls, shardshuffle=False, empty_check=False).decode())
     assert len(samples) == len(RawPairs(dataset)) == 13
-    for sample, ours in zip(samples, RawPairs(dataset), strict=True):
-        assert sample["__key__"] == ours.row["key"]
+    for sample, sample_of_reader in zip(samples, RawPairs(dataset), strict=True):
+        assert sample["__key__"] == sample_of_reader.row["key"]
         assert sample["clean.npy"].dtype == sample["noisy.npy"].dtype == np.uint16
-        assert np.array_equal(sample["clean.npy"], ours.clean)
-        assert np.array_equal(sample["noisy.npy"], ours.noisy)
-        assert sample["json"] == in_json(ours.row)
+        assert np.array_equal(sample["clean.npy"], sample_of_reader.clean)
+        assert np.array_equal(sample["noisy.npy"], sample_of_reader.noisy)
+        assert sample["json"] == in_json(sample_of_reader.row)
 
 
 def test_rows_in_the_shards_are_typed_rows_of_the_manifest(dataset: Path) -> None:

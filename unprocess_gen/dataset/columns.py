@@ -225,23 +225,23 @@ def _short(value: object) -> str:
 
 COLUMNS = (
     Column(
-        "key", str, "source index as eight digits; then patch, and level and draw, where there are several", KEY_TEXT
+        "key", str, "source index as eight digits; then patch, level and draw if there are several", KEY_TEXT
     ),
     Column("source", str, "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name"),
     Column("source_sha256", str, "SHA-256 of the source's bytes", HEX_256),
     Column("source_bytes", int, "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes"),
     Column("status", str, "ok or failed", Words(("ok", "failed"))),
-    Column("reason", str, "why it failed", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt")),
-    Column("width", int, "of the arrays; twice that of packed planes", SIDE, Patch),
-    Column("height", int, "of the arrays; twice that of packed planes", SIDE, Patch),
+    Column("reason", str, "reason of the failure", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt")),
+    Column("width", int, "width of the frame, pixels; packed planes have half of it", SIDE, Patch),
+    Column("height", int, "height of the frame, pixels; packed planes have half of it", SIDE, Patch),
     Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8", Range(1, 8)),
     Column("shard", int, "number of the shard", Range(0, 10**9)),
     Column("seed", int, "seed of the run", COUNT, Plan),
     Column("stream_key", str, "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
-    Column("camera", str, "convex, or the camera", ANY_TEXT, Plan),
+    Column("camera", str, "convex, or the name of the camera", ANY_TEXT, Plan),
     *(
         Column(
-            f"w_{camera}", float, "weight of this camera in the mix; 0 where it is not part of it",
+            f"w_{camera}", float, "weight of this camera in the mix; 0 if it is not part of it",
             SHARE, Plan, "weights",
         )
         for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
@@ -254,22 +254,25 @@ COLUMNS = (
     Column("red_gain", float, "forward white-balance gain of red", GAIN, Plan),
     Column("blue_gain", float, "forward white-balance gain of blue", GAIN, Plan),
     Column("inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it", GAIN, Plan),
-    Column("tone", str, "tone curve that was inverted: smoothstep or none", Words(("smoothstep", "none")), Plan),
+    Column("tone", str, "inverted tone curve: smoothstep or none", Words(("smoothstep", "none")), Plan),
     Column(
-        "gamma", number_or_text, "gamma that was expanded: a number or srgb", Range(0.1, 10, ("srgb",)), Plan,
+        "gamma", number_or_text, "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",)), Plan,
         spelling=GAMMA,
     ),
-    Column("highlight", str, "per_channel, gray_mean or none", Words(("per_channel", "gray_mean", "none")), Plan),
+    Column(
+        "highlight", str, "preservation of highlights: per_channel, gray_mean or none",
+        Words(("per_channel", "gray_mean", "none")), Plan,
+    ),
     Column(
         "highlight_threshold", float, "intensity above which highlights are kept",
         Range(0, math.nextafter(1, 0)), Plan,
     ),
     Column("pattern", str, "Bayer pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), Plan),
-    Column("bits", int, "of the sensor", Range(1, 16), Plan),
-    Column("black_level_dn", int, "DN of no light", Range(0, 65534), Plan),
-    Column("white_level_dn", int, "DN of saturation", Range(1, 65535), Plan),
+    Column("bits", int, "bits of the sensor", Range(1, 16), Plan),
+    Column("black_level_dn", int, "black level, DN", Range(0, 65534), Plan),
+    Column("white_level_dn", int, "white level (saturation), DN", Range(1, 65535), Plan),
     Column(
-        "sensor_clip", str, "how the noisy frame was clipped: sensor, black or none",
+        "sensor_clip", str, "clipping of the noisy frame: sensor, black or none",
         Words(("sensor", "black", "none")), Plan,
     ),
     Column("noise", str, "name of the noise profile", ANY_TEXT, Plan),
@@ -277,10 +280,10 @@ COLUMNS = (
         "a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2", Range(-1e30, 1e30), Plan
     ),
     Column("b_dn2", float, "noise variance at black, DN²", FINITE, Plan),
-    Column("effects", str, "what was simulated, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST),
-    Column("skipped", str, "what was not, each with its reason, separated by ;", ANY_TEXT, Plan, spelling=LIST),
-    Column("accuracy", str, "the accuracy asked for", ANY_TEXT, Plan),
-    Column("methods", str, "how each stage was computed, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("effects", str, "simulated effects, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("skipped", str, "skipped effects, each with its reason, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("accuracy", str, "requested accuracy", ANY_TEXT, Plan),
+    Column("methods", str, "method of each stage, separated by ;", ANY_TEXT, Plan, spelling=LIST),
     Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes", HEX_128),
     Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
     Column("clean_clipped_low", int, "clean sites below black before clipping", COUNT, Counts),
@@ -288,70 +291,75 @@ COLUMNS = (
     Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping", COUNT, Counts),
     Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping", COUNT, Counts),
     Column("saturated", int, "clean sites at the white level", COUNT, Counts),
-    Column("zero_variance", int, "sites to which the noise law gives no variance", COUNT, Counts),
+    Column("zero_variance", int, "sites at which the noise has no variance", COUNT, Counts),
     Column(
-        "law_distance", float, "how far the distribution of shot and read noise may be from its law, at most",
+        "law_distance", float, "largest accepted CDF distance of shot plus read noise",
         NOT_NEGATIVE, Plan,
     ),
-    Column("scene", str, "what the scene was taken for", ANY_TEXT, Plan),
-    Column("exposure_ratio", float, "what the scene was darkened by", Range(1e-4, 1e7), Plan),
+    Column("scene", str, "name of the scene", ANY_TEXT, Plan),
+    Column("exposure_ratio", float, "factor by which the scene was darkened", Range(1e-4, 1e7), Plan),
     Column(
-        "saturated_as", str, "what noisy sites are where the clean ones are saturated: noisy, or pinned to white",
+        "saturated_as", str, "noisy sites whose clean site is saturated: noisy, or pinned to white",
         Words(("noisy", "pinned")), Plan, "saturated",
     ),
     Column(
-        "noise_law", str, "of a two-parameter profile: gaussian or poisson", Words(("gaussian", "poisson")), Plan
+        "noise_law", str, "distribution of a two-parameter profile: gaussian or poisson",
+        Words(("gaussian", "poisson")), Plan,
     ),
     Column(
         "iso", float, "ISO of a physical profile; this and all columns to its right are 0 or none for other profiles",
         Range(0, 1e9), Physics,
     ),
     Column("exposure_s", float, "exposure time, seconds", Range(0, 1e7), Physics),
-    Column("temperature_c", float, "of the sensor, degrees Celsius", Range(-300, 1000), Physics),
+    Column("temperature_c", float, "temperature of the sensor, degrees Celsius", Range(-300, 1000), Physics),
     Column("dn_per_e", float, "system gain K, DN per electron", Range(0, 1e20), Physics),
-    Column("prnu_std", float, "relative deviation of the pixels' responses", SHARE, Physics),
+    Column("prnu_std", float, "PRNU: relative standard deviation of pixel responses", SHARE, Physics),
     Column("dark_e", float, "mean dark current of the exposure, electrons", ELECTRONS, Physics),
     Column(
-        "dark_offset", str, "whether its mean was removed or kept", Words(("removed", "kept", "none")), Physics
+        "dark_offset", str, "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics
     ),
-    Column("hot_pixel_share", float, "share of pixels that are hot", SHARE, Physics),
+    Column("hot_pixel_share", float, "fraction of hot pixels", SHARE, Physics),
     Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure, electrons", ELECTRONS, Physics),
-    Column("full_well_e", float, "electrons that a pixel holds; 0: not known", ELECTRONS, Physics),
-    Column("read_law", str, "gaussian or tukey", Words(("gaussian", "tukey", "none")), Physics),
-    Column("read_shape", float, "shape of Tukey's lambda law", Range(-0.5, 10), Physics),
-    Column("read_std_dn", float, "deviation of the read noise, DN", NOT_NEGATIVE, Physics),
-    Column("row_std_dn", float, "deviation of a row's offset, DN", NOT_NEGATIVE, Physics),
-    Column("column_std_dn", float, "deviation of a column's offset, DN", NOT_NEGATIVE, Physics),
+    Column("full_well_e", float, "full-well capacity, electrons; 0: unknown", ELECTRONS, Physics),
+    Column(
+        "read_law", str, "distribution of the read noise: gaussian or tukey",
+        Words(("gaussian", "tukey", "none")), Physics,
+    ),
+    Column("read_shape", float, "shape of the Tukey lambda distribution", Range(-0.5, 10), Physics),
+    Column("read_std_dn", float, "standard deviation of the read noise, DN", NOT_NEGATIVE, Physics),
+    Column("row_std_dn", float, "standard deviation of row offsets, DN", NOT_NEGATIVE, Physics),
+    Column("column_std_dn", float, "standard deviation of column offsets, DN", NOT_NEGATIVE, Physics),
     *(
         Column(
-            f"black_error_dn_{i}{j}", float, "error of the black level at row, column of the 2x2 sites, DN",
+            f"black_error_dn_{i}{j}", float, "black-level error at row, column of the 2x2 CFA, DN",
             FINITE, Physics, "black_error_dn",
         )
         for i in range(2)
         for j in range(2)
     ),
-    Column("dead_pixel_share", float, "share of pixels that read 0", SHARE, Physics),
-    Column("sensor_unit", str, "the camera body", ANY_TEXT, Physics),
-    Column("body_key", str, "key of the body's fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
+    Column("dead_pixel_share", float, "fraction of dead pixels, which read 0", SHARE, Physics),
+    Column("sensor_unit", str, "camera body", ANY_TEXT, Physics),
+    Column("body_key", str, "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
     Column(
-        "fixed_pattern_in_clean", int, "1 where the clean frame has the fixed patterns too", SHARE, Physics,
+        "fixed_pattern_in_clean", int, "1 if the clean frame has the fixed patterns too", SHARE, Physics,
         spelling=SWITCH,
     ),
     Column("level", int, "number of the noise level", Range(0, 99), Plan),
     Column("draw", int, "number of the draw at this level", Range(0, 99), Plan),
     Column("frame", int, "number of the frame in its clip", COORDINATE, Plan),
-    Column("clip", str, "the clip", ANY_TEXT, Source),
+    Column("clip", str, "name of the clip; none for single photographs", ANY_TEXT, Source),
     Column("downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan),
-    Column("dequantize", str, "whether 8-bit codes were dithered: off or dither", Words(("off", "dither")), Plan),
+    Column("dequantize", str, "dequantization of 8-bit codes: off or dither", Words(("off", "dither")), Plan),
     Column("patch", int, "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
-    Column("patch_y", int, "row of the full frame in which the arrays begin; even", COORDINATE, Patch, "y"),
-    Column("patch_x", int, "column of the full frame in which the arrays begin; even", COORDINATE, Patch, "x"),
+    Column("patch_y", int, "first row of the arrays in the full frame; even", COORDINATE, Patch, "y"),
+    Column("patch_x", int, "first column of the arrays in the full frame; even", COORDINATE, Patch, "x"),
     Column(
-        "dtype", str, "of the arrays: uint16, DN, or float32, 0 at black and 1 at white", Words((UINT16, FLOAT32)), Plan
+        "dtype", str, "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)",
+        Words((UINT16, FLOAT32)), Plan,
     ),
-    Column("layout", str, "of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), Plan),
+    Column("layout", str, "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), Plan),
     Column(
-        "detail", str, "of a failed source: what was found, one line", ANY_TEXT, since="0.2", in_json=False
+        "detail", str, "explanation of a failed source, one line", ANY_TEXT, since="0.2", in_json=False
     ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
