@@ -66,6 +66,9 @@ _DAMAGE = re.compile(
     rb"|Unsupported marker|JPEGLib:|Improper JPEG strip/tile size|PackBitsDecode: Discarding|TIFF_Error"
 )
 
+_LOG_PREFIX = re.compile(r"\[ *[A-Z]+:\d+@[\d.]+\] global \S+ \S+ ")
+"""Severity, seconds since the start, file and function of an OpenCV message; they would make manifests differ."""
+
 _UNCHANGED = cv2.IMREAD_UNCHANGED
 _COLOUR = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _COLOUR_16 = _COLOUR | cv2.IMREAD_ANYDEPTH
@@ -190,7 +193,7 @@ def _pixels(data: bytes, header: Header, name: str) -> Srgb:
     decoded, messages = _imdecode(tiff_without_orientation(data) if header.format == "tiff" else data, flags)
     if decoded is None:
         _check_memory(header)
-    text = " ".join(messages.decode(errors="replace").split())
+    text = " ".join(_LOG_PREFIX.sub("", messages.decode(errors="replace")).split())
     if decoded is None or _DAMAGE.search(messages):
         complaint = text[:200] or "it gives no reason"
         raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {complaint}")
