@@ -245,3 +245,13 @@ def test_cfg_job_prints_every_job_of_a_sweep(mine: Path, door: Door) -> None:
     assert done.code == 0
     cameras = re.findall(r"^camera:\n  name: (\w+)$", done.out, re.MULTILINE)
     assert cameras == ["sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p"]
+
+
+def test_primary_config_that_the_built_in_one_hides_is_refused(mine: Path, door: Door) -> None:
+    write(mine / "config.yaml", {"seed": 3}, "")
+    done = door("--config-dir", "mine", "--config-name", "config", "--cfg", "job")
+    assert (done.code, done.err) == (
+        2,
+        "gen-dataset: --config-name config: mine/config.yaml has the name of a built-in config, which would be used "
+        "instead; rename the file\n",
+    )
