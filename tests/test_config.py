@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from unprocess_gen.config import distributions as draws
+from unprocess_gen.config import distributions
 from unprocess_gen.config.distributions import DISTRIBUTION_NUMBERS, parse_distribution
 from unprocess_gen.config.noise_validation import PROFILE_RANGES
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
@@ -604,7 +604,7 @@ def test_integers_that_no_float_holds_are_refused(number: int) -> None:
 def test_choices_match_their_implementations() -> None:
     assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
     assert set(unprocess.TONES) == set(tone_curves.TONES) == {"smoothstep", "none"}
-    assert set(DISTRIBUTION_NUMBERS) == set(draws.DISTRIBUTIONS)
+    assert set(DISTRIBUTION_NUMBERS) == set(distributions.DISTRIBUTIONS)
 
 
 @pytest.mark.parametrize("gain", [0, ["per_iso", 0.0], 1e-12])

@@ -215,10 +215,10 @@ def test_wrong_noise_parameters_are_detected(settings: Settings, wrong: str) -> 
     assert misfits(plan, histograms(plan, 1), WRONG[wrong]) != []
 
 
-@pytest.mark.parametrize(("made", "said"), [("sensor", "black"), ("black", "sensor")])
-def test_wrong_clip_is_detected(settings: Settings, made: str, said: str) -> None:
-    plan = plan_of(settings, "imx385_iso3200", f"sensor.clip={made}")
-    assert misfits(dataclasses.replace(plan, sensor_clip=said), histograms(plan, 1)) != []
+@pytest.mark.parametrize(("simulated", "assumed"), [("sensor", "black"), ("black", "sensor")])
+def test_wrong_clip_is_detected(settings: Settings, simulated: str, assumed: str) -> None:
+    plan = plan_of(settings, "imx385_iso3200", f"sensor.clip={simulated}")
+    assert misfits(dataclasses.replace(plan, sensor_clip=assumed), histograms(plan, 1)) != []
 
 
 def test_mirrored_negative_variance_is_detected(settings: Settings) -> None:

@@ -96,9 +96,9 @@ def test_reference_tier_uses_numpy_methods_only(settings: Settings) -> None:
 
 
 def test_custom_budget_chooses_by_its_limits(settings: Settings) -> None:
-    said = ("accuracy.name=mine", "accuracy.normal_error=6e-4", "accuracy.clean_dn=1")
-    own = accuracy_budget(settings(*said, "accuracy.clean_changed_share=1e-3").accuracy)
-    stricter = accuracy_budget(settings(*said, "accuracy.clean_changed_share=1e-4").accuracy)
+    limits = ("accuracy.name=mine", "accuracy.normal_error=6e-4", "accuracy.clean_dn=1")
+    own = accuracy_budget(settings(*limits, "accuracy.clean_changed_share=1e-3").accuracy)
+    stricter = accuracy_budget(settings(*limits, "accuracy.clean_changed_share=1e-4").accuracy)
 
     assert "normal:polynomial_float32" in choose_methods(own, counts_electrons=False)
     assert "normal:quadratic_float64" in choose_methods(stricter, counts_electrons=False)

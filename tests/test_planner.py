@@ -20,7 +20,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
-from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline import generate
 from unprocess_gen.planning.effect_contributions import SignalRange, signal_range
 from unprocess_gen.planning.effect_selection import Prediction, facts_of, select_effects
 from unprocess_gen.planning.plan import plan_image, plan_with_reasons
@@ -516,7 +516,7 @@ def test_selection_does_not_depend_on_order_of_pixels(settings: Settings) -> Non
 
 
 def test_number_of_workers_does_not_change_the_selection(
-    make: Callable[..., runner.Summary], tree_hash: Callable[[Path], str], tmp_path: Path
+    make: Callable[..., generate.Summary], tree_hash: Callable[[Path], str], tmp_path: Path
 ) -> None:
     photos = fill(tmp_path / "photos", 4)
     chosen = ("noise=oppo_reno10x", "scene=indoor", "noise.assumed=[]", "output.pairs_per_shard=2")
@@ -583,7 +583,7 @@ def test_effect_above_tolerance_alone_is_always_simulated(
 # Decisions of the config ----------------------------------------------------------------------------------------------
 
 
-def told(settings: Settings, *overrides: str) -> dict[str, Prediction]:
+def predictions_of(settings: Settings, *overrides: str) -> dict[str, Prediction]:
     config = configured(settings, "noise=sony_a7s2", "scene=indoor", *overrides)
     predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(cut("highlights-0", 40, 56)))[1]
     return {one.effect: one for one in predictions}
@@ -592,33 +592,33 @@ def told(settings: Settings, *overrides: str) -> dict[str, Prediction]:
 @pytest.mark.parametrize("switch", ["auto", "on", "off"])
 @pytest.mark.parametrize("effect", ["read", "prnu", "dark_current"])
 def test_switch_of_an_effect_takes_precedence_over_all(settings: Settings, effect: str, switch: str) -> None:
-    named = told(settings, f"effects.all={switch}", f"effects.{effect}=on")[effect]
+    named = predictions_of(settings, f"effects.all={switch}", f"effects.{effect}=on")[effect]
     assert (named.simulated, named.reason) == (True, "switched on")
-    named = told(settings, f"effects.all={switch}", f"effects.{effect}=off")[effect]
+    named = predictions_of(settings, f"effects.all={switch}", f"effects.{effect}=off")[effect]
     assert (named.simulated, named.reason) == (False, "switched off")
 
 
 def test_all_off_keeps_rounding(settings: Settings) -> None:
-    predictions = told(settings, "effects.all=off")
+    predictions = predictions_of(settings, "effects.all=off")
     assert [name for name, one in predictions.items() if one.simulated] == ["quantise"]
     assert {one.reason for name, one in predictions.items() if name != "quantise"} == {"switched off"}
 
 
 def test_auto_by_name_lets_the_image_decide(settings: Settings) -> None:
-    assert told(settings, "effects.all=off", "effects.shot=auto")["shot"].simulated
-    assert not told(settings, "effects.all=on", "effects.prnu=auto")["prnu"].simulated
+    assert predictions_of(settings, "effects.all=off", "effects.shot=auto")["shot"].simulated
+    assert not predictions_of(settings, "effects.all=on", "effects.prnu=auto")["prnu"].simulated
 
 
 def test_assumed_numbers_are_off_under_auto_with_reason(settings: Settings) -> None:
-    predictions = told(settings)
+    predictions = predictions_of(settings)
     for effect in ASSUMED:
         assert not predictions[effect].simulated
         assert "is assumed, no source gives it" in predictions[effect].reason
-        assert told(settings, f"effects.{effect}=on")[effect].simulated
+        assert predictions_of(settings, f"effects.{effect}=on")[effect].simulated
 
 
 def test_all_on_simulates_known_numbers_and_lists_missing_ones(settings: Settings) -> None:
-    predictions = told(settings, "effects.all=on")
+    predictions = predictions_of(settings, "effects.all=on")
     lacking = {name: one.reason for name, one in predictions.items() if not one.simulated}
     assert lacking == {
         "full_well": "noise=sony_a7s2 gives no full_well_e",
@@ -647,7 +647,7 @@ def test_reasons_contain_numbers_and_fit_a_row(
 
 def test_reasons_of_the_config_fit_a_row(settings: Settings) -> None:
     for switch in ("auto", "on", "off"):
-        for one in told(settings, f"effects.all={switch}").values():
+        for one in predictions_of(settings, f"effects.all={switch}").values():
             assert one.reason
             assert not {";", "\n"} & set(one.reason)
 
