@@ -304,10 +304,10 @@ def test_image_smaller_than_a_patch_is_unsupported(make: Make, tmp_path: Path) -
 def test_failure_of_a_small_image_is_explained(settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "source.patch=14")
     (source,) = photographs.list_photographs(config.source).sources
-    why = r"unsupported: 16 x 12 pixels hold no patch of 14 x 14 \(source.patch\)$"
+    why = r"unsupported: 16 x 12 pixels contain no patch of 14 x 14 \(source.patch\)$"
     with pytest.raises(SourceError, match=f"^{why}"):
         photographs.load_source(config.source, source)
-    assert "fails     000.png: unsupported\n          16 x 12 pixels hold no patch" in format_estimate(
+    assert "fails     000.png: unsupported\n          16 x 12 pixels contain no patch" in format_estimate(
         config, estimate_run(config, 1, True)
     )
 
@@ -501,10 +501,10 @@ def test_rows_of_more_than_ten_thousand_patches_keep_their_order(
     """Number 10000 comes after 9999, which text would not say."""
     inside = [{"key": f"00000001-p{number:04d}"} for number in (9998, 9999, 10000, 10001)]
     failures = [{"key": f"0000000{index}", "status": "failed", "shard": 0} for index in (0, 2)]
-    monkeypatch.setattr(repair, "_is_sound", lambda *_: True)
+    monkeypatch.setattr(repair, "_is_intact", lambda *_: True)
     monkeypatch.setattr(repair, "_rows_inside", lambda *_: inside)
     monkeypatch.setattr(repair, "readable_rows", lambda *_: failures)
-    kept = list(repair._kept_rows(tmp_path, {"shards": [{"file": "shards/shard-00000.tar"}]}))
+    kept = list(repair._readable_rows_in_order(tmp_path, {"shards": [{"file": "shards/shard-00000.tar"}]}))
     assert kept == [failures[0], *inside, failures[1]]
 
 
