@@ -173,7 +173,7 @@ def expand(
     described = tuple(dict.fromkeys(described))
     if plugins and use_plugins:
         return Expansion(None, (), plugins, described, fixed_overrides, out)
-    for choice in choices:
+    for choice in [*choices, *(one for params, _ in bases.values() for one in params)]:
         if choice.swept and not choice.values:
             raise ConfigError(f"{choice.text}: an interval has no list of values; expected choice or range")
     for own in _combinations(choices):
