@@ -737,3 +737,11 @@ def test_other_primaries_of_a_png_are_treated_like_a_profile() -> None:
 def test_srgb_code_points_override_the_profile_of_a_png() -> None:
     data = with_cicp(1, 13, icc_profile=swapped_primaries())
     np.testing.assert_array_equal(pixels_of(data, icc="refuse"), smooth())
+
+
+def test_reason_of_damage_does_not_depend_on_the_codec_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    for words in (b"Corrupt JPEG data: 9 bytes before 0xd9 of libjpeg 9\n", b"Corrupt JPEG data: premature end 62\n"):
+        monkeypatch.setattr(cv2, "imdecode", lambda buffer, flags, words=words: os.write(2, words) and None)
+        with pytest.raises(SourceError) as caught:
+            decode(pillow(smooth(), "JPEG"), max_pixels=2**26, icc="ignore")
+        assert caught.value.text == "OpenCV cannot decode all of the jpeg data: Corrupt JPEG data"

@@ -166,7 +166,7 @@ def _profile_objection(icc: bytes) -> str:
     try:
         moved = _codes_moved(icc)
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError, KeyError) as error:
-        return f"the embedded colour profile cannot be used ({error})"
+        return f"the embedded colour profile cannot be used ({type(error).__name__})"
     return f"the embedded colour profile moves colours by up to {moved} codes" if moved > SRGB_TOLERANCE else ""
 
 
@@ -194,9 +194,12 @@ def _pixels(data: bytes, header: Header, name: str) -> Srgb:
     if decoded is None:
         _check_memory(header)
     text = " ".join(_LOG_PREFIX.sub("", messages.decode(errors="replace")).split())
-    if decoded is None or _DAMAGE.search(messages):
-        complaint = text[:200] or "it gives no reason"
-        raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {complaint}")
+    damage = _DAMAGE.search(messages)
+    if decoded is None or damage:
+        # only the recognised words go into the manifest: the others differ between versions of the codecs
+        _LOGGER.debug("%s: %s", name, text)
+        words = damage[0].decode() if damage else "the codec fails"
+        raise SourceError("corrupt", f"OpenCV cannot decode all of the {header.format} data: {words}")
     if text:
         _LOGGER.warning("%s: %s", name, text)
     _check_array(decoded, header)
