@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 
-from unprocess_gen.reports.contact_sheet import contact_sheet
+from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 
 KEYS = ["00000001", "00000004"]
 

@@ -15,9 +15,12 @@ from PIL import Image
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GainsConfig, NoiseConfig
 from unprocess_gen.config.serialization import read_option
-from unprocess_gen.reports import figure_pictures, paper_figures, paper_sources, report_files
-from unprocess_gen.reports.figure_pictures import PaperFigure
-from unprocess_gen.reports.paper_sources import (
+from unprocess_gen.reports import report_files
+from unprocess_gen.reports.paper import figures as paper_figures
+from unprocess_gen.reports.paper import pictures as figure_pictures
+from unprocess_gen.reports.paper import sources as paper_sources
+from unprocess_gen.reports.paper.pictures import PaperFigure
+from unprocess_gen.reports.paper.sources import (
     INTERPRETATIONS,
     ImageSaturation,
     PaperOptions,

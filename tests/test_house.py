@@ -27,8 +27,8 @@ ONLY_IN = {
     "llvmlite": {"simulation.kernels.simd"},
     "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
-        *("sources.image.decode", "reports.dataset_report", "reports.contact_sheet", "reports.panels"),
-        *("reports.stages_sheet", "simulation.reference.isp", "pipeline.worker"),
+        *("sources.image.decode", "reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
+        *("reports.sheets.stages_sheet", "simulation.reference.isp", "pipeline.worker"),
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},

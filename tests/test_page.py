@@ -37,8 +37,9 @@ from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
 from unprocess_gen.planning import plan
-from unprocess_gen.reports import dataset_report, formatting, html_pages, photon_transfer, report_files
-from unprocess_gen.reports.manifest_statistics import (
+from unprocess_gen.reports import formatting, html_pages, photon_transfer, report_files
+from unprocess_gen.reports.dataset_page import page as dataset_report
+from unprocess_gen.reports.dataset_page.statistics import (
     PARAMETER_COLUMNS,
     TEXT_COLUMNS,
     Histogram,
@@ -444,7 +445,7 @@ def test_missing_library_gives_one_line_that_names_the_extra(
 
 def test_import_of_the_dataset_report_leaves_numba_out() -> None:
     code = (
-        "import sys, unprocess_gen.reports.dataset_report\n"
+        "import sys, unprocess_gen.reports.dataset_page.page\n"
         "print([name for name in ('numba', 'matplotlib', 'jinja2') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

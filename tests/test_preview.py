@@ -18,7 +18,8 @@ from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.dataset.manifest import plan_from_row
-from unprocess_gen.reports import contact_sheet, panels, sheet_pairs, stages_sheet
+from unprocess_gen.reports.sheets import contact_sheet, panels, stages_sheet
+from unprocess_gen.reports.sheets import pairs as sheet_pairs
 from unprocess_gen.simulation.reference import isp as process
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import PATTERNS, mosaic

@@ -163,7 +163,8 @@ def run_figures(call: Call) -> int:
 def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None]:
     from unprocess_gen.config.schema import GainsConfig, NoiseConfig
     from unprocess_gen.config.serialization import read_option
-    from unprocess_gen.reports import paper_figures, report_files
+    from unprocess_gen.reports import report_files
+    from unprocess_gen.reports.paper import figures as paper_figures
 
     out = Path(config.out)
     report_files.check_report_folder(out, "figures")
@@ -330,7 +331,7 @@ def _skipped(failed: int) -> str:
 
 def run_report(call: Call) -> int:
     """Write the HTML page of a dataset."""
-    from unprocess_gen.reports.dataset_report import write_dataset_report
+    from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
     folder = _dataset("report", call)
     to, root = call.values.get("to"), call.values.get("source")
@@ -342,7 +343,7 @@ def run_preview(call: Call) -> int:
     """Draw contact sheets of pairs."""
     from unprocess_gen.dataset.selection import select_pairs
     from unprocess_gen.pipeline.replay import source_root
-    from unprocess_gen.reports.contact_sheet import write_sheets
+    from unprocess_gen.reports.sheets.contact_sheet import write_sheets
 
     folder = _dataset("preview", call)
     to, root, with_stages = _folder_to("preview", call), call.values.get("source"), "stages" in call.values

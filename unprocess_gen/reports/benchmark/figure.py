@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from unprocess_gen.config.accuracy import STAGES
 from unprocess_gen.reports.benchmark.measure import Measurement
 from unprocess_gen.reports.benchmark.session import REFERENCE
-from unprocess_gen.reports.figure_pictures import BLUE, GREEN, GREY, INK, ORANGE
 from unprocess_gen.reports.formatting import short_number
+from unprocess_gen.reports.paper.pictures import BLUE, GREEN, GREY, INK, ORANGE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

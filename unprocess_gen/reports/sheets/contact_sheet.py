@@ -21,7 +21,8 @@ import numpy as np
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.reports.panels import (
+from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs, sheet_heading
+from unprocess_gen.reports.sheets.panels import (
     PANEL_PX,
     STRIP_PX,
     DetailWindow,
@@ -36,8 +37,7 @@ from unprocess_gen.reports.panels import (
     tile_channels,
     to_codes,
 )
-from unprocess_gen.reports.sheet_pairs import SheetPair, selected_pairs, sheet_heading
-from unprocess_gen.reports.stages_sheet import stages_sheet
+from unprocess_gen.reports.sheets.stages_sheet import stages_sheet
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
 
 PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3)

@@ -18,11 +18,11 @@ from pathlib import Path
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.reports.figure_pictures import PaperFigure
 from unprocess_gen.reports.html_pages import PageTable, render_page
-from unprocess_gen.reports.paper_curves import draw_gamma, draw_highlight_function, draw_tone
-from unprocess_gen.reports.paper_raw_frames import draw_default_raw, draw_highlights, draw_saturation
-from unprocess_gen.reports.paper_sources import (
+from unprocess_gen.reports.paper.curves import draw_gamma, draw_highlight_function, draw_tone
+from unprocess_gen.reports.paper.pictures import PaperFigure
+from unprocess_gen.reports.paper.raw_frames import draw_default_raw, draw_highlights, draw_saturation
+from unprocess_gen.reports.paper.sources import (
     AUTHORS_NOISE,
     GAINS,
     PaperOptions,

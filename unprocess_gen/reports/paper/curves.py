@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unprocess_gen.core.types import Float, Srgb
-from unprocess_gen.reports.figure_pictures import (
+from unprocess_gen.reports.paper.pictures import (
     BLUE,
     GREEN,
     GREY,
@@ -20,7 +20,7 @@ from unprocess_gen.reports.figure_pictures import (
     show_picture,
     small_photograph,
 )
-from unprocess_gen.reports.paper_sources import DEFAULT_GAINS, FigureSource
+from unprocess_gen.reports.paper.sources import DEFAULT_GAINS, FigureSource
 from unprocess_gen.simulation.reference.isp import compress_gamma, smoothstep
 from unprocess_gen.simulation.reference.unprocess import (
     expand_gamma,

@@ -15,7 +15,8 @@ import numpy as np
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.dataset.manifest import patch_from_row
-from unprocess_gen.reports.panels import (
+from unprocess_gen.reports.sheets.pairs import SheetPair, sheet_heading
+from unprocess_gen.reports.sheets.panels import (
     PANEL_PX,
     DetailWindow,
     Picture,
@@ -27,7 +28,6 @@ from unprocess_gen.reports.panels import (
     lay_out,
     to_codes,
 )
-from unprocess_gen.reports.sheet_pairs import SheetPair, sheet_heading
 from unprocess_gen.simulation.reference import unprocess
 from unprocess_gen.simulation.reference.cfa import mosaic
 from unprocess_gen.simulation.reference.isp import to_light

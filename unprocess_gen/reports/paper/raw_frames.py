@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unprocess_gen.core.types import Float, Frame, Plan
-from unprocess_gen.reports.figure_pictures import (
+from unprocess_gen.reports.paper.curves import HIGHLIGHT_THRESHOLD
+from unprocess_gen.reports.paper.pictures import (
     BLUE,
     ORANGE,
     PaperFigure,
@@ -23,8 +24,7 @@ from unprocess_gen.reports.figure_pictures import (
     show_stretched,
     small_photograph,
 )
-from unprocess_gen.reports.paper_curves import HIGHLIGHT_THRESHOLD
-from unprocess_gen.reports.paper_sources import (
+from unprocess_gen.reports.paper.sources import (
     DEFAULT_GAINS,
     GAINS,
     INTERPRETATIONS,

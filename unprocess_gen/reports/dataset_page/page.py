@@ -28,17 +28,17 @@ from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.workspace import REPORT, read_dataset
 from unprocess_gen.reports import photon_transfer
-from unprocess_gen.reports.contact_sheet import contact_sheet
-from unprocess_gen.reports.formatting import byte_size, percentage, short_number
-from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
-from unprocess_gen.reports.manifest_statistics import (
+from unprocess_gen.reports.dataset_page.statistics import (
     PARAMETER_COLUMNS,
     SITE_COLUMNS,
     TEXT_COLUMNS,
     ColumnStatistics,
     ManifestStatistics,
 )
+from unprocess_gen.reports.formatting import byte_size, percentage, short_number
+from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import DATASET_ENTRIES, require_libraries
+from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 from unprocess_gen.sources.listing import encode_name
 
 PAIRS_FITTED = 8

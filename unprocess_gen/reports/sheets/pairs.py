@@ -13,7 +13,7 @@ from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
-from unprocess_gen.reports.panels import DetailWindow, Mosaic
+from unprocess_gen.reports.sheets.panels import DetailWindow, Mosaic
 from unprocess_gen.sources.patches import crop_patch
 
 PAIRS_SHOWN = 8
@@ -40,7 +40,7 @@ class SheetPair:
 def selected_pairs(folder: Path, keys: Sequence[str], source: Path | None) -> Iterator[SheetPair]:
     """Yield pairs in the order of the manifest; a photograph shared by adjacent pairs is decoded once."""
     from unprocess_gen.pipeline.replay import source_root  # imports Numba
-    from unprocess_gen.reports.row_sources import load_row_source  # imports Numba
+    from unprocess_gen.reports.sheets.row_sources import load_row_source  # imports Numba
 
     if source is not None and not source.is_dir():
         raise ConfigError(f"--source {source}: is not a folder; expected the folder of the photographs")
