@@ -39,8 +39,8 @@ REFUSED = [
     (["+new=1"], r"new=1: no such key; expected one of source, camera, "),
     (["+source.new=1"], r"source.new=1: no such key; source has root, "),
     (["++new=1"], r"new=1: no such key; expected one of source, camera, "),
-    (["~camera"], r"~camera: a setting cannot be taken away"),
-    (["~camera.law=convex"], r"~camera.law=convex: a setting cannot be taken away"),
+    (["~camera"], r"~camera: a setting cannot be removed"),
+    (["~camera.law=convex"], r"~camera.law=convex: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
     (["seed=abc"], r"seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
     (["seed=2.5"], r"seed=2.5: Value '2.5' of type 'float' could not be converted to Integer"),
@@ -86,7 +86,7 @@ REFUSED = [
     (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs nine numbers"),
     (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a distribution"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
-    (["gains.red=0"], r"gains.red=0: a gain must be above 0"),
+    (["gains.red=0"], r"gains.red=0: expected a gain above 0"),
     (["out="], r"out='': expected the name of a folder"),
     (["-m", "camera=nope"], r"camera=nope: camera=nope: no such option"),
     (["-m", "seed=choice(1"], r".*choice"),
@@ -450,7 +450,7 @@ def test_again_of_scenes_refuses_a_source_root(door: Door, make: Make, tmp_path:
     make(None, tmp_path / "old", "source.limit=1")
     fill(tmp_path / "p", 1)
     done = door("again", "old", "source.root=p", "out=new")
-    assert (done.code, "was made from a source of kind synthetic; leave source.root out" in done.err) == (2, True)
+    assert (done.code, "was generated from a source of kind synthetic; expected no root" in done.err) == (2, True)
     assert not (tmp_path / "new").exists()
 
 
@@ -506,7 +506,7 @@ def test_again_needs_a_source_if_none_is_recorded(moved: Path, door: Door, tmp_p
     (tmp_path / "ds/dataset.json").unlink()
     done = door("again", moved, "out=new")
     assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "kind folder and does not record which; give source.root=" in done.err
+    assert "does not record the folder of its sources; expected that folder; give source.root=" in done.err
     assert not (tmp_path / "new").exists()
 
 

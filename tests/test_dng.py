@@ -348,7 +348,7 @@ def test_the_clean_frame_has_no_noise_profile(ds: Path) -> None:
 def test_frames_without_a_noise_profile_are_counted(folder: Path, make: Make, door: Door, tmp_path: Path) -> None:
     make(folder, tmp_path / "ds", "noise=imx385_iso3200_rvdd", "source.limit=3")
     done = door("dng", "ds", "--keys", "00000000,00000002", "--to", "to")
-    assert "2 noisy ones without NoiseProfile, which their noise distribution does not fit" in done.out
+    assert "2 noisy ones without NoiseProfile, which cannot describe their noise" in done.out
 
 
 # -------------------------------------------------------------------------------------------------------------- tags
@@ -443,7 +443,7 @@ def test_existing_identical_file_is_kept(ds: Path, door: Door, tmp_path: Path) -
     door("dng", ds, "--keys", "00000000", "--noisy", "--to", "to")
     before = (tmp_path / "to" / "00000000.noisy.dng").stat()
     done = door("dng", ds, "--keys", "00000000", "--to", "to")
-    assert done.out == "to: 1 DNG files written; 1 were there already, the same\n"
+    assert done.out == "to: 1 DNG files written; 1 existed with the same bytes\n"
     assert (tmp_path / "to" / "00000000.noisy.dng").stat() == before
 
 
@@ -460,9 +460,9 @@ def test_another_file_of_the_name_is_refused_and_kept(ds: Path, door: Door, tmp_
 REFUSED = [
     ([], "dng: expected the folder of a dataset"),
     (["--keys", "00000000"], "dng: expected the folder of a dataset"),
-    (["DS", "--to", "to"], r"dng: missing --keys K,…: the rows to write"),
+    (["DS", "--to", "to"], r"dng: --keys is missing; expected the keys of the rows to write"),
     (["DS", "--keys=", "--to", "to"], r"dng: --keys: a value is missing"),
-    (["DS", "--keys", "00000000"], "dng: missing --to FOLDER"),
+    (["DS", "--keys", "00000000"], "dng: --to is missing; expected the folder to write to"),
     (["DS", "--keys", "00000000", "--to", "to", "--both"], "dng: --both: no such flag; expected --keys, --to"),
     (["DS", "--keys", "00000000,00000009", "--to", "to"], "--keys 00000009: .*has no such key"),
     (["DS", "--keys", "00000000,00000001", "--to", "to"], r"--keys 00000001: failed \(\w+\), so it has no frames"),
@@ -520,7 +520,7 @@ def test_without_tifffile_one_line_names_the_extra(
     done = door("dng", ds, "--keys", "00000000", "--to", "to")
     assert (done.code, done.err) == (
         2,
-        "gen-dataset: dng: writing needs tifffile; pip install 'unprocess_gen[dng]'\n",
+        "gen-dataset: dng: tifffile is missing; pip install 'unprocess_gen[dng]'\n",
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -368,7 +368,7 @@ def test_the_estimated_bytes_are_exact(
 def test_plan_reports_the_loss_of_odd_sides(photos: Path, door: Door) -> None:
     done = door("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
     assert done.code == 0
-    assert "packed    8 of 12 images have an odd side, whose last row or column is left out: " in done.out
+    assert "packed    8 of 12 images have an odd side, whose last row or column is omitted: " in done.out
     assert "one.png: unsupported\n          1 x 1 pixels hold no 2 x 2 sites" in done.out
 
 
@@ -458,4 +458,4 @@ def test_contradictory_output_settings_give_one_line(
 def test_accuracy_requires_integer_frames(door: Door, tmp_path: Path) -> None:
     done = door("accuracy", "output.dtype=float32")
     assert (done.code, list(tmp_path.iterdir())) == (2, [])
-    assert "errors are measured in whole DN; say output.dtype=uint16" in done.err
+    assert "errors are in integer DN; expected uint16; set output.dtype=uint16" in done.err

@@ -172,7 +172,7 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
         (("noise=nikon_d850", "noise.levels=[{a:1,b:1}]"), r"expected an ISO for noise=nikon_d850"),
         (("noise=nikon_d850", "noise.levels=2", "noise.full_well_e=9000"), r"the clean frame depends on the ISO"),
         (("noise=nikon_d850", "noise.levels=2", "clean.includes_fixed_pattern=true"), r"depends on the ISO"),
-        (("source.clips=true",), r"source.clips=true: the built-in scenes are no clips"),
+        (("source.clips=true",), r"source.clips=true: the built-in scenes are not clips"),
         (("source.downscale=0",), r"source.downscale=0: expected 1 to 64"),
         (("source.dequantize=yes",), r"source.dequantize=yes: expected one of off, dither"),
     ],

@@ -65,7 +65,10 @@ def test_out_inside_a_finished_dataset_is_refused_with_2(
     before = sorted(copy.rglob("*"))
     done = door("source.limit=1", f"out={inside}")
     assert (done.code, done.out) == (2, "")
-    assert done.err == f"gen-dataset: out={inside}: is inside the dataset {copy}/ds; choose a folder outside of it\n"
+    assert (
+        done.err == f"gen-dataset: out={inside}: is inside the dataset {copy}/ds; expected a folder outside of it; "
+        "choose another out\n"
+    )
     assert sorted(copy.rglob("*")) == before
     assert verify(copy / "ds") == []
 

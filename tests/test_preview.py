@@ -406,7 +406,7 @@ def test_changed_photograph_is_named_and_its_panel_omitted(
     assert done.code == 5
     assert "; restore the file, or regenerate the dataset\n" in done.err
     assert done.out == "3 pictures in to\n"
-    assert done.err.startswith("gen-dataset: 00000000 (a.png): the source's panel and the stages are left out: ")
+    assert done.err.startswith("gen-dataset: 00000000 (a.png): the source's panel and the stages are omitted: ")
     assert reason in done.err
     assert done.err.count("\n") == 1
 
@@ -420,7 +420,7 @@ def test_other_content_of_the_same_size_is_detected(few: Path, make: Make, tmp_p
 
     done = door("preview", "ds", "--to=to", "--source=2")
 
-    assert "flat.bmp): the source's panel is left out: it has changed: its SHA-256 differs" in done.err
+    assert "flat.bmp): the source's panel is omitted: it has changed: its SHA-256 differs" in done.err
     assert done.code == 5
 
 
@@ -464,7 +464,10 @@ def test_dataset_argument_is_required(door: Door, arguments: tuple[str, ...]) ->
 
 
 def test_folder_argument_is_required(few: Path, door: Door) -> None:
-    assert door("preview", few).err == "gen-dataset: preview: missing --to FOLDER: where to write the files\n"
+    assert (
+        door("preview", few).err
+        == "gen-dataset: preview: --to is missing; expected the folder to write to; give --to FOLDER\n"
+    )
 
 
 @pytest.mark.parametrize("inside", ["", "shards"])

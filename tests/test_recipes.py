@@ -21,7 +21,7 @@ from unprocess_gen.sources.scenes import synthetic
 RECIPE = "experiment"
 RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml"))
 NO_CLIPS = {"crvd_like": ("source.clips=false",)}
-"""Overrides that an experiment needs with the built-in scenes, which are no clips."""
+"""Overrides that an experiment needs with the built-in scenes, which are not clips."""
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -86,10 +86,13 @@ def test_experiments_can_be_swept(clip: Path, door: Door, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("argument", "complaint"),
     [
-        (f"{RECIPE}=ipol_demo", "a recipe is added to the settings; say +experiment=ipol_demo"),
+        (f"{RECIPE}=ipol_demo", "a recipe is added to the settings; write +experiment=ipol_demo"),
         (f"+{RECIPE}=imagenet", "no such option; expected one of brooks2019_training, crvd_like, eld_low_light, ipol"),
         (f"+{RECIPE}=[ipol_demo,crvd_like]", "expected the name of an option: brooks2019_training"),
-        (f"+{RECIPE}=crvd_like", "source.clips=true: the built-in scenes are no clips; give source.root"),
+        (
+            f"+{RECIPE}=crvd_like",
+            "source.clips=true: the built-in scenes are not clips; expected folders or videos; give source.root",
+        ),
     ],
 )
 def test_invalid_experiment_is_refused_in_one_line(argument: str, complaint: str, door: Door, tmp_path: Path) -> None:

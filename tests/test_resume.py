@@ -383,7 +383,9 @@ def test_folder_with_foreign_files_is_refused_and_unchanged(name: str, make: Mak
     path = tmp_path / "ds" / name
     path.parent.mkdir(parents=True)
     path.write_text("precious")
-    with pytest.raises(ConfigError, match="which is not of a dataset; choose an empty folder"):
+    with pytest.raises(
+        ConfigError, match=r"but no config.yaml; expected an empty folder or a dataset; choose another out"
+    ):
         make(fill(tmp_path / "p", 1), tmp_path / "ds")
     assert path.read_text() == "precious"
     assert sorted(entry.name for entry in (tmp_path / "ds").iterdir()) == [name.split("/")[0]]
@@ -399,7 +401,11 @@ def test_folder_locked_by_another_run_is_refused_with_11(door: Door, tmp_path: P
     fill(tmp_path / "p", 1)
     with held(tmp_path / "ds"):
         done = door("source.root=p")
-    assert done == (11, "", "gen-dataset: out=ds: another run is writing to it; wait for it or choose another\n")
+    assert done == (
+        11,
+        "",
+        "gen-dataset: out=ds: another run is writing to it; wait for that run, or choose another out\n",
+    )
     assert list((tmp_path / "ds").iterdir()) == []
 
 
@@ -429,7 +435,7 @@ def test_two_runs_at_once_make_one_dataset(forty: Path, undisturbed: str, tree_h
 def test_folder_with_a_foreign_file_names_it_and_stays_unchanged(make: Make, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds/thesis.tex").write_text("mine")
-    with pytest.raises(ConfigError, match=r"out=.*/ds: contains thesis.tex, which is not of a dataset; choose"):
+    with pytest.raises(ConfigError, match=r"out=.*/ds: contains thesis.tex, but no config.yaml; expected"):
         make(fill(tmp_path / "p", 1), tmp_path / "ds")
     assert os.listdir(tmp_path / "ds") == ["thesis.tex"]
 
@@ -557,7 +563,7 @@ def test_source_that_kills_two_workers_is_retried_by_the_next_run(
 ) -> None:
     done = run_with_deaths(cli, tmp_path, deaths=2)
     lines = [line for line in done.stderr.splitlines() if "images/s" not in line]
-    assert (done.returncode, lines) == (3, ["gen-dataset: 009.png: its worker died twice; run again to retry it"])
+    assert (done.returncode, lines) == (3, ["gen-dataset: 009.png: its worker died twice; rerun to retry it"])
     rows = list(read_rows(tmp_path / "ds/manifest.csv"))
     assert [row["reason"] for row in rows] == [""] * 8 + ["worker_died"] * 4
     entries = read_dataset(tmp_path / "ds/dataset.json")["shards"]

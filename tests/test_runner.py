@@ -460,7 +460,7 @@ def test_progress_is_plain_lines_without_a_terminal(make: Make, photos: Path, tm
 
 
 def test_only_the_first_run_reports_compiling(cli: Cli, tmp_path: Path) -> None:
-    line = "gen-dataset: 0/1 images, compiling kernels (needed once per machine and version)"
+    line = "gen-dataset: 0/1 images, compiling kernels, once per machine and version"
     said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
 
     assert [line in one for one in said] == [True, False]

@@ -201,7 +201,7 @@ def test_a_failed_self_test_stops_the_run_before_the_first_pair(
     assert done.err.startswith(
         "gen-dataset: the self-test failed: results differ (the golden clean frame (per_channel) is 443ea2ae"
     )
-    assert done.err.endswith("or say self_test=go_on\n")
+    assert done.err.endswith("or set self_test=go_on\n")
     assert len(done.err.splitlines()) == 1
     assert list((tmp_path / "ds" / "shards").iterdir()) == []
     assert not (tmp_path / "ds" / "dataset.json").exists()

@@ -117,7 +117,7 @@ def test_failing_job_does_not_stop_others_and_decides_exit_code(door: Door, sour
 def test_error_of_a_job_is_one_line_with_its_name(door: Door, source: Path) -> None:
     done = door("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     errors = [line for line in done.err.splitlines() if "images/s" not in line]
-    assert errors == ["gen-dataset: gains.red=0: gains.red=0: a gain must be above 0, from 0.001 to 1000"]
+    assert errors == ["gen-dataset: gains.red=0: gains.red=0: expected a gain above 0, from 0.001 to 1000"]
 
 
 def test_unknown_option_in_one_job_does_not_stop_others(door: Door, source: Path, tmp_path: Path) -> None:

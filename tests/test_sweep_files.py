@@ -200,7 +200,7 @@ def test_unknown_key_in_a_sweep_fails_its_jobs_only(mine: Path, door: Door) -> N
 def test_a_sweep_without_plus_is_refused_with_advice(door: Door) -> None:
     done = door("sweep=cameras")
     assert (done.code, done.err) == (
-        2, "gen-dataset: sweep=cameras: a sweep is added to the settings; say +sweep=cameras\n",
+        2, "gen-dataset: sweep=cameras: a sweep is added to the settings; write +sweep=cameras\n",
     )  # fmt: skip
 
 

@@ -78,7 +78,7 @@ def test_failing_job_of_a_launcher_decides_the_exit_code(cli: Cli, tmp_path: Pat
     fill(tmp_path / "p", 1)
     done = cli("-m", "gains.red=0,2", "source.root=p", "n_jobs=1", "out=sweep", "hydra/launcher=joblib")
     assert done.returncode == 2
-    assert done.stderr.count("gains.red=0: a gain must be above 0") == 1
+    assert done.stderr.count("gains.red=0: expected a gain above 0") == 1
     assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
         ("gains.red=0", "2"), ("gains.red=2", "0"),
     ]  # fmt: skip

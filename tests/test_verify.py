@@ -118,9 +118,9 @@ def test_damage_is_named_by_shard_key_and_member(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("member", "at", "what"),
     [
-        ("clean.npy", -512, "its tar header differs from what the manifest says, from byte 0 on"),
-        ("clean.npy", 60, "its npy header differs from what the manifest says, from byte 60 on"),
-        ("json", 5, "its member differs from what the manifest says, from byte 517 on"),
+        ("clean.npy", -512, "its tar header differs from what the manifest records, from byte 0 on"),
+        ("clean.npy", 60, "its npy header differs from what the manifest records, from byte 60 on"),
+        ("json", 5, "its member differs from what the manifest records, from byte 517 on"),
     ],
 )
 def test_damage_of_headers_and_json_is_named(member: str, at: int, what: str, copy: Path) -> None:
@@ -243,7 +243,7 @@ def test_a_row_whose_plan_was_edited_gives_other_arrays(intact: Path) -> None:
 
 
 def test_a_row_of_a_file_needs_a_folder(intact: Path) -> None:
-    with pytest.raises(ConfigError, match=r"row 00000000 was made from the file .*: give source.root="):
+    with pytest.raises(ConfigError, match=r"row 00000000 was generated from the file .*; give source.root="):
         list(replay(read_rows(intact / "manifest.csv"), root=None))
 
 

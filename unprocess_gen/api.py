@@ -1,7 +1,7 @@
 """Make, generate, verify and develop pairs from Python: the functions that `unprocess_gen` exports.
 
-Each function does what the verb of its name does on the command line, without signal handlers or exit codes. Exceptions
-carry the sentence that the command line prints. `load_config` is in `config.composition`, `RawPairs` in
+`generate`, `verify` and `replay` do the work of the verbs of these names, without signal handlers or exit codes.
+Exceptions carry the sentence that the command line prints. `load_config` is in `config.composition`, `RawPairs` in
 `dataset.reader`.
 """
 

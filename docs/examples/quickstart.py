@@ -1,6 +1,6 @@
 """Make raw pairs from Python: run this file, or open its cells in a notebook (``# %%``).
 
-It writes below a temporary folder and needs nothing but unprocess_gen.
+It writes below a temporary folder and needs only unprocess_gen.
 """
 
 # %% A photograph: any uint8 or uint16 array [H, W, 3] in R, G, B order

@@ -1,8 +1,8 @@
 """Describe the arguments of verbs as data, and parse a command line into a `Call`.
 
-Each verb has its own `argparse` parser, built from its `Argument` list. Only flags go through argparse. Words are
-assigned here, because a dataset's folder may be called ``camera=sony_a7r`` and settings may be mixed with flags in any
-order, which argparse cannot express.
+Each verb has its own `argparse` parser, built from its `Argument` list. argparse parses only flags. This module
+assigns words, for two reasons that argparse cannot express: a dataset's folder may be called ``camera=sony_a7r``, and
+settings may be mixed with flags in any order.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ HYDRA_FLAGS: dict[tuple[str, ...], tuple[tuple[str, ...], str]] = {
     ("-cd", "--config-dir"): (ANY_VALUE, "add a folder of your own options"),
     ("-cn", "--config-name"): (ANY_VALUE, "use another primary config"),
     ("-cp", "--config-path"): (ANY_VALUE, "use another folder for the primary config"),
-    ("-p", "--package"): (ANY_VALUE, "print only this part of the settings, with --cfg"),
-    ("--resolve",): ((), "resolve interpolations, with --cfg"),
+    ("-p", "--package"): (ANY_VALUE, "with --cfg: print only this part of the settings"),
+    ("--resolve",): ((), "with --cfg: resolve interpolations"),
     ("-i", "--info"): (
         ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
         "print information about Hydra and stop",

@@ -1,7 +1,7 @@
 """Complete command lines in bash and zsh: verbs, flags, settings and options.
 
-``gen-dataset completion bash`` prints a script. Its function calls ``gen-dataset completion query LINE`` for the line
-up to the cursor, and gets a kind of completion (``words``, ``folders``, ``files``) and the candidates.
+``gen-dataset completion bash`` prints a script. Its function calls ``gen-dataset completion query LINE`` with the line
+up to the cursor. The query prints the kind of completion (``words``, ``folders``, ``files``) and the candidates.
 
 Design: ``docs/design/command_line.md``.
 """

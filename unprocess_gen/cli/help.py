@@ -37,7 +37,7 @@ GROUP_KEYS: Mapping[str, str] = {
     "gains": "",
     "isp": "",
     "sensor": "",
-    "noise": "levels, draws: several frames of one clean frame; iso: that of the scene unless set",
+    "noise": "levels, draws: several frames of one clean frame; iso: overrides the ISO of the scene",
     "scene": "",
     "effects": "all (auto, on, off), tolerance, and each effect by name",
     "clean": "includes_fixed_pattern",
@@ -46,8 +46,8 @@ GROUP_KEYS: Mapping[str, str] = {
 }
 """Groups of settings in the order of the config, and the keys that the help mentions."""
 
-ADDED_GROUPS = {"experiment": "settings of published work", "sweep": "ready sweeps"}
-"""Groups that are no part of the settings; their options are added with a plus: ``+experiment=ipol_demo``."""
+ADDED_GROUPS = {"experiment": "settings of published work", "sweep": "prepared sweeps"}
+"""Groups that do not belong to the settings; their options are added with a plus: ``+experiment=ipol_demo``."""
 
 ENDING = """\
 and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on),
@@ -63,9 +63,9 @@ Flags:
 
 Tab completion: eval "$(gen-dataset completion bash)", or zsh.
 
-Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 finished with failed images · 4 damage found
-            5 system error (disk full, source changed) · 11 output locked by another run
-            129, 130, 143 stopped by a signal (SIGHUP, SIGINT, SIGTERM)
+Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 more failed sources than max_failed
+            4 damage found · 5 system error (disk full, source changed)
+            11 output locked by another run · 129, 130, 143 ended by SIGHUP, SIGINT, SIGTERM
 """
 
 

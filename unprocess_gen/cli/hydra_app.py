@@ -57,7 +57,7 @@ def compose(
     if request.prints_without_config:
         return _print_with_hydra(request.flags, request.overrides)
     if "--resolve" in request.flags and not request.prints_config:
-        raise ConfigError("--resolve: expected together with --cfg")
+        raise ConfigError("--resolve: --cfg is missing; expected both; add --cfg job")
     from unprocess_gen.config.composition import validated_config
     from unprocess_gen.config.sweep_expansion import expand
 

@@ -1,6 +1,6 @@
 """Parse overrides and Hydra's flags, and run Hydra itself.
 
-Hydra prints several lines for a mistake and exits with 1; therefore it is set to raise.
+Hydra prints several lines for a mistake and exits with 1; `run_hydra` therefore makes it raise.
 """
 
 from __future__ import annotations

@@ -193,17 +193,19 @@ def run_again(call: Call) -> int:
     folder = _dataset("again", call)
     config, kind = read_dataset_yaml(folder / "config.yaml")
     if "out" not in call.values:
-        raise ConfigError("again: out=… is missing; expected the folder for the new dataset")
+        raise ConfigError("again: out is missing; expected the folder of the new dataset; give out=…")
     root = call.values.get("source")
     if kind != "folder" and root is not None:
         raise ConfigError(
-            f"again: source.root={root}: {folder} was made from a source of kind {kind}; leave source.root out"
+            f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "
+            "leave source.root out"
         )
     if kind == "folder":
         root = source_root(folder / "manifest.csv", root)
         if root is None:
             raise ConfigError(
-                f"again: {folder} was made from a source of kind folder and does not record which; give source.root=…"
+                f"again: source.root is missing: {folder} does not record the folder of its sources; expected "
+                "that folder; give source.root=…"
             )
     config.out, config.source.root = call.values["out"], root
     config.n_jobs = call.values.get("n_jobs", config.n_jobs)
@@ -358,7 +360,7 @@ def run_preview(call: Call) -> int:
         if sheet.missing_source:
             code = SourceChangedError.exit_code if has_root else code
             omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
-            report(f"{sheet.key} ({sheet.source}): {omitted} left out: {sheet.missing_source}")
+            report(f"{sheet.key} ({sheet.source}): {omitted} omitted: {sheet.missing_source}")
     print_result(f"{files} pictures in {to}{_skipped(failed)}")
     return code
 
@@ -370,14 +372,14 @@ def run_dng(call: Call) -> int:
 
     folder = _dataset("dng", call)
     if "keys" not in call.values:
-        raise ConfigError("dng: missing --keys K,…: the rows to write")
+        raise ConfigError("dng: --keys is missing; expected the keys of the rows to write; give --keys K,…")
     to = _folder_to("dng", call)
     frames = [frame for frame in FRAMES if frame in call.values] or FRAMES
     exported = export(folder, call.values["keys"], frames, to)
     counts = (
         (exported.written, "DNG files written"),
-        (exported.present, "were there already, the same"),
-        (exported.without_profile, "noisy ones without NoiseProfile, which their noise distribution does not fit"),
+        (exported.present, "existed with the same bytes"),
+        (exported.without_profile, "noisy ones without NoiseProfile, which cannot describe their noise"),
         (select_pairs(folder / "manifest.csv", call.values["keys"]).failed, "failed rows skipped"),
     )
     print_result(f"{to}: " + "; ".join(f"{count} {what}" for count, what in counts if count))
@@ -386,7 +388,7 @@ def run_dng(call: Call) -> int:
 
 def _folder_to(verb: str, call: Call) -> Path:
     if "to" not in call.values:
-        raise ConfigError(f"{verb}: missing --to FOLDER: where to write the files")
+        raise ConfigError(f"{verb}: --to is missing; expected the folder to write to; give --to FOLDER")
     return Path(call.values["to"])
 
 
@@ -443,14 +445,14 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "accuracy",
-            "measure what accuracy costs in time, and report it in out (accuracy)",
+            "measure error and time of the accuracy tiers; write a report to out (accuracy)",
             run_accuracy,
             (SETTINGS_SOURCE,),
             composes=True,
         ),
         Verb(
             "figures",
-            "draw the article's figures on the first photograph, in out (figures)",
+            "draw the article's figures for the first photograph; write them to out (figures)",
             run_figures,
             (SETTINGS_SOURCE,),
             composes=True,
@@ -521,7 +523,7 @@ VERBS: dict[str, Verb] = {
                 SOURCE,
                 Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders"),
                 _whole_number(("n_jobs",), "worker processes; -1: all cores"),
-                _whole_number(("source.max_failed",), "failed images before the exit code is 3"),
+                _whole_number(("source.max_failed",), "largest number of failed sources with exit code 0"),
             ),
             DATASET,
             resumes=True,

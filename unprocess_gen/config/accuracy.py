@@ -2,7 +2,7 @@
 
 Each `Method` states its largest error against the reference. Tests prove the statements, exhaustively if the domain is
 finite. Methods are tried in a fixed order of cost, never in a measured one: the data must not depend on the machine.
-``gen-dataset accuracy`` measures what each method costs and errs.
+``gen-dataset accuracy`` measures the time and the error of each method.
 
 Errors of the clean frame are those of a frame whose stages all have the method's precision, because one kernel computes
 them all. Errors of normal deviates are against the true quantile, in standard deviations; so the reference has one too

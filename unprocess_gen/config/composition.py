@@ -129,7 +129,7 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     """
     folders = folders or OptionFolders()
     if folders.own is not None and not folders.own.is_dir():
-        raise ConfigError(f"--config-dir: folder '{folders.own}' not found; expected a folder of option files")
+        raise ConfigError(f"--config-dir {folders.own}: no such folder; expected a folder of option files")
     _refuse_hidden_options(overrides, folders)
     try:
         with _hydra_for(folders):

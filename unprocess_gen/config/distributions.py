@@ -96,19 +96,19 @@ DISTRIBUTIONS: dict[str, Callable[..., float]] = {
 
 
 def _check_increasing(low: float, high: float) -> str | None:
-    return None if low < high else "the lowest value must be below the highest"
+    return None if low < high else "expected the lowest value below the highest"
 
 
 def _check_truncated(mean: float, std: float, low: float, high: float) -> str | None:
     if std <= 0:
-        return "the standard deviation must be above 0"
+        return "expected a standard deviation above 0"
     if abs(low - mean) > 6 * std or abs(high - mean) > 6 * std:
-        return "the limits must be within six standard deviations of the mean"
+        return "expected limits within six standard deviations of the mean"
     return _check_increasing(low, high)
 
 
 def _check_log_range(low: float, high: float) -> str | None:
-    return _check_increasing(low, high) if low > 0 else "the lowest value must be above 0"
+    return _check_increasing(low, high) if low > 0 else "expected a lowest value above 0"
 
 
 def _check_line(slope: float, intercept: float, std: float) -> str | None:

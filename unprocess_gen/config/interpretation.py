@@ -62,7 +62,7 @@ def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, 
     for name, distribution in zip(("red", "blue", "inverse_rgb"), distributions, strict=True):
         if not (lowest(distribution) >= MIN_GAIN and highest(distribution) <= MAX_GAIN):
             value = value_text(getattr(gains, name))
-            raise ConfigError(f"gains.{name}={value}: a gain must be above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}")
+            raise ConfigError(f"gains.{name}={value}: expected a gain above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}")
     return distributions
 
 

@@ -57,14 +57,17 @@ def check_noise(noise: NoiseConfig, scene: SceneConfig) -> None:
 def _check_two_numbers(noise: NoiseConfig) -> None:
     if noise.iso is not None:
         raise ConfigError(
-            f"noise.iso={value_text(noise.iso)}: noise={noise.name} holds for one ISO; choose a physical profile"
+            f"noise.iso={value_text(noise.iso)}: noise={noise.name} holds for one ISO; expected null; choose "
+            "a physical profile"
         )
     _, b = noise_distributions(noise)
     if noise.law == "poisson" and (noise.black == "included" or lowest(b) < 0):
-        raise ConfigError("noise.law=poisson: needs the black level subtracted and b of 0 or more")
+        raise ConfigError(
+            "noise.law=poisson: expected noise.black=subtracted and noise.b of 0 or more; set noise.law=gaussian"
+        )
     if noise.units == "normalized":
         if noise.black == "included":
-            raise ConfigError("noise.black=included: normalized units have black at 0, so it must be subtracted")
+            raise ConfigError("noise.black=included: normalized units have black at 0; expected subtracted")
         offset = 0.0
     else:
         _check_calibration(noise)
@@ -114,14 +117,20 @@ def _check_countable(noise: NoiseConfig) -> None:
 
 def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
     if noise.law != "gaussian":
-        raise ConfigError(f"noise.law={noise.law}: needs a profile with two numbers; noise={noise.name} is physical")
+        raise ConfigError(
+            f"noise.law={noise.law}: noise={noise.name} is a physical profile; expected one with two numbers, a and b"
+        )
     for key in ("a", "b"):
         if getattr(noise, key) is not None:
             raise ConfigError(
-                f"noise.{key}={value_text(getattr(noise, key))}: noise={noise.name} is a physical profile; set iso"
+                f"noise.{key}={value_text(getattr(noise, key))}: noise={noise.name} is a physical profile; "
+                "expected null; set noise.iso instead"
             )
     if noise.units != "dn" or noise.black != "subtracted":
-        raise ConfigError(f"noise.units={noise.units}: a physical profile is in dn, with the black level subtracted")
+        raise ConfigError(
+            f"noise.units={noise.units}: noise={noise.name} is a physical profile; expected units: dn, black: "
+            "subtracted"
+        )
     _check_calibration(noise)
     for number, branch in enumerate(noise.branches):
         _check_branch(f"noise.branches[{number}]", noise, branch)

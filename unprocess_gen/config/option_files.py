@@ -74,13 +74,15 @@ def check_override(override: str) -> None:
     if max(override.count(bracket) for bracket in "[{(") > MAX_BRACKETS:
         raise ConfigError(f"{override[:60]}…: nested too deeply; expected at most {MAX_BRACKETS} brackets")
     if override.startswith("~"):
-        raise ConfigError(f"{override}: a setting cannot be taken away; choose another value or option")
+        raise ConfigError(
+            f"{override}: a setting cannot be removed; expected key=value; choose another value or option"
+        )
     if not equals:
         raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
     if len(key) > MAX_KEY_CHARACTERS:
         raise ConfigError(f"{key[:60]}…: no such key; see gen-dataset --help")
     if key in ADDED_GROUPS and not override.startswith("+"):
-        raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; say +{override}")
+        raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; write +{override}")
     options = group_options(key) if key.isalpha() else []
     word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
     if options and not word:

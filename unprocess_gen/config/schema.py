@@ -32,7 +32,7 @@ class SourceConfig:
     max_pixels : int
         Images with more pixels fail with reason ``too_large``.
     max_failed : int
-        Number of failed images above which a run exits with 3.
+        Number of failed sources above which a run exits with code 3.
     icc : str
         ``ignore`` colour profiles, or ``refuse`` images whose profile is not sRGB.
     clips : bool

@@ -266,7 +266,10 @@ def _params(node: DictConfig, choices: Sequence[_Choice], folders: OptionFolders
     for override in overrides:
         check_override(override)
         if override.lstrip("+").startswith("hydra"):
-            raise ConfigError(f"hydra.sweeper.params.{override}: a sweep over settings of Hydra is not supported")
+            raise ConfigError(
+                f"hydra.sweeper.params.{override}: a sweep over settings of Hydra is not supported; expected "
+                "keys of a dataset"
+            )
     return [choice for choice in _parse(overrides, folders) if choice.name not in given]
 
 

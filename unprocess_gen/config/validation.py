@@ -163,7 +163,9 @@ def _check_environment(source: SourceConfig) -> None:
             f"source.root={source.root}: no such folder or file; expected photographs, or null for the built-in scenes"
         )
     if source.clips and source.root is None:
-        raise ConfigError("source.clips=true: the built-in scenes are no clips; give source.root=…")
+        raise ConfigError(
+            "source.clips=true: the built-in scenes are not clips; expected folders or videos; give source.root=…"
+        )
     if source.icc == "refuse" and find_spec("PIL") is None:
         raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
 
@@ -227,11 +229,13 @@ def _check_levels(config: Config) -> None:
         return
     if noise.full_well_e is not None:
         raise ConfigError(
-            f"noise.levels={value_text(noise.levels)}: with noise.full_well_e the clean frame depends on the ISO"
+            f"noise.levels={value_text(noise.levels)}: with noise.full_well_e the clean frame depends on the ISO; "
+            "expected null or one level; leave noise.levels out"
         )
     if config.clean.includes_fixed_pattern:
         raise ConfigError(
-            "clean.includes_fixed_pattern=true: the fixed pattern depends on the ISO; leave noise.levels out"
+            "clean.includes_fixed_pattern=true: the fixed pattern depends on the ISO; expected one level; leave "
+            "noise.levels out"
         )
 
 
@@ -255,7 +259,7 @@ def _check_effects(config: Config) -> None:
 def _check_switched_on(config: Config, effect: str) -> None:
     noise = config.noise
     if (effect == "heteroscedastic") == is_physical(noise):
-        offers = "the physical effects" if is_physical(noise) else "heteroscedastic only"
+        offers = "the physical effects, not this one" if is_physical(noise) else "heteroscedastic only"
         raise ConfigError(f"effects.{effect}=on: noise={noise.name} offers {offers}")
     number = missing_number(noise, effect)
     if number is not None:

@@ -14,7 +14,7 @@ Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 
 Pixel x takes output word x % 64 // 16. The layout does not depend on the image width, and 16 neighbouring pixels use 16
 consecutive counters, which vectorises. Alternatives and timings: ``docs/design/random_numbers.md``.
 
-This module is the NumPy reference; `simulation.kernels.gaussian` contains the compiled form.
+This module is the NumPy reference; `simulation.kernels.philox` contains the compiled form.
 """
 
 from __future__ import annotations

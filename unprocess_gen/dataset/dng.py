@@ -9,10 +9,10 @@ The tags follow the DNG Specification 1.4 and, where it is silent, Adobe's DNG S
   that white is reached where the first channel saturates (dng_color_spec::SetWhiteXY; LibRaw too); the tag cancels this
   scale. LibRaw and dcraw leave the tag to their callers. LibRaw also takes the brightest DN for white if it exceeds
   three quarters of it; adjust_maximum_thr=0 switches this off.
-* NoiseProfile: variance = S·x + O, x = 0 at black and 1 at white, so S = a_dn / span and O = b_dn2 / span², of the shot
-  and read noise that were simulated. The tag cannot describe row, column and dark-current noise, PRNU and rounding.
-  Readers refuse S of 0 or less and O below 0 (dng_noise_function::IsValid). The clean frame and noisy frames with such
-  values have no NoiseProfile.
+* NoiseProfile describes the simulated shot and read noise: variance = S·x + O, with x = 0 at black and 1 at white.
+  Therefore S = a_dn / span and O = b_dn2 / span². The tag cannot describe row, column and dark-current noise, PRNU and
+  rounding. Readers refuse S of 0 or less and O below 0 (dng_noise_function::IsValid). The clean frame and noisy frames
+  with such values have no NoiseProfile.
 * BlackLevel is the camera's nominal value, equal at all four sites; a black-level error is unknown to the camera.
 
 No tag records how highlights were kept. Above the row's threshold readers show them brighter than the photograph,
@@ -109,7 +109,7 @@ def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> ExportSu
         If writing fails.
     """
     if find_spec("tifffile") is None:
-        raise ConfigError("dng: writing needs tifffile; pip install 'unprocess_gen[dng]'")
+        raise ConfigError("dng: tifffile is missing; pip install 'unprocess_gen[dng]'")
     if to.resolve() in (folder.resolve(), (folder / "shards").resolve()):
         raise ConfigError(f"--to {to}: is the dataset's own folder; expected a folder outside the dataset")
     numbers = _numbers(folder / "manifest.csv", keys)
@@ -285,7 +285,7 @@ def rational(value: float) -> tuple[int, int]:
     """
     bits = 30 - max(math.frexp(value)[1], 0)
     if bits < 0:
-        raise ConfigError(f"a colour number of the row, {value:g}, is too large for a DNG, which ends at 2^30")
+        raise ConfigError(f"a colour value of the row is {value:g}; expected at most 2^30, the limit of a DNG")
     return round(math.ldexp(value, bits)), 1 << bits
 
 

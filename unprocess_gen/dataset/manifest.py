@@ -4,7 +4,7 @@ A row maps each column of `columns.COLUMNS` to a typed value. If a column does n
 None. Floats are written in Python's shortest round-trip spelling, so a row read back gives the same plan bit for bit.
 
 The shards hold each row as JSON too. It is padded with blanks to a size that depends only on the name of the source and
-the number of pairs. Therefore the size of a shard is known before it is made.
+the number of pairs. Therefore the size of a shard is known before the shard is written.
 
 Format and compatibility: ``docs/design/dataset_format.md``.
 """

@@ -450,7 +450,7 @@ def _check_bytes(stream: BinaryIO, wanted: bytes, what: str) -> Iterator[str]:
         yield f"its {what} is cut short"
     elif found != wanted:
         at = next(i for i, (a, b) in enumerate(zip(found, wanted, strict=True)) if a != b)
-        yield f"its {what} differs from what the manifest says, from byte {at} on"
+        yield f"its {what} differs from what the manifest records, from byte {at} on"
 
 
 def _check_digest(stream: BinaryIO, size: int, wanted: str) -> Iterator[str]:
@@ -461,4 +461,4 @@ def _check_digest(stream: BinaryIO, size: int, wanted: str) -> Iterator[str]:
     if left:
         yield f"its data are cut short by {left} bytes"
     elif digest.hexdigest() != wanted:
-        yield f"the XXH3-128 of its data is {digest.hexdigest()}, the manifest says {wanted}"
+        yield f"the XXH3-128 of its data is {digest.hexdigest()}, the manifest records {wanted}"

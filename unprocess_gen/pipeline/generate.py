@@ -167,7 +167,7 @@ def _run(
             workspace.commit(result)
         else:
             provisional[result.shard] = result
-            progress.warn(f"{result.killer}: its worker died twice; run again to retry it")
+            progress.warn(f"{result.killer}: its worker died twice; rerun to retry it")
         if result.self_test and not warned:
             warned = True
             progress.warn(f"the self-test failed: {result.self_test}; continuing because of self_test=go_on")

@@ -96,10 +96,10 @@ class Progress:
         while not marker.exists():
             if self._over.wait(COMPILING_POLL_S):
                 return
-        self._bar.set_postfix_str("compiling kernels, once per machine")
+        self._bar.set_postfix_str("compiling kernels, once per machine and version")
         if self._lines:
             LOGGER.info(
-                "%s%d/%d %ss, compiling kernels (needed once per machine and version)",
+                "%s%d/%d %ss, compiling kernels, once per machine and version",
                 *(self._prefix, self._done, self._total, self._unit),
             )
 

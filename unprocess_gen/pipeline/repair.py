@@ -333,7 +333,10 @@ def _regenerated_rows(folder: Path, facts: Facts, config: Config, temporary: Pat
 
 def _with_sources(config: Config) -> Config:
     if config.source.root == "":
-        raise ConfigError("repair: rows must be regenerated from the photographs: give source.root=…")
+        raise ConfigError(
+            "repair: source.root is missing: rows are regenerated from the photographs; expected their "
+            "folder; give source.root=…"
+        )
     return config
 
 

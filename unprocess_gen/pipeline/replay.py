@@ -166,7 +166,10 @@ class PairRegenerator:
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
         if self._root is None and not _is_scene(row):
-            raise ConfigError(f"row {row['key']} was made from the file {row['source']}: give source.root=…")
+            raise ConfigError(
+                f"source.root is missing: row {row['key']} was generated from the file {row['source']}; "
+                "expected its folder; give source.root=…"
+            )
         plan = plan_from_row(row)
         self_test.check(self_test.kernels(plan))
         sha256, photograph = self._load_unchanged(row)
@@ -176,8 +179,8 @@ class PairRegenerator:
         pixels = crop_patch(photograph.srgb, patch)
         if pixels.shape[:2] != (patch.height, patch.width):
             raise DamageError(
-                f"its {patch.width} x {patch.height} pixels from row {patch.y}, column {patch.x} on "
-                f"are not all in its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]}"
+                f"its patch of {patch.width} x {patch.height} pixels at row {patch.y}, column {patch.x} "
+                f"exceeds its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]} pixels"
             )
         return make_pair(pixels, plan, patch.origin)
 

@@ -141,7 +141,7 @@ def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
         if not self_test.are_compiled(kernels):
             context.compiling_path.touch()
         if context.config.self_test == "stop":
-            self_test.check(kernels, ", or say self_test=go_on")
+            self_test.check(kernels, ", or set self_test=go_on")
         failures += self_test.failures(kernels)
     return failures
 

@@ -97,22 +97,30 @@ class Workspace:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise LockedError(f"out={self.out}: another run is writing to it; wait for it or choose another") from None
+            raise LockedError(
+                f"out={self.out}: another run is writing to it; wait for that run, or choose another out"
+            ) from None
         except OSError as error:
-            raise ConfigError(f"out={self.out}: this file system cannot lock it ({error.strerror})") from error
+            raise ConfigError(
+                f"out={self.out}: this file system cannot lock it ({error.strerror}); choose another out"
+            ) from error
 
     def _refuse_datasets_around(self) -> None:
         """Refuse a folder inside a dataset, finished or begun, which would become a foreign file of that dataset."""
         for parent in Path(os.path.realpath(self.out)).parents:
             if (parent / "dataset.json").is_file() or (parent / ".work" / "sources.json").is_file():
-                raise ConfigError(f"out={self.out}: is inside the dataset {parent}; choose a folder outside of it")
+                raise ConfigError(
+                    f"out={self.out}: is inside the dataset {parent}; expected a folder outside of it; choose "
+                    "another out"
+                )
 
     def _refuse_foreign_files(self) -> None:
         """Refuse a folder that contains files but no dataset, so that no file of the user is overwritten."""
         foreign = sorted(set(os.listdir(self.out)) - {".work"})
         if foreign and not (self.out / "config.yaml").exists():
             raise ConfigError(
-                f"out={self.out}: contains {foreign[0]}, which is not of a dataset; choose an empty folder"
+                f"out={self.out}: contains {foreign[0]}, but no config.yaml; expected an empty folder or a dataset; "
+                "choose another out"
             )
 
     @property
@@ -164,7 +172,10 @@ class Workspace:
         another size.
         """
         if not (self.out / "config.yaml").exists():
-            raise DamageError(f"{self.out}/config.yaml: is missing from a finished dataset; remove {self.out}")
+            raise DamageError(
+                f"{self.out}/config.yaml: is missing from a finished dataset; gen-dataset verify {self.out} "
+                "--repair restores it"
+            )
         self._check_same_settings()
         rows = read_rows(self.out / "manifest.csv")
         known = {str(row["source"]): (row["source_bytes"], row["source_sha256"]) for row in rows}

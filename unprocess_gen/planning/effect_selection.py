@@ -5,8 +5,8 @@ noise of the other effects that stay on. Under ``auto``, the weakest effects are
 stay within the tolerance in every statistic. Random parts add in quadrature, offsets linearly. The idea is imSim's:
 thresholds in units of the noise.
 
-Hot and dead pixels above one standard deviation of the masking noise are too rare for that. They are counted instead,
-and simulated if at least `MIN_OUTLIERS` are expected per frame.
+Hot and dead pixels above one standard deviation of the masking noise are too rare for a variance. They are counted
+instead, and simulated if at least `MIN_OUTLIERS` are expected per frame.
 """
 
 from __future__ import annotations

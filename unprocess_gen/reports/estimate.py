@@ -1,4 +1,4 @@
-"""Estimate what a run would make: pairs, shards, bytes, time and effects. Nothing is written.
+"""Estimate the pairs, shards, bytes, time and effects of a run, without writing anything.
 
 Up to `SAMPLE` evenly spaced sources are read, or all of them on request. The bytes of the shards are exact if all were
 read, because the size of a pair depends only on its width, height and name.
@@ -276,8 +276,8 @@ def _patch_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[
     if rule is None and cropped:
         fraction = sum(source.unused_pixels for source in cropped) / sum(source.pixels for source in readable)
         return [
-            f"packed    {len(cropped)} of {len(readable)} images have an odd side, whose last row or column is left "
-            f"out: {fraction:.2%} of the pixels"
+            f"packed    {len(cropped)} of {len(readable)} images have an odd side, whose last row or column is "
+            f"omitted: {fraction:.2%} of the pixels"
         ]
     if rule is None or not readable:
         return []

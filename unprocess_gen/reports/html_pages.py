@@ -1,8 +1,8 @@
 """Render the HTML pages of reports from the Jinja2 templates in ``templates/``.
 
 A page is one file without scripts that opens offline, on phones, in light and dark mode. Autoescaping is on for every
-template, and characters that are invisible or reverse the text around them are shown as escapes, so a file name can
-never become markup.
+template, so a file name cannot become markup. Characters that are invisible or reverse the text around them are shown
+as escapes.
 """
 
 from __future__ import annotations

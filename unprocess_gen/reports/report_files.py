@@ -1,6 +1,6 @@
-"""Check that a report can be written where it was asked for, and write its files.
+"""Check that a report can be written to the requested place, and write its files.
 
-Reports are no part of a dataset. This module imports no kernel, so that the dataset report starts without Numba.
+A report is not part of a dataset. This module imports no kernel, so that the dataset report starts without Numba.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Simulate pairs with two-parameter Gaussian noise in float32, for accuracy budgets that allow errors.
 
-Takes three quarters of the time of `gaussian`. `config.accuracy` states the errors, tests prove them, and every CPU
-makes the same ones. Apart from precision, three things differ from `gaussian`:
+A pair takes three quarters of the time of `gaussian`. `config.accuracy` states the errors, tests prove them, and they
+are equal on every CPU. Apart from precision, three things differ from `gaussian`:
 
 * The tabulated products include gains, exposure and span, so sums of them are DN above the black level.
 * The polynomials of the normal deviates have lower degrees (`normal.coarse_normal`).

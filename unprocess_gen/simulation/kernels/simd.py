@@ -1,8 +1,8 @@
 """Write SIMD code in kernels: vectors of eight numbers, and raw pointers.
 
-For loops that LLVM does not vectorise by itself. Kernels load vectors, compute with them and store them. Vectors
-support ``+ - * / & | ^ >> <<`` per lane, also with a scalar operand, and the functions of this module. Every operation
-rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused.
+This module serves loops that LLVM does not vectorise by itself. Kernels load vectors, compute with them and store them.
+Vectors support ``+ - * / & | ^ >> <<`` per lane, also with a scalar operand, and the functions of this module. Every
+operation rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused.
 
 Each function has two implementations, which tests compare. Uncompiled kernels use the one on NumPy arrays of eight
 elements. Compiled kernels use LLVM instructions on ``<8 x type>``, which LLVM maps to the registers of the processor.

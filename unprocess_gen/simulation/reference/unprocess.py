@@ -1,7 +1,7 @@
 """Algorithm 1 of the article, step by step: from a display-referred image to the light at the sensor.
 
 This is the reference (NumPy, float64, one function per step, in the article's order). It defines the clean frame; the
-kernels compute the same DN. About 200 ns per pixel, 50 times as slow as the kernels.
+kernels compute the same DN. It takes about 200 ns per pixel, 50 times as long as the kernels.
 
 The formulas of the tone curves use libm, whose last bit differs between machines. Datasets never depend on it: kernels,
 and ``accuracy=reference``, read exact tables (`core.tone_curves`). With 8-bit sources and all five sensors, table

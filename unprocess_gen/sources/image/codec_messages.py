@@ -1,9 +1,9 @@
 """Capture what image codecs write to standard error.
 
 libjpeg and libtiff fill in missing or broken data, return a picture, and report the damage on standard error only. The
-promise that no damaged picture is decoded depends on these messages. Codecs write to file descriptor 2 directly, so
-the descriptor of the complete process is redirected to a temporary file during a decode, under a lock. Other threads'
-output to it during that time is delayed, not lost. A decode costs 30 µs more.
+promise that no damaged picture is decoded depends on these messages. Codecs write to file descriptor 2 directly.
+So this module redirects the descriptor of the process to a temporary file during a decode, under a lock. Output of
+other threads to it is delayed, not lost. A decode takes 30 µs longer.
 """
 
 from __future__ import annotations

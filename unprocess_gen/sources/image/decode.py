@@ -11,7 +11,7 @@ What OpenCV does (4.13 and 5.0 agree), and what this module does about it:
   "white is zero" is not inverted (at 8 bits it is), and separate planes contain uninitialised memory. The first is
   inverted here, the second refused.
 * Alpha: the transparent gray of a PNG (tRNS) and the alpha of a gray TIFF are dropped silently. The first is searched
-  in the pixels, the second refused.
+  for in the pixels, the second refused.
 * Refused because OpenCV decodes them wrongly: 16-bit BMP (white becomes 248), CMYK JPEG (no profile is applied), TIFF
   tiles narrower than 32 pixels at 8 bits. TIFF tiles are allocated at the size they declare, so it is limited.
 * Damage: codecs report it on standard error only (`codec_messages`). libjpeg reports the first problem of a file only,

@@ -1,9 +1,8 @@
 """Read the headers of JPEG, PNG, TIFF, WebP and BMP files without decoding pixels.
 
 A header takes 5 to 60 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
-shape of the decoded array is compared with the header later (`decode`). Pillow is not used: its PNG plugin decodes
-all pixels to reach an ``eXIf`` chunk behind them, its WebP plugin starts a decoder, and it refuses some TIFFs without a
-usable reason.
+shape of the decoded array is compared with the header later (`decode`). Why Pillow is not used:
+``docs/design/decoding.md``.
 
 A file is complete if it contains its end-of-image marker, IEND, or its last strip; bytes after the end (motion photos)
 are accepted. Data missing from the middle are found when the file is decoded.
