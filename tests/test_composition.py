@@ -103,7 +103,7 @@ REFUSED = [
     ("out=${", r"out=\$\{: "),
     ("out=${no.such}", r"out=\$\{no.such\}: Interpolation key 'no.such' not found"),
     ("camera=null", r"camera=null: expected the name of an option: choice, "),
-    ("experiment=ipol_demo", r"experiment=ipol_demo: a recipe is added to the settings; say \+experiment=ipol_demo"),
+    ("experiment=ipol_demo", r"experiment=ipol_demo: a recipe is added to the settings; write \+experiment=ipol_demo"),
     ("hydra.mode=MULTIRUN", r"hydra.mode=MULTIRUN: settings of Hydra belong to the command line"),
 ]
 

@@ -445,14 +445,14 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "accuracy",
-            "measure error and time of the accuracy tiers; write a report to out (accuracy)",
+            "measure error and time of each tier; write a report to out (accuracy)",
             run_accuracy,
             (SETTINGS_SOURCE,),
             composes=True,
         ),
         Verb(
             "figures",
-            "draw the article's figures for the first photograph; write them to out (figures)",
+            "draw the article's figures for the first photograph, in out (figures)",
             run_figures,
             (SETTINGS_SOURCE,),
             composes=True,
