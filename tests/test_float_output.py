@@ -369,7 +369,7 @@ def test_plan_reports_the_loss_of_odd_sides(photos: Path, door: Door) -> None:
     done = door("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
     assert done.code == 0
     assert "packed    8 of 12 images have an odd side, whose last row or column is omitted: " in done.out
-    assert "one.png: unsupported\n          1 x 1 pixels hold no 2 x 2 sites" in done.out
+    assert "one.png: unsupported\n          1 x 1 pixels contain no 2 x 2 tile" in done.out
 
 
 @pytest.mark.parametrize("accuracy", ["fast", pytest.param("reference", marks=pytest.mark.slow)])

@@ -285,7 +285,7 @@ def rational(value: float) -> tuple[int, int]:
     """
     bits = 30 - max(math.frexp(value)[1], 0)
     if bits < 0:
-        raise ConfigError(f"a colour value of the row is {value:g}; expected at most 2^30, the limit of a DNG")
+        raise ConfigError(f"a colour value of the row is {value:g}; expected less than 2^30, the limit of a DNG")
     return round(math.ldexp(value, bits)), 1 << bits
 
 
