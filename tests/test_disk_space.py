@@ -89,7 +89,7 @@ def test_run_that_does_not_fit_the_disk_ends_with_5_before_its_first_image(
         done.err,
     )
     assert found and little_space < int(found[1]) < 60_000 and int(found[2]) < little_space
-    assert list((tmp_path / "ds/shards").iterdir()) == []
+    assert list((tmp_path / "ds").iterdir()) == []
 
 
 def test_check_disk_false_starts_anyway(little_space: int, tmp_path: Path, make: Make) -> None:

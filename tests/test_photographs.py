@@ -15,6 +15,7 @@ from PIL import Image
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.planning.plan import plan_image
@@ -129,3 +130,10 @@ def test_clip_of_different_photographs_gives_warnings(door: Door, tmp_path: Path
     done = door(f"source.root={tmp_path}", "source.clips=true", "n_jobs=1")
     assert (done.code, "all 2 photographs are in one folder" in done.err) == (0, True), done
     assert "has frames of 14 x 9 and of 8 x 12 pixels" in done.err
+    planned = door("plan", f"source.root={tmp_path}", "source.clips=true", "n_jobs=1")
+    assert "photographs are in one folder" in planned.out
+
+
+def test_row_of_a_scene_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(SourceError, match=r"^unreadable: synthetic scene 'p0.png'"):
+        load_source(SourceConfig(root=None), Source(0, "p0.png", "p0.png", 0))

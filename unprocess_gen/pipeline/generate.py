@@ -120,12 +120,13 @@ def generate(config: Config, label: str = "") -> Summary:
         if workspace.complete:
             facts = workspace.check_complete(listing.sources)
             return _summary(workspace.out, facts, listing, made=0, started=started)
-        workspace.begin(listing.sources)
+        workspace.check_begun(listing.sources)
         tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
         done = set(workspace.committed(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
         if config.check_disk:
             check_free_space(config, todo, workspace.out)
+        workspace.begin(listing.sources)
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         context = RunContext(config, str(workspace.tmp), os.getpid(), core_to_spare=n_jobs < own_cores())
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)

@@ -129,16 +129,19 @@ class Workspace:
         path = self.out / "dataset.json"
         return path.exists() and not any(entry.get("provisional") for entry in read_dataset(path)["shards"])
 
-    def begin(self, sources: Sequence[Source]) -> None:
-        """Start a dataset, or continue one that an earlier run began.
-
-        Raises ConfigError if that run had other settings or sources, naming the differences, or if the folder cannot be
-        written; MachineError if the disk is full.
-        """
+    def check_begun(self, sources: Sequence[Source]) -> None:
+        """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences."""
         self._check_same_settings()
         listing = self.work / "sources.json"
         if listing.exists():
             self._check_same_sources(_read_listing(listing), sources)
+
+    def begin(self, sources: Sequence[Source]) -> None:
+        """Start a dataset, or continue one that an earlier run began and `check_begun` has accepted.
+
+        Raises ConfigError if the folder cannot be written; MachineError if the disk is full.
+        """
+        listing = self.work / "sources.json"
         try:
             self.work.mkdir(exist_ok=True)
             self.rows.mkdir(exist_ok=True)

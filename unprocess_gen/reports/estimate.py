@@ -95,6 +95,8 @@ class RunEstimate:
         readable.
     unmatched : dict of str to int
         Number of files that no pattern of ``source.include`` matches, by suffix.
+    warnings : tuple of str
+        Sentences about the listing, such as clips of different photographs.
     """
 
     sources: int
@@ -107,6 +109,7 @@ class RunEstimate:
     source_estimates: tuple[SourceEstimate, ...]
     tier_ns: dict[str, float]
     unmatched: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     @property
     def pairs(self) -> int:
@@ -159,6 +162,7 @@ def estimate_run(
         source_estimates=estimates,
         tier_ns=_tier_ns(config, estimates, tiers or {}),
         unmatched=listing.unmatched,
+        warnings=listing.warnings,
     )
 
 
@@ -246,7 +250,7 @@ def format_estimate(config: Config, estimate: RunEstimate) -> str:
     unmatched = unmatched_sentence(estimate.unmatched)
     lines = [
         f"sources   {estimate.sources} ({config.source.root or 'built-in scenes'}), {sampled} of them read",
-        *([f"          {unmatched}"] if unmatched else []),
+        *(f"          {sentence}" for sentence in (unmatched, *estimate.warnings) if sentence),
         f"pairs     {about}{estimate.pairs}, in {estimate.shards} shards of {config.output.pairs_per_shard}",
         *_patch_lines(config, estimate.source_estimates),
         f"bytes     {about}{estimate.bytes:,} in shards"

@@ -134,7 +134,10 @@ def downscaled(srgb: Srgb, side: int) -> Srgb:
 
 def _decoded(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
     if config.root is None:
-        pixels = synthetic.scene(source.path)
+        try:
+            pixels = synthetic.scene(source.path)
+        except ValueError as error:  # only the row of an edited manifest can name a scene that does not exist
+            raise SourceError("unreadable", str(error)) from error
         return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)
     if source.is_video:
         return _frame(config, config.root, source)
