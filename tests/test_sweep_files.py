@@ -143,6 +143,28 @@ def test_experiment_without_params_stays_in_the_names() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "repeated",
+    [
+        ["+sweep=cameras", "+sweep=gain_extremes"],
+        ["+experiment=crvd_like", "+experiment=ipol_demo"],
+        ["-m", "seed=1,2", "seed=5"],
+        ["-m", "seed=5", "++seed=1,2"],
+    ],
+)
+def test_repeated_groups_and_swept_keys_are_refused(repeated: list[str], door: Door, tmp_path: Path) -> None:
+    done = door("plan", *repeated)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    first, second = repeated[-2:]
+    assert f"{second}: {first} sets {second.lstrip('+').partition('=')[0]} too; expected one of them; " in done.err
+
+
+def test_repeated_setting_has_its_last_value() -> None:
+    assert jobs("seed=1", "seed=2", "camera=sony_a7r,nexus_6p", multirun=True) == [
+        "camera=sony_a7r,seed=2", "camera=nexus_6p,seed=2",
+    ]  # fmt: skip
+
+
 def test_mode_on_the_command_line_starts_a_sweep() -> None:
     assert jobs("hydra.mode=MULTIRUN", "seed=1,2") == ["seed=1", "seed=2"]
 

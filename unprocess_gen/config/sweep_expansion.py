@@ -212,25 +212,37 @@ def check_job(node: DictConfig, job: SweepJob) -> None:
 
 
 def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
-    """Parse overrides with Hydra's grammar; a key that occurs twice has its last value."""
+    """Parse overrides with Hydra's grammar; a key that occurs twice has its last value, as in Hydra."""
     parser = OverridesParser.create(config_loader=_GroupOptions(folders))  # type: ignore[arg-type]
+    choices: dict[str, _Choice] = {}
     try:
         parsed = parser.parse_overrides([quoted_path(one) for one in overrides])
-        choices = {}
         for text, one in zip(overrides, parsed, strict=True):
             key = one.get_key_element()
             if not one.is_sweep_override():
-                choices[key] = _Choice(key, (one.get_value_element_as_str(),), False, text)
+                choice = _Choice(key, (one.get_value_element_as_str(),), False, text)
             elif not one.is_discrete_sweep():
-                choices[key] = _Choice(key, (), True, text)  # an interval: for sweeper plugins only
+                choice = _Choice(key, (), True, text)  # an interval: for sweeper plugins only
             else:
                 values = tuple(itertools.islice(one.sweep_string_iterator(), MAX_JOBS + 1))
-                choices[key] = _Choice(key, values, True, text)
+                choice = _Choice(key, values, True, text)
+            _refuse_repetition(choice, choices.values())
+            choices[key] = choice
     except (HydraException, ValueError, RecursionError) as error:
         raise ConfigError(explain(error, overrides)) from error
     if math.prod(max(len(choice.values), 1) for choice in choices.values()) > MAX_JOBS:
         raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
     return list(choices.values())
+
+
+def _refuse_repetition(choice: _Choice, earlier: Iterable[_Choice]) -> None:
+    """Refuse an added group, or the key of a sweep, that an earlier override sets: its values would be lost."""
+    for other in earlier:
+        if other.name == choice.name and (choice.adds_group or choice.swept or other.swept):
+            raise ConfigError(
+                f"{choice.text}: {other.text} sets {choice.name} too; expected one of them; remove the other, or "
+                "separate the values of a sweep by commas"
+            )
 
 
 def _combinations(choices: Iterable[_Choice]) -> Iterator[dict[str, str]]:
