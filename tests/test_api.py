@@ -55,6 +55,26 @@ def test_every_exported_name_exists_and_is_listed(name: str) -> None:
     assert name in dir(ug)
 
 
+def test_dir_lists_public_names_only() -> None:
+    assert dir(ug) == sorted(ug.__all__)
+
+
+def test_overrides_instead_of_a_config_are_a_type_error() -> None:
+    for call in (ug.generate, lambda overrides: ug.make_pair(SRGB, overrides)):
+        with pytest.raises(TypeError, match=r"^config=\['seed=1'\]: is of type list; expected a Config; make it with "):
+            call(["seed=1"])
+
+
+def test_raw_pairs_shows_its_folder_and_length(dataset: Path) -> None:
+    pairs = ug.RawPairs(dataset)
+    assert repr(pairs) == f"RawPairs({str(dataset)!r}, length=13)"
+    assert repr(pairs[:2]) == f"RawPairs({str(dataset)!r}, length=2)"
+
+
+def test_replay_takes_one_number_as_key(dataset: Path) -> None:
+    assert [one.key for one in ug.replay(dataset, keys=2)] == ["00000002"]
+
+
 def test_importing_the_package_imports_nothing_heavy(tmp_path: Path) -> None:
     code = "import sys, unprocess_gen; print(sorted({'numpy', 'hydra', 'numba', 'cv2'} & set(sys.modules)))"
     assert run_python(code, tmp_path).stdout == "[]\n"

@@ -319,7 +319,7 @@ REFUSED = [
     ("output.pairs_per_shard=0", r"output.pairs_per_shard=0: expected 1 to 1000000"),
     ("output.pairs_per_shard=1000001", r"output.pairs_per_shard=1000001: expected 1 to 1000000"),
     ("noise=imx385", r"scene.iso=100: noise=imx385 is calibrated for ISO 1600, 3200, .* give noise.iso="),
-    ("noise=sony_a7s2;noise.iso=1800", r"noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 200, 200 to "),
+    ("noise=sony_a7s2;noise.iso=1800", r"noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to "),
     ("noise=sony_a7s2;noise.iso=[uniform,1000,3000]", r"noise.iso=\[uniform, 1000, 3000\]: noise=sony_a7s2 is "),
     ("noise=sony_a7s2;noise.a=3", r"noise.a=3: noise=sony_a7s2 is a physical profile; expected null"),
     ("noise.iso=3200", r"noise.iso=3200: noise=imx385_iso3200 holds for one ISO"),

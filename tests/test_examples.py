@@ -25,4 +25,5 @@ def test_example_runs_and_prints_its_results(path: Path, tmp_path: Path) -> None
     )
     assert done.returncode == 0, done.stderr
     assert "3 pairs in 1 shard" in done.stdout
+    assert int(done.stdout.partition("difference from the photograph: ")[2].split()[0]) < 5
     assert "did you mean" in done.stdout or "camera=leica" in done.stdout

@@ -110,7 +110,7 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
         Replaces ``config.seed``.
     key : str or int, optional
         Identity of the image, from which its random streams follow together with the seed; by default a digest of the
-        array. The ``source_sha256`` of a dataset's row gives the parameters of that row.
+        array. It is not the ``key`` of a manifest row: the ``source_sha256`` of a row gives the parameters of that row.
 
     Returns
     -------
@@ -121,6 +121,8 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     ------
     ConfigError
         If the config is incomplete or not allowed, or ``source.patch`` is set.
+    TypeError
+        If ``config`` is not a config.
     ValueError
         If ``srgb`` has another dtype or shape.
     """
@@ -144,7 +146,7 @@ def make_pair(
     seed : int, optional
         Replaces ``config.seed``. Not with a plan.
     key : str or int, optional
-        Identity of the image, see `plan_image`. Not with a plan.
+        Identity of the image, not the ``key`` of a manifest row; see `plan_image`. Not with a plan.
 
     Returns
     -------
@@ -157,6 +159,8 @@ def make_pair(
         If the config is incomplete or not allowed, ``source.patch`` is set, or ``seed`` or ``key`` come with a plan.
     MachineError
         If the self-test of the kernels fails on this machine.
+    TypeError
+        If ``config`` is neither a config nor a plan.
     ValueError
         If ``srgb`` has another dtype or shape.
 
@@ -206,6 +210,8 @@ def generate(config: Config) -> _generate.Summary:
         If ``out`` is a finished dataset with missing files.
     MachineError
         If the disk is full or fails, or a source was changed or deleted.
+    TypeError
+        If ``config`` is not a config.
     """
     _check_complete(config)
     validate_config(config)
@@ -244,7 +250,7 @@ def verify(folder: PathLike) -> list[_verify.Damage]:
 
 def replay(
     folder: PathLike,
-    keys: str | Iterable[str | int] | None = None,
+    keys: int | str | Iterable[str | int] | None = None,
     *,
     root: PathLike | None = None,
     to: PathLike | None = None,
@@ -255,8 +261,8 @@ def replay(
     ----------
     folder : path-like
         Folder of the dataset, or a ``manifest.csv``.
-    keys : str or iterable of str and int, optional
-        Source indices, ranges and keys: ``"3,7-9"`` or ``[3, "7-9", "00000003-p0007"]``; all rows if omitted.
+    keys : int, str, or iterable of str and int, optional
+        Source indices, ranges and keys: ``3``, ``"3,7-9"`` or ``[3, "7-9", "00000003-p0007"]``; all rows if omitted.
     root : path-like, optional
         Folder of the sources; by default the one that ``dataset.json`` records.
     to : path-like, optional
@@ -278,8 +284,9 @@ def replay(
     """
     manifest = Path(folder)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
-    selected = keys if keys is None or isinstance(keys, str) else ",".join(map(str, keys))
-    rows = select_rows(manifest, None, selected)
+    if keys is not None and not isinstance(keys, str):
+        keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))
+    rows = select_rows(manifest, None, keys)
     source_root = _replay.source_root(manifest, None if root is None else os.fspath(root))
     return list(_replay.replay(rows, source_root, None if to is None else Path(to)))
 
@@ -359,7 +366,12 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
 
 
 def _check_complete(config: Config) -> None:
-    """Raise ConfigError for ``Config()``, whose gains are in the option files."""
+    """Raise TypeError for another type, and ConfigError for ``Config()``, whose gains are in the option files."""
+    if not isinstance(config, Config):
+        raise TypeError(
+            f"config={repr(config)[:60]}: is of type {type(config).__name__}; expected a Config; "
+            "make it with unprocess_gen.load_config([…])"
+        )
     for name in ("red", "blue", "inverse_rgb"):
         if getattr(config.gains, name) is None:
             raise ConfigError(

@@ -3,7 +3,7 @@
 It writes below a temporary folder and needs only unprocess_gen.
 """
 
-# %% A photograph: any uint8 or uint16 array [H, W, 3] in R, G, B order
+# %% A photograph, here a smooth one: any uint8 or uint16 array [H, W, 3] in R, G, B order
 import tempfile
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 import unprocess_gen as ug
 
 y, x = np.mgrid[0:120, 0:160]
-srgb = np.stack([x * 255 // 159, y * 255 // 119, (x + y) % 256], axis=-1).astype(np.uint8)
+srgb = np.stack([x + 40, y + 60, 200 - (x + y) // 2], axis=-1).astype(np.uint8)
 
 # %% A config: the overrides of the command line
 config = ug.load_config(["camera=sony_a7r", "noise=imx385_iso3200", "seed=7"])

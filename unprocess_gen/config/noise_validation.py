@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from decimal import Decimal
 from typing import Any
 
@@ -235,15 +236,29 @@ def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
     key, value = ("scene.iso", scene.iso) if noise.iso is None else ("noise.iso", noise.iso)
     drawn = parse_distribution(key, value, SCENE_DISTRIBUTIONS)
     ends = drawn.numbers
-    inside = all(branch_of(noise, iso) is not None for iso in ends)
-    if inside and drawn.kind not in ("constant", "choice"):
-        inside = any(branch.iso[0] <= min(ends) and max(ends) <= branch.iso[1] for branch in noise.branches)
-    if not inside:
-        ranges = ", ".join(
-            f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in (b.iso for b in noise.branches)
-        )
-        advice = "" if noise.iso is not None else f" (the ISO of scene={scene.name}); give noise.iso=…"
-        raise ConfigError(f"{key}={value_text(value)}: noise={noise.name} is calibrated for ISO {ranges}{advice}")
+    branches = [(branch.iso[0], branch.iso[1]) for branch in noise.branches]
+    if any(branch_of(noise, iso) is None for iso in ends):
+        ranges, expected = _merged(branches), ""
+    elif drawn.kind not in ("constant", "choice") and not any(
+        low <= min(ends) and max(ends) <= high for low, high in branches
+    ):
+        ranges, expected = branches, "; expected a distribution within one of these ranges"
+    else:
+        return
+    texts = ", ".join(f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in ranges)
+    advice = "" if noise.iso is not None else "; give noise.iso=…"
+    raise ConfigError(f"{key}={value_text(value)}: noise={noise.name} is calibrated for ISO {texts}{expected}{advice}")
+
+
+def _merged(branches: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return ranges in ascending order; those that touch or overlap become one."""
+    ranges: list[tuple[float, float]] = []
+    for low, high in sorted(branches):
+        if ranges and low <= ranges[-1][1]:
+            ranges[-1] = ranges[-1][0], max(high, ranges[-1][1])
+        else:
+            ranges.append((low, high))
+    return ranges
 
 
 def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:

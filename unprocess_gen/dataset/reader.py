@@ -134,6 +134,9 @@ class RawPairs:
     def __len__(self) -> int:
         return len(self._offsets)
 
+    def __repr__(self) -> str:
+        return f"RawPairs({str(self.path)!r}, length={len(self)})"
+
     def __iter__(self) -> Iterator[Sample]:
         return (self[number] for number in range(len(self)))
 

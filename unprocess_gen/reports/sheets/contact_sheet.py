@@ -200,7 +200,7 @@ def _frame_panels(
     return (
         SheetPanel(
             f"{name} raw, own stretch",
-            f"{low:.6g} to {high:.6g} DN, its least and greatest",
+            f"{low:.6g} to {high:.6g} DN, its minimum and maximum",
             stretch_own(overview),
             stretch_own(detail),
         ),
@@ -253,6 +253,11 @@ def _difference_panel(
     clean = pair.clean[window.rows, window.columns]
     detail = pair.noisy[window.rows, window.columns].astype(np.float64) - clean
     limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(one * one))), 1.0) for one in (overview, detail)]
-    note = f"black to white: +-{limits[0]:.3g} DN (averaged), +-{limits[1]:.3g} DN (detail)"
+    note = f"black to white: {_symmetric(limits[0])} (averaged), {_symmetric(limits[1])} (detail)"
     pictures = [to_codes((one / dn + 1) / 2) for one, dn in zip((overview, detail), limits, strict=True)]
     return SheetPanel("noisy - clean", note, *pictures)
+
+
+def _symmetric(dn: float) -> str:
+    """Return the range from -dn to dn in words, because OpenCV's font lacks the plus-minus sign."""
+    return f"from -{dn:.3g} to {dn:.3g} DN"

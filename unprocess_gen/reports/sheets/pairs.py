@@ -84,8 +84,8 @@ def sheet_heading(pair: SheetPair, window: DetailWindow) -> list[str]:
         f"{plan.black_level_dn}, white {plan.white_level_dn} DN",
         f"camera {plan.camera}, gains red {plan.red_gain:.4g}, blue {plan.blue_gain:.4g}, inverse rgb "
         f"{plan.inverse_rgb_gain:.4g}, highlights {plan.highlight}, tone {plan.tone}, gamma {plan.gamma}; "
-        f"scene {plan.scene}{exposure}; noise {plan.noise}: a {plan.a_dn:.4g} DN, b {plan.b_dn2:.4g} DN^2, effects "
-        f"{' '.join(plan.effects) or 'none'}",
+        f"scene {plan.scene}{exposure}; noise {plan.noise}: a {plan.a_dn:.4g} DN, b {plan.b_dn2:.4g} DN squared, "
+        f"effects {' '.join(plan.effects) or 'none'}",
         f"details below the frames: rows {window.rows.start} to {window.rows.stop - 1}, columns "
         f"{window.columns.start} to {window.columns.stop - 1}, one pixel per site",
     ]
