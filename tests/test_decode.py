@@ -394,6 +394,13 @@ def test_other_formats_are_unsupported(data: bytes) -> None:
     assert reason_of(data) == "unsupported"
 
 
+@pytest.mark.parametrize(("brand", "name"), [(b"heic", "HEIC"), (b"mif1", "HEIC"), (b"avif", "AVIF")])
+def test_heif_content_is_named_with_advice(brand: bytes, name: str) -> None:
+    with pytest.raises(SourceError) as caught:
+        decode(b"\0\0\0\x1cftyp" + brand + bytes(16), max_pixels=2**26, icc="ignore")
+    assert (caught.value.reason, caught.value.text) == ("unsupported", f"{name}; convert it to JPEG, PNG or TIFF")
+
+
 GRADES = noise(4, 6, channels=1)[..., 0]
 UNSUPPORTED = {
     "float tiff": tiff(GRADES.astype(np.float32), "minisblack"),

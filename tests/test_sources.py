@@ -83,7 +83,13 @@ def test_unmatched_files_are_counted_by_suffix(tmp_path: Path) -> None:
 
 def test_unmatched_sentence_names_suffixes_and_what_to_do() -> None:
     assert unmatched_sentence({}) == ""
-    assert unmatched_sentence({".heic": 1}).startswith("1 file is not matched by source.include (1 .heic); convert")
+    assert unmatched_sentence({".heic": 1}) == (
+        "1 file is not matched by source.include (1 .heic); convert .heic to JPEG, PNG or TIFF"
+    )
+    assert unmatched_sentence({".png": 2, ".dng": 1, ".jpg": 1}).endswith(
+        "(2 .png, 1 .dng, 1 .jpg); extend source.include to read .jpg, .png; convert .dng to JPEG, PNG or TIFF"
+    )
+    assert unmatched_sentence({".tar": 2, ".csv": 1}) == ("3 files are not matched by source.include (2 .tar, 1 .csv)")
     many = {f".{letter}": 9 for letter in "abcdefg"} | {"": 1}
     sentence = unmatched_sentence(many)
     assert "64 files are not matched" in sentence

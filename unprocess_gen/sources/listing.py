@@ -35,6 +35,17 @@ MAX_FILE_BYTES = 2**30
 NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
 
+READABLE_SUFFIXES = frozenset((".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"))
+"""Suffixes of photographs that can be decoded; `unmatched_sentence` advises to extend ``source.include``."""
+
+CONVERTIBLE_SUFFIXES = frozenset(
+    (
+        *(".avif", ".gif", ".heic", ".heif", ".hif", ".jp2", ".jxl", ".ppm", ".psd"),
+        *(".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2"),
+    )
+)
+"""Suffixes of photographs that cannot be decoded; `unmatched_sentence` advises to convert them."""
+
 Stamp = tuple[int, int, int, int]
 """Device, inode, size in bytes and modification time in nanoseconds of a file."""
 
@@ -155,7 +166,7 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
     Returns
     -------
     str
-        How many files, which suffixes and what to do; empty if every file matches.
+        How many files, which suffixes, and what to do about those of photographs; empty if every file matches.
     """
     total = sum(unmatched.values())
     if not total:
@@ -164,7 +175,14 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
     others = sum(list(unmatched.values())[NAMED_SUFFIXES:])
     kinds = ", ".join([*named, *([f"{others} others"] if others else [])])
     files = "1 file is" if total == 1 else f"{total} files are"
-    return f"{files} not matched by source.include ({kinds}); convert photographs among them to JPEG, PNG or TIFF"
+    readable, convertible = (
+        ", ".join(sorted(unmatched.keys() & suffixes)) for suffixes in (READABLE_SUFFIXES, CONVERTIBLE_SUFFIXES)
+    )
+    return (
+        f"{files} not matched by source.include ({kinds})"
+        + (f"; extend source.include to read {readable}" if readable else "")
+        + (f"; convert {convertible} to JPEG, PNG or TIFF" if convertible else "")
+    )
 
 
 def encode_name(path: str) -> str:

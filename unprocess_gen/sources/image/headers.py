@@ -602,10 +602,16 @@ _FORMATS = {
 }
 
 
+_HEIF = re.compile(rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1|(?P<avif>avi[fs]))", re.DOTALL)
+"""First bytes of photographs of telephones, which often have the suffix of a JPEG."""
+
+
 def _header(data: bytes) -> Header:
     if not data:
         raise SourceError("empty", "the file has 0 bytes")
     name = next((name for name, each in _FORMATS.items() if each.magic.match(data)), None)
+    if name is None and (heif := _HEIF.match(data)):
+        raise SourceError("unsupported", f"{'AVIF' if heif['avif'] else 'HEIC'}; convert it to JPEG, PNG or TIFF")
     if name is None:
         raise _unsupported(f"a file that begins with {data[:8].hex(' ')}")
     try:
