@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import COMMAND, fill
+from conftest import COMMAND, fill, pixels
 from PIL import Image
 
 from unprocess_gen import RawPairs, __version__
@@ -412,10 +412,34 @@ def test_again_of_scenes_needs_no_source(
     assert tree_hash(tmp_path / "new") == tree_hash(tmp_path / "old")
 
 
-def test_again_reports_a_different_dataset(door: Door, make: Make, tmp_path: Path) -> None:
+def test_again_refuses_missing_and_resized_sources_before_generating(door: Door, make: Make, tmp_path: Path) -> None:
     make(fill(tmp_path / "p", 2), tmp_path / "old")
+    size = (tmp_path / "p/001.png").stat().st_size
+    with (tmp_path / "p/001.png").open("ab") as file:
+        file.write(b"0")
+    done = door("again", "old", "source.root=p", "out=new", "n_jobs=1")
+    assert done.code == 5
+    assert f"source 001.png: has {size + 1} bytes in p; expected {size}, as recorded; restore the file" in done.err
     fill(tmp_path / "other", 2, first=7)
     done = door("again", "old", "source.root=other", "out=new", "n_jobs=1")
+    assert (done.code, "source 000.png: is missing from other; restore the file" in done.err) == (5, True)
+    assert not (tmp_path / "new").exists()
+
+
+def test_again_names_a_source_of_equal_size_and_other_content(door: Door, make: Make, tmp_path: Path) -> None:
+    for folder, seed in (("p", 1), ("other", 2)):
+        (tmp_path / folder).mkdir()
+        Image.fromarray(pixels(seed, 9, 14)).save(tmp_path / folder / "a.bmp")
+    make(tmp_path / "p", tmp_path / "old")
+    done = door("again", "old", "source.root=other", "out=new", "n_jobs=1")
+    assert done.code == 5
+    assert "source a.bmp: has the SHA-256 " in done.err
+
+
+def test_again_reports_a_different_dataset(door: Door, make: Make, tmp_path: Path) -> None:
+    make(fill(tmp_path / "p", 2), tmp_path / "old")
+    fill(tmp_path / "p", 1, first=7)
+    done = door("again", "old", "source.root=p", "out=new", "n_jobs=1")
     assert (done.code, done.err.splitlines()[-1]) == (
         4,
         "gen-dataset: new/manifest.csv: differs from old/manifest.csv; check that the sources are the same",

@@ -154,6 +154,16 @@ def test_unmatched_files_are_counted_by_suffix_with_advice(settings: Settings, t
     assert "3 files are not matched by source.include (2 .heic, 1 .txt); convert " in line
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+def test_compiling_kernels_is_announced_unless_they_are_compiled(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, compiled: bool
+) -> None:
+    monkeypatch.setattr("unprocess_gen.simulation.self_test.are_compiled", lambda kernels: compiled)
+    caplog.set_level("INFO", "unprocess_gen")
+    estimate_run(settings("source.limit=1"), 1, True)
+    assert caplog.messages == ([] if compiled else ["compiling kernels, once per machine and version"])
+
+
 def test_failed_source_is_listed_with_its_explanation(settings: Settings, tmp_path: Path) -> None:
     (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"no picture")
     config = settings(f"source.root={tmp_path / 'p'}")

@@ -187,7 +187,7 @@ def run_again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.config.serialization import read_dataset_yaml
     from unprocess_gen.config.validation import validate_config
-    from unprocess_gen.pipeline.replay import source_root
+    from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_root
     from unprocess_gen.pipeline.verify import have_same_rows
 
     folder = _dataset("again", call)
@@ -211,11 +211,14 @@ def run_again(call: Call) -> int:
     config.n_jobs = call.values.get("n_jobs", config.n_jobs)
     config.source.max_failed = call.values.get("max_failed", config.source.max_failed)
     validate_config(config)
-    code, _ = generate_dataset(config)
     old, new = folder / "manifest.csv", Path(config.out) / "manifest.csv"
+    if root is not None and Path(root).exists() and old.exists():
+        check_source_sizes(old, root)
+    code, _ = generate_dataset(config)
     if not old.exists():
         print_result(f"{folder} has no manifest.csv to compare with")
     elif not have_same_rows(old, new):
+        check_source_digests(old, new)
         raise DamageError(f"{new}: differs from {old}; check that the sources are the same")
     elif old.stat().st_size == new.stat().st_size:
         print_result(f"the same as {folder}, bit for bit")

@@ -19,7 +19,7 @@ from unprocess_gen.core.files import array_xxh3, machine_error
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
 from unprocess_gen.dataset.keys import image_key
-from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, rows_with_offsets
+from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, read_rows, rows_with_offsets
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources import listing
@@ -81,6 +81,63 @@ def source_root(manifest: Path, root: str | None) -> str | None:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return None if recorded is None else str(recorded)
+
+
+def check_source_sizes(manifest: Path, root: str) -> None:
+    """Compare the sizes of the source files with those that a manifest records; opens no source.
+
+    Parameters
+    ----------
+    manifest : Path
+        The manifest.
+    root : str
+        Folder of the sources, or the single photograph; it exists.
+
+    Raises
+    ------
+    SourceChangedError
+        If a file is missing or has another size; names the first one.
+    DamageError
+        If the manifest cannot be read.
+    """
+    last = ""
+    for row in read_rows(manifest):
+        name, recorded = str(row["source"]), row["source_bytes"]
+        if name == last or not recorded:  # built-in scenes and unreadable files have no size
+            continue
+        last = name
+        try:
+            size = Path(listing.source_file(root, listing.decode_name(name))).stat().st_size
+        except (OSError, ValueError, SourceError):
+            raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
+        if size != recorded:
+            raise SourceChangedError(
+                f"source {name}: has {size} bytes in {root}; expected {recorded}, as recorded; {ADVICE}"
+            )
+
+
+def check_source_digests(old: Path, new: Path) -> None:
+    """Compare the digests of sources that two manifests record.
+
+    Parameters
+    ----------
+    old, new : Path
+        The manifests.
+
+    Raises
+    ------
+    SourceChangedError
+        If a source that is in both has another SHA-256; names the first one.
+    DamageError
+        If a manifest cannot be read.
+    """
+    recorded = {row["source"]: row["source_sha256"] for row in read_rows(old)}
+    for row in read_rows(new):
+        name, sha256 = row["source"], row["source_sha256"]
+        if sha256 and recorded.get(name) and sha256 != recorded[name]:
+            raise SourceChangedError(
+                f"source {name}: has the SHA-256 {sha256}; expected {recorded[name]}, as recorded; {ADVICE}"
+            )
 
 
 def evenly_spaced_rows(manifest: Path, count: int) -> Iterator[Row]:

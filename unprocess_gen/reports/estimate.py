@@ -7,9 +7,10 @@ read, because the size of a pair depends only on its width, height and name.
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,13 @@ from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_f
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark.measure import measure_tier_times
 from unprocess_gen.reports.formatting import value_range
+from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.listing import unmatched_sentence
 from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches, pixels_in_none
+
+LOGGER = logging.getLogger("unprocess_gen")
 
 SAMPLE = 16
 """Number of sources read unless all are asked for."""
@@ -147,7 +151,7 @@ def estimate_run(
     listing = list_photographs(config.source)
     sources = listing.sources
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
-    _compile_kernels(config)
+    _compile_kernels(config, (tiers or {}).values())
     estimates = tuple(estimate_source(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
     seconds = sum(source.seconds for source in estimates) / len(estimates) * len(sources) / n_jobs
@@ -220,10 +224,20 @@ def _tier_ns(
     return {}
 
 
-def _compile_kernels(config: Config) -> None:
-    """Make pairs of a tiny image, so that the time of the first source does not include compilation."""
+def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> None:
+    """Make pairs of a tiny image, so that the time of the first source does not include compilation.
+
+    Logs first that kernels will be compiled, those of the tiers included, because it takes up to 20 seconds.
+    """
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
-    for _ in make_pairs(srgb, plan_pairs(config, "0" * 64, facts=facts_for(config, srgb))):
+    plans, *of_tiers = (
+        plan_pairs(one, "0" * 64, facts=facts_for(one, srgb))
+        for one in (config, *(replace(config, accuracy=tier) for tier in tiers))
+    )
+    needed = {self_test.kernels(plan) for some in (plans, *of_tiers) for plan in some}
+    if not all(self_test.are_compiled(kernels) for kernels in needed):
+        LOGGER.info("compiling kernels, once per machine and version")
+    for _ in make_pairs(srgb, plans):
         pass
 
 
