@@ -95,7 +95,10 @@ REFUSED = [
     ("source.rot=p", r"source.rot=p: no such key; source has root, .*; did you mean root\?"),
     ("sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
     ("+sed=1", r"sed=1: no such key; expected one of source, .*; did you mean seed\?"),
-    ("seed=abc", r"seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
+    ("seed=abc", r"seed=abc: expected an integer"),
+    ("check_disk=maybe", "check_disk=maybe: expected true or false"),
+    ("source.include=*.jpg", r"source.include=\*.jpg: expected a list, such as \[\*.jpg\]"),
+    ("camera=sony_a7r,leica", "camera=sony_a7r,leica: several values; expected one$"),
     ("seed=-1", r"seed=-1: expected 0 to "),
     ("seed=[1", r"seed=\[1: not a valid override"),
     ("seed", r"seed: expected a setting key=value"),
@@ -130,8 +133,13 @@ def test_long_keys_are_refused_in_one_sentence() -> None:
 def test_sweeps_are_refused() -> None:
     with pytest.raises(ConfigError, match="the overrides describe a sweep; expected one config"):
         load_config(["+sweep=cameras"])
-    with pytest.raises(ConfigError, match=r"seed=1,2: several values; expected one; .*write seed=\[1,2\]"):
+    with pytest.raises(ConfigError, match=r"seed=1,2: several values; expected one; for a list, write seed=\[1,2\]"):
         load_config(["seed=1,2"])
+
+
+def test_one_string_of_overrides_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"overrides='seed=1': one string; expected a list .*\['seed=1'\]"):
+        load_config("seed=1")
 
 
 def test_a_missing_config_dir_is_refused(tmp_path: Path) -> None:

@@ -302,6 +302,17 @@ def test_every_dataset_of_a_sweep_is_verified(copy: Path, tmp_path: Path) -> Non
     ]
 
 
+def test_unfinished_dataset_of_an_interrupted_sweep_is_named(copy: Path, tmp_path: Path) -> None:
+    folder = sweep(tmp_path / "sweep", copy, ("seed=1", "0"))
+    (folder / "seed=2/.work").mkdir(parents=True)
+    (folder / "notes").mkdir()
+    results = [(result.folder, [str(damage) for damage in result.damages]) for result in verify_sweep(folder)]
+    assert results == [
+        ("seed=1", []),
+        ("seed=2", ["dataset.json: is missing: the sweep ended before this job; rerun the sweep to finish it"]),
+    ]
+
+
 @pytest.mark.parametrize("name", ["../ds", "/etc", "", "..", "a/b"])
 def test_sweep_table_naming_a_folder_elsewhere_is_refused(name: str, copy: Path, tmp_path: Path) -> None:
     folder = sweep(tmp_path / "sweep", copy, (name, "1"))

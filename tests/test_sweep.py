@@ -85,7 +85,7 @@ def test_sweep_csv_of_version_0_1_keeps_its_rows(door: Door, source: Path, tmp_p
 
     rows = table(tmp_path / "sweep")
     assert [(row["folder"], row["rows"], row["seed"], row["exit"]) for row in rows] == [
-        ("seed=1", "3", "1", "0"), ("seed=2", "3", "2", "0"), ("seed=7", "3", "", "0"),
+        ("seed=7", "3", "", "0"), ("seed=1", "3", "1", "0"), ("seed=2", "3", "2", "0"),
     ]  # fmt: skip
 
 
@@ -132,6 +132,23 @@ def test_unknown_option_in_one_job_does_not_stop_others(door: Door, source: Path
         ]
 
 
+def test_refused_last_job_has_a_row(door: Door, source: Path, tmp_path: Path) -> None:
+    done = door("-m", "camera=sony_a7r,leica", "source.root=p", "out=sweep", "n_jobs=1")
+    assert done.code == 2
+    assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+        ("camera=sony_a7r", "0"),
+        ("camera=leica", "2"),
+    ]
+
+
+@pytest.mark.parametrize("out", ["${nope}", "${oc.env:UG_NOT_SET}/x"])
+@pytest.mark.parametrize("flags", [(), ("--cfg", "job", "--resolve"), ("-m",)], ids=" ".join)
+def test_out_that_cannot_be_resolved_is_refused(out: str, flags: tuple[str, ...], door: Door, tmp_path: Path) -> None:
+    done = door(*flags, f"out={out}")
+    assert (done.code, done.err.count("\n"), os.listdir(tmp_path)) == (2, 1, [])
+    assert "nope" in done.err or "UG_NOT_SET" in done.err
+
+
 def test_glob_expands_to_matching_options(door: Door, source: Path, tmp_path: Path) -> None:
     assert door("-m", "camera=glob(s*)", "source.root=p", "out=sweep", "n_jobs=1").code == 0
     assert sorted(os.listdir(tmp_path / "sweep")) == ["camera=sony_a7r", "camera=sony_rx100", "sweep.csv"]
@@ -161,10 +178,10 @@ def test_repeated_sweep_changes_nothing(door: Door, source: Path, tmp_path: Path
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 
-def test_second_sweep_into_a_folder_keeps_earlier_rows(door: Door, source: Path, tmp_path: Path) -> None:
-    for seeds in ("seed=1,2", "seed=2,3"):
+def test_rows_of_a_second_sweep_follow_earlier_rows(door: Door, source: Path, tmp_path: Path) -> None:
+    for seeds in ("seed=2,1", "seed=3,1"):
         door("-m", seeds, "source.root=p", "out=sweep", "n_jobs=1")
-    assert sorted(row["folder"] for row in table(tmp_path / "sweep")) == ["seed=1", "seed=2", "seed=3"]
+    assert [row["folder"] for row in table(tmp_path / "sweep")] == ["seed=2", "seed=1", "seed=3"]
 
 
 @pytest.mark.parametrize(

@@ -219,6 +219,16 @@ def test_unknown_key_in_a_sweep_fails_its_jobs_only(mine: Path, door: Door) -> N
     ]  # fmt: skip
 
 
+def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, door: Door) -> None:
+    write(mine / "sweep/seeds.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "1,2"}}}}, header="")
+    done = door("+sweep=seeds", *REST)
+    assert (done.code, done.err) == (
+        2,
+        "gen-dataset: sweep=seeds: the keys of the file are below 'sweep'; expected '# @package _global_' as its "
+        "first line\n",
+    )
+
+
 def test_a_sweep_without_plus_is_refused_with_advice(door: Door) -> None:
     done = door("sweep=cameras")
     assert (done.code, done.err) == (

@@ -203,8 +203,9 @@ def _default(field: Any) -> Any:
 
 
 def _values(key: str, current: str, folders: list[Path]) -> tuple[str, list[str]]:
-    """Return the values of a key: options of a group, true and false, the states of an effect, folders."""
+    """Return the values of a key: options of a group, strings, booleans, folders; and of the last item of a list."""
     from unprocess_gen.config.schema import Config
+    from unprocess_gen.config.validation import CHOICES
 
     if key == "out":
         return FOLDERS, []
@@ -217,4 +218,9 @@ def _values(key: str, current: str, folders: list[Path]) -> tuple[str, list[str]
         values = ("true", "false")
     elif group == "effects" and name and name != "tolerance":
         values = SWITCHED
-    return WORDS, _starting(current, (f"{key}={value}" for value in values))
+    elif key in CHOICES:
+        values = CHOICES[key]
+    before, comma, _ = current.rpartition(",")  # of a sweep: camera=sony_a7r,nex
+    listed = before.partition("=")[2].split(",")
+    start = f"{before}," if comma else f"{key}="
+    return WORDS, _starting(current, (f"{start}{value}" for value in values if value not in listed))

@@ -69,7 +69,7 @@ def compose(
         return task(validated_config(expansion.node, request.overrides), "")[0]
     if request.prints_config:
         return worst([_print_with_hydra(request.flags, list(job.overrides)) for job in expansion.jobs])
-    if expansion.plugins and use_plugins:
+    if expansion.plugins:
         from unprocess_gen.cli.sweep_plugins import run_with_plugins
 
         return run_with_plugins(request, expansion, task)
@@ -89,12 +89,14 @@ def _run_sweep(
     """Run every job of a sweep, one after the other, and return the worst exit code."""
     rows: list[JobRow] = []
     results: list[Any] = []
+    sweep_folder: Path | None = None
     for place, job in enumerate(expansion.jobs, start=1):
         row, out, result = _run_job(request.folders(), job, task, f"{place}/{len(expansion.jobs)}")
         rows.append(row)
         results += [] if result is None else [result]
-        if sweep_csv and out is not None:
-            write_table(out, rows)
+        sweep_folder = out or sweep_folder  # a refused job has no out; its row goes where the others are
+        if sweep_csv and sweep_folder is not None:
+            write_table(sweep_folder, rows)
     if totals is not None and results:
         print_result(totals(results))
     return worst(row.exit for row in rows)

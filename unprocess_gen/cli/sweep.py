@@ -128,7 +128,9 @@ def worst(exit_codes: Iterable[int]) -> int:
 
 
 def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
-    """Write ``sweep.csv`` in the sweep's folder, if the folder exists; rows of other sweeps are kept.
+    """Write ``sweep.csv`` in the sweep's folder, if the folder exists.
+
+    Earlier rows keep their places, so that the indices of `RawPairs` do not change; new rows follow them.
 
     Parameters
     ----------
@@ -140,21 +142,19 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
     if not out.is_dir():
         return
     path = out / "sweep.csv"
-    earlier = {row["folder"]: row for row in read_table(path)}
-    rows = []
+    rows = {row["folder"]: row for row in read_table(path)}
     for job in jobs:
         row = dict(job.cells)
-        before = earlier.pop(job.folder, {})
-        if not job.generated and before.get("seconds"):
-            row["seconds"] = before["seconds"]
-        rows.append(row)
-    rows += earlier.values()
-    keys = dict.fromkeys(key for row in rows for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS})
+        seconds = rows.get(job.folder, {}).get("seconds")
+        if not job.generated and seconds:
+            row["seconds"] = seconds
+        rows[job.folder] = row
+    keys = dict.fromkeys(key for row in rows.values() for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS})
     temporary = out / "sweep.csv.part"
     with temporary.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(rows.values())
     os.replace(temporary, path)
 
 

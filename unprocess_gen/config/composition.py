@@ -97,6 +97,8 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
     ConfigError
         If an override, an option file or a value is not allowed. The message names key, value and what is allowed.
     """
+    if isinstance(overrides, str):
+        raise ConfigError(f"overrides={overrides!r}: one string; expected a list of strings; write [{overrides!r}]")
     for override in overrides:
         check_override(override)
         if re.match(r"\+*hydra\b", override) and not override.startswith("hydra.searchpath="):
@@ -185,8 +187,36 @@ def is_multirun(node: DictConfig) -> bool:
     bool
         Whether ``hydra.mode`` is ``MULTIRUN``.
     """
-    mode = OmegaConf.select(node, "hydra.mode")
+    mode = resolved_value(node, "hydra.mode")
     return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
+def resolved_value(node: DictConfig, key: str, overrides: Sequence[str] = ()) -> Any:
+    """Return one value of a composed config, with its interpolations resolved.
+
+    Parameters
+    ----------
+    node : DictConfig
+        Result of `compose_node`.
+    key : str
+        Name of the value: ``hydra.mode``.
+    overrides : sequence of str
+        The overrides it was composed from, to quote in messages.
+
+    Returns
+    -------
+    any
+        The value; None if the key does not exist.
+
+    Raises
+    ------
+    ConfigError
+        If an interpolation fails.
+    """
+    try:
+        return OmegaConf.select(node, key)
+    except OmegaConfBaseException as error:
+        raise ConfigError(explain(error, overrides)) from error
 
 
 def quoted_path(override: str) -> str:

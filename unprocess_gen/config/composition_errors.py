@@ -9,6 +9,7 @@ from typing import Any
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
+from unprocess_gen.config.option_files import ADDED_GROUPS, group_options
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.suggestions import did_you_mean
@@ -40,7 +41,9 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         if isinstance(link, OmegaConfBaseException) and key:
             if isinstance(link, ConfigAttributeError | ConfigKeyError):
                 return unknown_key(key, overrides)
-            return f"{assignment(key, overrides)}: {str(link.msg or link).splitlines()[0]}"
+            return (
+                f"{assignment(key, overrides)}: {_wrong_value(key, str(link.msg or link).splitlines()[0], overrides)}"
+            )
     text = error_in_one_line(error)
     ambiguous = next((one for one in overrides if text.startswith(f"Ambiguous value for argument '{one}'")), None)
     if ambiguous:
@@ -48,17 +51,33 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     return text
 
 
-def several_values(override: str) -> str:
-    """Return the sentence about an override with several values where one is expected."""
+def several_values(override: str, advice: str = "") -> str:
+    """Return the sentence about an override with several values where one is expected.
+
+    Parameters
+    ----------
+    override : str
+        The override as the user wrote it.
+    advice : str, optional
+        What else to do, where a sweep is possible.
+
+    Returns
+    -------
+    str
+        One sentence; for a key that is no group of options it says how a list is written.
+    """
     key, _, values = override.partition("=")
-    return (
-        f"{override}: several values; expected one; to sweep over them, add --multirun; for a list, write "
-        f"{key}=[{values}]"
-    )
+    as_list = "" if group_options(key.lstrip("+")) else f"; for a list, write {key}=[{values}]"
+    return f"{override}: several values; expected one{advice}{as_list}"
 
 
 def unknown_key(key: str, overrides: Sequence[str]) -> str:
     """Return the sentence about a key that the schema lacks, with the keys it has there."""
+    if key in ADDED_GROUPS and assignment(key, overrides) != key:
+        return (
+            f"{assignment(key, overrides)}: the keys of the file are below '{key}'; expected '# @package _global_' "
+            "as its first line"
+        )
     path, name = key.split(".")[:-1], key.split(".")[-1]
     node: Any = Config()
     for part in path:
@@ -78,6 +97,23 @@ def unknown_option(group: str, name: str, options: Sequence[str]) -> str:
 def assignment(key: str, overrides: Sequence[str]) -> str:
     """Return ``key=value`` as the user wrote it, or the key alone if no override names it."""
     return next((one.lstrip("+~") for one in overrides if one.lstrip("+~").split("=")[0] == key), key)
+
+
+EXPECTED = {
+    "could not be converted to Integer": "expected an integer",
+    "could not be converted to Float": "expected a number",
+    "is not a valid bool": "expected true or false",
+    "is not Optional": "expected a value other than null",
+}
+"""What is allowed, by a part of OmegaConf's message."""
+
+
+def _wrong_value(key: str, message: str, overrides: Sequence[str]) -> str:
+    """Return what is expected where OmegaConf refuses the type of a value, else its message."""
+    if "is not a ListConfig, list or tuple" in message:
+        value = assignment(key, overrides).partition("=")[2]
+        return f"expected a list{f', such as [{value}]' if value and value[0] not in '[{' else ''}"
+    return next((expected for part, expected in EXPECTED.items() if part in message), message)
 
 
 def _missing_file(error: MissingConfigException) -> str:

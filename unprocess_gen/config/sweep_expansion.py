@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from unprocess_gen.config.composition import OptionFolders, compose_node, is_multirun, quoted_path
+from unprocess_gen.config.composition import OptionFolders, compose_node, is_multirun, quoted_path, resolved_value
 from unprocess_gen.config.composition_errors import explain, several_values
 from unprocess_gen.config.option_files import check_override, conf_dir, group_options
 from unprocess_gen.config.schema import Config
@@ -71,13 +71,13 @@ class Expansion:
     jobs : tuple of SweepJob
         Jobs of a sweep, in order; the value written last changes fastest.
     plugins : tuple of str
-        Classes of the user's Hydra launcher and sweeper that run the sweep, if any.
+        Classes of the user's Hydra launcher and sweeper that run the sweep, if any; then ``jobs`` is empty.
     described_by : tuple of str
         The overrides whose option files contain the swept values; they are not in the names of folders.
     fixed : tuple of str
         The overrides that are equal in all jobs.
     out : str
-        The sweep's folder; empty if no job can be composed.
+        The sweep's folder, if ``plugins`` run the sweep; else empty.
     """
 
     node: DictConfig | None
@@ -148,7 +148,7 @@ def expand(
     jobs: list[SweepJob] = []
     plugins: tuple[str, ...] = ()
     described: tuple[str, ...] = ()
-    out = ""
+    plugins_out = ""
     bases: dict[tuple[str, ...], tuple[list[_Choice], tuple[str, ...]]] = {}
     for combination in itertools.product(*(choice.overrides() for choice in swept_groups)):
         fixed = [choice.text for choice in choices if not choice.swept]
@@ -160,19 +160,19 @@ def expand(
             bases[combination] = [], ()  # each job reports the error itself
             continue
         _check_hydra_settings(node)
-        plugins = plugins or _plugins(node)
-        out = out or str(OmegaConf.select(node, "out"))
         if not multirun and not is_multirun(node):
             _refuse_values_without_sweep(choices, node)
             return Expansion(node)
+        if use_plugins and not plugins and (plugins := _plugins(node)):
+            plugins_out = str(resolved_value(node, "out", overrides))
         params = _params(node, choices, folders)
         origin = _described_by(_raw_params(node), choices, [*fixed, *combination], folders)
         described += origin
         bases[combination] = params, origin
     fixed_overrides = tuple(one for choice in choices if not choice.swept for one in choice.overrides())
     described = tuple(dict.fromkeys(described))
-    if plugins and use_plugins:
-        return Expansion(None, (), plugins, described, fixed_overrides, out)
+    if plugins:
+        return Expansion(None, (), plugins, described, fixed_overrides, plugins_out)
     for choice in [*choices, *(one for params, _ in bases.values() for one in params)]:
         if choice.swept and not choice.values:
             raise ConfigError(f"{choice.text}: an interval has no list of values; expected choice or range")
@@ -183,7 +183,7 @@ def expand(
             jobs.append(_job(own, added, [*choices, *params], origin))
             if len(jobs) > MAX_JOBS:
                 raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
-    return Expansion(None, tuple(jobs), plugins, described, fixed_overrides, out)
+    return Expansion(None, tuple(jobs), (), described, fixed_overrides)
 
 
 def check_job(node: DictConfig, job: SweepJob) -> None:
@@ -316,7 +316,7 @@ def _described_by(
 
 def _plugins(node: DictConfig) -> tuple[str, ...]:
     """Return the classes of a sweeper or launcher that is not Hydra's own."""
-    targets = [OmegaConf.select(node, f"hydra.{key}._target_") for key in PLUGIN_KEYS]
+    targets = [resolved_value(node, f"hydra.{key}._target_") for key in PLUGIN_KEYS]
     return tuple(target for target in targets if target is not None and not str(target).startswith(BUILT_IN))
 
 
@@ -334,7 +334,7 @@ def _check_hydra_settings(node: DictConfig) -> None:
 def _refuse_values_without_sweep(choices: Sequence[_Choice], node: DictConfig) -> None:
     for choice in choices:
         if choice.swept:
-            raise ConfigError(several_values(choice.text))
+            raise ConfigError(several_values(choice.text, "; to sweep over them, add --multirun"))
     params = _raw_params(node)
     if params:
         raise ConfigError(

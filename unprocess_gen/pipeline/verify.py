@@ -113,7 +113,7 @@ def is_sweep(folder: Path) -> bool:
 
 
 def verify_sweep(folder: Path) -> Iterator[SweepVerification]:
-    """Verify every dataset that ``sweep.csv`` lists.
+    """Verify every dataset that ``sweep.csv`` lists, and find those that an ended sweep left unfinished.
 
     Parameters
     ----------
@@ -123,19 +123,26 @@ def verify_sweep(folder: Path) -> Iterator[SweepVerification]:
     Yields
     ------
     SweepVerification
-        One for each job, in the order of ``sweep.csv``. A job without a finished dataset has one damage.
+        One for each job, in the order of ``sweep.csv``; then one for each unfinished dataset that it does not list.
+        A job without a finished dataset has one damage.
 
     Raises
     ------
     DamageError
         If ``sweep.csv`` cannot be read or names a folder elsewhere.
     """
-    for name, exit_code in read_sweep_table(folder / SWEEP_TABLE):
+    jobs = read_sweep_table(folder / SWEEP_TABLE)
+    for name, exit_code in jobs:
         dataset = folder / name
         if (dataset / "dataset.json").exists() or (dataset / "manifest.csv").exists():
             yield SweepVerification(name, tuple(verify(dataset)))
         else:
             what = f"is missing: the job ended with exit code {exit_code}; rerun the sweep to finish it"
+            yield SweepVerification(name, (Damage("dataset.json", what),))
+    listed = {name for name, _ in jobs}
+    for name in sorted(path.parent.name for path in folder.glob("*/.work")):
+        if name not in listed and not (folder / name / "dataset.json").exists():
+            what = "is missing: the sweep ended before this job; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage("dataset.json", what),))
 
 
