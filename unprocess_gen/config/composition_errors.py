@@ -41,9 +41,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
         if isinstance(link, OmegaConfBaseException) and key:
             if isinstance(link, ConfigAttributeError | ConfigKeyError):
                 return unknown_key(key, overrides)
-            return (
-                f"{assignment(key, overrides)}: {_wrong_value(key, str(link.msg or link).splitlines()[0], overrides)}"
-            )
+            message = str(link.msg or link).splitlines()[0]
+            return f"{assignment(key, overrides)}: {_wrong_value(key, message, overrides)}"
     text = error_in_one_line(error)
     ambiguous = next((one for one in overrides if text.startswith(f"Ambiguous value for argument '{one}'")), None)
     if ambiguous:
