@@ -388,7 +388,10 @@ def test_missing_library_is_reported_before_measuring(
     done = door("accuracy", "out=new")
 
     assert done.code == 2
-    assert done.err == "gen-dataset: accuracy: drawing needs matplotlib; pip install 'unprocess_gen[figures]'\n"
+    assert (
+        done.err
+        == "gen-dataset: accuracy: drawing needs matplotlib; in the source folder, run: pip install '.[figures]'\n"
+    )
     assert not (tmp_path / "new").exists()
 
 

@@ -93,7 +93,7 @@ REFUSED = [
     (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
     (["again"], r"again: expected the folder of a dataset"),
     (["again", "out=x"], r"again: expected the folder of a dataset"),
-    (["again", "/no/such", "out=x"], r"/no/such/config.yaml: no such file"),
+    (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
 ]  # fmt: skip
 
 
@@ -564,6 +564,91 @@ def test_verify_of_a_sweep_verifies_every_dataset(door: Door, tmp_path: Path) ->
     done = door("verify", "sweep", "--regenerate", "1")
     assert (done.code, "sweep: 1 of 2 datasets are intact" in done.out) == (4, True)
     assert done.err.startswith("gen-dataset: sweep/seed=1,source.limit=1: ")
+
+
+# Paths that the user names --------------------------------------------------------------------------------------------
+
+OUTPUTS = [
+    ("replay", "DS", "--to", "DS/shards"),
+    ("replay", "DS", "--to", "DS/new/deep"),
+    ("preview", "DS", "--to", "DS/sheets"),
+    ("dng", "DS", "--keys", "2", "--to", "DS/new"),
+    ("report", "DS", "--to", "DS/page.html"),
+    ("verify", "DS", "--noise", "--to", "DS/noise.png"),
+    ("verify", "DS", "--log-file", "DS/manifest.csv"),
+    ("figures", "out=DS/figures"),
+    ("accuracy", "out=DS/accuracy"),
+]
+
+
+@pytest.mark.parametrize("arguments", OUTPUTS, ids=" ".join)
+def test_no_verb_writes_into_a_dataset(arguments: tuple[str, ...], moved: Path, door: Door, tmp_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / moved).rglob("*")}
+    done = door(*(word.replace("DS", str(moved)) for word in arguments))
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert "is inside the dataset" in done.err
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / moved).rglob("*")} == before
+
+
+def test_log_file_is_not_appended_to_a_photograph(moved: Path, door: Door, tmp_path: Path) -> None:
+    photograph = tmp_path / "moved/002.png"
+    before = photograph.read_bytes()
+    done = door("verify", moved, "--log-file", photograph)
+    assert (done.code, photograph.read_bytes()) == (2, before)
+
+
+NOISE_FILES = [
+    (("--noise", "--to", "noise.txt"), "--to noise.txt: is not a PNG file"),
+    (("--noise", "--to", "no/noise.png"), "--to no/noise.png: expected the name of a file in a folder that exists"),
+    (("--noise", "--to", "moved/002.png"), "--to moved/002.png: exists and is not an earlier figure"),
+    (("--to", "noise.png"), "verify: --to noise.png: draws the fits of --noise; add --noise"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), NOISE_FILES)
+def test_figure_of_the_noise_is_checked_first(
+    arguments: tuple[str, ...], sentence: str, moved: Path, door: Door
+) -> None:
+    done = door("verify", moved, *arguments)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert done.err.startswith(f"gen-dataset: {sentence}")
+
+
+@pytest.mark.parametrize("rows", ["5:9", "1:0", "3:"])
+def test_rows_that_select_nothing_are_refused(rows: str, moved: Path, door: Door) -> None:
+    done = door("replay", moved, "--source", "moved", "--rows", rows)
+    assert (done.code, done.out) == (2, "")
+    assert done.err == f"gen-dataset: --rows {rows}: selects no row; expected A:B with A below B and below 3\n"
+
+
+def test_rows_and_keys_exclude_each_other(moved: Path, door: Door) -> None:
+    done = door("replay", moved, "--rows", "0:1", "--keys", "0")
+    assert (done.code, done.out) == (2, "")
+
+
+@pytest.mark.parametrize("verb", TAKES_SOURCE)
+def test_missing_source_root_is_refused_in_one_line(verb: str, moved: Path, door: Door) -> None:
+    done = door(verb, moved, *TAKES_SOURCE[verb], "source.root=nothere")
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert done.err.startswith("gen-dataset: source.root=nothere: no such folder")
+
+
+def test_replay_names_no_folder_of_arrays_without_arrays(moved: Path, door: Door, tmp_path: Path) -> None:
+    for photograph in (tmp_path / "moved").iterdir():
+        photograph.unlink()
+    done = door("replay", moved, "--source", "moved", "--to", "arrays")
+    assert (done.code, "arrays" in done.out) == (5, False)
+
+
+@pytest.mark.parametrize(
+    ("folder", "sentence"), [("nothere", "no such f"), ("DIR=t4", "no such f"), ("empty", "not a dataset; expected")]
+)
+@pytest.mark.parametrize("verb", ["verify", "replay", "report", "preview", "dng", "again"])
+def test_folder_without_a_dataset_is_refused(verb: str, folder: str, sentence: str, door: Door, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = door(verb, folder)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert done.err.startswith(f"gen-dataset: {verb}: {folder}: {sentence}")
 
 
 # Installation ---------------------------------------------------------------------------------------------------------

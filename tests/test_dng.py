@@ -467,9 +467,9 @@ REFUSED = [
     (["DS", "--keys", "00000000,00000009", "--to", "to"], "--keys 00000009: .*has no such key"),
     (["DS", "--keys", "00000000,00000001", "--to", "to"], r"--keys 00000001: failed \(\w+\), so it has no frames"),
     (["DS", "--keys", "00000000,00000004", "--to", "to"], "--keys 00000004: is 21 x 40; LibRaw.* under 22 pixels"),
-    (["DS", "--keys", "00000000", "--to", "DS"], "--to .*: is the dataset's own folder"),
-    (["DS", "--keys", "00000000", "--to", "DS/shards"], "--to .*: is the dataset's own folder"),
-    (["DS", "--keys", "00000000", "--to", "DS/config.yaml/to"], r"--to .*: cannot be written \(Not a directory\)"),
+    (["DS", "--keys", "00000000", "--to", "DS"], "--to .*: is inside the dataset"),
+    (["DS", "--keys", "00000000", "--to", "DS/shards"], "--to .*: is inside the dataset"),
+    (["DS", "--keys", "00000000", "--to", "DS/config.yaml/to"], "--to .*: is inside the dataset"),
 ]
 
 
@@ -520,7 +520,7 @@ def test_without_tifffile_one_line_names_the_extra(
     done = door("dng", ds, "--keys", "00000000", "--to", "to")
     assert (done.code, done.err) == (
         2,
-        "gen-dataset: dng: tifffile is missing; pip install 'unprocess_gen[dng]'\n",
+        "gen-dataset: dng: tifffile is missing; in the source folder, run: pip install '.[dng]'\n",
     )
     assert list(tmp_path.iterdir()) == []
 

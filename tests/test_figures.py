@@ -188,7 +188,10 @@ def test_missing_library_gives_one_line_that_names_the_extra(
     monkeypatch.setattr(report_files, "find_spec", lambda name: None)
     done = door("figures", "out=figs")
     assert done.code == 2
-    assert done.err == "gen-dataset: figures: drawing needs matplotlib; pip install 'unprocess_gen[figures]'\n"
+    assert (
+        done.err
+        == "gen-dataset: figures: drawing needs matplotlib; in the source folder, run: pip install '.[figures]'\n"
+    )
     assert list(tmp_path.iterdir()) == []
 
 

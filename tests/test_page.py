@@ -410,8 +410,18 @@ def test_report_does_not_replace_a_file_of_the_dataset(to: str, copy: Path, door
     before = tree_hash(copy)
     done = door("report", copy, "--to", to)
     assert done.code == 2
-    assert done.err == f"gen-dataset: --to {to}: belongs to the dataset; expected another file; choose another name\n"
+    assert done.err == (
+        f"gen-dataset: --to {to}: is inside the dataset {copy.resolve()}; expected a file outside of datasets; "
+        "choose another name\n"
+    )
     assert tree_hash(copy) == before
+
+
+@pytest.mark.parametrize(("content", "code"), [(b"\xff\xd8\xff a photograph", 2), (b"<!DOCTYPE html>", 0)])
+def test_report_replaces_only_an_html_page(content: bytes, code: int, copy: Path, door: Door, tmp_path: Path) -> None:
+    (tmp_path / "page").write_bytes(content)
+    assert door("report", copy, "--to", "page").code == code
+    assert ((tmp_path / "page").read_bytes() == content) == (code == 2)
 
 
 @pytest.mark.parametrize(
@@ -440,7 +450,7 @@ def test_missing_library_gives_one_line_that_names_the_extra(
     monkeypatch.setattr(report_files, "find_spec", lambda name: None if name == library else "spec")
     done = door("report", copy)
     assert done.code == 2
-    assert done.err == f"gen-dataset: report: {purpose}; pip install 'unprocess_gen[figures]'\n"
+    assert done.err == f"gen-dataset: report: {purpose}; in the source folder, run: pip install '.[figures]'\n"
 
 
 def test_import_of_the_dataset_report_leaves_numba_out() -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
+from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.reports.sheets import contact_sheet, panels, stages_sheet
@@ -430,7 +430,7 @@ def test_other_content_of_the_same_size_is_detected(few: Path, make: Make, tmp_p
         (("--keys", "77"), "--keys 77: "),
         (("--keys", "00000000,"), "--keys 00000000,: '' is no key; "),
         (("--keys", "00000002"), "--keys 00000002: failed (unsupported), so it has no frames"),
-        (("--source", "nowhere"), "--source nowhere: is not a folder"),
+        (("--source", "nowhere"), "source.root=nowhere: no such folder or file"),
         (("--to", "file"), "--to file: is a file; expected a folder"),
         (("--draw", "1"), "preview: --draw: no such flag; expected --keys, --to, --source"),
     ],
@@ -475,7 +475,7 @@ def test_sheets_are_not_written_into_the_dataset(few: Path, door: Door, inside: 
     done = door("preview", few, "--to", few / inside)
 
     assert done.code == 2
-    assert "belongs to the dataset; expected another folder" in done.err
+    assert "expected a folder outside of datasets" in done.err
 
 
 def test_dataset_without_a_pair_is_refused(make: Make, tmp_path: Path) -> None:
@@ -500,10 +500,10 @@ def test_missing_shard_is_damage(make: Make, tmp_path: Path) -> None:
         contact_sheet.contact_sheet(tmp_path / "ds")
 
 
-def test_uncreatable_folder_is_a_system_error(few: Path, tmp_path: Path) -> None:
+def test_uncreatable_folder_is_refused(few: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
 
-    with pytest.raises(MachineError, match="Not a directory"):
+    with pytest.raises(ConfigError, match="Not a directory"):
         list(contact_sheet.write_sheets(few, tmp_path / "file" / "sheets"))
 
 

@@ -785,7 +785,7 @@ def test_without_pyav_a_video_is_refused_with_the_way_out(
     monkeypatch.setattr(photographs, "is_installed", lambda: False)
     done = door(f"source.root={films}", "source.clips=true")
     assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "h264.mp4 is a video, which needs PyAV; install it with pip install 'unprocess_gen[video]'" in done.err
+    assert "h264.mp4 is a video, which needs PyAV; in the source folder, run: pip install '.[video]'" in done.err
     assert not (tmp_path / "ds").exists()
     assert door(f"source.root={films}", "source.clips=true", "source.video=[]", "n_jobs=1").code == 0
 

@@ -12,9 +12,11 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
+from unprocess_gen.core.output_paths import check_log_file
 
 LOGGER = logging.getLogger("unprocess_gen")
 RESULTS = logging.getLogger("unprocess_gen.results")
@@ -82,12 +84,14 @@ def logging_to(quiet: bool = False, verbose: bool = False, log_file: str | None 
     Raises
     ------
     ConfigError
-        If the log file cannot be written, or ``quiet`` and ``verbose`` are both given.
+        If the log file cannot be written, is inside a dataset or is no text, or ``quiet`` and ``verbose`` are both
+        given.
     """
     if quiet and verbose:
         raise ConfigError("--quiet and --verbose exclude each other; expected one of them")
     handlers: list[logging.Handler] = [_StderrHandler()]
     if log_file is not None:
+        check_log_file(Path(log_file), f"--log-file {log_file}")
         try:
             handlers.append(_FileHandler(log_file, encoding="utf-8"))
         except OSError as error:

@@ -20,6 +20,7 @@ from unprocess_gen.cli.messages import print_result, report, report_error
 from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, UnprocessGenError
+from unprocess_gen.core.output_paths import DATASET_ENTRIES
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import AccuracyConfig, Config
@@ -194,7 +195,7 @@ def run_again(call: Call) -> int:
     config, kind = read_dataset_yaml(folder / "config.yaml")
     if "out" not in call.values:
         raise ConfigError("again: out is missing; expected the folder of the new dataset; give out=…")
-    root = call.values.get("source")
+    root = _root(call)
     if kind != "folder" and root is not None:
         raise ConfigError(
             f"again: source.root={root}: {folder} was generated from a source of kind {kind}; expected no root; "
@@ -231,8 +232,14 @@ def run_verify(call: Call) -> int:
     """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
     from unprocess_gen.pipeline.verify import is_sweep, verify, verify_sweep
 
-    folder = call.path
-    assert folder is not None
+    folder = _dataset("verify", call, sweeps=True)
+    _root(call)
+    if "to" in call.values:
+        if "noise" not in call.values:
+            raise ConfigError(f"verify: --to {call.values['to']}: draws the fits of --noise; add --noise")
+        from unprocess_gen.reports.photon_transfer import check_figure_file
+
+        check_figure_file(Path(call.values["to"]))
     if not is_sweep(folder):
         return _finish_verification(folder, verify(folder), call)
     codes = []
@@ -310,20 +317,23 @@ def run_replay(call: Call) -> int:
     from unprocess_gen.dataset.selection import select_rows
     from unprocess_gen.pipeline.replay import replay, source_root
 
-    manifest = _dataset("replay", call)
+    if {"rows", "keys"} <= call.values.keys():
+        raise ConfigError("replay: --rows and --keys exclude each other; expected one of them")
+    manifest = _dataset("replay", call, files=True)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(call.values["to"]) if "to" in call.values else None
     skipped: list[Row] = []
     rows = select_rows(manifest, call.values.get("rows"), call.values.get("keys"), skipped)
-    codes = []
-    for result in replay(rows, source_root(manifest, call.values.get("source")), to):
+    codes, written = [], False
+    for result in replay(rows, source_root(manifest, _root(call)), to):
         codes.append(result.exit_code)
+        written |= result.written
         if result.complaint:
             report(_complaint(result), logging.ERROR)
     same = codes.count(0)
     print_result(
         f"{same} pairs are the same, bit for bit; {len(codes) - same} are not"
-        + (f"; arrays in {to}" if to else "")
+        + (f"; arrays in {to}" if written else "")
         + _skipped(len(skipped))
     )
     return worst(codes)
@@ -339,7 +349,7 @@ def run_report(call: Call) -> int:
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
     folder = _dataset("report", call)
-    to, root = call.values.get("to"), call.values.get("source")
+    to, root = call.values.get("to"), _root(call)
     print_result(write_dataset_report(folder, None if to is None else Path(to), None if root is None else Path(root)))
     return 0
 
@@ -351,7 +361,7 @@ def run_preview(call: Call) -> int:
     from unprocess_gen.reports.sheets.contact_sheet import write_sheets
 
     folder = _dataset("preview", call)
-    to, root, with_stages = _folder_to("preview", call), call.values.get("source"), "stages" in call.values
+    to, root, with_stages = _folder_to("preview", call), _root(call), "stages" in call.values
     keys: list[str] = []
     failed = files = 0
     if "keys" in call.values:
@@ -395,11 +405,42 @@ def _folder_to(verb: str, call: Call) -> Path:
     return Path(call.values["to"])
 
 
-def _dataset(verb: str, call: Call) -> Path:
-    """Return the verb's dataset; refuse the folder of a sweep with the name of one of its datasets."""
+def _root(call: Call) -> str | None:
+    """Return the root that the user gives; ConfigError if it is no folder or photograph, None if none is given."""
+    from unprocess_gen.sources.listing import root_status
+
+    root: str | None = call.values.get("source")
+    if root is not None:
+        root_status(root)
+    return root
+
+
+def _place(verb: str) -> str:
+    place = VERBS[verb].place
+    assert place is not None
+    return place.expected
+
+
+def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False) -> Path:
+    """Return the verb's dataset; refuse anything else, and for a sweep name one of its datasets.
+
+    ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
+    """
     path = call.path
     assert path is not None
-    if (path / "sweep.csv").is_file() and not (path / "dataset.json").exists():
+    if not path.exists():
+        kind = "file or folder" if files else "folder"
+        raise ConfigError(f"{verb}: {path}: no such {kind}; expected {_place(verb)}")
+    if not path.is_dir():
+        if files:
+            return path
+        raise ConfigError(f"{verb}: {path}: is a file; expected {_place(verb)}")
+    is_sweep = (path / "sweep.csv").is_file()
+    if not is_sweep and not any((path / name).exists() for name in DATASET_ENTRIES):
+        raise ConfigError(f"{verb}: {path}: not a dataset; expected {_place(verb)}")
+    if sweeps:
+        return path
+    if is_sweep and not (path / "dataset.json").exists():
         datasets = sorted(file.parent for file in path.glob("*/dataset.json"))
         example = f", such as {datasets[0]}" if datasets else ""
         raise ConfigError(f"{verb}: {path}: is the folder of a sweep; expected one of its datasets{example}")

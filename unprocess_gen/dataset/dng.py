@@ -39,6 +39,7 @@ import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
+from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
@@ -109,9 +110,8 @@ def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> ExportSu
         If writing fails.
     """
     if find_spec("tifffile") is None:
-        raise ConfigError("dng: tifffile is missing; pip install 'unprocess_gen[dng]'")
-    if to.resolve() in (folder.resolve(), (folder / "shards").resolve()):
-        raise ConfigError(f"--to {to}: is the dataset's own folder; expected a folder outside the dataset")
+        raise ConfigError("dng: tifffile is missing; in the source folder, run: pip install '.[dng]'")
+    check_output_folder(to, f"--to {to}")
     numbers = _numbers(folder / "manifest.csv", keys)
     files = [_File(number, key, frame) for key, number in numbers.items() for frame in frames]
     pairs = RawPairs(folder)

@@ -125,13 +125,20 @@ def select_rows(
     Raises
     ------
     ConfigError
-        If ``rows`` or ``keys`` cannot be read, or the manifest has no row for an index, a key or a complete range.
+        If ``rows`` or ``keys`` cannot be read, ``rows`` selects no row, or the manifest has no row for an index, a key
+        or a complete range.
     DamageError
         If the manifest cannot be read.
     """
     if keys is None:
         first, last = _positions(rows)
-        yield from itertools.islice(read_rows(manifest), first, last)
+        empty = rows is not None
+        for row in itertools.islice(read_rows(manifest), first, last):
+            empty = False
+            yield row
+        if empty:
+            count = sum(1 for _ in read_rows(manifest))
+            raise ConfigError(f"--rows {rows}: selects no row; expected A:B with A below B and below {count}")
         return
     selection = parse_keys(keys)
     found: set[str] = set()

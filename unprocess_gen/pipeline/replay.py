@@ -16,6 +16,7 @@ import numpy as np
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error
+from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
 from unprocess_gen.dataset.keys import image_key
@@ -44,12 +45,15 @@ class ReplayResult:
         What differs; empty if the pair is the same, bit for bit.
     source_changed : bool
         Whether the source was changed or deleted, so that the row could not be checked.
+    written : bool
+        Whether the arrays were written.
     """
 
     key: str
     source: str
     complaint: str = ""
     source_changed: bool = False
+    written: bool = False
 
     @property
     def exit_code(self) -> int:
@@ -179,10 +183,12 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
     Raises
     ------
     ConfigError
-        If a row was made from a file and ``root`` is None.
+        If a row was made from a file and ``root`` is None, or ``to`` is inside a dataset or no folder.
     MachineError
         If the self-test fails, or the arrays cannot be written.
     """
+    if to is not None:
+        check_output_folder(to, f"--to {to}")
     regenerator = PairRegenerator(root)
     for row in rows:
         if row["status"] == "ok":
@@ -203,7 +209,7 @@ def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayRe
         return ReplayResult(key, source, str(error))
     if to is not None:
         _save(pair, to, key)
-    return ReplayResult(key, source, _difference(pair, row))
+    return ReplayResult(key, source, _difference(pair, row), written=to is not None)
 
 
 class PairRegenerator:

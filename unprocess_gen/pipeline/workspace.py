@@ -36,6 +36,7 @@ from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
 from unprocess_gen.core.files import RESUME, commit_file, machine_error
+from unprocess_gen.core.output_paths import enclosing_dataset
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.columns import NAMES
 from unprocess_gen.dataset.dataset_json import MAX_BYTES, check_dataset_json
@@ -107,12 +108,11 @@ class Workspace:
 
     def _refuse_datasets_around(self) -> None:
         """Refuse a folder inside a dataset, finished or begun, which would become a foreign file of that dataset."""
-        for parent in Path(os.path.realpath(self.out)).parents:
-            if (parent / "dataset.json").is_file() or (parent / ".work" / "sources.json").is_file():
-                raise ConfigError(
-                    f"out={self.out}: is inside the dataset {parent}; expected a folder outside of it; choose "
-                    "another out"
-                )
+        dataset = enclosing_dataset(Path(os.path.realpath(self.out)).parent)
+        if dataset is not None:
+            raise ConfigError(
+                f"out={self.out}: is inside the dataset {dataset}; expected a folder outside of it; choose another out"
+            )
 
     def _refuse_foreign_files(self) -> None:
         """Refuse a folder that contains files but no dataset, so that no file of the user is overwritten."""

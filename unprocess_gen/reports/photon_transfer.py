@@ -21,6 +21,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.types import FLOAT32, Float, Frame, Row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.reports.report_files import require_libraries
@@ -257,6 +259,25 @@ def _shared_error(row: Row) -> float:
     return math.hypot(
         *(_number(row, std) ** 2 * math.sqrt(2 / _number(row, size)) for name, std, size in parts if name in effects)
     )
+
+
+def check_figure_file(to: Path) -> None:
+    """Check, before the pairs are fitted, that a figure can be drawn and written.
+
+    Parameters
+    ----------
+    to : Path
+        The PNG file.
+
+    Raises
+    ------
+    ConfigError
+        If matplotlib is missing, the suffix is not .png, or the file cannot be written or is not an earlier figure.
+    """
+    if to.suffix.lower() != ".png":
+        raise ConfigError(f"--to {to}: is not a PNG file; expected a name that ends with .png")
+    check_output_file(to, f"--to {to}", "an earlier figure", b"matplotlib")
+    require_libraries(f"--to {to}", ("matplotlib",))
 
 
 def draw_fits(fits: list[NoiseFit], to: Path | BinaryIO) -> None:

@@ -5,16 +5,13 @@ A report is not part of a dataset. This module imports no kernel, so that the da
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_error
-
-DATASET_ENTRIES = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work")
-"""Names that mark a folder as a dataset, finished or not. Other files in such a folder count as damage."""
+from unprocess_gen.core.output_paths import DATASET_ENTRIES, check_output_folder
 
 LIBRARIES = {"matplotlib": "drawing needs", "jinja2": "HTML pages need"}
 """Optional libraries of the extra ``figures``, and the purpose that an error message names."""
@@ -37,7 +34,7 @@ def require_libraries(verb: str, names: tuple[str, ...] = ("matplotlib", "jinja2
     """
     for name in names:
         if find_spec(name) is None:
-            raise ConfigError(f"{verb}: {LIBRARIES[name]} {name}; pip install 'unprocess_gen[figures]'")
+            raise ConfigError(f"{verb}: {LIBRARIES[name]} {name}; in the source folder, run: pip install '.[figures]'")
 
 
 def check_report_folder(out: Path, verb: str) -> None:
@@ -53,7 +50,7 @@ def check_report_folder(out: Path, verb: str) -> None:
     Raises
     ------
     ConfigError
-        If a library is missing, the folder cannot be written, or it contains a dataset.
+        If a library is missing, the folder cannot be written, or it contains or is inside a dataset.
     """
     require_libraries(verb)
     for name in DATASET_ENTRIES:
@@ -61,11 +58,7 @@ def check_report_folder(out: Path, verb: str) -> None:
             raise ConfigError(
                 f"out={out}: contains a dataset ({name}); expected a folder without one; choose another out"
             )
-    nearest = next(path for path in (out, *out.absolute().parents) if path.exists())
-    if not nearest.is_dir():
-        raise ConfigError(f"out={out}: cannot be written ({nearest} is not a folder); choose another out")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ConfigError(f"out={out}: cannot be written (Permission denied); choose another out")
+    check_output_folder(out, f"out={out}")
 
 
 def write_files(out: Path, contents: Mapping[str, bytes]) -> None:

@@ -133,7 +133,7 @@ def list_folder(
     ConfigError
         If the root does not exist, a sub-folder cannot be read, or no file matches.
     """
-    status = _root_status(root)
+    status = root_status(root)
     if stat.S_ISREG(status.st_mode):
         return Listing((_as_source(0, _Entry(Path(root).name, matched=True, status=status)),))
     found, skipped = _walk(root, matcher(include), recursive)
@@ -389,12 +389,13 @@ def _digest(root: str, source: Source) -> str:
         return hashlib.sha256(source.name.encode()).hexdigest()
 
 
-def _root_status(root: str) -> os.stat_result:
+def root_status(root: str) -> os.stat_result:
     """Return the status of a folder or regular file; ConfigError for anything else."""
     try:
         status = Path(root).stat()
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
+        why = "no such folder or file" if isinstance(error, FileNotFoundError) else why
         raise ConfigError(f"source.root={root}: {why}; expected an existing folder of photographs") from None
     if not stat.S_ISDIR(status.st_mode) and not stat.S_ISREG(status.st_mode):
         raise ConfigError(f"source.root={root}: not a folder; expected a folder of photographs, or one photograph")

@@ -198,8 +198,8 @@ def _video(root: str, source: Source) -> tuple[str, Video]:
     """Return a video's digest and the open video; both are cached until the file changes."""
     if not is_installed():
         raise ConfigError(
-            f"source.video: {source.name} is a video, which needs PyAV; install it with "
-            "pip install 'unprocess_gen[video]', or omit videos with source.video=[]"
+            f"source.video: {source.name} is a video, which needs PyAV; "
+            "in the source folder, run: pip install '.[video]', or omit videos with source.video=[]"
         )
     whole = replace(source, index=0, occurrence=0, sha256=None, frame=0, frames=1, clip_sha256=None, clip_occurrence=0)
     return _open_video(root, whole, listing.stamp(root, source))

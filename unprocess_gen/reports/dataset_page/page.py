@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import cv2
 import yaml
 
-from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
+from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.dataset.keys import sample_key
@@ -37,7 +38,7 @@ from unprocess_gen.reports.dataset_page.statistics import (
 )
 from unprocess_gen.reports.formatting import byte_size, percentage, short_number
 from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
-from unprocess_gen.reports.report_files import DATASET_ENTRIES, require_libraries
+from unprocess_gen.reports.report_files import require_libraries
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
 from unprocess_gen.sources.listing import encode_name
 
@@ -68,7 +69,8 @@ def write_dataset_report(folder: Path, to: Path | None = None, source: Path | No
     Raises
     ------
     ConfigError
-        If a library is missing, ``to`` belongs to the dataset, or ``source`` is not a folder.
+        If a library is missing, ``to`` is inside a dataset or a file that is no HTML page, or ``source`` is not a
+        folder.
     DamageError
         If the dataset is not finished, or its manifest or config differs from the one ``dataset.json`` records.
     MachineError
@@ -90,10 +92,8 @@ def write_dataset_report(folder: Path, to: Path | None = None, source: Path | No
 
 
 def _check_to(folder: Path, to: Path) -> None:
-    if any(to.resolve().is_relative_to((folder / name).resolve()) for name in DATASET_ENTRIES):
-        raise ConfigError(f"--to {to}: belongs to the dataset; expected another file; choose another name")
-    if to.is_dir() or not to.parent.is_dir():
-        raise ConfigError(f"--to {to}: expected the name of a file in a folder that exists")
+    if to.resolve() != (folder / REPORT).resolve():
+        check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
 
 
 def dataset_page(folder: Path, source: Path | None = None) -> str:

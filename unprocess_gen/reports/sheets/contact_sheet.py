@@ -18,8 +18,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs, sheet_heading
 from unprocess_gen.reports.sheets.panels import (
@@ -78,13 +78,13 @@ def write_sheets(
     Raises
     ------
     ConfigError
-        If ``to`` belongs to the dataset or is not a folder, and as for `contact_sheet`.
+        If ``to`` is inside a dataset or is not a folder, and as for `contact_sheet`.
     DamageError
         As for `contact_sheet`.
     MachineError
         If a file cannot be written.
     """
-    _check_to(folder, to)
+    check_output_folder(to, f"--to {to}")
     for pair in selected_pairs(folder, keys, source):
         pictures = {f"{pair.key}.png": pair_sheet(pair)}
         if with_stages and pair.source is not None:
@@ -119,13 +119,6 @@ def contact_sheet(folder: Path, keys: Sequence[str] = (), source: Path | None = 
         If the dataset is damaged.
     """
     return np.vstack([_strip(pair) for pair in selected_pairs(folder, keys, source)])
-
-
-def _check_to(folder: Path, to: Path) -> None:
-    if to.resolve() in (folder.resolve(), (folder / "shards").resolve()):
-        raise ConfigError(f"--to {to}: belongs to the dataset; expected another folder; choose another name")
-    if to.exists() and not to.is_dir():
-        raise ConfigError(f"--to {to}: is a file; expected a folder")
 
 
 def _write(picture: Picture, path: Path) -> Path:
