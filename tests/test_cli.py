@@ -333,7 +333,8 @@ def test_more_failures_than_allowed_give_exit_code_3(door: Door, tmp_path: Path)
 
 def test_plan_writes_nothing(door: Door, tmp_path: Path, photos: Path) -> None:
     done = door("plan", f"source.root={photos}", "out=a/b/c")
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
+    assert done.err in ("", "gen-dataset: compiling kernels, once per machine and version\n")  # if the cache is empty
     assert list(tmp_path.iterdir()) == []
 
 
