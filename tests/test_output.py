@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import signal
@@ -14,6 +15,8 @@ from typing import Any
 
 import pytest
 from conftest import Make, fill
+
+from unprocess_gen.cli import verbs
 
 Door = Callable[..., Any]
 
@@ -85,6 +88,46 @@ def test_broken_pipe_gives_exit_code_141_without_a_message(name: str, folder: Pa
     broken = subprocess.run(command, cwd=folder, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write_end)
     assert (broken.returncode, broken.stderr) == (141, "")
+
+
+@pytest.mark.parametrize("code", [5, 141])
+@pytest.mark.parametrize("plugin", [[], ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]], ids=["own", "joblib"])
+def test_unwritable_stdout_ends_a_sweep_and_keeps_the_row(code: int, plugin: list[str], tmp_path: Path) -> None:
+    if plugin:
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    fill(tmp_path / "p", 1)
+    read_end, closed_pipe = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "unprocess_gen", "-m", "seed=1,2", "source.root=p", "n_jobs=1", "out=sweep"]
+    with Path("/dev/full").open("w") as full, os.fdopen(closed_pipe, "wb") as pipe:
+        stdout = full if code == 5 else pipe
+        done = subprocess.run(
+            [*command, *plugin], cwd=tmp_path, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (done.returncode, "Traceback" in done.stderr) == (code, False)
+    with (tmp_path / "sweep/sweep.csv").open(newline="") as stream:
+        rows = [(row["folder"], row["rows"], row["exit"]) for row in csv.DictReader(stream)]
+    assert rows == [("seed=1", "1", "0"), ("seed=2", "1", "0")][: 2 if plugin else 1]  # a launcher starts all jobs
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signal_that_a_library_turns_into_its_own_error_ends_a_sweep(
+    sent: signal.Signals, door: Door, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = []
+
+    def interrupted(config: Any, label: str = "") -> Any:
+        started.append(label)
+        try:
+            os.kill(os.getpid(), sent)
+        except BaseException as error:
+            raise ValueError("internal error") from error
+
+    monkeypatch.setattr(verbs, "generate_dataset", interrupted)
+    fill(tmp_path / "p", 1)
+    done = door("-m", "seed=1,2", "source.root=p", "out=sweep")
+    assert (done.code, started) == (128 + sent, ["1/2 seed=1"])
+    assert "Traceback" not in done.err
 
 
 # Messages -------------------------------------------------------------------------------------------------------------

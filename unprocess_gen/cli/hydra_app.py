@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.cli.hydra_request import Request, Task, parse_arguments, run_hydra
-from unprocess_gen.cli.messages import print_result, report_error
+from unprocess_gen.cli.messages import print_result, print_results, report_error
+from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, worst, write_table
 from unprocess_gen.core.errors import ConfigError
 
@@ -37,7 +38,7 @@ def compose(
     arguments : list of str
         Overrides and Hydra's flags.
     task : callable
-        Takes a config and a label; returns an exit code and a result.
+        Takes a config and a label; returns an exit code, a result and the texts to print (`Task`).
     sweep_csv : bool
         Whether a sweep writes ``sweep.csv`` in ``out``.
     totals : callable, optional
@@ -66,7 +67,9 @@ def compose(
     if expansion.node is not None:
         if request.prints_config:
             return _print_with_hydra(request.flags, request.overrides)
-        return task(validated_config(expansion.node, request.overrides), "")[0]
+        code, _, texts = task(validated_config(expansion.node, request.overrides), "")
+        print_results(texts)
+        return code
     if request.prints_config:
         return worst([_print_with_hydra(request.flags, list(job.overrides)) for job in expansion.jobs])
     if expansion.plugins:
@@ -86,26 +89,33 @@ def _run_sweep(
     sweep_csv: bool,
     totals: Callable[[Sequence[Any]], str] | None,
 ) -> int:
-    """Run every job of a sweep, one after the other, and return the worst exit code."""
+    """Run every job of a sweep, one after the other, and return the worst exit code.
+
+    A job's row is written before its results are printed, so that an error of stdout ends the sweep without losing it.
+    """
     rows: list[JobRow] = []
     results: list[Any] = []
     sweep_folder: Path | None = None
     for place, job in enumerate(expansion.jobs, start=1):
-        row, out, result = _run_job(request.folders(), job, task, f"{place}/{len(expansion.jobs)}")
+        row, out, result, texts = _run_job(request.folders(), job, task, f"{place}/{len(expansion.jobs)}")
         rows.append(row)
         results += [] if result is None else [result]
         sweep_folder = out or sweep_folder  # a refused job has no out; its row goes where the others are
         if sweep_csv and sweep_folder is not None:
             write_table(sweep_folder, rows)
+        print_results(texts)
     if totals is not None and results:
         print_result(totals(results))
     return worst(row.exit for row in rows)
 
 
-def _run_job(folders: OptionFolders, job: SweepJob, task: Task, place: str) -> tuple[JobRow, Path | None, Any]:
-    """Run one job in its own folder below ``out``; any error becomes its exit code.
+def _run_job(
+    folders: OptionFolders, job: SweepJob, task: Task, place: str
+) -> tuple[JobRow, Path | None, Any, list[str]]:
+    """Run one job in its own folder below ``out``; any error becomes its exit code, unless a signal arrived.
 
-    Returns its row of ``sweep.csv``, the sweep's ``out`` (None if the config is refused), and the task's result.
+    Returns its row of ``sweep.csv``, the sweep's ``out`` (None if the config is refused), the task's result, and the
+    texts to print.
     """
     from unprocess_gen.config.composition import compose_node, validated_config
     from unprocess_gen.config.sweep_expansion import check_job
@@ -113,16 +123,19 @@ def _run_job(folders: OptionFolders, job: SweepJob, task: Task, place: str) -> t
     text = overrides_text(job.named)
     folder = folder_name(text)
     out, result = None, None
+    texts: list[str] = []
     try:
         node = compose_node(job.overrides, folders)
         check_job(node, job)
         config = validated_config(node, job.overrides)
         out = Path(config.out)
         config.out = str(out / folder)
-        code, result = task(config, f"{place} {folder}")
+        code, result, texts = task(config, f"{place} {folder}")
     except Exception as error:
+        if SIGNALS.received is not None:  # libraries may fail in their own way when they are interrupted
+            raise
         code = report_error(error, f"{folder}: ")
-    return JobRow.of(folder, text, job.swept, code, result), out, result
+    return JobRow.of(folder, text, job.swept, code, result), out, result, texts
 
 
 # ---------------------------------------------------------------------------------------------------- printing by Hydra

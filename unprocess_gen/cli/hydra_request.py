@@ -41,10 +41,11 @@ HYDRA_SETTINGS = (
 )
 """Settings of Hydra that an override may set."""
 
-Task = Callable[["Config", str], tuple[int, Any]]
-"""Run on a config and a label, such as ``3/20 camera=sony_a7r`` (empty outside sweeps); returns exit code and result.
+Task = Callable[["Config", str], tuple[int, Any, list[str]]]
+"""Run on a config and a label, such as ``3/20 camera=sony_a7r`` (empty outside sweeps).
 
-The result of a task that generates a dataset is its `Summary`.
+Returns exit code, result and the texts to print. The result of a task that generates a dataset is its `Summary`. The
+caller prints, because a stdout that cannot be written is no failure of the job.
 """
 
 

@@ -12,15 +12,14 @@ import os
 import re
 import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 
 from unprocess_gen import __version__
 from unprocess_gen.cli.arguments import Verb, parse
 from unprocess_gen.cli.help import global_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
+from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, UnprocessGenError
@@ -33,17 +32,7 @@ OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
 BROKEN_PIPE = 141
 """Exit code if stdout is a pipe whose reader ended, as for a process that SIGPIPE ends."""
 
-ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
 KEPT = "finished shards are kept; rerun to resume"
-
-
-class TerminationSignal(BaseException):
-    """SIGTERM or SIGHUP arrived; ``number`` is the signal's."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
 
 
 def main() -> int:
@@ -57,7 +46,7 @@ def main() -> int:
     for limit in OPENCV_LIMITS:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
-    with checked_streams(), _SIGNALS:
+    with checked_streams(), SIGNALS:
         code = _exit_code(lambda: run(arguments), arguments)
         return _exit_code(_flush_stdout, arguments) or code
 
@@ -144,8 +133,8 @@ def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:
     except TerminationSignal as error:
         return _report_signal(error.number, arguments)
     except Exception as error:
-        if _SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
-            return _report_signal(_SIGNALS.received, arguments)
+        if SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
+            return _report_signal(SIGNALS.received, arguments)
         if isinstance(error, UnprocessGenError):
             return report_error(error)
         if LOGGER.handlers:
@@ -156,65 +145,6 @@ def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:
 def _flush_stdout() -> int:
     sys.stdout.flush()
     return 0
-
-
-# ------------------------------------------------------------------------------------------------------------ signals
-
-
-class _Signals:
-    """Turn signals into exceptions while it is entered: SIGINT, SIGTERM and SIGHUP, unless the caller ignores them.
-
-    Python drops exceptions that are raised while LLVM calls back into Python. Without `_repeat`, 3 of 47 SIGTERM at
-    random times of a first run with ``n_jobs=1`` were lost, or ended with a traceback and exit code 1.
-
-    Attributes
-    ----------
-    received : int or None
-        The last signal; None if there was none.
-    """
-
-    REPEAT_S = 0.05
-    """Delay before a dropped signal is sent again; LLVM's callbacks take far less."""
-
-    def __init__(self) -> None:
-        self.received: int | None = None
-        self._caught: list[int] = []
-        self._timer: threading.Timer | None = None
-        self._hook = sys.unraisablehook
-
-    def __enter__(self) -> None:
-        self.received = None
-        self._hook, sys.unraisablehook = sys.unraisablehook, self._repeat
-        self._caught = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # nohup
-        for number in self._caught:
-            signal.signal(number, self._handle)
-
-    def __exit__(self, *_: object) -> None:
-        for number in self._caught:
-            signal.signal(number, signal.SIG_DFL)  # a late signal ends the process without a traceback
-        sys.unraisablehook = self._hook
-        if self._timer is not None:
-            self._timer.cancel()
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.received = number
-        if number == signal.SIGINT:
-            raise KeyboardInterrupt
-        raise TerminationSignal(number)
-
-    def _repeat(self, unraisable: sys.UnraisableHookArgs) -> None:
-        """Send a signal again if the exception of its handler was dropped; pass anything else on."""
-        if not isinstance(unraisable.exc_value, KeyboardInterrupt | TerminationSignal):
-            sys.__unraisablehook__(unraisable)
-        elif self.received is not None:
-            if self._timer is not None:
-                self._timer.cancel()
-            self._timer = threading.Timer(self.REPEAT_S, os.kill, (os.getpid(), self.received))
-            self._timer.daemon = True
-            self._timer.start()
-
-
-_SIGNALS = _Signals()
 
 
 def _report_signal(number: int, arguments: Sequence[str]) -> int:

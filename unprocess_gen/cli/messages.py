@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
@@ -29,6 +29,13 @@ def print_result(text: object) -> None:
     """Print a line on stdout; with ``--log-file``, log it too."""
     print(text)
     RESULTS.info("%s", text)
+
+
+def print_results(texts: Iterable[object]) -> None:
+    """Print lines as `print_result` does, and flush: an error of stdout is raised here, not by a later step."""
+    for text in texts:
+        print_result(text)
+    sys.stdout.flush()
 
 
 def report_error(error: BaseException, job: str = "") -> int:

@@ -19,7 +19,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from unprocess_gen.cli.hydra_request import Request, Task, run_hydra
-from unprocess_gen.cli.messages import report_error
+from unprocess_gen.cli.messages import checked_streams, print_results, report_error
+from unprocess_gen.cli.signals import SIGNALS
 from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, worst, write_table
 from unprocess_gen.config.composition import validated_config
 from unprocess_gen.config.sweep_expansion import Expansion
@@ -49,23 +50,28 @@ class PluginJob:
     rows: str
 
     def __call__(self, node: DictConfig) -> int:
-        """Run the job, write its row and return its exit code."""
+        """Run the job, write its row, print its results and return its exit code."""
         settings = HydraConfig.get()
         overrides = list(settings.overrides.task)
         text = overrides_text([one for one in overrides if one not in self.described_by])
         swept = [one.lstrip("+").partition("=") for one in overrides if one not in self.fixed]
         folder, result = folder_name(text), None
+        texts: list[str] = []
         try:
             config = validated_config(node, overrides)
             config.out = str(Path(config.out) / folder)
-            code, result = self.task(config, f"{settings.job.num + 1} {folder}")
+            code, result, texts = self.task(config, f"{settings.job.num + 1} {folder}")
         except Exception as error:
+            if SIGNALS.received is not None:  # libraries may fail in their own way when they are interrupted
+                raise
             code = report_error(error, f"{folder}: ")
         row = JobRow.of(folder, text, {key: value for key, _, value in swept}, code, result)
         path = Path(self.rows, f"{settings.job.num:06d}.json")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.with_suffix(".part").write_text(json.dumps(asdict(row)), encoding="utf-8")
         path.with_suffix(".part").replace(path)
+        with checked_streams():  # a launcher's process has its own stdout
+            print_results(texts)
         return code
 
 

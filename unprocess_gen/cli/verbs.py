@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import SOURCE, Argument, Call, Place, Verb
 from unprocess_gen.cli.completion import SHELLS, print_completion
-from unprocess_gen.cli.messages import print_result, report, report_error
+from unprocess_gen.cli.messages import print_result, print_results, report, report_error
 from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, UnprocessGenError
@@ -40,8 +40,8 @@ def run_generate(call: Call) -> int:
     return compose(call.overrides, generate_dataset, sweep_csv=True)
 
 
-def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary]:
-    """Generate one dataset and print its summary.
+def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, list[str]]:
+    """Generate one dataset and describe it.
 
     Parameters
     ----------
@@ -52,20 +52,20 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary]:
 
     Returns
     -------
-    tuple of int and Summary
-        Exit code: 3 if more sources failed than ``source.max_failed`` allows; and what was generated.
+    tuple of int, Summary and list of str
+        Exit code: 3 if more sources failed than ``source.max_failed`` allows; what was generated; the lines to print.
     """
     from unprocess_gen.pipeline.generate import generate
     from unprocess_gen.sources.listing import unmatched_sentence
 
     summary = generate(config, label)
-    print_result(_summary_line(summary))
+    lines = [_summary_line(summary)]
     if summary.made and summary.sites["all"]:
-        print_result(_clipping_line(summary.sites))
+        lines.append(_clipping_line(summary.sites))
     if summary.unmatched:
-        print_result(unmatched_sentence(summary.unmatched))
+        lines.append(unmatched_sentence(summary.unmatched))
     too_many = sum(summary.failed.values()) > config.source.max_failed
-    return 3 if too_many else 0, summary
+    return 3 if too_many else 0, summary, lines
 
 
 def _summary_line(summary: Summary) -> str:
@@ -96,14 +96,12 @@ def run_plan(call: Call) -> int:
     return compose(call.overrides, partial(_plan, read_all="all" in call.values), totals=plan_totals)
 
 
-def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate]:
+def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate, list[str]]:
     from unprocess_gen.pipeline.executors.local import effective_jobs
     from unprocess_gen.reports.estimate import estimate_run, format_estimate
 
     estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
-    print_result(f"out       {config.out}")
-    print_result(format_estimate(config, estimate))
-    return 0, estimate
+    return 0, estimate, [f"out       {config.out}", format_estimate(config, estimate)]
 
 
 def run_accuracy(call: Call) -> int:
@@ -114,7 +112,7 @@ def run_accuracy(call: Call) -> int:
     return compose(overrides, partial(_accuracy, command=shlex.join(["gen-dataset", "accuracy", *overrides])))
 
 
-def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None]:
+def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.config.schema import NoiseConfig, SensorConfig
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports import report_files
@@ -132,9 +130,7 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
     )
     benchmark = measure.measure_accuracy(config, profiles, command=command)
     benchmark_report.write_benchmark(benchmark, out)
-    print_result(benchmark_report.text_table(benchmark.rows))
-    print_result(f"{out}: {', '.join(benchmark_report.FILES)}")
-    return 0, None
+    return 0, None, [benchmark_report.text_table(benchmark.rows), f"{out}: {', '.join(benchmark_report.FILES)}"]
 
 
 def _tiers() -> dict[str, AccuracyConfig]:
@@ -161,7 +157,7 @@ def run_figures(call: Call) -> int:
     return compose(overrides, partial(_figures, command=shlex.join(["gen-dataset", "figures", *overrides])))
 
 
-def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None]:
+def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.config.schema import GainsConfig, NoiseConfig
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports import report_files
@@ -172,8 +168,7 @@ def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, Non
     gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_figures.GAINS}
     authors = read_option(conf_dir() / "noise" / f"{paper_figures.AUTHORS_NOISE}.yaml", NoiseConfig)
     drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
-    print_result(f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}")
-    return 0, None
+    return 0, None, [f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}"]
 
 
 def _with_out(overrides: list[str], out: str) -> list[str]:
@@ -215,7 +210,8 @@ def run_again(call: Call) -> int:
     old, new = folder / "manifest.csv", Path(config.out) / "manifest.csv"
     if root is not None and Path(root).exists() and old.exists():
         check_source_sizes(old, root)
-    code, _ = generate_dataset(config)
+    code, _, lines = generate_dataset(config)
+    print_results(lines)
     if not old.exists():
         print_result(f"{folder} has no manifest.csv to compare with")
     elif not have_same_rows(old, new):
