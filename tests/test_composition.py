@@ -105,6 +105,7 @@ REFUSED = [
     ("~seed", r"~seed: a setting cannot be removed"),
     ("out=${", r"out=\$\{: "),
     ("out=${no.such}", r"out=\$\{no.such\}: Interpolation key 'no.such' not found"),
+    ("out=${oc.env:UG_NOT_SET}", r"out=\$\{oc.env:UG_NOT_SET\}: Environment variable 'UG_NOT_SET' not found$"),
     ("camera=null", r"camera=null: expected the name of an option: choice, "),
     ("experiment=ipol_demo", r"experiment=ipol_demo: a recipe is added to the settings; write \+experiment=ipol_demo"),
     ("hydra.mode=MULTIRUN", r"hydra.mode=MULTIRUN: settings of Hydra belong to the command line"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -109,6 +110,7 @@ EXPECTED = {
 
 def _wrong_value(key: str, message: str, overrides: Sequence[str]) -> str:
     """Return what is expected where OmegaConf refuses the type of a value, else its message."""
+    message = re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)
     if "is not a ListConfig, list or tuple" in message:
         value = assignment(key, overrides).partition("=")[2]
         return f"expected a list{f', such as [{value}]' if value and value[0] not in '[{' else ''}"
