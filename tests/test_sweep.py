@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,8 @@ import pytest
 from conftest import COMMAND, environment, fill
 
 from unprocess_gen.cli.sweep import SHARES, folder_name, overrides_text
+
+PATHS = os.pathsep.join(filter(None, sys.path))
 
 Door = Callable[..., Any]
 Make = Callable[..., Any]
@@ -276,6 +279,35 @@ def test_interval_is_refused_in_one_line(door: Door) -> None:
     done = door("-m", "gains.red=interval(1,2)")
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert "gains.red=interval(1,2): an interval has no list of values; expected choice or range" in done.err
+
+
+def test_processes_that_share_a_folder_keep_each_others_rows(tmp_path: Path) -> None:
+    """Two processes write 60 tables each; without a lock, rows are lost within the first few."""
+    code = (
+        "import sys; from pathlib import Path; from unprocess_gen.cli.sweep import JobRow, write_table\n"
+        "for i in range(60):\n"
+        "    name = f'{sys.argv[1]}{i}'\n"
+        "    write_table(Path('.'), [JobRow(name, 0, {'folder': name})])"
+    )
+    running = [
+        subprocess.Popen([sys.executable, "-c", code, name], cwd=tmp_path, env=environment(PYTHONPATH=PATHS))
+        for name in "ab"
+    ]
+    assert [process.wait(60) for process in running] == [0, 0]
+    assert sorted(row["folder"] for row in table(tmp_path)) == sorted(f"{name}{i}" for name in "ab" for i in range(60))
+    assert os.listdir(tmp_path) == ["sweep.csv"]
+
+
+@pytest.mark.parametrize(("content", "code"), [(b"folder\xff\n", 4), (b'folder\n"' + b"a" * 200_000, 4), (None, 5)])
+def test_unreadable_sweep_csv_ends_in_one_line(
+    content: bytes | None, code: int, door: Door, source: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "sweep").mkdir()
+    path = tmp_path / "sweep/sweep.csv"
+    path.mkdir() if content is None else path.write_bytes(content)
+    done = door("-m", "seed=1", "source.root=p", "out=sweep", "n_jobs=1", "-q")
+    assert (done.code, done.err.count("\n")) == (code, 1), done.err
+    assert "sweep/sweep.csv: " in done.err
 
 
 def test_names_omit_keys_of_the_executor() -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from unprocess_gen.core.errors import DamageError
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -138,10 +143,39 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
         The sweep's folder.
     jobs : sequence of JobRow
         The jobs that have finished, in order.
+
+    Raises
+    ------
+    DamageError
+        If the file exists and is no table.
+    MachineError
+        If it cannot be read or written.
     """
     if not out.is_dir():
         return
-    path = out / "sweep.csv"
+    try:
+        with _locked(out):  # several processes may sweep into one folder
+            _update_table(out / "sweep.csv", jobs)
+    except OSError as error:
+        from unprocess_gen.core.files import RESUME, machine_error  # imports NumPy, too slow for --help
+
+        raise machine_error(error, out, RESUME) from error
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the kernel's lock of a folder; a file system without locks is used without one."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
+    """Read the rows of the file, add those of jobs, and replace the file."""
     rows = {row["folder"]: row for row in read_table(path)}
     for job in jobs:
         row = dict(job.cells)
@@ -150,12 +184,15 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
             row["seconds"] = seconds
         rows[job.folder] = row
     keys = dict.fromkeys(key for row in rows.values() for key in row if key not in {*FIRST_COLUMNS, *LAST_COLUMNS})
-    temporary = out / "sweep.csv.part"
-    with temporary.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows.values())
-    os.replace(temporary, path)
+    temporary = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.DictWriter(stream, [*FIRST_COLUMNS, *keys, *LAST_COLUMNS], restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows.values())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
@@ -170,12 +207,21 @@ def read_table(path: Path) -> list[dict[str, str]]:
     -------
     list of dict
         One mapping of column to text for each job; empty if the file does not exist.
+
+    Raises
+    ------
+    DamageError
+        If the file is not UTF-8 text, or no CSV.
     """
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream, restval=""))
     except FileNotFoundError:
         return []
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DamageError(
+            f"{path}: no table of a sweep ({error}); expected CSV in UTF-8; move the file away and rerun"
+        ) from error
     return [{column: text for column, text in row.items() if column} for row in rows if row.get("folder")]
 
 
