@@ -294,7 +294,8 @@ def test_command_without_arguments_writes_ds_only(cli: Cli, tmp_path: Path) -> N
     done = cli()
     assert done.returncode == 0, done.stderr
     made, limits = done.stdout.splitlines()
-    assert re.fullmatch(r"ds: 10 pairs in 2 shards, [\d.]+ MB, 0 failed; 10 of 10 made now, [\d.]+ s", made)
+    rows = "10 of 10 rows generated in this run"
+    assert re.fullmatch(rf"ds: 10 pairs in 2 shards, [\d.]+ MB, 0 failed; {rows}, [\d.]+ s", made)
     assert re.match(r"of 3,725,623 sites, clean: 0\.\d{3}% were clipped at black, ", limits)
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
         "ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards", "ds/shards/shard-00000.tar",
@@ -306,8 +307,8 @@ def test_failed_photographs_give_exit_code_3_and_are_counted(door: Door, tmp_pat
     (fill(tmp_path / "p", 2) / "empty.png").touch()
     done = door("source.root=p", "n_jobs=1")
     assert done.code == 3
-    assert "2 pairs in 1 shards" in done.out
-    assert "1 failed (1 empty; see ds/manifest.csv)" in done.out
+    assert "2 pairs in 1 shard" in done.out
+    assert "1 failed (1 empty; see ds/manifest.csv), more than source.max_failed=0; " in done.out
 
 
 def test_allowed_number_of_failures_gives_exit_code_0(door: Door, tmp_path: Path) -> None:
@@ -339,7 +340,7 @@ def test_plan_writes_nothing(door: Door, tmp_path: Path, photos: Path) -> None:
 
 
 def bytes_in(text: str) -> int:
-    return int(re.search(r"^bytes +([\d,]+) in shards$", text, re.MULTILINE)[1].replace(",", ""))  # type: ignore[index]
+    return int(re.search(r"^bytes +([\d,]+) in shards, [\d.]+ MB$", text, re.MULTILINE)[1].replace(",", ""))  # type: ignore[index]
 
 
 @pytest.mark.parametrize("shard", [1, 5, 8])
@@ -542,7 +543,7 @@ def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, m
         keys = "1-2"  # LibRaw opens no picture of 12 x 16 pixels
     done = door(verb, moved, "--keys", keys, "--to", "there", *(["--source=moved"] if verb != "dng" else []))
     assert done.code == 0, done.err
-    assert ("; 1 failed rows skipped" in done.out) == ("-" in keys)
+    assert ("; 1 failed row skipped" in done.out) == ("-" in keys)
 
 
 def test_folder_of_a_sweep_is_refused_where_one_dataset_is_needed(moved: Path, door: Door, tmp_path: Path) -> None:
@@ -565,6 +566,40 @@ def test_verify_of_a_sweep_verifies_every_dataset(door: Door, tmp_path: Path) ->
     done = door("verify", "sweep", "--regenerate", "1")
     assert (done.code, "sweep: 1 of 2 datasets are intact" in done.out) == (4, True)
     assert done.err.startswith("gen-dataset: sweep/seed=1,source.limit=1: ")
+
+
+# Order and kind of words ----------------------------------------------------------------------------------------------
+
+HINTS = [
+    (("-q", "verify", "ds"), "verify: the verb must be the first word: gen-dataset verify -q ds"),
+    (("moved",), "moved: no such verb; .*; moved is a file or folder: write source.root=moved"),
+    (("ds",), "ds: no such verb; .*; ds is a dataset: write gen-dataset verify ds, or another verb"),
+    (
+        ("plan", "./moved"),
+        "plan: ./moved: expected a setting key=value; ./moved is a file or folder: write source",
+    ),
+    (("figures", "ds"), "figures: ds: expected a setting key=value; ds is a dataset: write gen-dataset verify ds"),
+    (("again", "ds", "out=ds"), "again: out=ds: is the dataset itself; expected another folder"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), HINTS, ids=[" ".join(arguments) for arguments, _ in HINTS])
+def test_misplaced_word_is_answered_with_what_to_write(
+    arguments: tuple[str, ...], sentence: str, moved: Path, door: Door
+) -> None:
+    done = door(*arguments)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert re.match(f"gen-dataset: {sentence}", done.err), done.err
+
+
+@pytest.mark.parametrize(
+    ("verb", "required"),
+    [("again", "out=FOLDER"), ("preview", "--to FOLDER"), ("dng", "--keys KEYS --to FOLDER")],
+)
+def test_help_shows_required_arguments(verb: str, required: str, door: Door) -> None:
+    text = door(verb, "--help").out
+    assert f"DIR {required} " in text.splitlines()[0]
+    assert text.count("(required)") == len(re.findall("FOLDER|KEYS", required))
 
 
 # Paths that the user names --------------------------------------------------------------------------------------------

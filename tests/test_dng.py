@@ -348,7 +348,7 @@ def test_the_clean_frame_has_no_noise_profile(ds: Path) -> None:
 def test_frames_without_a_noise_profile_are_counted(folder: Path, make: Make, door: Door, tmp_path: Path) -> None:
     make(folder, tmp_path / "ds", "noise=imx385_iso3200_rvdd", "source.limit=3")
     done = door("dng", "ds", "--keys", "00000000,00000002", "--to", "to")
-    assert "2 noisy ones without NoiseProfile, which cannot describe their noise" in done.out
+    assert "2 noisy frames without NoiseProfile, which cannot describe the noise" in done.out
 
 
 # -------------------------------------------------------------------------------------------------------------- tags

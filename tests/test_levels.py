@@ -82,8 +82,8 @@ def test_the_pairs_of_an_image_differ_in_noise_only(many: Path) -> None:
 
 def test_the_end_of_a_run_counts_pairs(door: Door) -> None:
     said = door("source.limit=1", "noise.levels=2", "noise.draws=2", "noise=brooks2019", "n_jobs=1").out
-    assert said.startswith("ds: 4 pairs in 1 shards")
-    assert "; 4 of 4 made now, " in said
+    assert said.startswith("ds: 4 pairs in 1 shard")
+    assert "; 4 of 4 rows generated in this run, " in said
 
 
 def test_levels_draw_their_own_profile_and_draws_share_it(many: Path) -> None:
@@ -141,7 +141,7 @@ def test_a_manifest_is_regenerated_from_the_shards(many: Path, door: Door, tmp_p
 
 def test_an_images_key_selects_all_of_its_pairs(many: Path, photographs: Path, door: Door) -> None:
     assert door("replay", many, "--keys", "00000001").out.startswith("6 pairs are the same")
-    assert door("replay", many, "--keys", "00000001-l02d01").out.startswith("1 pairs are the same")
+    assert door("replay", many, "--keys", "00000001-l02d01").out.startswith("1 pair is the same")
 
 
 def test_levels_can_be_isos_of_a_physical_profile(photographs: Path, make: Make, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -56,6 +56,8 @@ class Argument:
         What ``read`` accepts, for error messages.
     completes : str
         ``folders`` or ``files`` if shells complete the value as such.
+    required : bool
+        Whether the verb needs it; shown by ``--help``, checked by the verb.
     """
 
     names: tuple[str, ...]
@@ -64,6 +66,7 @@ class Argument:
     read: Callable[[str], Any] = str
     expected: str = "text"
     completes: str = ""
+    required: bool = False
 
     @property
     def key(self) -> str:
@@ -180,6 +183,36 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(f"{verb}: {message.removeprefix('argument ')}; see {self.prog} --help")
 
 
+SWITCHES = frozenset(
+    (
+        *(flag for argument in STANDARD if not argument.metavar for flag in argument.flags),
+        *(flag for spellings, (values, _) in HYDRA_FLAGS.items() if not values for flag in spellings),
+    )
+)
+"""Flags without a value that verbs share."""
+
+
+def path_hint(word: str) -> str:
+    """Return what to write instead of the bare name of a file or folder, for an error message.
+
+    Parameters
+    ----------
+    word : str
+        A word of the command line.
+
+    Returns
+    -------
+    str
+        Begins with a semicolon; empty if there is no file or folder of that name.
+    """
+    path = Path(word)
+    if not word or not os.path.lexists(word):
+        return ""
+    if any((path / name).is_file() for name in ("dataset.json", "manifest.csv", "sweep.csv")):
+        return f"; {word} is a dataset: write gen-dataset verify {word}, or another verb"
+    return f"; {word} is a file or folder: write source.root={word}"
+
+
 def flag_parser(verb: Verb) -> argparse.ArgumentParser:
     """Return the parser of a verb's flags; it knows no words."""
     parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False, argument_default=None)
@@ -243,7 +276,11 @@ def _read(argument: Argument, spelling: str, text: Any) -> Any:
 
 def _overrides(verb: Verb, words: list[str], values: dict[str, Any]) -> list[str]:
     """Return what is passed on to Hydra; ``--source ROOT`` becomes ``source.root=ROOT``."""
-    for flag in _flags_among(words):
+    flags, others = _flags_and_words(words)
+    for word in others:
+        if "=" not in word and (hint := path_hint(word)):
+            raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{hint}")
+    for flag in flags:
         if not any(flag.partition("=")[0] in spellings for spellings in HYDRA_FLAGS):
             raise ConfigError(f"{flag}: no such flag; {_expected(verb, flag)}")
     root = values.get("source")
@@ -254,14 +291,18 @@ def _overrides(verb: Verb, words: list[str], values: dict[str, Any]) -> list[str
     return [*words, f"source.root={root}"]
 
 
-def _flags_among(words: list[str]) -> Iterator[str]:
-    """Yield the words that are flags, not values of Hydra's flags."""
+def _flags_and_words(words: list[str]) -> tuple[list[str], list[str]]:
+    """Return the words that are flags, and those that are neither flags nor values of Hydra's flags."""
+    flags, others = [], []
     waiting = iter(words)
     for word in waiting:
-        if word.startswith("-"):
-            yield word
-            if any(word in spellings and values for spellings, (values, _) in HYDRA_FLAGS.items()):
-                next(waiting, None)
+        if not word.startswith("-"):
+            others.append(word)
+            continue
+        flags.append(word)
+        if any(word in spellings and values for spellings, (values, _) in HYDRA_FLAGS.items()):
+            next(waiting, None)
+    return flags, others
 
 
 def _assign_words(verb: Verb, words: list[str], values: dict[str, Any]) -> Call:

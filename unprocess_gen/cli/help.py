@@ -122,10 +122,14 @@ def verb_help(verb: Verb) -> str:
     """
     words = [verb.place.metavar] if verb.place else []
     words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
+    words += [_spelled(argument) for argument in verb.arguments if argument.required]
     words += ["[key=value ...]"] if verb.composes or any(one.settings for one in verb.arguments) else []
     sections = {
         "Arguments": [(verb.place.metavar, verb.place.expected)] if verb.place else [],
-        "Flags and settings": [(_spelled(argument), argument.help) for argument in (*verb.arguments, *STANDARD)]
+        "Flags and settings": [
+            (_spelled(argument), argument.help + (" (required)" if argument.required else ""))
+            for argument in (*verb.arguments, *STANDARD)
+        ]
         + [("-h, --help", "show this help")],
         "Hydra's flags": [
             (", ".join(spellings) + (f" {_choices(values)}" if values else ""), text)

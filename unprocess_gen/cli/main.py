@@ -10,13 +10,13 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from unprocess_gen import __version__
-from unprocess_gen.cli.arguments import Verb, parse
+from unprocess_gen.cli.arguments import SWITCHES, Verb, parse, path_hint
 from unprocess_gen.cli.help import global_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
 from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
@@ -110,16 +110,23 @@ def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
         If there is no such verb.
     """
     if not arguments or not re.fullmatch("[a-z]+", arguments[0]):
+        _refuse_late_verb(arguments)
         return VERBS["generate"], list(arguments)
     name, *rest = arguments
     if name not in VERBS:
         if {"-h", "--help"} & set(rest):
             return VERBS["generate"], list(arguments)
-        hint = did_you_mean(name, VERBS)
-        if not hint and Path(name).exists():
-            hint = f"; {name} is a file or folder: write source.root={name}"
+        hint = path_hint(name) or did_you_mean(name, VERBS)
         raise ConfigError(f"{name}: no such verb; expected {', '.join(VERBS)} or settings key=value{hint}")
     return VERBS[name], rest
+
+
+def _refuse_late_verb(arguments: Sequence[str]) -> None:
+    """Refuse a verb behind switches such as ``-q``, with the order that is expected."""
+    at = next((at for at, word in enumerate(arguments) if word not in SWITCHES), len(arguments))
+    if 0 < at < len(arguments) and arguments[at] in VERBS:
+        verb, rest = arguments[at], [*arguments[:at], *arguments[at + 1 :]]
+        raise ConfigError(f"{verb}: the verb must be the first word: {shlex.join(['gen-dataset', verb, *rest])}")
 
 
 def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:

@@ -7,9 +7,11 @@ kernels or Hydra takes longer than ``--help`` may take.
 from __future__ import annotations
 
 import logging
+import os
 import re
 import shlex
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +23,7 @@ from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.output_paths import DATASET_ENTRIES
+from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
     from unprocess_gen.config.schema import AccuracyConfig, Config
@@ -59,7 +62,7 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, lis
     from unprocess_gen.sources.listing import unmatched_sentence
 
     summary = generate(config, label)
-    lines = [_summary_line(summary)]
+    lines = [_summary_line(summary, config.source.max_failed)]
     if summary.made and summary.sites["all"]:
         lines.append(_clipping_line(summary.sites))
     if summary.unmatched:
@@ -68,14 +71,17 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, lis
     return 3 if too_many else 0, summary, lines
 
 
-def _summary_line(summary: Summary) -> str:
-    failed = ", ".join(f"{count} {reason}" for reason, count in summary.failed.items())
-    facts = f"{summary.pairs} pairs in {summary.shards} shards, {summary.bytes / 1e6:,.1f} MB, " + (
-        f"{sum(summary.failed.values())} failed ({failed}; see {summary.out}/manifest.csv)" if failed else "0 failed"
+def _summary_line(summary: Summary, max_failed: int) -> str:
+    count, failed = sum(summary.failed.values()), ", ".join(f"{n} {reason}" for reason, n in summary.failed.items())
+    facts = (
+        f"{counted(summary.pairs, 'pair')} in {counted(summary.shards, 'shard')}, {summary.bytes / 1e6:,.1f} MB, "
+        + (f"{count} failed ({failed}; see {summary.out}/manifest.csv)" if failed else "0 failed")
     )
+    facts += f", more than source.max_failed={max_failed}" if count > max_failed else ""
     if not summary.made:
         return f"{summary.out} is complete: {facts}; nothing to do"
-    return f"{summary.out}: {facts}; {summary.made} of {summary.rows} made now, {summary.seconds:.1f} s"
+    rows = f"{summary.made} of {counted(summary.rows, 'row')} generated in this run"
+    return f"{summary.out}: {facts}; {rows}, {summary.seconds:.1f} s"
 
 
 def _clipping_line(sites: dict[str, int]) -> str:
@@ -85,7 +91,7 @@ def _clipping_line(sites: dict[str, int]) -> str:
         f"of {sites['all']:,} sites, clean: {share['clean_clipped_low']} were clipped at black, "
         f"{share['clean_clipped_high']} at white, {share['saturated']} are saturated; "
         f"noisy: {share['noisy_clipped_low']} were clipped low, {share['noisy_clipped_high']} high; "
-        f"{share['zero_variance']} have no noise variance"
+        f"{share['zero_variance']} have zero noise variance"
     )
 
 
@@ -101,7 +107,8 @@ def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunE
     from unprocess_gen.reports.estimate import estimate_run, format_estimate
 
     estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
-    return 0, estimate, [f"out       {config.out}", format_estimate(config, estimate)]
+    blank = [""] if label and not label.startswith("1/") else []
+    return 0, estimate, [*blank, f"out       {config.out}", format_estimate(config, estimate)]
 
 
 def run_accuracy(call: Call) -> int:
@@ -190,6 +197,8 @@ def run_again(call: Call) -> int:
     config, kind = read_dataset_yaml(folder / "config.yaml")
     if "out" not in call.values:
         raise ConfigError("again: out is missing; expected the folder of the new dataset; give out=…")
+    if Path(call.values["out"]).resolve() == folder.resolve():
+        raise ConfigError(f"again: out={call.values['out']}: is the dataset itself; expected another folder")
     root = _root(call)
     if kind != "folder" and root is not None:
         raise ConfigError(
@@ -275,7 +284,9 @@ def _finish_verification(folder: Path, found: Iterable[Damage], call: Call) -> i
         damages += _check_noise(folder, call.values.get("to"))
     if damages:
         return worst(codes) or DamageError.exit_code
-    print_result(f"{folder} is intact" + (f"; {regenerated} pairs regenerated, bit for bit" if regenerated else ""))
+    print_result(
+        f"{folder} is intact" + (f"; {counted(regenerated, 'pair')} regenerated, bit for bit" if regenerated else "")
+    )
     return 0
 
 
@@ -292,7 +303,8 @@ def _check_noise(folder: Path, to: str | None) -> list[str]:
         print_result(f"{folder}: no pair has enough sites to fit its noise")
         return []
     print_result(
-        f"noise of {fits.count} pairs fitted (a, b with 95 % intervals); the farthest from its row: {fits.worst}"
+        f"noise of {counted(fits.count, 'pair')} fitted (a, b with 95 % intervals); "
+        f"the farthest from its row: {fits.worst}"
     )
     if to is not None:
         photon_transfer.draw_fits(fits.first, Path(to))
@@ -328,7 +340,7 @@ def run_replay(call: Call) -> int:
             report(_complaint(result), logging.ERROR)
     same = codes.count(0)
     print_result(
-        f"{same} pairs are the same, bit for bit; {len(codes) - same} are not"
+        f"{counted(same, 'pair')} {'is' if same == 1 else 'are'} the same, bit for bit; {len(codes) - same} are not"
         + (f"; arrays in {to}" if written else "")
         + _skipped(len(skipped))
     )
@@ -337,7 +349,7 @@ def run_replay(call: Call) -> int:
 
 def _skipped(failed: int) -> str:
     """Return the end of a verb's result that counts failed rows inside ranges of ``--keys``."""
-    return f"; {failed} failed rows skipped" if failed else ""
+    return f"; {counted(failed, 'failed row')} skipped" if failed else ""
 
 
 def run_report(call: Call) -> int:
@@ -370,7 +382,7 @@ def run_preview(call: Call) -> int:
             code = SourceChangedError.exit_code if has_root else code
             omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
             report(f"{sheet.key} ({sheet.source}): {omitted} omitted: {sheet.missing_source}")
-    print_result(f"{files} pictures in {to}{_skipped(failed)}")
+    print_result(f"{counted(files, 'picture')} in {to}{_skipped(failed)}")
     return code
 
 
@@ -385,13 +397,17 @@ def run_dng(call: Call) -> int:
     to = _folder_to("dng", call)
     frames = [frame for frame in FRAMES if frame in call.values] or FRAMES
     exported = export(folder, call.values["keys"], frames, to)
+    failed = select_pairs(folder / "manifest.csv", call.values["keys"]).failed
     counts = (
-        (exported.written, "DNG files written"),
-        (exported.present, "existed with the same bytes"),
-        (exported.without_profile, "noisy ones without NoiseProfile, which cannot describe their noise"),
-        (select_pairs(folder / "manifest.csv", call.values["keys"]).failed, "failed rows skipped"),
+        (exported.written, f"{counted(exported.written, 'DNG file')} written"),
+        (exported.present, f"{exported.present} existed with the same bytes"),
+        (
+            exported.without_profile,
+            f"{counted(exported.without_profile, 'noisy frame')} without NoiseProfile, which cannot describe the noise",
+        ),
+        (failed, f"{counted(failed, 'failed row')} skipped"),
     )
-    print_result(f"{to}: " + "; ".join(f"{count} {what}" for count, what in counts if count))
+    print_result(f"{to}: " + "; ".join(text for count, text in counts if count))
     return 0
 
 
@@ -424,7 +440,7 @@ def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False
     """
     path = call.path
     assert path is not None
-    if not path.exists():
+    if not os.path.lexists(path):  # False for names that are too long, too
         kind = "file or folder" if files else "folder"
         raise ConfigError(f"{verb}: {path}: no such {kind}; expected {_place(verb)}")
     if not path.is_dir():
@@ -537,7 +553,7 @@ VERBS: dict[str, Verb] = {
             run_preview,
             (
                 KEYS,
-                Argument(("--to",), "write the pictures to FOLDER", "FOLDER", completes="folders"),
+                Argument(("--to",), "write the pictures to FOLDER", "FOLDER", completes="folders", required=True),
                 SOURCE,
                 Argument(("--stages",), "draw each processing step too"),
             ),
@@ -548,8 +564,8 @@ VERBS: dict[str, Verb] = {
             "write frames as DNG files, for raw converters",
             run_dng,
             (
-                KEYS,
-                Argument(("--to",), "write the files to FOLDER", "FOLDER", completes="folders"),
+                replace(KEYS, required=True),
+                Argument(("--to",), "write the files to FOLDER", "FOLDER", completes="folders", required=True),
                 Argument(("--noisy",), "only noisy frames"),
                 Argument(("--clean",), "only clean frames"),
             ),
@@ -561,7 +577,7 @@ VERBS: dict[str, Verb] = {
             run_again,
             (
                 SOURCE,
-                Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders"),
+                Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True),
                 _whole_number(("n_jobs",), "worker processes; -1: all cores"),
                 _whole_number(("source.max_failed",), "largest number of failed sources with exit code 0"),
             ),

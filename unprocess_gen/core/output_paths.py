@@ -121,6 +121,10 @@ def _first_bytes(file: Path, option: str) -> bytes:
 
 
 def _refuse_dataset(path: Path, option: str, kind: str) -> None:
+    try:
+        path.exists()
+    except OSError as error:  # the name is too long, or a parent may not be searched
+        raise ConfigError(f"{option}: cannot be written ({error.strerror}); choose another name") from None
     if (dataset := enclosing_dataset(path)) is not None:
         raise ConfigError(
             f"{option}: is inside the dataset {dataset}; expected a {kind} outside of datasets; choose another name"

@@ -26,7 +26,7 @@ from unprocess_gen.pipeline.sizes import source_bytes
 from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark.measure import measure_tier_times
-from unprocess_gen.reports.formatting import value_range
+from unprocess_gen.reports.formatting import byte_size, counted, value_range
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.listing import unmatched_sentence
@@ -263,13 +263,13 @@ def format_estimate(config: Config, estimate: RunEstimate) -> str:
     sampled = len(estimate.source_estimates)
     unmatched = unmatched_sentence(estimate.unmatched)
     lines = [
-        f"sources   {estimate.sources} ({config.source.root or 'built-in scenes'}), {sampled} of them read",
+        f"sources   {estimate.sources} in {config.source.root or 'the built-in scenes'}; {sampled} of them read",
         *(f"          {sentence}" for sentence in (unmatched, *estimate.warnings) if sentence),
-        f"pairs     {about}{estimate.pairs}, in {estimate.shards} shards of {config.output.pairs_per_shard}",
+        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}",
         *_patch_lines(config, estimate.source_estimates),
-        f"bytes     {about}{estimate.bytes:,} in shards"
+        f"bytes     {about}{estimate.bytes:,} in shards, {byte_size(estimate.bytes)}"
         + ("" if estimate.exact else " (--all reads every source: exact)"),
-        f"disk      {estimate.free_bytes:,} bytes free"
+        f"disk      {byte_size(estimate.free_bytes)} free"
         + ("" if estimate.free_bytes > estimate.bytes else ": NOT ENOUGH"),
         f"time      about {format_duration(estimate.seconds)} with {estimate.n_jobs} "
         f"worker{'s' if estimate.n_jobs > 1 else ''}, plus the time to write to disk",

@@ -26,3 +26,21 @@ def value_range(values: Sequence[float], digits: int = 6) -> str:
 def byte_size(count: int) -> str:
     """Return a number of bytes in decimal megabytes or gigabytes."""
     return f"{count / 1e9:,.2f} GB" if count >= 1e9 else f"{count / 1e6:,.1f} MB"
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number and a noun, which gets an s unless the number is 1.
+
+    Parameters
+    ----------
+    number : int
+        The number.
+    noun : str
+        Singular; its plural ends with s.
+
+    Returns
+    -------
+    str
+        Such as ``1 pair`` or ``1200 pairs``.
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
