@@ -416,7 +416,7 @@ def test_the_command_writes_the_frames_asked_for(
 ) -> None:
     done = door("dng", ds, "--keys", "00000002", *flags, "--to", "deep/to")
     assert (done.code, done.err) == (0, "")
-    assert done.out == f"deep/to: {len(names)} DNG files written\n"
+    assert done.out == f"deep/to: {len(names)} DNG file{'s' * (len(names) > 1)} written\n"
     assert sorted(path.name for path in (tmp_path / "deep" / "to").iterdir()) == names
 
 
@@ -443,7 +443,7 @@ def test_existing_identical_file_is_kept(ds: Path, door: Door, tmp_path: Path) -
     door("dng", ds, "--keys", "00000000", "--noisy", "--to", "to")
     before = (tmp_path / "to" / "00000000.noisy.dng").stat()
     done = door("dng", ds, "--keys", "00000000", "--to", "to")
-    assert done.out == "to: 1 DNG files written; 1 existed with the same bytes\n"
+    assert done.out == "to: 1 DNG file written; 1 existed with the same bytes\n"
     assert (tmp_path / "to" / "00000000.noisy.dng").stat() == before
 
 
