@@ -75,7 +75,7 @@ def test_closed_streams_and_full_stderr_do_not_end_a_command(name: str, stream: 
 
 def test_mistake_keeps_its_exit_code_without_stderr(folder: Path) -> None:
     assert shell('exec "$@" 2>/dev/full', folder, "verfy").returncode == 2
-    assert shell('exec "$@" 2>&-', folder, "verify", "no such folder").returncode == 2
+    assert shell('exec "$@" 2>&-', folder, "verify", "no such folder").returncode == 4
 
 
 @pytest.mark.parametrize("name", ["help", "plan", "verify"])
@@ -163,7 +163,14 @@ def test_log_file_has_messages_results_errors_and_exit_code(door: Door, tmp_path
     lines = (tmp_path / "run.log").read_text().splitlines()
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|ERROR) ", line) for line in lines)
     text = "\n".join(lines)
-    for part in ("2/2 images", "ds: 2 pairs", "ds is complete", "INFO exit code 0", "ERROR nothing: ", "exit code 4"):
+    for part in (
+        "2/2 images",
+        "ds: 2 pairs",
+        "ds is complete",
+        "INFO exit code 0",
+        "ERROR verify: nothing: ",
+        "exit code 4",
+    ):
         assert part in text
 
 

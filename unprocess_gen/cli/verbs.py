@@ -440,16 +440,18 @@ def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False
     """
     path = call.path
     assert path is not None
+    # a dataset that was deleted is damage, as in version 0.1; only again, which reads settings, calls it wrong usage
+    missing: type[UnprocessGenError] = ConfigError if verb == "again" else DamageError
     if not os.path.lexists(path):  # False for names that are too long, too
         kind = "file or folder" if files else "folder"
-        raise ConfigError(f"{verb}: {path}: no such {kind}; expected {_place(verb)}")
+        raise missing(f"{verb}: {path}: no such {kind}; expected {_place(verb)}")
     if not path.is_dir():
         if files:
             return path
         raise ConfigError(f"{verb}: {path}: is a file; expected {_place(verb)}")
     is_sweep = (path / "sweep.csv").is_file()
     if not is_sweep and not any((path / name).exists() for name in DATASET_ENTRIES):
-        raise ConfigError(f"{verb}: {path}: not a dataset; expected {_place(verb)}")
+        raise missing(f"{verb}: {path}: not a dataset; expected {_place(verb)}")
     if sweeps:
         return path
     if is_sweep and not (path / "dataset.json").exists():

@@ -390,7 +390,23 @@ def _digest(root: str, source: Source) -> str:
 
 
 def root_status(root: str) -> os.stat_result:
-    """Return the status of a folder or regular file; ConfigError for anything else."""
+    """Return the status of a source root.
+
+    Parameters
+    ----------
+    root : str
+        Value of ``source.root``.
+
+    Returns
+    -------
+    os.stat_result
+        Status of the folder or regular file.
+
+    Raises
+    ------
+    ConfigError
+        If nothing is there, or something else than a folder or a regular file.
+    """
     try:
         status = Path(root).stat()
     except (OSError, ValueError) as error:
