@@ -377,7 +377,7 @@ def test_existing_file_is_refused(door: Door, tmp_path: Path) -> None:
 
     assert (done.code, done.err) == (
         2,
-        "gen-dataset: out=file: cannot be written (file is not a folder); choose another out\n",
+        "gen-dataset: out=file: is a file; expected a folder\n",
     )
 
 

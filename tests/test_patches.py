@@ -442,7 +442,7 @@ def test_row_with_a_moved_patch_differs(cut_up: Path, sources: Path) -> None:
     (moved,) = replay([{**row, "patch_x": int(row["patch_x"] or 0) ^ 2}], str(sources))
     (outside,) = replay([{**row, "patch_y": 36}], str(sources))
     assert moved.complaint.startswith("the XXH3-128 of clean is ")
-    assert "its 30 x 30 pixels from row 36, column " in outside.complaint
+    assert "its patch of 30 x 30 pixels at row 36, column " in outside.complaint
 
 
 @pytest.mark.parametrize(

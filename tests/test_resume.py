@@ -210,8 +210,8 @@ def test_unfinished_shards_are_deleted_at_the_start(begun: Path, make: Make, mon
     left = begun / "ds/.work/tmp/shard-00002.tar.1.1"
     left.write_bytes(b"half")
     there: list[bool] = []
-    list_tasks = runner.shard_tasks
-    monkeypatch.setattr(runner, "shard_tasks", lambda *given: (there.append(left.exists()), list_tasks(*given))[1])
+    count_jobs = runner.effective_jobs
+    monkeypatch.setattr(runner, "effective_jobs", lambda *given: (there.append(left.exists()), count_jobs(*given))[1])
     make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
     assert there == [False]
 
