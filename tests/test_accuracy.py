@@ -163,13 +163,13 @@ def test_gaussian_approximation_has_the_stated_cdf_difference(
     settings: Settings, profiles: BenchmarkProfiles, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = settings("noise=sony_a7s2", "scene=night", "source.limit=1")
-    bench = session.open_session(config, profiles, LITTLE)
-    plans = [plan for _, plan in bench.flat_plans(TIERS[REFERENCE])]
-    counted = bench.flat_frames(TIERS[REFERENCE])
+    opened = session.open_session(config, profiles, LITTLE)
+    plans = [plan for _, plan in opened.flat_plans(TIERS[REFERENCE])]
+    counted = opened.flat_frames(TIERS[REFERENCE])
     near = noise.REFERENCE_DRAWS._replace(poisson=lambda words, rate: rate + np.sqrt(rate) * noise.normals(words))
     monkeypatch.setattr(noise, "REFERENCE_DRAWS", near)
-    bench.clear()
-    drawn = bench.flat_frames(TIERS[REFERENCE])
+    opened.clear()
+    drawn = opened.flat_frames(TIERS[REFERENCE])
 
     for plan, one, other in zip(plans, drawn, counted, strict=True):
         physics = plan.physics

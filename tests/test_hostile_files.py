@@ -343,12 +343,12 @@ def weigh_all(door: Connection, config: Config, tmp: str) -> None:
     """Make a shard of each source that comes in, and send out what it took. Runs in a process of its own."""
     for dtype in (np.uint8, np.uint16):  # compile and read once before measuring
         make_pair(np.zeros((4, 4, 3), dtype), plan_image(config, "0" * 64, 0))
-    bench = RunContext(config, tmp, os.getpid())
+    context = RunContext(config, tmp, os.getpid())
     while True:
         source: Source = door.recv()
         Path("/proc/self/clear_refs").write_text("5")  # sets the high-water mark back
         start = time.process_time()
-        made = make_shard(bench, ShardTask(0, (source,)))
+        made = make_shard(context, ShardTask(0, (source,)))
         seconds = time.process_time() - start
         if made.path is not None:
             Path(made.path).unlink()

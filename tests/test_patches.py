@@ -32,7 +32,7 @@ from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.sources import loader as photographs
-from unprocess_gen.sources import patches as room
+from unprocess_gen.sources import patches as patches_module
 from unprocess_gen.sources.patches import list_patches, pixels_in_none
 
 Settings = Callable[..., Config]
@@ -196,7 +196,7 @@ def test_random_places_are_even_and_inside(side: int, down: int, right: int, key
 
 
 def test_random_places_include_the_first_and_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "patch_words", lambda key, count: [(0, 2**32 - 1), (2**32 - 1, 0)])
+    monkeypatch.setattr(patches_module, "patch_words", lambda key, count: [(0, 2**32 - 1), (2**32 - 1, 0)])
     found = list_patches(PatchRule("random", 10, count=2), 0, 31, 40)
     assert [patch.origin for patch in found] == [(0, 30), (20, 0)]
 

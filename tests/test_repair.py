@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import Door, Make
 
-from unprocess_gen.pipeline import repair as room
+from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import verify
 
 FILES = ("config.yaml", "manifest.csv", "dataset.json", *(f"shards/shard-0000{number}.tar" for number in range(4)))
@@ -161,7 +161,7 @@ def test_only_damaged_pairs_are_regenerated(
 
 
 def _json_rows(folder: Path, shard: int) -> list[str]:
-    return [json.dumps(json.loads(row)) for row in room.json_inside(folder / "shards" / f"shard-{shard:05d}.tar")]
+    return [json.dumps(json.loads(row)) for row in repair.json_inside(folder / "shards" / f"shard-{shard:05d}.tar")]
 
 
 def test_lost_manifest_needs_no_source_if_shards_are_intact(copy: Path, door: Door, make: Make, tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_interrupted_repair_adds_no_damage(
     for name in damaged:
         flip(copy / name, 77_777 % (8 * (copy / name).stat().st_size))
     with monkeypatch.context() as patched:
-        patched.setattr(room.os, "replace", _interrupt)
+        patched.setattr(repair.os, "replace", _interrupt)
         assert door("verify", copy, "--repair").code == 130
     assert {damage.file for damage in verify(copy)} == set(damaged)
 
