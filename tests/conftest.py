@@ -5,74 +5,30 @@ from __future__ import annotations
 import copy
 import functools
 import hashlib
-import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pytest
+from helpers.commands import COMMAND, Cli, Done, RunMain, environment
+from helpers.datasets import Make, Settings
+from helpers.photographs import pixels
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf, open_dict
 from PIL import Image
 
-from unprocess_gen.cli import main as door_room
+from unprocess_gen.cli import main as entry_point
 from unprocess_gen.config.composition import compose_node
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline import generate as runner
 
-COMMAND = Path(sys.executable).with_name("gen-dataset")
-
 np.seterr(all="raise")  # in every test: no NaN, overflow, underflow or division by zero goes by unseen
-
-
-def pixels(seed: int, height: int, width: int, dtype: type = np.uint8, channels: int = 3) -> np.ndarray:
-    """Smooth random colours with some of them saturated, so that highlights and shadows both occur."""
-    noise = np.random.default_rng(seed).random((height // 4 + 2, width // 4 + 2, channels)) * 1.3 - 0.1
-    smooth = cv2.resize(noise, (width, height), interpolation=cv2.INTER_LINEAR).reshape(height, width, channels)
-    return (np.clip(smooth, 0, 1) * np.iinfo(dtype).max).astype(dtype)
-
-
-def fill(folder: Path, count: int, first: int = 0) -> Path:
-    """Write ``count`` small PNGs, all of another content and size, and return their folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for i in range(first, first + count):
-        Image.fromarray(pixels(i, 12 + i % 5, 16 + i % 7)).save(folder / f"{i:03d}.png")
-    return folder
-
-
-PHOTOS = (
-    "50%25.png",
-    "%3Dformula.png",
-    "comma, and space.jpg",
-    "deep.png",
-    "gray.png",
-    "one.png",
-    "scan.tif",
-    "strip.bmp",
-    "sub/inner one.jpg",
-    "sub/été.png",
-    "turned.jpg",
-    "web.webp",
-    "wide.png",
-)
-"""The photographs of the fixture `photos`, as a manifest spells and orders them."""
-
-
-CRVD = {
-    1600: (3.513262, 11.917691),
-    3200: (6.955588, 38.117816),
-    6400: (13.486051, 130.818508),
-    12800: (26.585953, 484.539790),
-    25600: (52.032536, 1819.818657),
-}
-"""Gain and read variance of the IMX385 by ISO, DN above black (Yue et al. 2020)."""
 
 
 @pytest.fixture(scope="session")
@@ -100,9 +56,6 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-Settings = Callable[..., Config]
-
-
 @pytest.fixture(scope="session")
 def settings() -> Settings:
     """Return a function that composes a config from overrides, without validating it."""
@@ -126,9 +79,6 @@ def settings() -> Settings:
         return config
 
     return composed
-
-
-Make = Callable[..., runner.Summary]
 
 
 @pytest.fixture(scope="session")
@@ -166,14 +116,6 @@ def tree_hash() -> Callable[[Path], str]:
     return _tree_hash
 
 
-def environment(**changes: str) -> dict[str, str]:
-    """Return this process's environment with changes."""
-    return os.environ | {"HYDRA_FULL_ERROR": ""} | changes
-
-
-Cli = Callable[..., "subprocess.CompletedProcess[str]"]
-
-
 @pytest.fixture
 def cli(tmp_path: Path) -> Cli:
     """Return a function that runs ``gen-dataset`` in its own process, in ``tmp_path`` by default."""
@@ -193,19 +135,8 @@ def cli(tmp_path: Path) -> Cli:
     return called
 
 
-class Done(NamedTuple):
-    """Exit code, stdout and stderr of a call."""
-
-    code: int
-    out: str
-    err: str
-
-
-Door = Callable[..., Done]
-
-
 @pytest.fixture
-def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[Door]:
+def run_main(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[RunMain]:
     """Return a function that calls the command line's `main` in this process, in ``tmp_path``: quicker than `cli`."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "")
@@ -215,7 +146,7 @@ def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
         monkeypatch.setattr(sys, "argv", ["gen-dataset", *map(str, arguments)])
         capfd.readouterr()
         try:
-            code = door_room.main()
+            code = entry_point.main()
         except SystemExit as error:  # argparse, below Hydra
             code = int(error.code or 0)
         return Done(code, *capfd.readouterr())

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Make, fill, pixels
+from helpers.datasets import Make
+from helpers.photographs import fill, pixels
 from PIL import Image
 
 import unprocess_gen as ug

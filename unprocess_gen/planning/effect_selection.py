@@ -43,7 +43,7 @@ COST_NS = {
     "heteroscedastic": 1.8, "prnu": 3.3, "shot": 9.5, "dark_current": 15.5, "hot_pixels": 1.0, "full_well": 0.1,
     "read": 1.8, "row": 0.1, "column": 0.1, "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3,
 }  # fmt: skip
-"""Cost of each effect, nanoseconds per pixel (``tests/bench_scenes.py``; AVX2, one thread).
+"""Cost of each effect, nanoseconds per pixel (``tests/benchmarks/bench_scenes.py``; AVX2, one thread).
 
 The verb ``plan`` prints it; it decides nothing. Conditions: ``docs/design/effect_selection.md``.
 """

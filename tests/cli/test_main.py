@@ -1,0 +1,710 @@
+"""Command line: exit codes, one line for every mistake, help, and each verb."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers.commands import COMMAND, Cli, RunMain
+from helpers.datasets import Make
+from helpers.photographs import fill, pixels
+from PIL import Image
+
+from unprocess_gen import RawPairs, __version__
+from unprocess_gen.cli.arguments import STANDARD, Verb
+from unprocess_gen.cli.help import GROUP_KEYS, global_help
+from unprocess_gen.cli.verbs import VERBS
+from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.schema import Config
+
+REFUSED = [
+    (["camera=nope"], r"camera=nope: no such option; expected one of choice, convex, custom, identity, nexus_6p, "),
+    (["noise=imx386"], r"noise=imx386: no such option; expected one of brooks2019, canon_5d4, canon_700d, canon_70d, "),
+    (["gains=Fixed"], r"gains=Fixed: no such option; expected one of brooks2019, "),
+    (["source.rot=photos"], r"source.rot=photos: no such key; source has root, include, recursive, limit, "),
+    (["sed=1"], r"sed=1: no such key; expected one of source, camera, gains, isp, sensor, noise, scene, effects, "),
+    (["camera.blck=3"], r"camera.blck=3: no such key; camera has name, law, xyz2cam"),
+    (["+new=1"], r"new=1: no such key; expected one of source, camera, "),
+    (["+source.new=1"], r"source.new=1: no such key; source has root, "),
+    (["++new=1"], r"new=1: no such key; expected one of source, camera, "),
+    (["~camera"], r"~camera: a setting cannot be removed"),
+    (["~camera.law=convex"], r"~camera.law=convex: a setting cannot be removed"),
+    (["+camera=convex"], r".*camera.*more than once"),
+    (["seed=abc"], r"seed=abc: expected an integer"),
+    (["seed=2.5"], r"seed=2.5: expected an integer"),
+    (["seed=true"], r"seed=true: expected an integer"),
+    (["seed=null"], r"seed=null: expected a value other than null"),
+    (["gains.threshold=high"], r"gains.threshold=high: expected a number"),
+    (["source.recursive=perhaps"], r"source.recursive=perhaps: expected true or false"),
+    (["source.include=a.jpg"], r"source.include=a.jpg: "),
+    (["seed=${no.such}"], r"seed=\$\{no.such\}: Interpolation key 'no.such' not found"),
+    (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
+    (["word"], r"word: no such verb; expected generate, plan, .*again, completion or settings key=value"),
+    (["camera=convex", "word"], r"word: expected a setting key=value"),
+    (["camera.name"], r"camera.name: expected a setting key=value"),
+    ([""], r"."),
+    (["seed=[1"], r".*\[1"),
+    (["a b=c"], r".*a b=c"),
+    (["--flag"], r"--flag: no such flag; expected --source, --quiet, .*--multirun, "),
+    (["-x"], r"-x: no such flag"),
+    (["-j2"], r"-j2: no such flag"),
+    (["--multirun=2"], r"--multirun=2: "),
+    (["verfy", "ds"], r"verfy: no such verb; expected generate, plan, .*; did you mean verify\?"),
+    (["--multrun", "seed=1,2"], r"--multrun: no such flag; .*; did you mean --multirun\?"),
+    (["plan", "--al"], r"--al: no such flag; expected --all, .*; did you mean --all\?"),
+    (["camera=sony_a7"], r"camera=sony_a7: no such option; .*; did you mean sony_a7r\?"),
+    (["nois=none"], r"nois=none: no such key; .*; did you mean noise\?"),
+    (["verify", "ds", "--regenrate", "2"], r"verify: --regenrate: no such flag; .*; did you mean --regenerate\?"),
+    (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
+    (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
+    (["verify", "ds", "--regenerate", "two"], r"verify: --regenerate two: expected an integer of 0 or more"),
+    (["verify", "ds", "sorce.root=x"], r"verify: sorce.root=x: unknown argument; .*; did you mean source.root\?"),
+    (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
+    (["replay", "ds", "other"], r"replay: other: unknown argument"),
+    (["verify"], r"verify: expected the folder of a dataset or of a sweep"),
+    (["replay", "source.root=x"], r"replay: expected a manifest.csv, or the folder of a dataset"),
+    (["--source", "a", "source.root=b"], r"--source a: the source is also given by source.root=b"),
+    (["plan", "--quiet", "--verbose"], r"--quiet and --verbose exclude each other"),
+    (["plan", "--log-file", "/no/such/file"], r"--log-file /no/such/file: cannot be written"),
+    (["plan", "--any"], r"--any: no such flag"),
+    (["plan", "camera=nope"], r"camera=nope: no such option"),
+    (["plan", "seed=-1"], r"seed=-1: expected 0 to "),
+    (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
+    (["--config-name", "other"], r".*'other'"),
+    (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs nine numbers"),
+    (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a distribution"),
+    (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
+    (["gains.red=0"], r"gains.red=0: expected a gain above 0"),
+    (["out="], r"out='': expected the name of a folder"),
+    (["-m", "camera=nope"], r"camera=nope: camera=nope: no such option"),
+    (["-m", "seed=choice(1"], r".*choice"),
+    (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
+    (["again"], r"again: expected the folder of a dataset"),
+    (["again", "out=x"], r"again: expected the folder of a dataset"),
+    (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
+def test_mistake_gives_one_line_and_exit_code_2_and_writes_nothing(
+    arguments: list[str], sentence: str, run_main: RunMain, tmp_path: Path
+) -> None:
+    done = run_main(*arguments)
+    assert (done.code, done.out) == (2, "")
+    assert re.match("gen-dataset: " + sentence, done.err), done.err
+    assert done.err.count("\n") == 1 and done.err.endswith("\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+GROUP_VALUES = ["camera=null", "noise=3200", "sensor=12", "gains=2.0", "isp=true"]
+
+
+@pytest.mark.parametrize("argument", GROUP_VALUES)
+def test_number_instead_of_an_option_is_refused_in_one_line(argument: str, run_main: RunMain) -> None:
+    done = run_main(argument)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+
+
+@pytest.mark.parametrize("arguments", [("--cfg", "nope"), ("--cfg",), ("--info", "nope"), ("--config-name",)])
+def test_flag_with_a_wrong_value_is_refused_in_one_line(arguments: tuple[str, ...], run_main: RunMain) -> None:
+    done = run_main(*arguments)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+
+
+def test_process_reports_a_mistake_in_one_line_with_exit_code_2(cli: Cli, tmp_path: Path) -> None:
+    done = cli("camera=nope", "out=there")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_error_is_one_line_with_hydra_full_error_set(cli: Cli) -> None:
+    assert cli("seed=abc", HYDRA_FULL_ERROR="1").stderr.count("\n") == 1
+
+
+def test_empty_folder_is_refused_and_nothing_written(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = run_main("source.root=empty")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "source.root=empty: no file matches source.include=" in done.err
+    assert os.listdir(tmp_path) == ["empty"]
+
+
+def test_out_below_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "file").touch()
+    done = run_main(f"source.root={photos}", "out=file/ds")
+    assert (done.code, done.err) == (2, "gen-dataset: out=file/ds: cannot be written (Not a directory)\n")
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_out_that_is_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    done = run_main(f"source.root={photos}", "out=file")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_own_options_are_validated(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/bad.yaml").write_text("name: bad\nblak: 3\n")
+    done = run_main("--config-dir", "mine", "noise=bad")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "blak" in done.err
+
+
+def test_profile_without_units_is_refused(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/bare.yaml").write_text("name: bare\nunits: null\na: 1\nb: 1\n")
+    done = run_main("--config-dir=mine", "noise=bare", "noise.black=subtracted")
+    assert (done.code, done.err) == (2, "gen-dataset: noise.units=null: expected one of dn, normalized\n")
+
+
+def test_invalid_yaml_is_refused_in_one_line(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/broken.yaml").write_text("name: [")
+    done = run_main("--config-dir", "mine", "noise=broken")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+
+
+def test_own_options_are_used(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    (tmp_path / "mine/noise/quiet.yaml").write_text(
+        "name: quiet\nunits: normalized\nblack: subtracted\na: 0.001\nb: 0\n"
+    )
+    done = run_main(
+        "--config-dir", "mine", "noise=quiet", "noise.bits=null", f"source.root={photos}", "n_jobs=1", "--cfg", "job"
+    )
+    assert (done.code, yaml.safe_load(done.out)["noise"]["name"]) == (0, "quiet")
+
+
+# Help and printed settings --------------------------------------------------------------------------------------------
+
+
+HELP = global_help(VERBS, conf_dir())
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("-h",), ("camera=nope", "--help"), ("nope", "-h")])
+def test_help_lists_verbs_whatever_else_is_given(arguments: tuple[str, ...], run_main: RunMain) -> None:
+    assert run_main(*arguments) == (0, HELP, "")
+
+
+@pytest.mark.parametrize("verb", VERBS.values(), ids=VERBS)
+def test_every_verb_answers_help_with_its_own_arguments(verb: Verb, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main(verb.name, "--help", "word", "--flag")
+    assert (done.code, done.err) == (0, "")
+    for argument in (*verb.arguments, *STANDARD):
+        for name in argument.names:
+            assert re.search(rf"(?<!\S){re.escape(name)}\b", done.out), name
+    assert ("--multirun" in done.out) == verb.composes
+    assert max(map(len, done.out.splitlines())) <= 100
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_verb_group_and_option() -> None:
+    for verb in VERBS:
+        assert f"gen-dataset {verb}" in HELP
+    for folder in conf_dir().glob("*/"):
+        listed = re.search(rf"^  {folder.name} +(.*(?:\n {{13}}.*)*)$", HELP, re.MULTILINE)
+        assert listed is not None, folder.name
+        assert {file.stem for file in folder.glob("*.yaml")} - {"default"} <= set(re.findall(r"\w+", listed[1]))
+
+
+def test_help_names_every_group_and_top_level_setting() -> None:
+    assert list(GROUP_KEYS) == [field.name for field in fields(Config) if is_dataclass(getattr(Config(), field.name))]
+    for field in fields(Config):
+        assert re.search(rf"\b{field.name}\b", HELP)
+    for group, keys in GROUP_KEYS.items():
+        known = {field.name for field in fields(getattr(Config(), group))}
+        assert {key for key in re.findall(r"\w+(?=[,:]|$)", keys) if "_" in key} <= known
+
+
+def test_help_fits_a_hundred_columns() -> None:
+    assert max(map(len, HELP.splitlines())) <= 100
+
+
+def test_help_imports_nothing_slow() -> None:
+    code = (
+        "import sys; sys.argv = ['gen-dataset', '--help']; from unprocess_gen.cli import main as cli; "
+        "assert cli.main() == 0; "
+        "print({'hydra', 'omegaconf', 'numpy', 'numba', 'cv2', 'joblib', 'PIL', 'yaml', 'tqdm'} & set(sys.modules),"
+        " file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "set()\n"
+
+
+@pytest.mark.parametrize("flag", [("--config-dir", "mine"), ("--config-dir=mine",), ("-cd", "mine")])
+def test_flags_are_accepted_at_any_position(flag: tuple[str, ...], run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "mine/noise").mkdir(parents=True)
+    own = (Path(__file__).parents[2] / "conf/noise/none.yaml").read_text().replace("name: none", "name: own")
+    (tmp_path / "mine/noise/own.yaml").write_text(own)
+    done = run_main("source.limit=1", *flag, "noise=own", "out=ds", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert [sample.row["noise"] for sample in RawPairs(tmp_path / "ds")] == ["own"]
+
+
+def test_version_is_the_package_version(run_main: RunMain) -> None:
+    assert run_main("--version") == (0, f"unprocess_gen {__version__}\n", "")
+
+
+def test_help_is_shown_on_an_ascii_terminal(cli: Cli) -> None:
+    assert cli("--help", PYTHONIOENCODING="ascii").returncode == 0
+
+
+def test_cfg_job_prints_settings_and_writes_nothing(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("--cfg", "job", "seed=7", "camera=sony_a7r")
+    loaded = yaml.safe_load(done.out)
+    assert (done.code, loaded["seed"], loaded["camera"]["name"]) == (0, 7, "sony_a7r")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cfg_job_omits_hydra_settings(run_main: RunMain) -> None:
+    assert "hydra" not in yaml.safe_load(run_main("--cfg", "job").out)
+
+
+def test_hydra_completes_options_and_writes_nothing(cli: Cli, tmp_path: Path) -> None:
+    line = "gen-dataset camera=s"
+    done = cli("-sc", "query=bash", COMP_LINE=line, COMP_POINT=str(len(line)))
+    assert (done.returncode, done.stdout.split()) == (0, ["camera=sony_a7r", "camera=sony_rx100"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_hydra_completion_scripts_name_the_command(shell: str, run_main: RunMain) -> None:
+    done = run_main("-sc", f"install={shell}")
+    assert done.code == 0
+    assert "gen-dataset" in done.out
+
+
+# generate -------------------------------------------------------------------------------------------------------------
+
+
+def test_command_without_arguments_writes_ds_only(cli: Cli, tmp_path: Path) -> None:
+    done = cli()
+    assert done.returncode == 0, done.stderr
+    made, limits = done.stdout.splitlines()
+    rows = "10 of 10 rows generated in this run"
+    assert re.fullmatch(rf"ds: 10 pairs in 2 shards, [\d.]+ MB, 0 failed; {rows}, [\d.]+ s", made)
+    assert re.match(r"of 3,725,623 sites, clean: 0\.\d{3}% were clipped at black, ", limits)
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
+        "ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards", "ds/shards/shard-00000.tar",
+        "ds/shards/shard-00001.tar",
+    ]  # fmt: skip
+
+
+def test_failed_photographs_give_exit_code_3_and_are_counted(run_main: RunMain, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 2) / "empty.png").touch()
+    done = run_main("source.root=p", "n_jobs=1")
+    assert done.code == 3
+    assert "2 pairs in 1 shard" in done.out
+    assert "1 failed (1 empty; see ds/manifest.csv), more than source.max_failed=0; " in done.out
+
+
+def test_allowed_number_of_failures_gives_exit_code_0(run_main: RunMain, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 2) / "empty.png").touch()
+    assert run_main("source.root=p", "n_jobs=1", "source.max_failed=1").code == 0
+
+
+def test_rerun_with_failed_photographs_gives_exit_code_3(run_main: RunMain, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 2) / "empty.png").touch()
+    run_main("source.root=p", "n_jobs=1")
+    done = run_main("source.root=p", "n_jobs=1")
+    assert (done.code, "ds is complete: 2 pairs" in done.out) == (3, True)
+
+
+def test_more_failures_than_allowed_give_exit_code_3(run_main: RunMain, tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        fill(tmp_path / "p", 1).joinpath(name).touch()
+    assert run_main("source.root=p", "n_jobs=1", "source.max_failed=1").code == 3
+
+
+# plan -----------------------------------------------------------------------------------------------------------------
+
+
+def test_plan_writes_nothing(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
+    done = run_main("plan", f"source.root={photos}", "out=a/b/c")
+    assert done.code == 0
+    assert done.err in ("", "gen-dataset: compiling kernels, once per machine and version\n")  # if the cache is empty
+    assert list(tmp_path.iterdir()) == []
+
+
+def bytes_in(text: str) -> int:
+    return int(re.search(r"^bytes +([\d,]+) in shards, [\d.]+ MB$", text, re.MULTILINE)[1].replace(",", ""))  # type: ignore[index]
+
+
+@pytest.mark.parametrize("shard", [1, 5, 8])
+def test_plan_all_reports_exact_bytes_of_shards(
+    shard: int, run_main: RunMain, make: Make, photos: Path, tmp_path: Path
+) -> None:
+    done = run_main("plan", "--all", f"source.root={photos}", f"output.pairs_per_shard={shard}")
+    make(photos, tmp_path / "ds", f"output.pairs_per_shard={shard}")
+    assert bytes_in(done.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+
+
+def test_plan_all_reports_exact_bytes_with_failing_photographs(run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 5)
+    for name in ("000.png", "002.png", "003.png"):
+        (source / name).write_bytes(b"")
+    done = run_main("plan", "--all", "source.root=p", "output.pairs_per_shard=2")
+    make(source, tmp_path / "ds", "output.pairs_per_shard=2")
+    assert bytes_in(done.out) == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+
+
+def test_plan_estimates_bytes_from_a_sample(run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 40)
+    done = run_main("plan", "source.root=p")
+    make(source, tmp_path / "ds")
+    about = re.search(r"^bytes +about ([\d,]+)", done.out, re.MULTILINE)
+    assert about is not None, done.out
+    real = sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+    assert int(about[1].replace(",", "")) == pytest.approx(real, rel=0.1)
+
+
+def test_plan_names_failing_photographs_and_reasons(run_main: RunMain, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "empty.png").touch()
+    assert re.search(r"^fails +empty.png: empty$", run_main("plan", "source.root=p").out, re.MULTILINE)
+
+
+def test_plan_prints_converted_noise_parameters(run_main: RunMain, photos: Path) -> None:
+    text = run_main("plan", f"source.root={photos}", "sensor=generic_14bit", "noise=imx385_iso1600").out
+    scale = (16383 - 1024) / (4095 - 240)
+    assert f"a_dn {3.513262 * scale:.6g}, b_dn2 {11.917691 * scale**2:.6g}" in text
+
+
+# again ----------------------------------------------------------------------------------------------------------------
+
+
+def test_again_regenerates_the_same_dataset(
+    run_main: RunMain, dataset: Path, photos: Path, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    done = run_main("again", dataset, f"source.root={photos}", "out=new", "n_jobs=1")
+    assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {dataset}, bit for bit")
+    assert tree_hash(tmp_path / "new") == tree_hash(dataset)
+
+
+def test_again_reports_columns_of_a_later_version(run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "old", "source.limit=2")
+    manifest = tmp_path / "old/manifest.csv"
+    *_, last = manifest.read_text().split("\n")[0].split(",")
+    lines = [line.rpartition(",") for line in manifest.read_text().splitlines()]
+    assert [value for _, _, value in lines] == [last, "", ""]
+    manifest.write_text("".join(f"{rest}\n" for rest, _, _ in lines))
+    done = run_main("again", "old", "out=new", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert done.out.splitlines()[-1].startswith("the same rows as old, in its columns; new/manifest.csv has columns of")
+
+
+def test_again_of_scenes_needs_no_source(
+    run_main: RunMain, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    make(None, tmp_path / "old", "source.limit=2", "noise=brooks2019", "seed=5", "gains.red=2")
+    done = run_main("again", "old", "out=new", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert tree_hash(tmp_path / "new") == tree_hash(tmp_path / "old")
+
+
+def test_again_refuses_missing_and_resized_sources_before_generating(
+    run_main: RunMain, make: Make, tmp_path: Path
+) -> None:
+    make(fill(tmp_path / "p", 2), tmp_path / "old")
+    size = (tmp_path / "p/001.png").stat().st_size
+    with (tmp_path / "p/001.png").open("ab") as file:
+        file.write(b"0")
+    done = run_main("again", "old", "source.root=p", "out=new", "n_jobs=1")
+    assert done.code == 5
+    assert f"source 001.png: has {size + 1} bytes in p; expected {size}, as recorded; restore the file" in done.err
+    fill(tmp_path / "other", 2, first=7)
+    done = run_main("again", "old", "source.root=other", "out=new", "n_jobs=1")
+    assert (done.code, "source 000.png: is missing from other; restore the file" in done.err) == (5, True)
+    assert not (tmp_path / "new").exists()
+
+
+def test_again_names_a_source_of_equal_size_and_other_content(run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    for folder, seed in (("p", 1), ("other", 2)):
+        (tmp_path / folder).mkdir()
+        Image.fromarray(pixels(seed, 9, 14)).save(tmp_path / folder / "a.bmp")
+    make(tmp_path / "p", tmp_path / "old")
+    done = run_main("again", "old", "source.root=other", "out=new", "n_jobs=1")
+    assert done.code == 5
+    assert "source a.bmp: has the SHA-256 " in done.err
+
+
+def test_again_reports_a_different_dataset(run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    make(fill(tmp_path / "p", 2), tmp_path / "old")
+    fill(tmp_path / "p", 1, first=7)
+    done = run_main("again", "old", "source.root=p", "out=new", "n_jobs=1")
+    assert (done.code, done.err.splitlines()[-1]) == (
+        4,
+        "gen-dataset: new/manifest.csv: differs from old/manifest.csv; check that the sources are the same",
+    )
+
+
+AGAIN_REFUSED = [
+    ([], r"again: out is missing"),
+    (["out=new", "source.root=p", "seed=1"], r"again: seed=1: unknown argument; expected --source, source.root, "),
+    (["out=new", "source.root=p", "word"], r"again: word: unknown argument; expected --source, source.root"),
+    (["out=new", "sorce.root=p"], r"again: sorce.root=p: unknown argument; .*; did you mean source.root\?"),
+    (["out=new", "source.root=p", "n_jobs=two"], r"again: n_jobs=two: expected an integer"),
+    (["out=new", "source.root=p", "n_jobs=0"], r"n_jobs=0: expected 1 to 1024"),
+    (["out=new", "source.root=/no/such"], r"source.root=/no/such: no such f"),
+    (["out=", "source.root=p"], r"again: out=: a value is missing"),
+    (["out=new", "source.root=p", "--source", "p"], r"again: source.root=p: given twice, also as --source"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), AGAIN_REFUSED)
+def test_again_refuses_wrong_arguments(
+    arguments: list[str], sentence: str, run_main: RunMain, dataset: Path, tmp_path: Path
+) -> None:
+    fill(tmp_path / "p", 1)
+    done = run_main("again", dataset, *arguments)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert re.match("gen-dataset: " + sentence, done.err), done.err
+    assert os.listdir(tmp_path) == ["p"]
+
+
+def test_again_of_scenes_refuses_a_source_root(run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "old", "source.limit=1")
+    fill(tmp_path / "p", 1)
+    done = run_main("again", "old", "source.root=p", "out=new")
+    assert (done.code, "was generated from a source of kind synthetic; expected no root" in done.err) == (2, True)
+    assert not (tmp_path / "new").exists()
+
+
+# One spelling in every verb -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def moved(make: Make, tmp_path: Path) -> Path:
+    """Return the folder ``ds`` of a dataset; its photographs, two good ones and a bad one, are in ``moved``.
+
+    ``dataset.json`` records another folder, which does not exist.
+    """
+    fill(tmp_path / "photos", 1)
+    (tmp_path / "photos/001.png").touch()
+    Image.fromarray(np.arange(32 * 32 * 3, dtype=np.uint8).reshape(32, 32, 3)).save(tmp_path / "photos/002.png")
+    make(tmp_path / "photos", tmp_path / "ds")
+    (tmp_path / "photos").rename(tmp_path / "moved")
+    return Path("ds")
+
+
+SPELLINGS = [("--source", "moved"), ("--source=moved",), ("source.root=moved",)]
+TAKES_SOURCE = {
+    "verify": ("--regenerate", "9"),
+    "replay": (),
+    "report": ("--to", "page.html"),
+    "preview": ("--to", "sheets"),
+    "again": ("out=copy", "n_jobs=1", "source.max_failed=1"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS, ids=" ".join)
+@pytest.mark.parametrize("verb", TAKES_SOURCE)
+def test_source_has_two_spellings_in_every_verb(
+    verb: str, spelling: tuple[str, ...], moved: Path, run_main: RunMain
+) -> None:
+    done = run_main(verb, moved, *TAKES_SOURCE[verb], *spelling)
+    assert (done.code, "left out" in done.err) == (0, False), done.err
+    assert run_main(verb, *spelling, moved, *(word.replace("copy", "copy2") for word in TAKES_SOURCE[verb])).code == 0
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS, ids=" ".join)
+@pytest.mark.parametrize("verb", ["generate", "plan"])
+def test_source_has_two_spellings_with_settings(
+    verb: str, spelling: tuple[str, ...], moved: Path, run_main: RunMain
+) -> None:
+    assert run_main(verb, *spelling, "n_jobs=1", "out=new", "source.max_failed=1").code == 0
+
+
+@pytest.mark.parametrize("verb", TAKES_SOURCE)
+def test_recorded_source_is_the_default(verb: str, moved: Path, run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "moved").rename(tmp_path / "photos")
+    done = run_main(verb, moved, *TAKES_SOURCE[verb])
+    assert (done.code, "left out" in done.err) == (0, False), done.err
+
+
+def test_again_needs_a_source_if_none_is_recorded(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "ds/dataset.json").unlink()
+    done = run_main("again", moved, "out=new")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "does not record the folder of its sources; expected that folder; give source.root=" in done.err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("keys", ["2", "1-2", "00000002,2", "0-2"])
+@pytest.mark.parametrize("verb", ["replay", "preview", "dng"])
+def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, moved: Path, run_main: RunMain) -> None:
+    if verb == "dng" and keys == "0-2":
+        keys = "1-2"  # LibRaw opens no picture of 12 x 16 pixels
+    done = run_main(verb, moved, "--keys", keys, "--to", "there", *(["--source=moved"] if verb != "dng" else []))
+    assert done.code == 0, done.err
+    assert ("; 1 failed row skipped" in done.out) == ("-" in keys)
+
+
+def test_folder_of_a_sweep_is_refused_where_one_dataset_is_needed(
+    moved: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "ds").rename(tmp_path / "sweep/seed=1")
+    (tmp_path / "sweep/sweep.csv").touch()
+    for verb in ("replay", "report", "preview", "dng", "again"):
+        done = run_main(verb, "sweep", *(["out=new"] if verb == "again" else []))
+        expected = (
+            f"gen-dataset: {verb}: sweep: is the folder of a sweep; expected one of its datasets, such as sweep/seed=1"
+        )
+        assert (done.code, done.err) == (2, f"{expected}\n")
+
+
+def test_verify_of_a_sweep_verifies_every_dataset(run_main: RunMain, tmp_path: Path) -> None:
+    assert run_main("-m", "seed=1,2", "source.limit=1", "n_jobs=1", "out=sweep").code == 0
+    lines = [f"sweep/seed={seed},source.limit=1 is intact" for seed in (1, 2)]
+    assert run_main("verify", "sweep") == (0, "\n".join([*lines, "sweep: 2 of 2 datasets are intact", ""]), "")
+    (tmp_path / "sweep/seed=1,source.limit=1/manifest.csv").write_text("")
+    done = run_main("verify", "sweep", "--regenerate", "1")
+    assert (done.code, "sweep: 1 of 2 datasets are intact" in done.out) == (4, True)
+    assert done.err.startswith("gen-dataset: sweep/seed=1,source.limit=1: ")
+
+
+# Order and kind of words ----------------------------------------------------------------------------------------------
+
+HINTS = [
+    (("-q", "verify", "ds"), "verify: the verb must be the first word: gen-dataset verify -q ds"),
+    (("moved",), "moved: no such verb; .*; moved is a file or folder: write source.root=moved"),
+    (("ds",), "ds: no such verb; .*; ds is a dataset: write gen-dataset verify ds, or another verb"),
+    (
+        ("plan", "./moved"),
+        "plan: ./moved: expected a setting key=value; ./moved is a file or folder: write source",
+    ),
+    (("figures", "ds"), "figures: ds: expected a setting key=value; ds is a dataset: write gen-dataset verify ds"),
+    (("again", "ds", "out=ds"), "again: out=ds: is the dataset itself; expected another folder"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), HINTS, ids=[" ".join(arguments) for arguments, _ in HINTS])
+def test_misplaced_word_is_answered_with_what_to_write(
+    arguments: tuple[str, ...], sentence: str, moved: Path, run_main: RunMain
+) -> None:
+    done = run_main(*arguments)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert re.match(f"gen-dataset: {sentence}", done.err), done.err
+
+
+@pytest.mark.parametrize(
+    ("verb", "required"),
+    [("again", "out=FOLDER"), ("preview", "--to FOLDER"), ("dng", "--keys KEYS --to FOLDER")],
+)
+def test_help_shows_required_arguments(verb: str, required: str, run_main: RunMain) -> None:
+    text = run_main(verb, "--help").out
+    assert f"DIR {required} " in text.splitlines()[0]
+    assert text.count("(required)") == len(re.findall("FOLDER|KEYS", required))
+
+
+# Paths that the user names --------------------------------------------------------------------------------------------
+
+OUTPUTS = [
+    ("replay", "DS", "--to", "DS/shards"),
+    ("replay", "DS", "--to", "DS/new/deep"),
+    ("preview", "DS", "--to", "DS/sheets"),
+    ("dng", "DS", "--keys", "2", "--to", "DS/new"),
+    ("report", "DS", "--to", "DS/page.html"),
+    ("verify", "DS", "--noise", "--to", "DS/noise.png"),
+    ("verify", "DS", "--log-file", "DS/manifest.csv"),
+    ("figures", "out=DS/figures"),
+    ("accuracy", "out=DS/accuracy"),
+]
+
+
+@pytest.mark.parametrize("arguments", OUTPUTS, ids=" ".join)
+def test_no_verb_writes_into_a_dataset(
+    arguments: tuple[str, ...], moved: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / moved).rglob("*")}
+    done = run_main(*(word.replace("DS", str(moved)) for word in arguments))
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert "is inside the dataset" in done.err
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / moved).rglob("*")} == before
+
+
+def test_log_file_is_not_appended_to_a_photograph(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
+    photograph = tmp_path / "moved/002.png"
+    before = photograph.read_bytes()
+    done = run_main("verify", moved, "--log-file", photograph)
+    assert (done.code, photograph.read_bytes()) == (2, before)
+
+
+NOISE_FILES = [
+    (("--noise", "--to", "noise.txt"), "--to noise.txt: is not a PNG file"),
+    (("--noise", "--to", "no/noise.png"), "--to no/noise.png: expected the name of a file in a folder that exists"),
+    (("--noise", "--to", "moved/002.png"), "--to moved/002.png: exists and is not an earlier figure"),
+    (("--to", "noise.png"), "verify: --to noise.png: draws the fits of --noise; add --noise"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), NOISE_FILES)
+def test_figure_of_the_noise_is_checked_first(
+    arguments: tuple[str, ...], sentence: str, moved: Path, run_main: RunMain
+) -> None:
+    done = run_main("verify", moved, *arguments)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert done.err.startswith(f"gen-dataset: {sentence}")
+
+
+@pytest.mark.parametrize("rows", ["5:9", "1:0", "3:"])
+def test_rows_that_select_nothing_are_refused(rows: str, moved: Path, run_main: RunMain) -> None:
+    done = run_main("replay", moved, "--source", "moved", "--rows", rows)
+    assert (done.code, done.out) == (2, "")
+    assert done.err == f"gen-dataset: --rows {rows}: selects no row; expected A:B with A below B and below 3\n"
+
+
+def test_rows_and_keys_exclude_each_other(moved: Path, run_main: RunMain) -> None:
+    done = run_main("replay", moved, "--rows", "0:1", "--keys", "0")
+    assert (done.code, done.out) == (2, "")
+
+
+@pytest.mark.parametrize("verb", TAKES_SOURCE)
+def test_missing_source_root_is_refused_in_one_line(verb: str, moved: Path, run_main: RunMain) -> None:
+    done = run_main(verb, moved, *TAKES_SOURCE[verb], "source.root=nothere")
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert done.err.startswith("gen-dataset: source.root=nothere: no such folder")
+
+
+def test_replay_names_no_folder_of_arrays_without_arrays(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
+    for photograph in (tmp_path / "moved").iterdir():
+        photograph.unlink()
+    done = run_main("replay", moved, "--source", "moved", "--to", "arrays")
+    assert (done.code, "arrays" in done.out) == (5, False)
+
+
+@pytest.mark.parametrize(
+    ("folder", "sentence"), [("nothere", "no such f"), ("DIR=t4", "no such f"), ("empty", "not a dataset; expected")]
+)
+@pytest.mark.parametrize("verb", ["verify", "replay", "report", "preview", "dng", "again"])
+def test_folder_without_a_dataset_is_refused(
+    verb: str, folder: str, sentence: str, run_main: RunMain, tmp_path: Path
+) -> None:
+    (tmp_path / "empty").mkdir()
+    done = run_main(verb, folder)
+    assert (done.code, done.out, done.err.count("\n")) == (2 if verb == "again" else 4, "", 1)
+    assert done.err.startswith(f"gen-dataset: {verb}: {folder}: {sentence}")
+
+
+# Installation ---------------------------------------------------------------------------------------------------------
+
+
+def test_console_script_is_installed_next_to_python() -> None:
+    assert COMMAND.is_file()
+
+
+def test_dataset_json_records_absolute_source_root(run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 1)
+    run_main("source.root=p", "n_jobs=1")
+    facts = json.loads((tmp_path / "ds/dataset.json").read_text())
+    assert facts["source"] == {"kind": "folder", "root": str(tmp_path / "p")}

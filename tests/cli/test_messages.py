@@ -1,0 +1,267 @@
+"""Where results and messages go, and signals: stdout, stderr, log files; full, closed and broken ones."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make
+from helpers.photographs import fill
+
+from unprocess_gen.cli import verbs
+
+COMMANDS = {
+    "help": ["--help"],
+    "version": ["--version"],
+    "verb help": ["plan", "--help"],
+    "generate": ["source.root=p", "out=ds", "n_jobs=1"],
+    "settings": ["--cfg", "job"],
+    "plan": ["plan", "source.root=p"],
+    "verify": ["verify", "ds"],
+    "replay": ["replay", "ds"],
+    "report": ["report", "ds", "--to", "page.html"],
+    "preview": ["preview", "ds", "--keys", "0", "--to", "sheets"],
+    "dng": ["dng", "wide", "--keys", "0", "--to", "dngs"],
+    "again": ["again", "ds", "out=copy"],
+    "completion": ["completion", "bash"],
+}
+"""Commands that print something, one for each verb that takes seconds."""
+
+pytestmark = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+
+
+@pytest.fixture(scope="module")
+def folder(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with photographs ``p``, their dataset ``ds``, and ``wide``, a dataset that DNG files can hold."""
+    top = tmp_path_factory.mktemp("output")
+    make(fill(top / "p", 2), top / "ds")
+    make(None, top / "wide", "source.limit=1")
+    return top
+
+
+def shell(line: str, folder: Path, *arguments: str, **more: Any) -> subprocess.CompletedProcess[str]:
+    """Run a line of sh in which ``"$@"`` is the command with its arguments."""
+    command = ["sh", "-c", line, "sh", sys.executable, "-m", "unprocess_gen", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False, **more)
+
+
+@pytest.mark.parametrize("arguments", COMMANDS.values(), ids=COMMANDS)
+def test_full_stdout_gives_one_line_and_exit_code_5(arguments: list[str], folder: Path) -> None:
+    done = shell('exec "$@" > /dev/full', folder, *arguments)
+    assert done.returncode == 5
+    lines = [line for line in done.stderr.splitlines() if " images, " not in line]
+    assert lines == [
+        "gen-dataset: stdout: cannot be written (No space left on device); redirect it elsewhere and rerun"
+    ]
+
+
+@pytest.mark.parametrize("stream", [">&-", "2>&-", "2>/dev/full", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("name", ["help", "generate", "plan", "verify"])
+def test_closed_streams_and_full_stderr_do_not_end_a_command(name: str, stream: str, folder: Path) -> None:
+    done = shell(f'exec "$@" {stream}', folder, *COMMANDS[name])
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+
+
+def test_mistake_keeps_its_exit_code_without_stderr(folder: Path) -> None:
+    assert shell('exec "$@" 2>/dev/full', folder, "verfy").returncode == 2
+    assert shell('exec "$@" 2>&-', folder, "verify", "no such folder").returncode == 4
+
+
+@pytest.mark.parametrize("name", ["help", "plan", "verify"])
+def test_broken_pipe_gives_exit_code_141_without_a_message(name: str, folder: Path) -> None:
+    done = shell('{ "$@"; echo $? >&3; } 3>&2 | true', folder, *COMMANDS[name])
+    assert done.stderr in ("141\n", "0\n")  # 0: the pipe still had a reader
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "unprocess_gen", *COMMANDS[name]]
+    broken = subprocess.run(command, cwd=folder, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write_end)
+    assert (broken.returncode, broken.stderr) == (141, "")
+
+
+@pytest.mark.parametrize("code", [5, 141])
+@pytest.mark.parametrize("plugin", [[], ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]], ids=["own", "joblib"])
+def test_unwritable_stdout_ends_a_sweep_and_keeps_the_row(code: int, plugin: list[str], tmp_path: Path) -> None:
+    if plugin:
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    fill(tmp_path / "p", 1)
+    read_end, closed_pipe = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "unprocess_gen", "-m", "seed=1,2", "source.root=p", "n_jobs=1", "out=sweep"]
+    with Path("/dev/full").open("w") as full, os.fdopen(closed_pipe, "wb") as pipe:
+        stdout = full if code == 5 else pipe
+        done = subprocess.run(
+            [*command, *plugin], cwd=tmp_path, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (done.returncode, "Traceback" in done.stderr) == (code, False)
+    with (tmp_path / "sweep/sweep.csv").open(newline="") as stream:
+        rows = [(row["folder"], row["rows"], row["exit"]) for row in csv.DictReader(stream)]
+    assert rows == [("seed=1", "1", "0"), ("seed=2", "1", "0")][: 2 if plugin else 1]  # a launcher starts all jobs
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signal_that_a_library_turns_into_its_own_error_ends_a_sweep(
+    sent: signal.Signals, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = []
+
+    def interrupted(config: Any, label: str = "") -> Any:
+        started.append(label)
+        try:
+            os.kill(os.getpid(), sent)
+        except BaseException as error:
+            raise ValueError("internal error") from error
+
+    monkeypatch.setattr(verbs, "generate_dataset", interrupted)
+    fill(tmp_path / "p", 1)
+    done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep")
+    assert (done.code, started) == (128 + sent, ["1/2 seed=1"])
+    assert "Traceback" not in done.err
+
+
+# Messages -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("flag", ["-q", "--quiet"])
+def test_quiet_shows_no_progress_but_results(flag: str, run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 2)
+    done = run_main("source.root=p", "n_jobs=1", flag)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.startswith("ds: 2 pairs")
+
+
+def test_quiet_shows_errors(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("verify", "nothing", "-q")
+    assert (done.code, done.err.count("\n")) == (4, 1)
+
+
+@pytest.mark.parametrize("flag", ["-v", "--verbose"])
+def test_verbose_shows_version_and_command(flag: str, run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 2)
+    done = run_main("plan", flag, "source.root=p")
+    assert re.match(r"gen-dataset: unprocess_gen [\d.]+\S*, Python 3\.\d+\.\d+\S*: \['plan', '-v", done.err) or (
+        flag == "--verbose" and "'--verbose'" in done.err
+    )
+
+
+def test_log_file_has_messages_results_errors_and_exit_code(run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 2)
+    for _ in range(2):
+        assert run_main("source.root=p", "n_jobs=1", "--log-file", "run.log").code == 0
+    assert run_main("verify", "nothing", "--log-file=run.log").code == 4
+    lines = (tmp_path / "run.log").read_text().splitlines()
+    assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|ERROR) ", line) for line in lines)
+    text = "\n".join(lines)
+    for part in (
+        "2/2 images",
+        "ds: 2 pairs",
+        "ds is complete",
+        "INFO exit code 0",
+        "ERROR verify: nothing: ",
+        "exit code 4",
+    ):
+        assert part in text
+
+
+def test_refused_setting_is_logged(run_main: RunMain, tmp_path: Path) -> None:
+    assert run_main("camera=nope", "--log-file", "run.log").code == 2
+    assert "ERROR camera=nope: no such option" in (tmp_path / "run.log").read_text()
+
+
+def test_full_log_file_does_not_end_a_run(run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "p", 2)
+    assert run_main("source.root=p", "n_jobs=1", "--log-file", "/dev/full").code == 0
+
+
+# Signals --------------------------------------------------------------------------------------------------------------
+
+ENDS = {signal.SIGHUP: "ended by SIGHUP", signal.SIGINT: "interrupted", signal.SIGTERM: "ended by SIGTERM"}
+
+
+def start(folder: Path, *arguments: str, prefix: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+    command = [*prefix, sys.executable, "-m", "unprocess_gen", *arguments]
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+def wait_for(path: Path, seconds: float = 60) -> None:
+    until = time.monotonic() + seconds
+    while not path.exists():
+        assert time.monotonic() < until, path
+        time.sleep(0.02)
+
+
+def messages(text: str) -> list[str]:
+    """Return the lines of stderr without those of progress."""
+    return [line for line in text.splitlines() if " images, " not in line]
+
+
+@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+def test_signal_during_a_run_gives_one_line(number: signal.Signals, tmp_path: Path) -> None:
+    process = start(tmp_path, "source.limit=2000", "output.pairs_per_shard=1", "n_jobs=1")
+    wait_for(tmp_path / "ds/.work")
+    process.send_signal(number)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 128 + number
+    assert messages(err) == [f"gen-dataset: {ENDS[number]}; finished shards are kept; rerun to resume"]
+
+
+@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+@pytest.mark.parametrize("delay_s", [0.4, 0.6, 0.9])
+def test_signal_while_settings_are_composed_ends_within_two_seconds(
+    number: signal.Signals, delay_s: float, tmp_path: Path
+) -> None:
+    process = start(tmp_path, "plan", "source.limit=2", "camera=sony_a7r")
+    time.sleep(delay_s)
+    process.send_signal(number)
+    sent = time.monotonic()
+    _, err = process.communicate(timeout=20)
+    assert time.monotonic() - sent < 2
+    if process.returncode == 128 + number:
+        assert messages(err) == [f"gen-dataset: {ENDS[number]}"]
+    else:  # before the command catches signals, or after its last line
+        assert process.returncode in (-number, 0)
+
+
+MASKED = """
+import os, signal, sys
+from unprocess_gen.cli import main
+from unprocess_gen.core.errors import ConfigError
+
+def run(arguments):
+    try:
+        os.kill(os.getpid(), int(sys.argv[1]))
+        signal.sigtimedwait([], 5)
+    finally:
+        raise ConfigError("seed: no such key")
+
+main.run = run
+sys.exit(main.main())
+"""
+
+
+@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+def test_error_that_replaces_a_signal_is_reported_as_the_signal(number: signal.Signals) -> None:
+    command = [sys.executable, "-c", MASKED, str(int(number))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 128 + number
+    assert done.stderr.startswith(f"gen-dataset: {ENDS[number]}")
+
+
+def test_nohup_is_respected(tmp_path: Path) -> None:
+    process = start(tmp_path, "source.limit=2", "n_jobs=1", "out=ds", prefix=("nohup",))
+    wait_for(tmp_path / "ds/.work")
+    process.send_signal(signal.SIGHUP)
+    process.communicate(timeout=60)
+    assert process.returncode == 0

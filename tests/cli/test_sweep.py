@@ -1,0 +1,321 @@
+"""A sweep: one dataset for each combination, and sweep.csv."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.commands import COMMAND, RunMain, environment
+from helpers.datasets import Make, TreeHash
+from helpers.photographs import fill
+
+from unprocess_gen.cli.sweep import SHARES, folder_name, overrides_text
+
+PATHS = os.pathsep.join(filter(None, sys.path))
+
+
+TWO_BY_TWO = ("-m", "camera=sony_a7r,nexus_6p", "noise=imx385_iso1600,imx385_iso3200", "source.root=p", "out=sweep")
+COMBINATIONS = [
+    (camera, noise) for camera in ("sony_a7r", "nexus_6p") for noise in ("imx385_iso1600", "imx385_iso3200")
+]
+FOLDERS = [f"camera={camera},noise={noise}" for camera, noise in COMBINATIONS]
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return fill(tmp_path / "p", 3)
+
+
+def test_every_combination_has_its_own_dataset(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    done = run_main(*TWO_BY_TWO, "n_jobs=1")
+    assert done.code == 0, done.err
+    assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*FOLDERS, "sweep.csv"])
+    assert sorted(os.listdir(tmp_path)) == ["p", "sweep"]
+
+
+def test_sweep_csv_has_a_row_for_every_job(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main(*TWO_BY_TWO, "n_jobs=1")
+    rows = table(tmp_path / "sweep")
+
+    assert [row["folder"] for row in rows] == [row["overrides"] for row in rows] == FOLDERS
+    assert [(row["camera"], row["noise"]) for row in rows] == COMBINATIONS
+    assert [(row["rows"], row["failed"], row["exit"]) for row in rows] == [("3", "0", "0")] * 4
+
+
+def test_sweep_csv_has_the_columns_of_the_contract(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    content = (tmp_path / "sweep/sweep.csv").read_bytes()
+    assert content.split(b"\n")[0].decode().split(",") == [
+        "folder", "overrides", "seed", "rows", "failed", "clean_clipped_low_share", "clean_clipped_high_share",
+        "noisy_clipped_low_share", "noisy_clipped_high_share", "saturated_share", "seconds", "bytes", "exit",
+    ]  # fmt: skip
+    assert b"\r" not in content
+
+
+def test_sweep_csv_agrees_with_the_datasets(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main("-m", "gains=paper_max,fig6_bottom", "source.root=p", "out=sweep", "n_jobs=1")
+    for row in table(tmp_path / "sweep"):
+        folder = tmp_path / "sweep" / row["folder"]
+        sites = json.loads((folder / "dataset.json").read_text())["sites"]
+
+        for name in SHARES:
+            assert float(row[f"{name}_share"]) == sites[name] / sites["all"]
+        assert int(row["bytes"]) == sum(path.stat().st_size for path in (folder / "shards").iterdir())
+        assert float(row["seconds"]) > 0
+
+
+def test_sweep_csv_of_version_0_1_keeps_its_rows(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    (tmp_path / "sweep").mkdir()
+    old = "folder,overrides,rows,failed,exit\nseed=7,seed=7,3,0,0\nseed=1,seed=1,2,0,5\n"
+    (tmp_path / "sweep/sweep.csv").write_text(old)
+    run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+
+    rows = table(tmp_path / "sweep")
+    assert [(row["folder"], row["rows"], row["seed"], row["exit"]) for row in rows] == [
+        ("seed=7", "3", "", "0"), ("seed=1", "3", "1", "0"), ("seed=2", "3", "2", "0"),
+    ]  # fmt: skip
+
+
+def test_sweeps_over_other_keys_share_one_table(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    for swept in ("seed=1,2", "isp=linear,srgb"):
+        run_main("-m", swept, "source.root=p", "out=sweep", "n_jobs=1")
+    rows = table(tmp_path / "sweep")
+    assert sorted((row["seed"], row["isp"]) for row in rows) == [("", "linear"), ("", "srgb"), ("1", ""), ("2", "")]
+
+
+def test_datasets_of_a_sweep_equal_those_of_single_runs(
+    run_main: RunMain, source: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    run_main(*TWO_BY_TWO, "n_jobs=1")
+    for (camera, noise), folder in zip(COMBINATIONS, FOLDERS, strict=True):
+        make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}")
+        assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
+
+
+def test_failing_job_does_not_stop_others_and_decides_exit_code(
+    run_main: RunMain, source: Path, tmp_path: Path
+) -> None:
+    done = run_main("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
+    assert done.code == 2
+    assert [(row["folder"], row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+        ("gains.red=0", "", "", "2"), ("gains.red=2", "3", "0", "0"),
+    ]  # fmt: skip
+    assert (tmp_path / "sweep/gains.red=2/dataset.json").exists()
+
+
+def test_error_of_a_job_is_one_line_with_its_name(run_main: RunMain, source: Path) -> None:
+    done = run_main("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
+    errors = [line for line in done.err.splitlines() if "images/s" not in line]
+    assert errors == ["gen-dataset: gains.red=0: gains.red=0: expected a gain above 0, from 0.001 to 1000"]
+
+
+def test_unknown_option_in_one_job_does_not_stop_others(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    done = run_main("source.root=p", "-m", "camera=sony_a7r,nosuch,nexus_6p", "out=sweep", "n_jobs=1")
+    assert done.code == 2
+    assert "gen-dataset: camera=nosuch: camera=nosuch: no such option; expected one of choice, " in done.err
+    with (tmp_path / "sweep/sweep.csv").open(newline="") as stream:
+        assert [(row["folder"], row["exit"]) for row in csv.DictReader(stream)] == [
+            ("camera=sony_a7r", "0"),
+            ("camera=nosuch", "2"),
+            ("camera=nexus_6p", "0"),
+        ]
+
+
+def test_refused_last_job_has_a_row(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    done = run_main("-m", "camera=sony_a7r,leica", "source.root=p", "out=sweep", "n_jobs=1")
+    assert done.code == 2
+    assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
+        ("camera=sony_a7r", "0"),
+        ("camera=leica", "2"),
+    ]
+
+
+@pytest.mark.parametrize("out", ["${nope}", "${oc.env:UG_NOT_SET}/x"])
+@pytest.mark.parametrize("flags", [(), ("--cfg", "job", "--resolve"), ("-m",)], ids=" ".join)
+def test_out_that_cannot_be_resolved_is_refused(
+    out: str, flags: tuple[str, ...], run_main: RunMain, tmp_path: Path
+) -> None:
+    done = run_main(*flags, f"out={out}")
+    assert (done.code, done.err.count("\n"), os.listdir(tmp_path)) == (2, 1, [])
+    assert "nope" in done.err or "UG_NOT_SET" in done.err
+
+
+def test_glob_expands_to_matching_options(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    assert run_main("-m", "camera=glob(s*)", "source.root=p", "out=sweep", "n_jobs=1").code == 0
+    assert sorted(os.listdir(tmp_path / "sweep")) == ["camera=sony_a7r", "camera=sony_rx100", "sweep.csv"]
+
+
+def test_sweep_of_refused_jobs_writes_nothing(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    assert run_main("-m", "gains.red=0,-1", "source.root=p", "out=sweep").code == 2
+    assert sorted(os.listdir(tmp_path)) == ["p"]
+
+
+def test_failed_images_are_counted_and_exit_code_is_3(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    (source / "001.png").write_bytes(b"")
+    assert run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1").code == 3
+    assert [(row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [("3", "1", "3")] * 2
+
+
+def test_config_error_is_worse_than_a_failed_image(run_main: RunMain, source: Path) -> None:
+    (source / "001.png").write_bytes(b"")
+    assert run_main("-m", "gains.red=2,0", "source.root=p", "out=sweep", "n_jobs=1").code == 2
+
+
+def test_repeated_sweep_changes_nothing(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    before = (tmp_path / "sweep/sweep.csv").read_bytes()
+    done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    assert (done.code, done.out.count("nothing to do")) == (0, 2)
+    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
+
+
+def test_rows_of_a_second_sweep_follow_earlier_rows(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    for seeds in ("seed=2,1", "seed=3,1"):
+        run_main("-m", seeds, "source.root=p", "out=sweep", "n_jobs=1")
+    assert [row["folder"] for row in table(tmp_path / "sweep")] == ["seed=2", "seed=1", "seed=3"]
+
+
+@pytest.mark.parametrize(
+    "excluded", ["n_jobs=2", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on", "hydra.mode=MULTIRUN"]
+)
+def test_folder_names_omit_keys_that_do_not_decide_data(
+    excluded: str, run_main: RunMain, source: Path, tmp_path: Path
+) -> None:
+    run_main("-m", "seed=1", "source.root=p", "out=sweep", "n_jobs=1", excluded)
+    assert sorted(os.listdir(tmp_path / "sweep")) == ["seed=1", "sweep.csv"]
+
+
+def test_sweep_without_values_has_one_folder(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main("-m", "source.root=p", "out=sweep", "n_jobs=1")
+    assert sorted(os.listdir(tmp_path / "sweep")) == ["default", "sweep.csv"]
+
+
+def test_slash_in_a_value_creates_no_nested_folder(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    (source / "sub").mkdir()
+    (source / "001.png").rename(source / "sub/001.png")
+    done = run_main("-m", "source.include=['sub/*.png'],['0*.png']", "source.root=p", "out=sweep", "n_jobs=1")
+    assert done.code == 0, done.err
+    folders = sorted(path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    assert len(folders) == 2
+    assert [name for name in folders if "%2F" in name]
+    assert all((tmp_path / "sweep" / name / "dataset.json").exists() for name in folders)
+
+
+def test_long_overrides_have_distinct_folder_names(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    numbers = ",".join(["0.123456789012345678"] * 12)
+    one, other = (f"['*.png','{numbers}{end}']" for end in "ab")
+    done = run_main("-m", f"source.include={one},{other}", "source.root=p", "out=sweep", "n_jobs=1")
+    assert done.code == 0, done.err
+    folders = [path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
+    assert len(folders) == 2
+    assert max(len(name) for name in folders) <= 255
+
+
+def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    done = run_main("plan", *TWO_BY_TWO, "n_jobs=1")
+    assert (done.code, done.out.count("sources   3")) == (0, 4)
+    assert re.search(r"^totals    4 jobs: 12 pairs in 4 shards, 116,736 bytes, about [\d.]+ s$", done.out, re.MULTILINE)
+    assert sorted(os.listdir(tmp_path)) == ["p"]
+
+
+def test_plan_does_not_change_sweep_csv(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    before = (tmp_path / "sweep/sweep.csv").read_bytes()
+    run_main("plan", "-m", "seed=1,2", "source.root=p", "out=sweep")
+    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
+
+
+def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 12)
+    arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")
+    folders = [f"{folder},output.pairs_per_shard=1" for folder in FOLDERS]
+    process = subprocess.Popen(
+        [str(COMMAND), *arguments], cwd=tmp_path, env=environment(), stderr=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while len(list((tmp_path / "sweep").glob("*/shards/*.tar"))) < 18 and process.poll() is None:
+        assert time.monotonic() < until
+        time.sleep(0.002)
+    assert process.poll() is None
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert len(list((tmp_path / "sweep").glob("*/dataset.json"))) in (1, 2)
+
+    done = run_main(*arguments)
+    assert (done.code, done.out.count("nothing to do") >= 1) == (0, True)
+    assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*folders, "sweep.csv"])
+    assert [row["exit"] for row in table(tmp_path / "sweep")] == ["0"] * 4
+    for (camera, noise), folder in zip(COMBINATIONS, folders, strict=True):
+        make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}", "output.pairs_per_shard=1")
+        assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
+
+
+def test_jobs_are_announced_with_their_place(run_main: RunMain, source: Path) -> None:
+    done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    assert "1/2 seed=1" in done.err
+    assert "2/2 seed=2" in done.err
+
+
+def test_too_many_jobs_are_refused_at_once(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("-m", "seed=range(0,1000000000)", "out=sweep")
+    assert (done.code, done.err) == (2, "gen-dataset: a sweep of more than 100000 jobs; expected fewer values\n")
+    assert os.listdir(tmp_path) == []
+
+
+def test_interval_is_refused_in_one_line(run_main: RunMain) -> None:
+    done = run_main("-m", "gains.red=interval(1,2)")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "gains.red=interval(1,2): an interval has no list of values; expected choice or range" in done.err
+
+
+def test_processes_that_share_a_folder_keep_each_others_rows(tmp_path: Path) -> None:
+    """Two processes write 60 tables each; without a lock, rows are lost within the first few."""
+    code = (
+        "import sys; from pathlib import Path; from unprocess_gen.cli.sweep import JobRow, write_table\n"
+        "for i in range(60):\n"
+        "    name = f'{sys.argv[1]}{i}'\n"
+        "    write_table(Path('.'), [JobRow(name, 0, {'folder': name})])"
+    )
+    running = [
+        subprocess.Popen([sys.executable, "-c", code, name], cwd=tmp_path, env=environment(PYTHONPATH=PATHS))
+        for name in "ab"
+    ]
+    assert [process.wait(60) for process in running] == [0, 0]
+    assert sorted(row["folder"] for row in table(tmp_path)) == sorted(f"{name}{i}" for name in "ab" for i in range(60))
+    assert os.listdir(tmp_path) == ["sweep.csv"]
+
+
+@pytest.mark.parametrize(("content", "code"), [(b"folder\xff\n", 4), (b'folder\n"' + b"a" * 200_000, 4), (None, 5)])
+def test_unreadable_sweep_csv_ends_in_one_line(
+    content: bytes | None, code: int, run_main: RunMain, source: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "sweep").mkdir()
+    path = tmp_path / "sweep/sweep.csv"
+    path.mkdir() if content is None else path.write_bytes(content)
+    done = run_main("-m", "seed=1", "source.root=p", "out=sweep", "n_jobs=1", "-q")
+    assert (done.code, done.err.count("\n")) == (code, 1), done.err
+    assert "sweep/sweep.csv: " in done.err
+
+
+def test_names_omit_keys_of_the_executor() -> None:
+    overrides = ["seed=1", "executor=dask", "executor.address=x", "append=true", "+experiment=e", "output.dtype=uint16"]
+    assert overrides_text(overrides) == "+experiment=e,output.dtype=uint16,seed=1"
+
+
+def test_names_encode_slashes_and_percent_signs() -> None:
+    assert folder_name("a=b/c%") == "a=b%2Fc%25"
+    assert folder_name("") == "default"

@@ -1,0 +1,287 @@
+"""Sweeps that option files describe: how they reach Hydra, and what they generate compared with the command line."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from helpers.commands import RunMain
+from helpers.datasets import TreeHash
+from helpers.photographs import fill
+
+from unprocess_gen.config.composition import OptionFolders
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.sweep_expansion import expand
+from unprocess_gen.core.errors import ConfigError
+
+PARAMS = {"camera": "sony_a7r,nexus_6p", "gains.red": "2,2.2"}
+SWEEP = {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": PARAMS}}}
+FOLDERS = [f"camera={camera},gains.red={red}" for camera in ("sony_a7r", "nexus_6p") for red in ("2", "2.2")]
+REST = ("source.root=p", "source.limit=1", "out=sweep", "n_jobs=1", "--config-dir", "mine")
+NAMED = [f"{folder},source.limit=1" for folder in FOLDERS]
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """Return a folder of the user's option files, next to a folder ``p`` of one photograph."""
+    fill(tmp_path / "p", 1)
+    (tmp_path / "mine").mkdir()
+    return tmp_path / "mine"
+
+
+def write(path: Path, content: dict[str, Any], header: str = "# @package _global_\n") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(header + yaml.safe_dump(content, sort_keys=False))
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def jobs(*overrides: str, own: Path | None = None, multirun: bool = False) -> list[str]:
+    """Return the names of the folders that overrides expand to."""
+    expansion = expand(overrides, OptionFolders(own=own), multirun)
+    assert expansion.node is None
+    return [",".join(sorted(job.named)) for job in expansion.jobs]
+
+
+WAYS = {
+    "sweep": ("sweep/two.yaml", {}, ["+sweep=two"]),
+    "experiment": ("experiment/two.yaml", {}, ["+experiment=two"]),
+    "primary config": ("two.yaml", {"defaults": ["config", "_self_"]}, ["-cn", "two"]),
+}
+"""Each way in which a file reaches Hydra: the file, its other content, and the arguments."""
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_sweep_in_a_file_equals_the_command_line(
+    way: str, mine: Path, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    file, other, arguments = WAYS[way]
+    write(mine / file, other | SWEEP, "" if other else "# @package _global_\n")
+
+    done = run_main(*arguments, *REST)
+    assert done.code == 0, done.err
+    assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*NAMED, "sweep.csv"])
+    rows = table(tmp_path / "sweep")
+    (tmp_path / "sweep").rename(tmp_path / "from_file")
+
+    assert run_main("-m", *(f"{key}={value}" for key, value in PARAMS.items()), *REST).code == 0
+    expected = table(tmp_path / "sweep")
+    assert [row | {"seconds": ""} for row in rows] == [row | {"seconds": ""} for row in expected]
+    for name in NAMED:
+        assert tree_hash(tmp_path / "from_file" / name) == tree_hash(tmp_path / "sweep" / name)
+
+
+def test_repeating_a_sweep_in_a_file_changes_nothing(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    write(mine / "sweep/two.yaml", SWEEP)
+    run_main("+sweep=two", *REST)
+    before = (tmp_path / "sweep/sweep.csv").read_bytes()
+
+    done = run_main("+sweep=two", *REST)
+    assert (done.code, done.out.count("nothing to do")) == (0, 4)
+    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
+
+
+def test_settings_next_to_the_params_hold_for_every_job(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    write(mine / "sweep/two.yaml", {"defaults": [{"override /isp": "linear"}], "seed": 9} | SWEEP)
+    assert run_main("+sweep=two", *REST).code == 0
+    for name in NAMED:
+        config = yaml.safe_load((tmp_path / "sweep" / name / "config.yaml").read_text())
+        assert (config["seed"], config["isp"]["tone"]) == (9, "none")
+
+
+def test_overrides_win_over_params_of_a_file(mine: Path) -> None:
+    write(mine / "sweep/two.yaml", SWEEP)
+    assert jobs("+sweep=two", "gains.red=2.3", own=mine) == [
+        "camera=sony_a7r,gains.red=2.3", "camera=nexus_6p,gains.red=2.3",
+    ]  # fmt: skip
+    assert jobs("+sweep=two", "camera=convex,identity", "gains.red=2.3", own=mine) == [
+        "camera=convex,gains.red=2.3", "camera=identity,gains.red=2.3",
+    ]  # fmt: skip
+
+
+def test_values_on_the_command_line_multiply_those_of_a_file(mine: Path) -> None:
+    write(mine / "sweep/two.yaml", SWEEP)
+    assert jobs("+sweep=two", "seed=1,2", own=mine) == [
+        f"{folder},seed={seed}" for seed in (1, 2) for folder in FOLDERS
+    ]
+
+
+def test_several_sweep_files_are_run_one_after_the_other(mine: Path) -> None:
+    write(mine / "sweep/two.yaml", SWEEP)
+    write(mine / "sweep/seeds.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "1,2"}}}})
+    assert jobs("+sweep=two,seeds", own=mine, multirun=True) == [*FOLDERS, "seed=1", "seed=2"]
+
+
+def test_all_forms_of_values_are_expanded(mine: Path) -> None:
+    params = {"seed": "range(1,4)", "camera": "glob(sony*)", "source.recursive": True, "noise.draws": 2}
+    write(mine / "sweep/forms.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": params}}})
+    assert jobs("+sweep=forms", own=mine) == [
+        f"camera={camera},noise.draws=2,seed={seed},source.recursive=True"
+        for seed in (1, 2, 3)
+        for camera in ("sony_a7r", "sony_rx100")
+    ]
+
+
+def test_interpolations_in_params_are_resolved(mine: Path) -> None:
+    write(mine / "sweep/two.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "${n_jobs},7"}}}})
+    assert jobs("+sweep=two", "n_jobs=3", own=mine) == ["n_jobs=3,seed=3", "n_jobs=3,seed=7"]
+
+
+def test_experiment_without_params_stays_in_the_names() -> None:
+    assert jobs("+experiment=ipol_demo", "seed=1,2", multirun=True) == [
+        "+experiment=ipol_demo,seed=1", "+experiment=ipol_demo,seed=2",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "repeated",
+    [
+        ["+sweep=cameras", "+sweep=gain_extremes"],
+        ["+experiment=crvd_like", "+experiment=ipol_demo"],
+        ["-m", "seed=1,2", "seed=5"],
+        ["-m", "seed=5", "++seed=1,2"],
+    ],
+)
+def test_repeated_groups_and_swept_keys_are_refused(repeated: list[str], run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("plan", *repeated)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    first, second = repeated[-2:]
+    assert f"{second}: {first} sets {second.lstrip('+').partition('=')[0]} too; expected one of them; " in done.err
+
+
+def test_repeated_setting_has_its_last_value() -> None:
+    assert jobs("seed=1", "seed=2", "camera=sony_a7r,nexus_6p", multirun=True) == [
+        "camera=sony_a7r,seed=2", "camera=nexus_6p,seed=2",
+    ]  # fmt: skip
+
+
+def test_mode_on_the_command_line_starts_a_sweep() -> None:
+    assert jobs("hydra.mode=MULTIRUN", "seed=1,2") == ["seed=1", "seed=2"]
+
+
+REFUSED = {
+    "params without mode": (
+        {"sweeper": {"params": {"seed": "1,2"}}}, r"hydra.sweeper.params.seed: .*without hydra.mode: MULTIRUN; add",
+    ),
+    "other folder": ({"mode": "MULTIRUN", "sweep": {"dir": "elsewhere"}}, r"hydra.sweep.dir=elsewhere: has no effect"),
+    "subfolders": ({"mode": "MULTIRUN", "sweep": {"subdir": "x"}}, r"hydra.sweep.subdir=x: has no effect here"),
+    "working directory": ({"job": {"chdir": True}}, r"hydra.job.chdir=true: has no effect here"),
+    "environment": ({"job": {"env_set": {"A": "b"}}}, r"hydra.job.env_set=.*: has no effect here"),
+    "list of params": ({"mode": "MULTIRUN", "sweeper": {"params": ["seed=1,2"]}}, r".*Cannot merge"),
+    "interval": (
+        {"mode": "MULTIRUN", "sweeper": {"params": {"gains.red": "interval(1,2)"}}}, r"gains.red=interval\(1,2\): an",
+    ),
+    "broken values": ({"mode": "MULTIRUN", "sweeper": {"params": {"seed": "choice(1"}}}, r".*choice\(1"),
+    "settings of Hydra": (
+        {"mode": "MULTIRUN", "sweeper": {"params": {"hydra.verbose": "true,false"}}}, r".*over settings of Hydra is",
+    ),
+    "removed key": ({"mode": "MULTIRUN", "sweeper": {"params": {"~seed": "1"}}}, r"~seed=1: a setting cannot be"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_sweeps_that_cannot_be_honoured_are_refused(case: str, mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    content, sentence = REFUSED[case]
+    write(mine / "sweep/bad.yaml", {"hydra": content})
+    with pytest.raises(ConfigError, match=sentence):
+        jobs("+sweep=bad", own=mine)
+
+    done = run_main("+sweep=bad", *REST)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert not (tmp_path / "sweep").exists()
+
+
+def test_params_in_an_option_that_the_sweep_selects_are_refused(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    write(mine / "sweep/inner.yaml", {"hydra": {"sweeper": {"params": {"seed": "1,2"}}}})
+    write(mine / "sweep/outer.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"+sweep@x": "inner"}}}})
+    write(mine / "noise/hides.yaml", {"defaults": ["/sweep@_global_: inner"]}, "")
+    done = run_main("-m", "noise=hides", *REST)
+    assert (done.code, done.err.count("\n")) == (2, 1), done.err
+    assert not list((tmp_path).glob("sweep/*/dataset.json"))
+
+
+def test_unknown_key_in_a_sweep_fails_its_jobs_only(mine: Path, run_main: RunMain) -> None:
+    write(mine / "sweep/bad.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"sed": "1,2"}}}})
+    done = run_main("+sweep=bad", *REST)
+    assert done.code == 2
+    assert [line.split(": ", 2)[2].split(";")[0] for line in done.err.splitlines()] == [
+        "sed=1: no such key", "sed=2: no such key",
+    ]  # fmt: skip
+
+
+def test_sweep_file_without_package_line_is_refused_with_advice(mine: Path, run_main: RunMain) -> None:
+    write(mine / "sweep/seeds.yaml", {"hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"seed": "1,2"}}}}, header="")
+    done = run_main("+sweep=seeds", *REST)
+    assert (done.code, done.err) == (
+        2,
+        "gen-dataset: sweep=seeds: the keys of the file are below 'sweep'; expected '# @package _global_' as its "
+        "first line\n",
+    )
+
+
+def test_a_sweep_without_plus_is_refused_with_advice(run_main: RunMain) -> None:
+    done = run_main("sweep=cameras")
+    assert (done.code, done.err) == (
+        2, "gen-dataset: sweep=cameras: a sweep is added to the settings; write +sweep=cameras\n",
+    )  # fmt: skip
+
+
+def test_misspelt_sweep_has_a_suggestion(run_main: RunMain) -> None:
+    done = run_main("+sweep=camera")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "sweep=camera: no such option; expected one of camera_by_iso, cameras, " in done.err
+    assert done.err.endswith("did you mean cameras?\n")
+
+
+SHIPPED = {"iso_ladder": 5, "cameras": 4, "camera_by_iso": 20, "gain_extremes": 8, "paper_figure6": 4}
+
+
+def test_shipped_sweeps_are_those_of_the_contract() -> None:
+    assert group_options("sweep") == sorted(SHIPPED)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_sweeps_have_a_purpose_and_their_jobs(name: str) -> None:
+    text = (conf_dir() / "sweep" / f"{name}.yaml").read_text(encoding="utf-8")
+    assert "# Purpose: " in text
+    assert f"#   gen-dataset +sweep={name} source.root=photos out=sweep" in text
+    assert len(set(jobs(f"+sweep={name}"))) == SHIPPED[name]
+
+
+def test_the_largest_shipped_sweep_runs_and_shows_its_places(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("+sweep=camera_by_iso", "source.root=p", "out=sweep", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert [row["exit"] for row in table(tmp_path / "sweep")] == ["0"] * 20
+    assert "3/20 camera=sony_a7r,noise=imx385_iso6400" in done.err
+
+
+def test_plan_of_a_sweep_in_a_file_prints_totals(mine: Path, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("plan", "+sweep=cameras", "source.root=p", "n_jobs=1")
+    assert done.code == 0, done.err
+    assert "totals    4 jobs: 4 pairs in 4 shards, " in done.out
+    assert sorted(os.listdir(tmp_path)) == ["mine", "p"]
+
+
+def test_cfg_job_prints_every_job_of_a_sweep(mine: Path, run_main: RunMain) -> None:
+    done = run_main("+sweep=cameras", "--cfg", "job")
+    assert done.code == 0
+    cameras = re.findall(r"^camera:\n  name: (\w+)$", done.out, re.MULTILINE)
+    assert cameras == ["sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p"]
+
+
+def test_primary_config_that_the_built_in_one_hides_is_refused(mine: Path, run_main: RunMain) -> None:
+    write(mine / "config.yaml", {"seed": 3}, "")
+    done = run_main("--config-dir", "mine", "--config-name", "config", "--cfg", "job")
+    assert (done.code, done.err) == (
+        2,
+        "gen-dataset: --config-name config: mine/config.yaml has the name of a built-in config, which would be used "
+        "instead; rename the file\n",
+    )

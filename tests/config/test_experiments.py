@@ -1,0 +1,240 @@
+"""Experiment configs of ``+experiment=``: their values against the sources; they run and can be overridden."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make, Settings
+from helpers.photographs import fill, pixels
+from helpers.published import CRVD
+from PIL import Image
+
+from unprocess_gen import RawPairs
+from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.serialization import read_dataset_yaml
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.types import Srgb
+from unprocess_gen.sources.loader import downscaled
+from unprocess_gen.sources.scenes import synthetic
+
+RECIPE = "experiment"
+RECIPES = sorted(path.stem for path in (conf_dir() / RECIPE).glob("*.yaml"))
+NO_CLIPS = {"crvd_like": ("source.clips=false",)}
+"""Overrides that an experiment needs with the built-in scenes, which are not clips."""
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("noise=none",),
+        ("camera=sony_a7r", "gains=fixed", "isp=srgb", "sensor=generic_10bit", "accuracy=fast"),
+    ],
+    ids=["noise", "groups"],
+)
+def test_experiment_is_valid_with_all_compatible_options(
+    recipe: str, overrides: tuple[str, ...], settings: Settings
+) -> None:
+    config = settings(f"+{RECIPE}={recipe}", *overrides, *NO_CLIPS.get(recipe, ()))
+    validate_config(config)
+    if "noise=none" in overrides:
+        assert config.noise.name == "none"
+    if "camera=sony_a7r" in overrides:
+        assert (config.camera.name, config.isp.gamma, config.gains.red) == ("sony_a7r", "srgb", 2.15)
+        assert (config.sensor.bits, config.accuracy.name) == (10, "fast")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a folder of one image, just large enough for a patch of 256 after downscaling."""
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "clip").mkdir()
+    Image.fromarray(pixels(1, 512, 512)).save(folder / "clip/0.png")
+    return folder
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_experiment_runs_unmodified(recipe: str, clip: Path, run_main: RunMain, tmp_path: Path) -> None:
+    assert run_main(f"+{RECIPE}={recipe}", f"source.root={clip}", "n_jobs=1", "out=ds").code == 0
+    assert len(RawPairs(tmp_path / "ds")) == (16 if recipe == "brooks2019_training" else 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_noise_of_an_experiment_matches_its_rows(recipe: str, run_main: RunMain) -> None:
+    overrides = (f"+{RECIPE}={recipe}", "source.limit=2", "n_jobs=1", *NO_CLIPS.get(recipe, ()))
+    assert run_main(*overrides, "out=ds").code == 0
+    assert "noise of" in run_main("verify", "ds", "--noise").out
+
+
+def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(
+    clip: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    """``config.yaml`` contains all values, whatever they came from."""
+    source = (f"source.root={clip}", "n_jobs=1")
+    assert run_main(f"+{RECIPE}=brooks2019_training", "source.patch=[random,64,2]", "out=ds", *source).code == 0
+    config, kind = read_dataset_yaml(tmp_path / "ds/config.yaml")
+    assert (config.output.dtype, config.gains.highlight, kind) == ("float32", "gray_mean", "folder")
+    assert "the same as ds" in run_main("again", "ds", "out=again", *source).out
+
+
+def test_experiments_can_be_swept(clip: Path, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("-m", f"+{RECIPE}=ipol_demo,eld_low_light", f"source.root={clip}", "out=sweep", "n_jobs=1")
+    assert done.code == 0
+    assert (tmp_path / f"sweep/+{RECIPE}=eld_low_light/manifest.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("argument", "complaint"),
+    [
+        (f"{RECIPE}=ipol_demo", "a recipe is added to the settings; write +experiment=ipol_demo"),
+        (f"+{RECIPE}=imagenet", "no such option; expected one of brooks2019_training, crvd_like, eld_low_light, ipol"),
+        (f"+{RECIPE}=[ipol_demo,crvd_like]", "expected the name of an option: brooks2019_training"),
+        (
+            f"+{RECIPE}=crvd_like",
+            "source.clips=true: the built-in scenes are not clips; expected folders or videos; give source.root",
+        ),
+    ],
+)
+def test_invalid_experiment_is_refused_in_one_line(
+    argument: str, complaint: str, run_main: RunMain, tmp_path: Path
+) -> None:
+    done = run_main(argument)
+    assert (done.code, len(done.err.splitlines()), list(tmp_path.iterdir())) == (2, 1, [])
+    assert complaint in done.err
+
+
+# Demo of the article --------------------------------------------------------------------------------------------------
+
+
+def test_ipol_demo_has_the_defaults_of_the_article(settings: Settings) -> None:
+    """Section 5: the average values of Brooks et al., gamma 2.2, the convex camera, RGGB, IMX385 at ISO 3200."""
+    config = settings(f"+{RECIPE}=ipol_demo")
+    gains = config.gains
+    assert (gains.red, gains.blue, gains.inverse_rgb) == ((1.9 + 2.4) / 2, (1.5 + 1.9) / 2, 0.8)
+    assert (gains.highlight, gains.threshold) == ("per_channel", 0.9)  # section 2, function f
+    assert (config.camera.law, config.isp.tone, config.isp.gamma) == ("convex", "smoothstep", 2.2)
+    assert (config.sensor.pattern, config.sensor.black_level_dn, config.sensor.white_level_dn) == ("RGGB", 240, 4095)
+    # generate_raw_from_RGB.py of the author's RVDD: (8.0034·u - 2043.51144).clip(0), black level in u
+    noise = config.noise
+    assert (noise.a, noise.b, noise.black, noise.law) == (8.0034, -2043.51144, "included", "gaussian")
+    assert (config.output.dtype, config.output.layout) == ("uint16", "mosaic")  # 16-bit integers
+
+
+# Brooks et al. --------------------------------------------------------------------------------------------------------
+
+
+def test_brooks_distributions_are_those_of_the_script(settings: Settings) -> None:
+    """unprocess.py: random_gains(), random_noise_levels(), safe_invert_gains(), mosaic(); train.py: image_size."""
+    config = settings(f"+{RECIPE}=brooks2019_training")
+    gains, noise = config.gains, config.noise
+    assert (gains.red, gains.blue) == (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9])
+    assert gains.inverse_rgb == ["truncated_normal", 0.8, 0.1, 0.5, 1.1]  # the script: not truncated
+    assert (gains.highlight, gains.threshold) == ("gray_mean", 0.9)
+    assert (noise.a, noise.b) == (["log_uniform", 0.0001, 0.012], ["log_linear_in_a", 2.18, 1.2, 0.26])
+    assert (noise.units, noise.law) == ("normalized", "gaussian")
+    assert (config.camera.law, config.isp.tone, config.isp.gamma) == ("convex", "smoothstep", 2.2)
+    assert (config.sensor.pattern, config.sensor.clip) == ("RGGB", "none")
+    assert (config.source.downscale, config.source.patch[:2]) == (2, ["random", 256])
+    assert (config.output.dtype, config.output.layout) == ("float32", "packed")
+
+
+def clean_planes_of_brooks(srgb: Srgb, row: dict[str, Any]) -> np.ndarray:
+    """Apply the formulas of the script to pixels and the parameters of a row; float64 ``[4, H/2, W/2]``."""
+    x = srgb / np.iinfo(srgb.dtype).max
+    light = np.maximum(0.5 - np.sin(np.arcsin(1 - 2 * x) / 3), 1e-8) ** 2.2
+    rgb2cam = np.array([[row[f"rgb2cam_{i}{j}"] for j in range(3)] for i in range(3)])
+    light = light @ rgb2cam.T
+    k = np.array([1 / row["red_gain"], 1, 1 / row["blue_gain"]]) * row["inverse_rgb_gain"]
+    mask = (np.maximum(light.mean(axis=-1, keepdims=True) - 0.9, 0) / 0.1) ** 2
+    light = np.clip(light * np.maximum(mask + (1 - mask) * k, k), 0, 1)
+    red, of_red, of_blue, blue = light[::2, ::2, 0], light[::2, 1::2, 1], light[1::2, ::2, 1], light[1::2, 1::2, 2]
+    return np.stack([red, of_red, of_blue, blue])
+
+
+@pytest.fixture(scope="module")
+def brooks(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("recipes") / "brooks"
+    make(None, out, f"+{RECIPE}=brooks2019_training", "source.limit=2", "source.patch=[random,128,4]")
+    return out
+
+
+def test_clean_planes_match_the_formulas_of_brooks(brooks: Path) -> None:
+    """Within float32 rounding: half a unit in the last place of 1, ten times that for the constants of the script."""
+    scenes = {row["source"]: downscaled(synthetic.scene(row["source"]), 2) for *_, row in RawPairs(brooks)}
+    for clean, _, row in RawPairs(brooks):
+        y, x = row["patch_y"], row["patch_x"]
+        srgb = scenes[row["source"]][y : y + 128, x : x + 128]
+        assert np.abs(clean - clean_planes_of_brooks(srgb, row)).max() < 2**-25 * 10
+
+
+def test_noise_follows_brooks_and_exceeds_both_limits(brooks: Path) -> None:
+    """Residuals over √(shot·x + read) are standard normals: mean and variance within five standard errors."""
+    lowest = highest = 0.5
+    for clean, noisy, row in RawPairs(brooks):
+        shot, read = row["a_dn"] / 3855, row["b_dn2"] / 3855**2  # white less black
+        assert 0.0001 <= shot <= 0.012
+        assert abs(np.log(read) - (2.18 * np.log(shot) + 1.2)) < 0.26 * 6.4  # no normal is drawn farther out
+        standard = (noisy.astype(np.float64) - clean) / np.sqrt(shot * clean + read)
+        assert abs(standard.mean()) < 5 / np.sqrt(standard.size)
+        assert abs(standard.var() - 1) < 5 * np.sqrt(2 / standard.size)
+        lowest, highest = min(lowest, float(noisy.min())), max(highest, float(noisy.max()))
+    assert lowest < 0
+    assert highest > 1
+
+
+# CRVD and ELD ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_crvd_like_clip_has_one_of_five_isos(run_main: RunMain, tmp_path: Path) -> None:
+    for clip in range(4):
+        fill(tmp_path / f"photos/clip{clip}", 2, first=2 * clip)
+    assert run_main(f"+{RECIPE}=crvd_like", f"source.root={tmp_path / 'photos'}", "out=ds", "n_jobs=1").code == 0
+    isos: dict[str, set[float]] = {}
+    for clean, _, row in RawPairs(tmp_path / "ds"):
+        assert (row["pattern"], row["black_level_dn"], row["white_level_dn"]) == ("GBRG", 240, 4095)
+        assert (row["dn_per_e"], round(row["read_std_dn"] ** 2, 6)) == CRVD[int(row["iso"])]
+        assert clean.dtype == np.uint16
+        isos.setdefault(row["clip"], set()).add(row["iso"])
+    assert len(isos) == 4
+    assert {len(of_clip) for of_clip in isos.values()} == {1}
+    assert len(set.union(*isos.values())) > 1
+
+
+def test_crvd_like_draws_from_five_isos(settings: Settings) -> None:
+    config = settings(f"+{RECIPE}=crvd_like")
+    assert config.scene.iso == ["choice", *CRVD]
+    assert [branch.iso for branch in config.noise.branches] == [[iso, iso] for iso in CRVD]
+    assert (config.sensor.pattern, config.source.clips, config.noise.name) == ("GBRG", True, "imx385")
+
+
+def test_crvd_like_supports_every_iso_twice(make: Make, tmp_path: Path) -> None:
+    """Reproduces what synthesize_noise.py generates."""
+    (tmp_path / "photos/clip").mkdir(parents=True)
+    Image.fromarray(pixels(0, 16, 16)).save(tmp_path / "photos/clip/0.png")
+    levels = "noise.levels=[1600,3200,6400,12800,25600]"
+    make(tmp_path / "photos", tmp_path / "ds", f"+{RECIPE}=crvd_like", levels, "noise.draws=2")
+    assert [row["iso"] for *_, row in RawPairs(tmp_path / "ds")] == [iso for iso in CRVD for _ in range(2)]
+
+
+def test_eld_low_light_has_isos_and_factors_of_its_dataset(make: Make, tmp_path: Path) -> None:
+    """Section 5 of the paper: ISO 800, 1600, 3200; factors 100 and 200. K of the release: Kmin 0.415039 at ISO 100."""
+    fill(tmp_path / "photos", 10)
+    make(tmp_path / "photos", tmp_path / "ds", f"+{RECIPE}=eld_low_light")
+    rows = [row for *_, row in RawPairs(tmp_path / "ds")]
+    assert {row["iso"] for row in rows} == {800, 1600, 3200}
+    assert {row["exposure_ratio"] for row in rows} == {100, 200}
+    for row in rows:
+        on_this_sensor = (16383 - 1024) / (16383 - 400)
+        assert row["dn_per_e"] == pytest.approx(0.415039 * row["iso"] / 100 * on_this_sensor, rel=1e-6)
+        assert row["noise"] == "nikon_d850"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["nikon_d850", "sony_a7s2", "canon_5d4", "canon_70d", "canon_700d"])
+def test_eld_low_light_is_valid_for_each_camera(camera: str, settings: Settings) -> None:
+    validate_config(settings(f"+{RECIPE}=eld_low_light", f"noise={camera}"))

@@ -1,0 +1,635 @@
+"""Configuration: values of ``conf/`` against their sources, refused values and their messages, ``config.yaml``."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from helpers.commands import RunMain
+from helpers.published import CRVD
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from unprocess_gen.config import distributions
+from unprocess_gen.config.distributions import DISTRIBUTION_NUMBERS, parse_distribution
+from unprocess_gen.config.noise_validation import PROFILE_RANGES
+from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import (
+    NOT_DATA,
+    dataset_yaml,
+    differences,
+    parse_dataset_yaml,
+    read_dataset_yaml,
+    source_kind,
+)
+from unprocess_gen.config.validation import HIGHLIGHTS, validate_config
+from unprocess_gen.core import tone_curves
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import Distribution, Facts
+from unprocess_gen.planning.plan import plan_image, plan_pairs
+from unprocess_gen.simulation.reference import unprocess
+
+Settings = Callable[..., Config]
+FILES = sorted(
+    path.relative_to(conf_dir()) for path in conf_dir().glob("*/*.yaml") if path.parent.name not in ADDED_GROUPS
+)
+MATRIX = "[0.7, 0.1, -0.1, -0.4, 1.2, 0.2, -0.1, 0.2, 0.6]"
+NEEDS = {
+    "camera/custom.yaml": [f"camera.xyz2cam={MATRIX}"],
+    "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
+    "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
+}
+NOISE_KEYS = {"name", "units", "black", "bits", "black_level_dn", "white_level_dn"}
+TWO_NUMBERS = {"a", "b", "negative_variance"}
+PHYSICAL = {"branches", "assumed", *(key for key, _, _ in PROFILE_RANGES)}
+CHOSEN = {"iso", "law", "levels", "draws"}
+"""Keys that users set and no profile does."""
+SHA256 = "0" * 64
+
+
+# Options in conf/ -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_every_option_composes_and_is_valid(file: Path, settings: Settings) -> None:
+    validate_config(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_every_option_has_all_keys_of_its_group(file: Path) -> None:
+    group = getattr(Config(), str(file.parent))
+    written = yaml.safe_load((conf_dir() / file).read_text(encoding="utf-8"))
+    keys = {field.name for field in dataclasses.fields(group)}
+    if str(file.parent) == "noise":
+        assert keys == NOISE_KEYS | TWO_NUMBERS | PHYSICAL | CHOSEN
+        keys = NOISE_KEYS | (PHYSICAL if "branches" in written else TWO_NUMBERS)
+    assert set(written) == keys
+
+
+def test_options_are_those_of_the_contract() -> None:
+    options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in conf_dir().glob("*/")}
+    assert options == {
+        "source": {"default"},
+        "camera": {
+            "convex", "sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p", "choice", "identity", "custom",
+        },
+        "gains": {
+            "brooks2019", "fixed", "paper_min", "paper_max", "paper_literal", "fig6_top", "fig6_bottom", "unity",
+        },
+        "isp": {"smoothstep_gamma22", "gamma22", "srgb", "linear"},
+        "sensor": {"imx385_12bit", "generic_10bit", "generic_12bit", "generic_14bit", "generic_16bit"},
+        "noise": {
+            "imx385_iso1600", "imx385_iso3200", "imx385_iso6400", "imx385_iso12800", "imx385_iso25600",
+            "imx385_iso3200_rvdd", "brooks2019", "heteroscedastic", "none",
+            "imx385", "sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x",
+        },
+        "scene": {"daylight", "indoor", "long_exposure", "low_light", "night", "video_night"},
+        "effects": {"default"},
+        "accuracy": {"reference", "exact", "fast"},
+        "output": {"webdataset"},
+        "experiment": {"ipol_demo", "brooks2019_training", "crvd_like", "eld_low_light"},
+        "sweep": {"iso_ladder", "cameras", "camera_by_iso", "gain_extremes", "paper_figure6"},
+    }  # fmt: skip
+
+
+def test_defaults_are_those_of_the_contract(settings: Settings) -> None:
+    config = settings()
+    assert (config.seed, config.out, config.n_jobs) == (0, "ds", -1)
+    assert (config.source.root, config.source.limit, config.source.recursive) == (None, None, True)
+    assert (config.source.max_pixels, config.source.max_failed, config.source.icc) == (2**26, 0, "ignore")
+    assert (config.camera.name, config.camera.law) == ("convex", "convex")
+    assert (config.isp.tone, config.isp.gamma) == ("smoothstep", 2.2)
+    assert (config.noise.name, config.output.dtype, config.output.layout, config.output.pairs_per_shard) == (
+        "imx385_iso3200", "uint16", "mosaic", 8,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "photo.JPEG", "photo.png", "a.tif", "a.tiff", "a.webp", "a.bmp"])
+def test_default_globs_match_every_image_format(name: str, settings: Settings, tmp_path: Path) -> None:
+    from unprocess_gen.sources.listing import list_folder
+
+    (tmp_path / name).write_bytes(b"x")
+    assert len(list_folder(str(tmp_path), settings().source.include, True, None).sources) == 1
+
+
+@pytest.mark.parametrize("iso", CRVD)
+def test_imx385_profiles_have_the_numbers_of_crvd(iso: int, settings: Settings) -> None:
+    noise = settings(f"noise=imx385_iso{iso}").noise
+    assert (noise.a, noise.b) == CRVD[iso]
+    assert (noise.units, noise.black, noise.bits, noise.black_level_dn, noise.white_level_dn) == (
+        "dn", "subtracted", 12, 240, 4095,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("iso", CRVD)
+def test_imx385_profiles_are_unchanged_in_the_plan(iso: int, settings: Settings) -> None:
+    plan = plan_image(settings(f"noise=imx385_iso{iso}"), SHA256)
+    assert (plan.a_dn, plan.b_dn2) == CRVD[iso]
+
+
+def test_rvdd_profile_is_the_line_of_its_author(settings: Settings) -> None:
+    noise = settings("noise=imx385_iso3200_rvdd").noise
+    assert (noise.a, noise.b, noise.black, noise.negative_variance) == (8.0034, -2043.51144, "included", "clip")
+
+
+def test_rvdd_line_is_122_dn2_below_zero_at_black(settings: Settings) -> None:
+    plan = plan_image(settings("noise=imx385_iso3200_rvdd"), SHA256)
+    assert plan.b_dn2 == pytest.approx(8.0034 * 240 - 2043.51144, abs=1e-9)
+    assert -plan.b_dn2 / plan.a_dn == pytest.approx(15.33, abs=0.005)
+
+
+def test_brooks_noise_is_the_published_distribution(settings: Settings) -> None:
+    noise = settings("noise=brooks2019").noise
+    assert (noise.units, noise.a, noise.b) == (
+        "normalized", ["log_uniform", 0.0001, 0.012], ["log_linear_in_a", 2.18, 1.2, 0.26],
+    )  # fmt: skip
+
+
+def test_noise_none_has_no_variance(settings: Settings) -> None:
+    plan = plan_image(settings("noise=none"), SHA256)
+    assert (plan.a_dn, plan.b_dn2, plan.effects) == (0, 0, ("quantise",))
+
+
+@pytest.mark.parametrize("sensor", ["imx385_12bit", "generic_10bit", "generic_14bit", "generic_16bit"])
+def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(sensor: str, settings: Settings) -> None:
+    plan = plan_image(settings(f"sensor={sensor}", "noise=heteroscedastic", "noise.a=3.5", "noise.b=12"), SHA256)
+    assert (plan.a_dn, plan.b_dn2) == (3.5, 12)
+
+
+def test_profile_is_scaled_by_the_ratio_of_levels(settings: Settings) -> None:
+    plan = plan_image(settings("sensor=generic_14bit", "noise=imx385_iso1600"), SHA256)
+    scale = (16383 - 1024) / (4095 - 240)
+    assert (plan.a_dn, plan.b_dn2) == pytest.approx((3.513262 * scale, 11.917691 * scale**2), rel=1e-15)
+
+
+GAINS = {
+    "brooks2019": (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["truncated_normal", 0.8, 0.1, 0.5, 1.1]),
+    "fixed": (2.15, 1.7, 0.8),
+    "paper_min": (1.9, 1.5, 1 / 0.85),
+    "paper_max": (2.4, 1.9, 1 / 2.05),
+    "paper_literal": (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["inverse_truncated_normal", 0.8, 0.1, 0.5, 1.1]),
+    "fig6_top": (1.9, 1.5, 0.85),
+    "fig6_bottom": (2.4, 1.9, 2.05),
+    "unity": (1, 1, 1),
+}
+
+
+@pytest.mark.parametrize("name", GAINS)
+def test_gains_are_those_of_the_contract(name: str, settings: Settings) -> None:
+    gains = settings(f"gains={name}").gains
+    assert (gains.red, gains.blue, gains.inverse_rgb) == GAINS[name]
+    assert gains.highlight == ("none" if name == "unity" else "per_channel")
+    assert gains.threshold == 0.9
+
+
+SENSORS = {
+    "imx385_12bit": (12, 240, 4095),
+    "generic_10bit": (10, 64, 1023),
+    "generic_12bit": (12, 256, 4095),
+    "generic_14bit": (14, 1024, 16383),
+    "generic_16bit": (16, 4096, 65535),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_sensors_are_those_of_the_contract(name: str, settings: Settings) -> None:
+    sensor = settings(f"sensor={name}").sensor
+    assert (sensor.bits, sensor.black_level_dn, sensor.white_level_dn) == SENSORS[name]
+    assert (sensor.pattern, sensor.clip) == ("RGGB", "sensor")
+
+
+ISPS = {
+    "smoothstep_gamma22": ("smoothstep", 2.2),
+    "gamma22": ("none", 2.2),
+    "srgb": ("none", "srgb"),
+    "linear": ("none", 1),
+}
+
+
+@pytest.mark.parametrize("name", ISPS)
+def test_isps_are_those_of_the_contract(name: str, settings: Settings) -> None:
+    isp = settings(f"isp={name}").isp
+    assert (isp.tone, isp.gamma) == ISPS[name]
+
+
+# Refused values -------------------------------------------------------------------------------------------------------
+
+REFUSED = [
+    ("seed=-1", r"seed=-1: expected 0 to 9223372036854775807"),
+    ("seed=9223372036854775808", r"seed=9223372036854775808: expected 0 to 9223372036854775807"),
+    ("n_jobs=0", r"n_jobs=0: expected 1 to 1024 or -1"),
+    ("n_jobs=-2", r"n_jobs=-2: expected 1 to 1024 or -1"),
+    ("self_test=off", r"self_test=off: expected one of stop, go_on"),
+    ("out=''", r"out='': expected the name of a folder"),
+    ("source.root=/no/such/folder", r"source.root=/no/such/folder: no such folder"),
+    ("source.include=[]", r"source.include=\[\]: expected at least one pattern"),
+    ("source.limit=0", r"source.limit=0: expected 1 to 1000000000 or null"),
+    ("source.max_pixels=0", r"source.max_pixels=0: expected 1 to "),
+    ("source.max_failed=-1", r"source.max_failed=-1: expected 0 to "),
+    ("source.icc=convert", r"source.icc=convert: expected one of ignore, refuse"),
+    ("camera.law=mean", r"camera.law=mean: expected one of fixed, convex, choice, identity, custom"),
+    ("camera.law=fixed", r"camera.name=convex: expected one of nexus_6p, sony_a7r, olympus_em10, sony_rx100"),
+    (f"camera.xyz2cam={MATRIX}", r"camera.xyz2cam=\[0.7, .*\]: a matrix needs camera.law=custom, not convex"),
+    ("camera.law=custom", r"camera.xyz2cam=null: camera=custom needs nine numbers"),
+    ("camera.law=custom;camera.xyz2cam=[1,2,3]", r"camera.xyz2cam=\[1.0, 2.0, 3.0\]: .*nine"),
+    ("camera.law=custom;camera.xyz2cam=[1,2,3,2,4,6,1,1,1]", r"camera.xyz2cam=\[1.0, 2.0, .*\]: .*invert"),
+    ("camera.law=custom;camera.xyz2cam=[0,0,0,0,0,0,0,0,0]", r"camera.xyz2cam=\[0.0, 0.0, .*\]: "),
+    ("camera.law=custom;camera.xyz2cam=[nan,0,0,0,1,0,0,0,1]", r"camera.xyz2cam=\[nan, 0.0, .*\]: "),
+    ("camera.law=custom;camera.xyz2cam=[inf,0,0,0,1,0,0,0,1]", r"camera.xyz2cam=\[inf, 0.0, .*\]: "),
+    ("gains.red=0", r"gains.red=0: expected a gain above 0"),
+    ("gains.red=1e-310", r"gains.red=1e-310: expected a gain above 0, from 0.001 to 1000"),
+    ("gains.blue=[uniform,1,1e9]", r"gains.blue=.*: expected a gain above 0, from 0.001 to 1000"),
+    (
+        "camera=custom;camera.name=sony_a7r;camera.xyz2cam=[1,0,0,0,1,0,0,0,1]",
+        r"camera.name=sony_a7r: is the name of",
+    ),
+    ("gains.blue=-1.5", r"gains.blue=-1.5: expected a gain above 0"),
+    ("gains.inverse_rgb=0.0", r"gains.inverse_rgb=0.0: expected a gain above 0"),
+    ("gains.red=nan", r"gains.red=nan: expected a finite number or a distribution: \[uniform, lowest, highest\]"),
+    ("gains.red=inf", r"gains.red=inf: expected a finite number or a distribution"),
+    ("gains.red=null", r"gains.red=null: expected a finite number or a distribution"),
+    ("gains.red=true", r"gains.red=True: expected a finite number or a distribution"),
+    ("gains.red=two", r"gains.red=two: expected a finite number or a distribution"),
+    ("gains.red=[]", r"gains.red=\[\]: expected a finite number or a distribution"),
+    ("gains.red=[normal,2,1]", r"gains.red=\[normal, 2, 1\]: expected a finite number or a distribution: \[uniform"),
+    ("gains.red=[uniform,2]", r"gains.red=\[uniform, 2\]: expected finite numbers: \[uniform, lowest, highest\]"),
+    ("gains.red=[uniform,1,nan]", r"gains.red=\[uniform, 1, nan\]: expected finite numbers"),
+    ("gains.red=[uniform,2,1]", r"gains.red=\[uniform, 2, 1\]: expected the lowest value below the highest"),
+    ("gains.red=[uniform,0,2]", r"gains.red=\[uniform, 0, 2\]: expected a gain above 0"),
+    ("gains.red=[uniform,2,2]", r"gains.red=\[uniform, 2, 2\]: expected the lowest value below the highest"),
+    ("gains.blue=[truncated_normal,1,0,0.5,2]", r"gains.blue=.*: expected a standard deviation above 0"),
+    ("gains.blue=[truncated_normal,1,0.1,0.5,1.7]", r"gains.blue=.*: expected limits within six standard dev"),
+    ("gains.inverse_rgb=[truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: expected a gain above 0"),
+    ("gains.inverse_rgb=[inverse_truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: expected a gain above 0"),
+    ("gains.red=[inverse_truncated_normal,1,1,0.5,2]", r"gains.red=.*: expected a finite number or a distribution"),
+    ("gains.highlight=clip", r"gains.highlight=clip: expected one of per_channel, gray_mean, none"),
+    ("gains.threshold=1", r"gains.threshold=1.0: expected 0 up to, but not including, 1"),
+    ("gains.threshold=-0.1", r"gains.threshold=-0.1: expected 0 up to"),
+    ("gains.threshold=nan", r"gains.threshold=nan: expected 0 up to"),
+    ("isp.tone=filmic", r"isp.tone=filmic: expected one of smoothstep, none"),
+    ("isp.gamma=0", r"isp.gamma=0: expected a number from 0.1 to 10, or srgb"),
+    ("isp.gamma=nan", r"isp.gamma=nan: expected a number from 0.1 to 10, or srgb"),
+    ("isp.gamma=rec709", r"isp.gamma=rec709: expected a number from 0.1 to 10, or srgb"),
+    ("isp.gamma=true", r"isp.gamma=True: expected a number from 0.1 to 10, or srgb"),
+    ("sensor.bits=0", r"sensor.bits=0: expected 1 to 16"),
+    ("sensor.bits=17", r"sensor.bits=17: expected 1 to 16"),
+    ("sensor.black_level_dn=-1", r"sensor.black_level_dn=-1: expected 0 to 4094"),
+    ("sensor.black_level_dn=4095", r"sensor.black_level_dn=4095: expected 0 to 4094"),
+    ("sensor.white_level_dn=240", r"sensor.white_level_dn=240: expected 241 to 4095 \(above the black level"),
+    ("sensor.white_level_dn=100", r"sensor.white_level_dn=100: expected 241 to 4095"),
+    ("sensor.white_level_dn=4096", r"sensor.white_level_dn=4096: expected 241 to 4095"),
+    ("sensor.pattern=RGBW", r"sensor.pattern=RGBW: expected one of RGGB, BGGR, GRBG, GBRG"),
+    ("sensor.clip=none", r"sensor.clip=none: output.dtype=uint16 holds no values beyond .*; set output.dtype=float32"),
+    ("sensor.clip=white", r"sensor.clip=white: expected one of sensor, black, none"),
+    ("noise.units=null", r"noise.units=null: expected one of dn, normalized"),
+    ("noise.units=electrons", r"noise.units=electrons: expected one of dn, normalized"),
+    ("noise.black=null", r"noise.black=null: expected one of subtracted, included"),
+    ("noise.negative_variance=abs", r"noise.negative_variance=abs: expected one of refuse, clip"),
+    ("noise.bits=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got null, 240, 4095"),
+    ("noise.black_level_dn=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got 12, null, 4095"),
+    ("noise.white_level_dn=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got 12, 240, null"),
+    ("noise.white_level_dn=240", r"noise.white_level_dn=240: expected 241 to 4095"),
+    ("noise.white_level_dn=5000", r"noise.white_level_dn=5000: expected 241 to 4095"),
+    ("noise.black_level_dn=-1", r"noise.black_level_dn=-1: expected 0 to 4094"),
+    ("noise.a=null", r"noise.a=null: expected a finite number or a distribution: \[uniform, .*\]; \[log_uniform, .*\]"),
+    ("noise.a=nan", r"noise.a=nan: expected a finite number"),
+    ("noise.a=inf", r"noise.a=inf: expected a finite number"),
+    ("noise.b=nan", r"noise.b=nan: expected a finite number"),
+    ("noise.b=-inf", r"noise.b=-inf: expected a finite number"),
+    ("noise.a=-1", r"noise.a=-1: expected a slope of the variance of 0 or more"),
+    ("noise.a=[uniform,-1,1]", r"noise.a=\[uniform, -1, 1\]: expected a slope of the variance of 0 or more"),
+    ("noise.a=[log_uniform,0,1]", r"noise.a=\[log_uniform, 0, 1\]: expected a lowest value above 0"),
+    ("noise=brooks2019;noise.a=0", r"noise.a=0: expected more than 0, because noise.b depends on ln a"),
+    ("noise=brooks2019;noise.b=[log_linear_in_a,2,1,-1]", r"noise.b=.*: expected a slope of -10 to 10"),
+    ("noise=brooks2019;noise.black=included", r"noise.black=included: normalized units have black at 0"),
+    ("noise.b=-1", r"noise.b=-1: variance at black is -1; expected 0 or more; set noise.negative_variance=clip"),
+    ("noise.b=[uniform,-1,1]", r"noise.b=\[uniform, -1, 1\]: variance at black is -1; expected 0 or more"),
+    ("noise=brooks2019;noise.b=-0.1", r"noise.b=-0.1: variance at black is -0.1; expected 0 or more"),
+    ("noise=imx385_iso3200_rvdd;noise.negative_variance=refuse", r"noise.b=-2043.51144: variance at black is -122"),
+    ("output.layout=zip", r"output.layout=zip: expected one of mosaic, packed"),
+    ("output.dtype=float64", r"output.dtype=float64: expected one of uint16, float32"),
+    ("output.dtype=float32;effects.quantise=on", r"effects.quantise=on: output.dtype=float32 is not rounded; set "),
+    ("output.pairs_per_shard=0", r"output.pairs_per_shard=0: expected 1 to 1000000"),
+    ("output.pairs_per_shard=1000001", r"output.pairs_per_shard=1000001: expected 1 to 1000000"),
+    ("noise=imx385", r"scene.iso=100: noise=imx385 is calibrated for ISO 1600, 3200, .* give noise.iso="),
+    ("noise=sony_a7s2;noise.iso=1800", r"noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to "),
+    ("noise=sony_a7s2;noise.iso=[uniform,1000,3000]", r"noise.iso=\[uniform, 1000, 3000\]: noise=sony_a7s2 is "),
+    ("noise=sony_a7s2;noise.a=3", r"noise.a=3: noise=sony_a7s2 is a physical profile; expected null"),
+    ("noise.iso=3200", r"noise.iso=3200: noise=imx385_iso3200 holds for one ISO"),
+    ("noise.law=laplace", r"noise.law=laplace: expected one of gaussian, poisson"),
+    (
+        "noise=imx385_iso3200_rvdd;noise.law=poisson",
+        r"noise.law=poisson: expected noise.black=subtracted and noise.b of 0",
+    ),
+    ("noise=sony_a7s2;noise.prnu_std=0.6", r"noise.prnu_std=0.6: expected 0 to 0.5"),
+    ("noise=sony_a7s2;noise.dark_e_per_s=1e6;scene.exposure_s=1e5", r"noise.dark_e_per_s=1000000.0: more than 1e\+09"),
+    ("noise=sony_a7s2;noise.dark_doubling_c=0.1;scene.temperature_c=150", r"noise.dark_e_per_s=1.0: more than 1e\+09"),
+    ("sensor.saturated=bright", r"sensor.saturated=bright: expected one of noisy, pinned"),
+    ("sensor.dark_offset=halved", r"sensor.dark_offset=halved: expected one of removed, kept"),
+    ("sensor.units=0", r"sensor.units=0: expected image, or a number of bodies"),
+    ("effects.all=maybe", r"effects.all=maybe: expected one of auto, on, off"),
+    ("effects.prnu=maybe", r"effects.prnu=maybe: expected one of auto, on, off"),
+    ("effects.tolerance=0", r"effects.tolerance=0.0: expected more than 0, up to 10"),
+    ("effects.quantise=off", r"effects.quantise=off: integer output is always rounded and clipped"),
+    ("effects.prnu=on", r"effects.prnu=on: noise=imx385_iso3200 offers heteroscedastic only"),
+    ("noise=sony_a7s2;effects.heteroscedastic=on", r"effects.heteroscedastic=on: noise=sony_a7s2 offers the physical"),
+    ("noise=sony_a7s2;effects.column=on", r"effects.column=on: noise=sony_a7s2 gives no column_std_dn"),
+    ("scene.exposure_ratio=0", r"scene.exposure_ratio=0: expected 0.001 to 1e\+06"),
+    ("scene.exposure_s=[uniform,1,1e6]", r"scene.exposure_s=\[uniform, 1, 1000000.0\]: expected 1e-07 to 100000"),
+    ("scene.temperature_c=[choice]", r"scene.temperature_c=\[choice\]: expected at least one value"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "sentence"), REFUSED, ids=[overrides for overrides, _ in REFUSED])
+def test_bad_value_is_refused_with_key_value_and_expectation(overrides: str, sentence: str, settings: Settings) -> None:
+    config = settings(*overrides.split(";"))
+    with pytest.raises(ConfigError, match="^" + sentence) as error:
+        validate_config(config)
+    assert "\n" not in str(error.value)
+
+
+ACCEPTED = [
+    "seed=9223372036854775807", "n_jobs=1024", "source.limit=1", "source.max_pixels=1", "gains.red=1e-3",
+    "gains.red=[uniform,0.001,9]", "gains.threshold=0", "gains.threshold=0.999", "isp.gamma=0.1", "isp.gamma=10",
+    "sensor.bits=16", "sensor.black_level_dn=0", "sensor.black_level_dn=4094", "sensor.white_level_dn=241",
+    "noise.a=0", "noise.b=0", "noise.a=[uniform,0,1]", "output.pairs_per_shard=1", "output.pairs_per_shard=1000000",
+    "sensor.clip=black", "sensor.pattern=GBRG", "noise.bits=14",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("override", ACCEPTED)
+def test_limits_of_ranges_are_accepted(override: str, settings: Settings) -> None:
+    validate_config(settings(override))
+
+
+def test_negative_b_is_accepted_with_negative_variance_clip(settings: Settings) -> None:
+    validate_config(settings("noise.b=-1", "noise.negative_variance=clip"))
+
+
+def test_single_picture_is_accepted_as_source_root(settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    validate_config(settings(f"source.root={tmp_path}/file"))
+
+
+@given(low=st.floats(0.01, 5), width=st.floats(0.01, 5))
+def test_distribution_is_parsed_to_kind_and_numbers(low: float, width: float) -> None:
+    assert parse_distribution("gains.red", ["uniform", low, low + width], ("uniform",)) == Distribution(
+        "uniform", (low, low + width)
+    )
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**53), 2**53))
+def test_number_is_parsed_to_constant(value: float) -> None:
+    assert parse_distribution("noise.a", value, ("uniform",)) == Distribution("constant", (float(value),))
+
+
+# config.yaml ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", FILES, ids=str)
+def test_config_yaml_round_trip_keeps_the_text(file: Path, settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), []))
+    text = dataset_yaml(config)
+    (tmp_path / "config.yaml").write_text(text, encoding="utf-8")
+    again, kind = read_dataset_yaml(tmp_path / "config.yaml")
+    assert kind == "synthetic"
+    assert dataset_yaml(again) == text
+
+
+@hypothesis_settings(deadline=None)
+@given(
+    numbers=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=3, max_size=3),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_config_yaml_round_trip_keeps_every_bit(numbers: list[float], seed: int) -> None:
+    config = Config(seed=seed)
+    config.noise.a, config.noise.b, config.gains.threshold = numbers
+    again, _ = parse_dataset_yaml(dataset_yaml(config))
+    assert repr((again.seed, again.noise.a, again.noise.b, again.gains.threshold)) == repr((seed, *numbers))
+
+
+def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_path: Path) -> None:
+    loaded = yaml.safe_load(dataset_yaml(settings(f"source.root={tmp_path}")))
+    assert loaded["source"]["kind"] == "folder"
+    assert str(tmp_path) not in dataset_yaml(settings(f"source.root={tmp_path}"))
+
+
+def test_source_kind_is_derived_from_root(settings: Settings) -> None:
+    assert source_kind(settings()) == "synthetic"
+    assert source_kind(settings("source.root=photos")) == "folder"
+
+
+def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> None:
+    loaded = yaml.safe_load(dataset_yaml(settings()))
+    assert NOT_DATA == {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
+    assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)
+    assert {"root", "max_failed"}.isdisjoint(loaded["source"])
+
+
+def test_config_yaml_contains_every_other_key(settings: Settings) -> None:
+    loaded = yaml.safe_load(dataset_yaml(settings()))
+    for field in dataclasses.fields(Config):
+        if dataclasses.is_dataclass(group := getattr(Config(), field.name)):
+            names = {key.name for key in dataclasses.fields(group)} - set(NOT_DATA.get(field.name, ()))
+            assert set(loaded[field.name]) - {"kind"} == names
+        else:
+            assert field.name in loaded or field.name in NOT_DATA[""]
+
+
+@pytest.mark.parametrize(
+    "keys", ["out=elsewhere", "n_jobs=3", "self_test=go_on", "check_disk=false", "source.max_failed=7"]
+)
+def test_keys_that_do_not_decide_data_keep_the_text(keys: str, settings: Settings) -> None:
+    assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
+
+
+SPELLINGS = [
+    ("gains.red=2", "gains.red=2.0"),
+    ("gains.red=[uniform,1,2]", "gains.red=[uniform,1.0,2.0]"),
+    ("scene.exposure_ratio=100", "scene.exposure_ratio=100.0"),
+    ("noise.iso=[choice,100,800]", "noise.iso=[choice,100.0,8e2]"),
+    ("noise.a=3", "noise.a=3.0"),
+    ("noise.b=30", "noise.b=3e1"),
+    ("isp.gamma=2", "isp.gamma=2.0"),
+    ("gains.threshold=0", "gains.threshold=0.0"),
+]
+
+
+@pytest.mark.parametrize(("one", "other"), SPELLINGS)
+def test_equal_numbers_have_one_spelling(one: str, other: str, settings: Settings) -> None:
+    assert dataset_yaml(settings(one)) == dataset_yaml(settings(other))
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["seed=1", "source.limit=3", "camera=choice", "gains.red=2", "isp=srgb", "sensor.clip=black", "noise.a=3"],
+)
+def test_keys_that_decide_data_change_the_text(override: str, settings: Settings) -> None:
+    assert dataset_yaml(settings(override)) != dataset_yaml(settings())
+
+
+def test_differences_contain_key_and_both_values(settings: Settings) -> None:
+    ours, theirs = dataset_yaml(settings("seed=1", "isp=srgb")), dataset_yaml(settings())
+    assert differences(ours, theirs) == [
+        "isp.gamma=srgb (there: 2.2)",
+        "isp.tone=none (there: smoothstep)",
+        "seed=1 (there: 0)",
+    ]
+
+
+def test_equal_configs_have_no_differences(settings: Settings) -> None:
+    assert differences(dataset_yaml(settings()), dataset_yaml(settings())) == []
+
+
+def test_missing_config_yaml_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"config.yaml: no such file; expected the config.yaml of a dataset"):
+        read_dataset_yaml(tmp_path / "config.yaml")
+
+
+NOT_CONFIGS: list[Any] = [
+    b"", b"[1, 2]", b"seed: 0", b"a: [", b"\xff\xfe", b"source: {kind: folder, rot: 1}", b"source: 3",
+    b"source: {kind: folder}\nseed: abc", b"source: {kind: folder}\nnew: 1",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("content", NOT_CONFIGS)
+def test_invalid_config_yaml_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_bytes(content)
+    with pytest.raises(ConfigError, match=r"config.yaml: not the config.yaml of a dataset \(") as error:
+        read_dataset_yaml(tmp_path / "config.yaml")
+    assert "\n" not in str(error.value)
+
+
+HOSTILE = [
+    *(None, True, -1, 0, 3, 2**63, -(2**63), math.nan, math.inf, -math.inf, 1e300, -1e300, 1e-300, 2.5),
+    *("x", "", "../../etc", "a\nb", "${oc.env:HOME}", [], {}, [1], ["x"], [["x"]], {"a": 1}, [{"a": -1, "b": 2}]),
+    *(["uniform", 1, 2], ["uniform", -1e300, 1e300], ["choice", 1e300], ["choice", 1, math.nan], [100, 200]),
+    *(["truncated_normal", 0, 1e-300, -1e-300, 1e-300], ["log_uniform", 1e-320, 1e308]),
+    *(["log_linear_in_a", 10, 50, 10], ["per_iso", 1e9], ["root", 0, 0, 1e9], ["line", 1e9, 1e9, 1e9]),
+    ["by_log_iso", [1e300] * 4],
+]
+"""Values that a careless or hostile editor could write anywhere in a ``config.yaml``."""
+
+
+def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in items:
+        yield (*path, key)
+        yield from paths_of(value, (*path, key))
+
+
+@pytest.mark.parametrize("overrides", [(), ("noise=sony_a7s2", "scene=low_light")], ids=str)
+@hypothesis_settings(deadline=None, max_examples=150)
+@given(data=st.data())
+def test_edited_config_yaml_is_refused_in_one_line_or_can_be_planned(
+    overrides: tuple[str, ...], data: st.DataObject, settings: Settings, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    tree = yaml.safe_load(dataset_yaml(settings(*overrides)))
+    *parents, key = data.draw(st.sampled_from(list(paths_of(tree))))
+    group = reduce(lambda node, name: node[name], parents, tree)
+    if data.draw(st.booleans()):
+        group[key] = data.draw(st.sampled_from(HOSTILE))
+    elif isinstance(group, dict):
+        del group[key]
+    path = tmp_path_factory.mktemp("hostile") / "config.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    try:
+        config, _ = read_dataset_yaml(path)
+    except ConfigError as error:
+        assert "\n" not in str(error)
+    else:
+        plan_pairs(config, SHA256, facts=Facts(64, 48, 256, 3, 250))
+
+
+EDITED = [
+    ("isp", "gamma", None, "isp.gamma=null: expected a number from 0.1 to 10, or srgb"),
+    ("gains", "red", math.nan, "gains.red=nan: expected a finite number"),
+    ("gains", "red", math.inf, "gains.red=inf: expected a finite number"),
+    ("source", "max_pixels", -1, "source.max_pixels=-1: expected 1 to"),
+    ("source", "max_pixels", 2**63, "source.max_pixels=9223372036854775808: expected 1 to"),
+    ("sensor", "bits", "twelve", "sensor.bits=twelve: expected a value of type int"),
+    ("sensor", "bits", True, "sensor.bits=True: expected a value of type int"),
+    ("source", "include", "*.jpg", r"source.include=\*.jpg: expected a value of type list"),
+    ("source", "root", "/etc", "unknown key source.root"),
+    ("noise", "gain", 1, "unknown key noise.gain"),
+    ("source", "kind", "web", "source.kind=web: expected one of folder, synthetic"),
+]
+
+
+@pytest.mark.parametrize(("group", "key", "value", "problem"), EDITED)
+def test_config_yaml_with_bad_value_is_refused_with_its_key(
+    group: str, key: str, value: Any, problem: str, settings: Settings, tmp_path: Path
+) -> None:
+    tree = yaml.safe_load(dataset_yaml(settings()))
+    tree[group][key] = value
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    with pytest.raises(ConfigError, match=problem) as error:
+        read_dataset_yaml(tmp_path / "config.yaml")
+    assert "\n" not in str(error.value)
+
+
+def test_config_yaml_with_missing_key_is_refused_with_its_name(settings: Settings, tmp_path: Path) -> None:
+    tree = yaml.safe_load(dataset_yaml(settings()))
+    del tree["gains"]["threshold"]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"missing key gains\.threshold"):
+        read_dataset_yaml(tmp_path / "config.yaml")
+
+
+def test_again_refuses_hostile_config_yaml_with_exit_2(run_main: RunMain, tmp_path: Path) -> None:
+    folder = tmp_path / "ds"
+    folder.mkdir()
+    for text in ("a: " + "[" * 200_000, "seed: 0", "", "source: {kind: folder}\nseed: -1"):
+        (folder / "config.yaml").write_text(text, encoding="utf-8")
+        done = run_main("again", "ds", "out=new")
+        assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
+
+
+def test_dollar_signs_in_config_yaml_are_literal(settings: Settings) -> None:
+    config = settings()
+    config.source.include = ["${oc.env:HOME}/*.jpg"]
+    assert parse_dataset_yaml(dataset_yaml(config))[0].source.include == ["${oc.env:HOME}/*.jpg"]
+
+
+@pytest.mark.parametrize("number", [10**400, -(10**5000)], ids=["large", "larger"])
+def test_integers_that_no_float_holds_are_refused(number: int) -> None:
+    with pytest.raises(ConfigError, match=r"gains.red=an integer of \d+ bits: expected a finite number"):
+        parse_distribution("gains.red", number, ("uniform",))
+
+
+def test_choices_match_their_implementations() -> None:
+    assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
+    assert set(unprocess.TONES) == set(tone_curves.TONES) == {"smoothstep", "none"}
+    assert set(DISTRIBUTION_NUMBERS) == set(distributions.DISTRIBUTIONS)
+
+
+@pytest.mark.parametrize("gain", [0, ["per_iso", 0.0], 1e-12])
+def test_gain_without_electrons_is_refused(gain: Any, settings: Settings) -> None:
+    config = settings("noise=sony_a7s2")
+    config.noise.branches[0].dn_per_e = gain
+    with pytest.raises(ConfigError, match=r"noise.branches\[0\].dn_per_e=.*: expected a gain above 0"):
+        validate_config(config)
+
+
+@pytest.mark.parametrize("shape", [-0.5, -0.7, 10, "x"])
+def test_shape_without_variance_is_refused(shape: Any, settings: Settings) -> None:
+    config = settings("noise=sony_a7s2")
+    config.noise.branches[0].read_shape = shape
+    with pytest.raises(ConfigError, match=r"noise.branches\[0\].read_shape="):
+        validate_config(config)
+
+
+@pytest.mark.parametrize("error", ["x", [1.0, 2.0], ["by_log_iso"], ["by_log_iso", 1.0], ["by_log_iso", None], []])
+def test_black_error_of_unknown_form_is_refused(error: Any, settings: Settings) -> None:
+    config = settings("noise=sony_a7s2")
+    config.noise.branches[0].black_error_dn = error
+    with pytest.raises(ConfigError, match=r"noise.branches\[0\].black_error_dn=.*: expected a number, four"):
+        validate_config(config)

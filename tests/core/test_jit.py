@@ -1,0 +1,225 @@
+"""Kernels and their cache on disk: machine code is used for exactly the sources it was compiled from."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numba
+import numpy as np
+import pytest
+
+from unprocess_gen.core import jit
+from unprocess_gen.core.jit import KERNEL_PACKAGES, inner, is_cached, kernel
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "unprocess_gen"
+
+content_stamps = pytest.mark.skipif(
+    numba.version_info.short < (0, 68), reason="Numba below 0.68 also compares the modification time of a kernel's file"
+)
+
+LIBRARY = """
+from unprocess_gen.core.jit import inner
+
+@inner
+def half(x):
+    return x / 2
+"""
+CALLER = """
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.simulation.library import half
+
+@kernel
+def quarter(x):
+    return half(half(x))
+"""
+CALL = """
+import sys
+from unprocess_gen.core.jit import is_cached
+from unprocess_gen.simulation.caller import quarter
+print(is_cached(quarter), quarter(8.0), len(quarter.stats.cache_hits))
+"""
+
+
+class Copy:
+    """A package with the real `core` and two small kernels, one of which calls the other across files."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.package = folder / "unprocess_gen"
+        shutil.copytree(PACKAGE / "core", self.package / "core", ignore=shutil.ignore_patterns("__pycache__"))
+        self.write("__init__.py", "")
+        self.write("simulation/__init__.py", "")
+        self.write("simulation/library.py", LIBRARY)
+        self.write("simulation/caller.py", CALLER)
+        self.write("cli/main.py", "x = 1")
+
+    def write(self, name: str, text: str) -> None:
+        (self.package / name).parent.mkdir(parents=True, exist_ok=True)
+        (self.package / name).write_text(text)
+
+    def call(self, **env: str) -> str:
+        """Call the outer kernel in a new process; return whether it was cached, its result, and its cache hits."""
+        return subprocess.run(
+            [sys.executable, "-c", CALL],
+            cwd=self.folder,
+            env={"PYTHONPATH": str(self.folder), "HOME": str(self.folder / "home"), **env},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Copy:
+    copy = Copy(tmp_path)
+    assert copy.call() == "False 2.0 0"
+    return copy
+
+
+def test_another_process_loads_the_machine_code(copy: Copy) -> None:
+    assert copy.call() == "True 2.0 1"
+
+
+def test_editing_other_packages_keeps_machine_code(copy: Copy) -> None:
+    copy.write("cli/main.py", "x = 2")
+    copy.write("cli/new.py", "y = 3")
+
+    assert copy.call() == "True 2.0 1"
+
+
+@content_stamps
+def test_other_modification_times_keep_machine_code(copy: Copy) -> None:
+    for path in copy.package.rglob("*.py"):
+        os.utime(path, (1e9, 1e9))
+
+    assert copy.call() == "True 2.0 1"
+
+
+def test_editing_a_called_kernel_recompiles_its_callers(copy: Copy) -> None:
+    copy.write("simulation/library.py", LIBRARY.replace("/ 2", "/ 4"))
+
+    assert copy.call() == "False 0.5 0"
+    assert copy.call() == "True 0.5 1"
+
+
+@pytest.mark.parametrize("name", ["core/random_streams.py", "core/jit.py", "simulation/new.py"])
+def test_changing_any_kernel_package_recompiles(copy: Copy, name: str) -> None:
+    path = copy.package / name
+    copy.write(name, (path.read_text() if path.exists() else "") + "\n# changed\n")
+
+    assert copy.call() == "False 2.0 0"
+
+
+def test_machine_code_of_earlier_sources_is_removed(copy: Copy) -> None:
+    copy.write("simulation/library.py", LIBRARY.replace("/ 2", "/ 4"))
+    copy.call()
+
+    assert len(list((copy.package / "__pycache__").glob(f"{jit.PREFIX}*"))) == 1
+
+
+def test_a_read_only_package_caches_below_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "package" / "core" / "jit.py"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    for name in KERNEL_PACKAGES:
+        (tmp_path / "package" / name).mkdir(parents=True)
+        (tmp_path / "package" / name / "__init__.py").touch()
+    (tmp_path / "package" / "__pycache__").touch()  # a file, so that no folder can be made there
+
+    folder = cast(Any, kernel_cache_folder()).parent
+
+    assert folder == tmp_path / "home" / "unprocess_gen"
+
+
+def test_no_place_for_a_cache_compiles_without_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "file"))
+    assert kernel_cache_folder() is None
+
+    monkeypatch.setattr(jit, "kernel_cache_folder", lambda: None)
+    double = kernel(_double)
+
+    assert double(2.0) == 4.0 and cast(Any, double).stats.cache_path is None
+
+
+def test_missing_sources_compile_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "__file__", str(tmp_path / "core" / "jit.py"))
+
+    assert kernel_cache_folder() is None
+
+
+def test_a_numba_that_ignores_the_folder_gets_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    def njit(cache: bool = False, **options: object) -> Callable[..., Any]:
+        path = "/elsewhere" if cache else None
+        return lambda function: SimpleNamespace(stats=SimpleNamespace(cache_path=path))
+
+    monkeypatch.setattr(numba, "njit", njit)
+
+    assert cast(Any, kernel(_double)).stats.cache_path is None
+
+
+def test_the_users_cache_setting_is_restored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "/of/the/user")
+
+    kernel(_double)
+
+    assert numba.config.CACHE_DIR == "/of/the/user"
+
+
+def kernel_cache_folder() -> Path | None:
+    """Return what `jit.kernel_cache_folder` returns in a new process."""
+    return cast(Any, jit.kernel_cache_folder).__wrapped__()
+
+
+def _double(x: float) -> float:
+    return x * 2
+
+
+def test_functions_without_a_file_are_compiled_without_a_cache() -> None:
+    names: dict[str, Any] = {"inner": inner, "kernel": kernel}
+    exec("@inner\ndef square(x):\n    return x * x\n@kernel\ndef power(x):\n    return square(x) * x", names)
+
+    assert names["power"](3.0) == 27.0
+    assert is_cached(names["power"])
+
+
+def test_kernels_of_other_packages_call_no_unhashed_files() -> None:
+    import unprocess_gen.reports.benchmark.measure
+    import unprocess_gen.sources.video.decode  # noqa: F401
+
+    hashed = tuple(str(PACKAGE / name) + os.sep for name in KERNEL_PACKAGES)
+    kernels = {
+        value.py_func
+        for name, module in list(sys.modules.items())
+        if name.startswith("unprocess_gen.")
+        for value in vars(module).values()
+        if hasattr(value, "py_func")
+    }
+    assert len(kernels) > 80
+    for function in kernels:
+        for name in function.__code__.co_names:
+            called = getattr(function.__globals__.get(name), "py_func", None)
+            if called is not None:
+                file = called.__code__.co_filename
+                assert file == function.__code__.co_filename or file.startswith(hashed), (function, called)
+
+
+def test_a_kernel_compiled_in_this_process_counts_as_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "glob", lambda path, pattern: iter(()))  # an empty cache
+    never_called = kernel(_first_is_one)
+
+    assert not is_cached(never_called)
+    never_called(np.zeros(1))
+    assert is_cached(never_called)
+
+
+def _first_is_one(x: np.ndarray) -> None:
+    x[0] = 1.0

@@ -1,0 +1,407 @@
+"""Exact tables: correctly rounded curves, package data, and normal quantiles within their error."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import math
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from decimal import Decimal, localcontext
+from pathlib import Path
+from statistics import NormalDist
+from types import ModuleType
+
+import mpmath
+import numpy as np
+import pytest
+import yaml
+
+from unprocess_gen.core import exact_distributions, lookup_tables, tone_curves, types
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.tone_curves import PUBLISHED_SHA256
+
+ROOT = Path(__file__).parents[2]
+
+CURVES_8 = [key[:2] for key in PUBLISHED_SHA256 if key[2] == 256]
+CURVES_16 = [key[:2] for key in PUBLISHED_SHA256 if key[2] == 65536]
+QUICK = [*((*curve, 256) for curve in CURVES_8), ("smoothstep", "2.2", 65536), ("none", "1", 65536)]
+"""Curves that are fast to test; the others are slow tests."""
+CURVES = [pytest.param(*key, marks=[] if key in QUICK else pytest.mark.slow) for key in PUBLISHED_SHA256]
+
+
+def true_value(tone: str, gamma: str, code: int, codes: int) -> mpmath.mpf:
+    """Return the curve by the formulas of the article, with 60 digits because they cancel near black."""
+    with mpmath.workdps(60):
+        v = mpmath.mpf(code) / (codes - 1)
+        if tone == "smoothstep":
+            v = mpmath.mpf("0.5") - mpmath.sin(mpmath.asin(1 - 2 * v) / 3)
+        if gamma != "srgb":
+            return v ** mpmath.mpf(gamma)
+        if v <= mpmath.mpf("0.04045"):
+            return v / mpmath.mpf("12.92")
+        return ((v + mpmath.mpf("0.055")) / mpmath.mpf("1.055")) ** mpmath.mpf("2.4")
+
+
+def wrongly_rounded(tone: str, gamma: str, codes: int) -> list[int]:
+    """Return the codes, except the ends, whose entry is more than half a unit in the last place off."""
+    table = tone_curves.linear_table(tone, gamma, codes)
+    with mpmath.workdps(60):
+        return [
+            code
+            for code in range(1, codes - 1)
+            if abs(mpmath.mpf(float(table[code])) - true_value(tone, gamma, code, codes))
+            > mpmath.mpf(math.ulp(table[code])) / 2
+        ]
+
+
+# Curves ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("tone", "gamma"), CURVES_8)
+def test_every_8_bit_entry_is_correctly_rounded(tone: str, gamma: str) -> None:
+    assert wrongly_rounded(tone, gamma, 256) == []
+
+
+@pytest.mark.parametrize(("tone", "gamma"), CURVES_16)
+def test_16_bit_entries_are_correctly_rounded_at_every_97th_code(tone: str, gamma: str) -> None:
+    """Single entries are tested, because a complete table takes seconds to compute."""
+    codes = range(97, 65535, 97)
+    entries = [float(tone_curves.exact_curve(tone, gamma, code, 65536)) for code in codes]
+    with mpmath.workdps(60):
+        for code, entry in zip(codes, entries, strict=True):
+            error = abs(mpmath.mpf(entry) - true_value(tone, gamma, code, 65536))
+            assert error <= mpmath.mpf(math.ulp(entry)) / 2, code
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tone", "gamma"), CURVES_16)
+def test_every_16_bit_entry_is_correctly_rounded(tone: str, gamma: str) -> None:
+    assert wrongly_rounded(tone, gamma, 65536) == []
+
+
+@pytest.mark.parametrize("gamma", ["1.8", "2.4", "0.45", "10", "3.3333333333333335"])
+def test_a_custom_gamma_is_correctly_rounded(gamma: str) -> None:
+    assert wrongly_rounded("smoothstep", gamma, 256) == []
+
+
+@pytest.mark.parametrize(("tone", "gamma", "codes"), [*CURVES, ("smoothstep", "10", 256), ("none", "0.1", 256)])
+def test_curves_increase_from_0_to_1(tone: str, gamma: str, codes: int) -> None:
+    table = tone_curves.linear_table(tone, gamma, codes)
+    assert table.shape == (codes,)
+    assert (table[0], table[-1]) == (0.0, 1.0)
+    assert (np.diff(table) > 0).all()
+
+
+@pytest.mark.parametrize(("tone", "gamma", "codes"), CURVES)
+def test_a_curve_has_the_published_hash(tone: str, gamma: str, codes: int) -> None:
+    assert lookup_tables.sha256(tone_curves.linear_table(tone, gamma, codes)) == PUBLISHED_SHA256[tone, gamma, codes]
+
+
+def test_the_default_curve_has_an_independently_computed_hash() -> None:
+    digest = "d358dd03d38f763306ef83a982403114f2ff8e5397025f2c68dbe50e85503bfa"
+    assert lookup_tables.sha256(tone_curves.linear_table("smoothstep", 2.2, 256)) == digest
+
+
+def test_the_default_curve_has_independently_computed_values() -> None:
+    table = tone_curves.linear_table("smoothstep", 2.2, 256)
+    assert table[1] == float.fromhex("0x1.6a87dde8e4622p-11")
+    assert table[127] == float.fromhex("0x1.bb298acba41f1p-3")
+    assert table[254] == float.fromhex("0x1.d7ac0bca1d3e3p-1")
+
+
+def test_a_curve_with_another_hash_is_refused(monkeypatch: pytest.MonkeyPatch, no_cached_curves: None) -> None:
+    monkeypatch.setitem(PUBLISHED_SHA256, ("none", "2.2", 256), "0" * 64)
+    with pytest.raises(MachineError, match="expected 0000"):
+        tone_curves.linear_table("none", 2.2, 256)
+
+
+def test_tables_are_read_only() -> None:
+    for table in (tone_curves.linear_table("none", 1, 256), lookup_tables.normal_table()):
+        with pytest.raises(ValueError, match="read-only"):
+            table[0] = 1
+
+
+def test_an_unknown_tone_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"tone=filmic: .*expected one of smoothstep, none"):
+        tone_curves.linear_table("filmic", 2.2, 256)
+
+
+@pytest.mark.parametrize(
+    ("gamma", "text"),
+    [(1, "1"), (1.0, "1"), (2.2, "2.2"), (2, "2"), (2.40, "2.4"), ("srgb", "srgb"), (1 / 3, "0.3333333333333333")],
+)
+def test_gamma_is_spelled_as_the_shortest_number(gamma: float | str, text: str) -> None:
+    assert types.gamma_text(gamma) == text
+
+
+def test_integer_gammas_share_one_curve() -> None:
+    assert tone_curves.linear_table("none", 1, 256) is tone_curves.linear_table("none", 1.0, 256)
+
+
+@pytest.mark.parametrize("code", [1, 100, 32767, 32768, 65534])
+def test_the_tone_curve_inverts_the_cubic_to_35_digits(code: int) -> None:
+    with localcontext(prec=exact_distributions.DIGITS):
+        x = Decimal(code) / 65535
+        y = tone_curves.smoothstep_inverse(x)
+        assert abs(y * y * (3 - 2 * y) - x) < Decimal("1e-35") * x
+
+
+# Package data ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_cached_curves() -> Iterator[None]:
+    """Forget the curves that this process holds, before and after the test."""
+    tone_curves._linear_table.cache_clear()
+    yield
+    tone_curves._linear_table.cache_clear()
+
+
+@pytest.mark.parametrize(("tone", "gamma"), CURVES_16)
+def test_offered_16_bit_curves_are_read_not_computed(
+    tone: str, gamma: str, monkeypatch: pytest.MonkeyPatch, no_cached_curves: None
+) -> None:
+    monkeypatch.setattr(tone_curves, "compute_curve", None)
+
+    assert not tone_curves.linear_table(tone, gamma, 65536).flags.writeable
+
+
+def test_every_isp_option_has_published_curves() -> None:
+    options = [yaml.safe_load(path.read_text()) for path in (ROOT / "conf" / "isp").glob("*.yaml")]
+    offered = {(option["tone"], types.gamma_text(option["gamma"])) for option in options}
+
+    assert offered == set(CURVES_8) == set(CURVES_16)
+
+
+@pytest.mark.slow
+def test_package_data_are_the_computed_curves(tmp_path: Path) -> None:
+    tone_curves.store_curves(tmp_path / "curves.npz")
+
+    with np.load(tmp_path / "curves.npz") as computed, np.load(tone_curves.STORED_CURVES) as stored:
+        assert set(computed) == set(stored)
+        assert all((computed[name] == stored[name]).all() for name in computed)
+
+
+def test_package_data_are_small() -> None:
+    assert tone_curves.STORED_CURVES.stat().st_size < 200_000
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: b"",
+        lambda content: content[:-1],
+        lambda content: content[:1000],
+        lambda content: bytes(len(content)),
+        lambda content: content[:5000] + bytes([content[5000] ^ 1]) + content[5001:],
+    ],
+    ids=["empty", "without the last byte", "truncated", "zeros", "one bit changed"],
+)
+def test_damaged_package_data_are_refused(
+    damage: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_cached_curves: None
+) -> None:
+    (tmp_path / "curves.npz").write_bytes(damage(tone_curves.STORED_CURVES.read_bytes()))
+    monkeypatch.setattr(tone_curves, "STORED_CURVES", tmp_path / "curves.npz")
+
+    with pytest.raises(MachineError, match=r"curves\.npz: cannot be read .*; reinstall unprocess_gen"):
+        tone_curves.linear_table("smoothstep", 2.2, 65536)
+
+
+def test_package_data_with_another_curve_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_cached_curves: None
+) -> None:
+    with np.load(tone_curves.STORED_CURVES) as stored:
+        np.savez(tmp_path / "curves.npz", **{"smoothstep-2.2": stored["none-2.2"]})
+    monkeypatch.setattr(tone_curves, "STORED_CURVES", tmp_path / "curves.npz")
+
+    with pytest.raises(MachineError, match="a table has SHA-256"):
+        tone_curves.linear_table("smoothstep", 2.2, 65536)
+
+
+def test_missing_package_data_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_cached_curves: None
+) -> None:
+    monkeypatch.setattr(tone_curves, "STORED_CURVES", tmp_path / "curves.npz")
+
+    with pytest.raises(MachineError, match="No such file"):
+        tone_curves.linear_table("smoothstep", 2.2, 65536)
+
+
+def test_another_gamma_is_computed(monkeypatch: pytest.MonkeyPatch, no_cached_curves: None) -> None:
+    monkeypatch.setattr(tone_curves, "exact_curve", lambda tone, gamma, code, codes: Decimal(code) / (codes - 1))
+
+    assert tone_curves.linear_table("none", 1.8, 65536)[1] == 1 / 65535
+
+
+def test_no_file_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_cached_curves: None) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    tone_curves.linear_table("smoothstep", 2.2, 65536)
+    tone_curves.linear_table("none", 1.8, 300)
+
+    assert list(tmp_path.iterdir()) == []
+
+
+IMPORT_WITHOUT = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {blocked!r}:
+            raise ImportError(name)
+sys.meta_path.insert(0, Blocked())
+import {module}
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "blocked"),
+    [
+        ("unprocess_gen", ["cv2", "fcntl", "hydra", "joblib", "numba", "omegaconf"]),
+        ("unprocess_gen.planning.effect_selection", ["cv2", "fcntl", "hydra", "joblib", "numba"]),
+    ],
+)
+def test_reader_and_planner_need_neither_numba_nor_posix(module: str, blocked: list[str]) -> None:
+    code = IMPORT_WITHOUT.format(module=module, blocked=blocked) + "unprocess_gen.RawPairs"
+
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# Normals --------------------------------------------------------------------------------------------------------------
+
+SMALL_J = range(1, 64, 2)
+EDGES = [
+    2**octave // 32 * (32 + segment) + side
+    for octave in range(6, 32)
+    for segment in range(32)
+    for side in (-1, 1)
+    if 2**octave // 32 * (32 + segment) + side > 63
+]
+
+
+def by_table(j: np.ndarray) -> np.ndarray:
+    """Return the quantile by octave, segment and position in the segment, as `normal_table` documents it."""
+    j = np.asarray(j, dtype=np.float64)
+    octave = np.floor(np.log2(j))  # exact here: no j < 2**32 lies nearer below a power of two than 1
+    position = (j / 2**octave - 1) * lookup_tables.SEGMENTS
+    segment = np.floor(position)
+    t = (position - segment) / lookup_tables.SEGMENTS
+    c0, c1, c2 = lookup_tables.normal_table()[(octave * lookup_tables.SEGMENTS + segment).astype(int)].T
+    return c0 + t * (c1 + t * c2)
+
+
+def test_the_normal_table_has_the_published_hash() -> None:
+    digest = "1de8806d2534020a52f8f25e981f0bc9f85f65e29bd634c29e7dc0820480ba5a"
+    assert lookup_tables.sha256(lookup_tables.normal_table()) == lookup_tables.NORMAL_SHA256 == digest
+
+
+def test_the_error_bound_holds_at_every_edge() -> None:
+    j = np.array([*SMALL_J, *EDGES, 2**32 - 1])
+    exact = np.array([-float(exact_distributions.normal_quantile(Decimal(int(value)) / 2**33)) for value in j])
+    assert np.abs(by_table(j) - exact).max() <= 1.5e-7
+
+
+def test_the_error_bound_holds_within_every_segment() -> None:
+    within = np.linspace(0, 1, 97)[:-1]
+    j = np.concatenate([2.0**octave * (1 + (segment + within) / 32) for octave in range(32) for segment in range(32)])
+    quantile = NormalDist().inv_cdf
+    exact = np.array([-quantile(value * 2.0**-33) for value in j])
+    assert np.abs(by_table(j) - exact).max() <= 1.5e-7
+
+
+@pytest.mark.parametrize("index", [0, 1, 2**16, 2**30, 2**31 - 1])
+def test_the_error_bound_holds_against_mpmath(index: int) -> None:
+    with mpmath.workdps(30):
+        exact = mpmath.sqrt(2) * mpmath.erfinv(1 - (2 * index + 1) / mpmath.mpf(2) ** 32)
+        assert abs(by_table(np.array(2 * index + 1)) - exact) <= 1.5e-7
+
+
+def test_the_last_index_is_next_to_the_middle() -> None:
+    assert 0 < by_table(np.array(2**32 - 1)) < 1.5e-7
+
+
+def test_the_quantile_decreases_within_every_segment() -> None:
+    _, c1, c2 = lookup_tables.normal_table().T
+    assert (c1 < 0).all()
+    assert (c1 + 2 * c2 / lookup_tables.SEGMENTS < 0).all()
+
+
+def test_quantiles_of_the_table_have_25_digits() -> None:
+    """Quantiles are compared with erfinv of mpmath, over the complete range of the table and its mirror image."""
+    ks = [1, 3, 2**10 + 1, 2**20 + 1, 2**28 - 1, 2**31, 2**32 - 1, 2**32 + 1, 2**33 - 2**20, 2**33 - 3, 2**33 - 1]
+    with localcontext(prec=60), mpmath.workdps(60):
+        for k in ks:
+            exact = mpmath.sqrt(2) * mpmath.erfinv(k / mpmath.mpf(2) ** 32 - 1)
+            assert abs(mpmath.mpf(str(exact_distributions.normal_quantile(Decimal(k) / 2**33))) - exact) <= mpmath.mpf(
+                "1e-25"
+            ), k
+
+
+@pytest.mark.parametrize("k", [1, 2, 2**20 + 1, 2**40 + 1, 2**52 - 1, 2**52 + 1, 2**53 - 2**40, 2**53 - 1])
+def test_quantiles_of_drawn_uniforms_have_enough_digits(k: int) -> None:
+    """About 200 sums of at most ½ with 40 digits err by 1e-38 in p; dividing by the density gives the error of z."""
+    with localcontext(prec=60), mpmath.workdps(60):
+        p = mpmath.mpf(k) / 2**53
+        exact = mpmath.sqrt(2) * mpmath.erfinv(2 * p - 1)
+        error = abs(mpmath.mpf(str(exact_distributions.normal_quantile(Decimal(k) / 2**53))) - exact)
+        assert error <= mpmath.mpf("1e-38") / mpmath.npdf(exact)
+
+
+def rows_from(quantiles: np.ndarray) -> np.ndarray:
+    """Return the rows of the table from the quantiles at the nodes [1024, 3], as `lookup_tables._normal_row` does."""
+    t = [node / lookup_tables.SEGMENTS for node in lookup_tables.NODES]
+    z = quantiles.T
+    slope01, slope12 = (z[1] - z[0]) / (t[1] - t[0]), (z[2] - z[1]) / (t[2] - t[1])
+    c2 = (slope12 - slope01) / (t[2] - t[0])
+    c1 = slope01 - c2 * (t[0] + t[1])
+    rows = np.stack([z[0] - t[0] * (c1 + t[0] * c2), c1, c2], axis=-1)
+    grid = np.array(lookup_tables.COEFFICIENT_GRID)
+    return np.rint(rows / grid) * grid
+
+
+def at_nodes(inv_cdf) -> np.ndarray:
+    return np.array(
+        [
+            [-inv_cdf(math.ldexp(1 + segment / 32 + node / 32, octave - 33)) for node in lookup_tables.NODES]
+            for octave in range(32)
+            for segment in range(32)
+        ]
+    )
+
+
+SIGNS = list(itertools.product((-1, 1), repeat=3))
+
+
+def test_quantiles_four_units_off_give_the_same_table() -> None:
+    """A coefficient is linear in its three quantiles, so the eight corners are the worst cases."""
+    z = at_nodes(NormalDist().inv_cdf)
+    assert (rows_from(z) == lookup_tables.normal_table()).all()
+    for signs in SIGNS:
+        assert (rows_from(z + 4 * np.spacing(np.abs(z)) * np.array(signs)) == lookup_tables.normal_table()).all(), signs
+
+
+def python_statistics() -> ModuleType:
+    """`statistics` without its C accelerator, whose logarithm can be replaced."""
+    spec = importlib.util.spec_from_file_location("statistics_in_python", statistics.__file__)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "_statistics", None)
+        spec.loader.exec_module(module)
+    return module
+
+
+def test_logarithms_two_units_off_give_the_same_table() -> None:
+    """A quantile uses only the logarithm of libm, and no libm in use is off by more than one unit."""
+    module = python_statistics()
+    log = module.log
+    z = {}
+    for units in (-2, -1, 0, 1, 2):
+        module.log = lambda x, units=units: log(x) + units * math.ulp(log(x))
+        z[units] = at_nodes(lambda p: module._normal_dist_inv_cdf(p, 0.0, 1.0))
+    for units in itertools.product(z, repeat=3):
+        quantiles = np.stack([z[unit][:, node] for node, unit in enumerate(units)], axis=-1)
+        assert (rows_from(quantiles) == lookup_tables.normal_table()).all(), units

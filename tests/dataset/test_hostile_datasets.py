@@ -1,0 +1,358 @@
+"""Edited and hostile datasets give one DamageError: no traceback, endless loop or huge allocation."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import shutil
+import tarfile
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.datasets import Make
+from helpers.photographs import fill
+
+from unprocess_gen import DamageError, RawPairs
+from unprocess_gen.dataset.columns import COLUMNS, HEADERS, NAMES
+from unprocess_gen.dataset.dataset_json import check_dataset_json
+from unprocess_gen.dataset.manifest import (
+    MAX_DETAIL,
+    MAX_LINE_BYTES,
+    detail_text,
+    failed_row,
+    plan_from_row,
+    read_header,
+    read_row,
+    read_rows,
+    row_json,
+    row_of_values,
+    rows_of_json,
+    rows_with_offsets,
+    write_rows,
+)
+from unprocess_gen.dataset.reader import sweep_folders
+from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.dataset.shards import json_inside, read_index
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.pipeline.workspace import dataset_text, fingerprint, read_dataset
+
+KEY = "00000001"
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
+    """A dataset of three pairs and a failed source, next to its photographs."""
+    folder = tmp_path_factory.mktemp("hostile")
+    (fill(folder / "p", 4) / "003.png").write_bytes(b"no picture")
+    make(folder / "p", folder / "ds", "output.pairs_per_shard=2")
+    return folder / "ds"
+
+
+@pytest.fixture
+def copy(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "ds"))
+
+
+def edit(folder: Path, **values: str) -> Path:
+    """Change cells of the row `KEY`, and the hashes that cover the manifest."""
+    path = folder / "manifest.csv"
+    header, *lines = csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline=""))
+    for cells in lines:
+        if cells[0] == KEY:
+            for name, value in values.items():
+                cells[header.index(name)] = value
+    stream = io.StringIO(newline="")
+    csv.writer(stream, lineterminator="\n").writerows([header, *lines])
+    path.write_bytes(stream.getvalue().encode())
+    rehash(folder)
+    return path
+
+
+def rehash(folder: Path, **facts: Any) -> None:
+    known = json.loads((folder / "dataset.json").read_text()) | facts
+    known.pop("dataset_sha256")
+    known["manifest_sha256"] = hashlib.sha256((folder / "manifest.csv").read_bytes()).hexdigest()
+    known["fingerprint"] = fingerprint(known["config_sha256"], known["manifest_sha256"])
+    (folder / "dataset.json").write_text(dataset_text(known))
+
+
+def as_version_0_1(folder: Path) -> Path:
+    """Rewrite a dataset as version 0.1 would have written it: without the columns added since."""
+    rows = list(read_rows(folder / "manifest.csv"))
+    with (folder / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, rows, HEADERS[0])
+    rehash(folder)
+    return folder
+
+
+# Values of a manifest -------------------------------------------------------------------------------------------------
+
+HOSTILE = [
+    ("width", "-5"), ("width", "0"), ("height", "99999999999999999999"), ("height", "9" * 5000), ("width", "1.5"),
+    ("bits", "0"), ("bits", "-1"), ("bits", "64"), ("black_level_dn", "-1"), ("white_level_dn", "99999"),
+    ("white_level_dn", "240"), ("red_gain", "nan"), ("blue_gain", "inf"), ("inverse_rgb_gain", "0"),
+    ("red_gain", "-2"), ("a_dn", "nan"), ("b_dn2", "-inf"), ("gamma", "nan"), ("gamma", "0"), ("gamma", "steep"),
+    ("highlight_threshold", "1"), ("rgb2cam_00", "1e300"), ("w_sony_a7r", "2"), ("stream_key", "-1"),
+    ("stream_key", "0x1f"), ("stream_key", "1" * 17), ("seed", "9223372036854775808"), ("shard", "-1"),
+    ("shard", "1e9"),
+    ("shard", ""), ("level", "100"), ("draw", "-1"), ("frame", "4294967296"), ("patch_y", "-2"),
+    ("patch_x", "4294967296"), ("orientation", "9"), ("downscale", "0"), ("downscale", "100000"), ("tone", "steep"),
+    ("pattern", "RGBG"), ("pattern", ""), ("dtype", "object"), ("layout", "tiled"), ("status", "fine"), ("status", ""),
+    ("exposure_ratio", "0"), ("source", "../../etc/passwd"), ("source", "/etc/passwd"), ("source", "a/../../b.png"),
+    ("source", "%2E%2E/x.png"), ("source", "%2Fetc/passwd"), ("source", "a%00.png"), ("clean_xxh3", "0"),
+    ("source_bytes", "-1"), ("read_law", "cauchy"), ("body_key", "zz"), ("fixed_pattern_in_clean", "7"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), HOSTILE)
+def test_value_outside_its_range_is_damage_of_row_column_and_value(name: str, value: str, copy: Path) -> None:
+    manifest = edit(copy, **{name: value})
+    with pytest.raises(DamageError) as error:
+        for row in read_rows(manifest):
+            if row["status"] == "ok":
+                plan_from_row(row)
+    sentence = str(error.value)
+    assert KEY in sentence
+    assert name in sentence
+    assert len(sentence) < 500
+    assert "\n" not in sentence
+
+
+@pytest.mark.parametrize("name", ["width", "seed", "red_gain", "gamma"])
+def test_every_reader_of_a_hostile_manifest_reports_damage(name: str, copy: Path) -> None:
+    edit(copy, **{name: "-7"})
+    assert [damage.file for damage in verify(copy)] == ["manifest.csv"]
+    with pytest.raises(DamageError, match=f"row {KEY}: {name}="):
+        RawPairs(copy)
+    with pytest.raises(DamageError, match=f"row {KEY}: {name}="):
+        list(select_rows(copy / "manifest.csv", None, "1"))
+
+
+def test_source_outside_the_root_is_never_looked_up(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (copy.parent / "secret.png").write_bytes(b"secret")
+    manifest = edit(copy, source="../secret.png")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a file outside the root was looked up")
+
+    rows = list(csv.DictReader(io.StringIO(manifest.read_text(encoding="utf-8"))))
+    assert rows[1]["source"] == "../secret.png"
+    monkeypatch.setattr("unprocess_gen.sources.listing.os.open", refuse)
+    monkeypatch.setattr("unprocess_gen.sources.listing.os.stat", refuse)
+    with pytest.raises(DamageError, match=r"source='\.\./secret\.png': expected a path below the source folder"):
+        list(replay(select_rows(manifest, None, "1"), str(copy.parent / "p")))
+
+
+def test_names_with_dots_and_percent_signs_stay_allowed() -> None:
+    (column,) = (column for column in COLUMNS if column.name == "source")
+    for name in ("..a.png", "a../b.png", "%3Dx.png", "50%25.png", "a/%2Da.png", "dead_leaves-0", "été.png"):
+        assert name in column.allowed
+
+
+def test_line_of_megabytes_is_damage(copy: Path) -> None:
+    manifest = edit(copy, noise="x" * 3 * 10**6)
+    started = time.monotonic()
+    with pytest.raises(DamageError, match=f"a line has more than {MAX_LINE_BYTES} bytes"):
+        list(read_rows(manifest))
+    assert time.monotonic() - started < 2
+
+
+def test_manifest_that_is_a_folder_is_damage(tmp_path: Path) -> None:
+    (tmp_path / "manifest.csv").mkdir()
+    with pytest.raises(DamageError, match=r"manifest\.csv: cannot be read"):
+        list(read_rows(tmp_path / "manifest.csv"))
+
+
+@pytest.mark.parametrize("at", [3, 10**12])
+def test_offset_without_a_row_is_damage(at: int, copy: Path) -> None:
+    with pytest.raises(DamageError, match="no row at byte"):
+        read_row(copy / "manifest.csv", at)
+
+
+# KEY.json -------------------------------------------------------------------------------------------------------------
+
+
+def sample_json(folder: Path, **values: Any) -> bytes:
+    content = json.loads(json_inside(folder / "shards" / "shard-00000.tar")[0]) | values
+    return json.dumps({key: value for key, value in content.items() if value is not ...}).encode()
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        ({"width": -1}, "width=-1: expected"), ({"width": "12"}, "width='12': expected"),
+        ({"width": 12.0}, r"width=12\.0: expected"), ({"seed": True}, "seed=True: expected"),
+        ({"red_gain": float("nan")}, "red_gain=nan: expected"), ({"red_gain": [1]}, "red_gain=list: expected"),
+        ({"source": "../x"}, r"source='\.\./x': expected"), ({"camera": None}, "camera=NoneType: expected"),
+        ({"bits": ...}, "bits is missing"), ({"others": 5}, "expected an object"),
+        ({"others": [5]}, "expected an object"),
+        ({"others": [{}]}, "key is missing"),
+    ],
+)  # fmt: skip
+def test_value_of_sample_json_is_checked(values: dict[str, Any], problem: str, original: Path) -> None:
+    with pytest.raises(DamageError, match=problem):
+        rows_of_json(sample_json(original, **values))
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"7", b"{", b"\xff", b"[" * 200_000, b'{"key":' * 200_000])
+def test_malformed_sample_json_is_damage(content: bytes) -> None:
+    with pytest.raises(DamageError, match="the JSON of a sample cannot be read"):
+        rows_of_json(content)
+
+
+def test_sample_json_gives_the_rows_of_the_manifest(original: Path) -> None:
+    inside = [row for shard in (0, 1) for text in json_inside(original / f"shards/shard-{shard:05d}.tar")
+              for row in rows_of_json(text)]  # fmt: skip
+    assert inside == [row for row in read_rows(original / "manifest.csv") if row["status"] == "ok"]
+
+
+def test_member_of_negative_size_does_not_loop(tmp_path: Path) -> None:
+    info = tarfile.TarInfo("a.json")
+    header = bytearray(info.tobuf(tarfile.USTAR_FORMAT))
+    header[124:136] = b"\xff" * 10 + (-1024 & 0xFFFF).to_bytes(2, "big")
+    header[148:156] = b" " * 8
+    header[148:156] = b"%06o\0 " % sum(header)
+    (tmp_path / "a.tar").write_bytes(bytes(header) * 4)
+    with pytest.raises(DamageError, match="not a complete shard"):
+        read_index(tmp_path / "a.tar")
+
+
+# dataset.json ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"pairs": -1}, "pairs='-1': expected"), ({"pairs": "3"}, "pairs='3': expected"),
+        ({"shards": {}}, "shards='{}': expected a list"), ({"shards": [7]}, r"shards\[0\]: expected an object"),
+        ({"shards": [{}]}, r"shards\[0\]: file is missing"), ({"failed": []}, "failed='\\[\\]': expected"),
+        ({"source": {"kind": "folder", "root": 5}}, "source=.*expected an object with kind and root"),
+        ({"source": None}, "source='None': expected"),
+        ({"sites": {"all": 1.5}}, "sites=.*expected an object of numbers"),
+        ({"config_sha256": "x"}, "config_sha256='x': expected 64 hexadecimal digits"),
+    ],
+)  # fmt: skip
+def test_value_of_dataset_json_is_checked(changes: dict[str, Any], problem: str, original: Path) -> None:
+    facts = json.loads((original / "dataset.json").read_text())
+    check_dataset_json(facts)
+    with pytest.raises(ValueError, match=problem):
+        check_dataset_json(facts | changes)
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "shards/shard-00001.tar", "", 7])
+def test_shard_elsewhere_is_damage(name: Any, copy: Path) -> None:
+    entries = json.loads((copy / "dataset.json").read_text())["shards"]
+    entries[0]["file"] = name
+    rehash(copy, shards=entries)
+    with pytest.raises(DamageError, match=r"shards\[0\]: file=.*expected null or shards/shard-00000\.tar"):
+        read_dataset(copy / "dataset.json")
+    assert "dataset.json" in {damage.file for damage in verify(copy)}
+
+
+@pytest.mark.parametrize("content", ["[" * 200_000, "null", "{}", '{"dataset_sha256": 1}', ""])
+def test_malformed_dataset_json_is_damage(content: str, copy: Path) -> None:
+    (copy / "dataset.json").write_text(content)
+    with pytest.raises(DamageError, match=r"dataset\.json: "):
+        read_dataset(copy / "dataset.json")
+
+
+# Sweeps ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("folder", ["..", ".", "", "../other", "/etc"])
+def test_sweep_that_names_a_folder_elsewhere_is_damage(folder: str, tmp_path: Path) -> None:
+    (tmp_path / "sweep.csv").write_text(f"folder,overrides,rows,failed,exit\n{folder},a=1,3,0,0\n")
+    with pytest.raises(DamageError, match="expected the name of a folder next to the table"):
+        RawPairs(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"a,b\n1,2\n", b"\xff\xfe", b'folder,exit\n"a,0\n'])
+def test_malformed_sweep_table_is_damage_or_empty(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "sweep.csv").write_bytes(content)
+    if not content:
+        assert sweep_folders(tmp_path / "sweep.csv") == []
+        return
+    with pytest.raises(DamageError, match="not the table of a sweep"):
+        RawPairs(tmp_path)
+
+
+# Datasets of version 0.1 ----------------------------------------------------------------------------------------------
+
+
+def test_version_0_1_has_the_first_columns() -> None:
+    assert HEADERS[-1] == NAMES
+    assert HEADERS[0] == NAMES[: len(HEADERS[0])]
+    assert "detail" not in HEADERS[0]
+
+
+def test_dataset_of_0_1_reads_verifies_and_replays(copy: Path, original: Path) -> None:
+    old = as_version_0_1(copy)
+    assert read_header(old / "manifest.csv") == HEADERS[0]
+    assert verify(old) == []
+    rows = list(read_rows(old / "manifest.csv"))
+    assert [row["detail"] for row in rows] == [""] * 4
+    assert [sample.row["key"] for sample in RawPairs(old)] == ["00000000", "00000001", "00000002"]
+    replayed = list(replay(select_rows(old / "manifest.csv", None, "0-3"), str(original.parent / "p")))
+    assert [one.complaint for one in replayed] == ["", "", ""]
+
+
+def test_header_of_0_1_restores_its_bytes(copy: Path) -> None:
+    before = (as_version_0_1(copy) / "manifest.csv").read_bytes()
+    stream = io.StringIO(newline="")
+    write_rows(stream, read_rows(copy / "manifest.csv"), read_header(copy / "manifest.csv"))
+    assert stream.getvalue().encode() == before
+
+
+def test_sample_json_does_not_have_the_column_detail(original: Path) -> None:
+    (row, *_) = read_rows(original / "manifest.csv")
+    assert "detail" not in json.loads(row_json([row]))
+    assert row_json([{**row, "detail": "x"}]) == row_json([row])
+
+
+def test_committed_rows_of_0_1_are_completed(original: Path) -> None:
+    (row, *_) = read_rows(original / "manifest.csv")
+    assert row_of_values([row[name] for name in HEADERS[0]]) == row
+    assert row_of_values([row[name] for name in NAMES]) == row
+    with pytest.raises(ValueError, match="a row of 3 values"):
+        row_of_values([1, 2, 3])
+
+
+# Explanations of failures ---------------------------------------------------------------------------------------------
+
+
+def test_failed_row_carries_its_explanation(original: Path) -> None:
+    (row,) = (row for row in read_rows(original / "manifest.csv") if row["status"] == "failed")
+    assert row["reason"] == "unsupported"
+    assert row["detail"]
+    assert str(original.parent) not in str(row["detail"])
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", ""),
+        ("two\n lines\tand  blanks ", "two lines and blanks"),
+        ("a\x00b\x1bc\u202ed\ud800e", "a?b?c?d?e"),
+        ("=HYPERLINK(1)", " =HYPERLINK(1)"),
+        ("-1 bytes", " -1 bytes"),
+        ("x" * 1000, "x" * (MAX_DETAIL - 1) + "…"),
+    ],
+)
+def test_explanation_is_one_bounded_harmless_line(text: str, line: str) -> None:
+    assert detail_text(text) == line
+    assert len(line) <= MAX_DETAIL
+
+
+def test_explanation_survives_the_manifest(tmp_path: Path, original: Path) -> None:
+    from helpers.records import SOURCE
+
+    row = failed_row(SOURCE, None, 0, 0, "corrupt", 'a "quoted", long text; with = signs')
+    with (tmp_path / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, [row])
+    assert list(read_rows(tmp_path / "manifest.csv")) == [row]
+    assert [at for at, _ in rows_with_offsets(tmp_path / "manifest.csv")] == [len(",".join(NAMES)) + 1]

@@ -1,0 +1,508 @@
+"""Manifest rows hold their plans bit for bit, in CSV and in JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.records import FACTS, PAIR, PATCH, PHYSICS, PLAN, SHA256, SOURCE
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.config.accuracy import STAGES, methods_of_stage
+from unprocess_gen.config.noise_validation import PROFILE_RANGES
+from unprocess_gen.core.errors import REASONS, DamageError
+from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source
+from unprocess_gen.dataset.columns import COLUMNS, NAMES, Range
+from unprocess_gen.dataset.keys import key_text
+from unprocess_gen.dataset.manifest import (
+    JSON_BYTES,
+    failed_row,
+    json_size,
+    pair_row,
+    patch_from_row,
+    plan_from_row,
+    read_rows,
+    row_json,
+    write_rows,
+)
+from unprocess_gen.planning.effect_contributions import STATISTICS
+from unprocess_gen.planning.plan import plan_image, plan_with_reasons
+from unprocess_gen.simulation.reference.noise import EFFECTS
+
+CONTRACT = [
+    "key",
+    "source",
+    "source_sha256",
+    "status",
+    "reason",
+    "width",
+    "height",
+    "orientation",
+    "shard",
+    "seed",
+    "stream_key",
+    "camera",
+    "w_nexus_6p",
+    "w_sony_a7r",
+    "w_olympus_em10",
+    "w_sony_rx100",
+    "rgb2cam_00",
+    "rgb2cam_01",
+    "rgb2cam_02",
+    "rgb2cam_10",
+    "rgb2cam_11",
+    "rgb2cam_12",
+    "rgb2cam_20",
+    "rgb2cam_21",
+    "rgb2cam_22",
+    "red_gain",
+    "blue_gain",
+    "inverse_rgb_gain",
+    "tone",
+    "gamma",
+    "highlight",
+    "highlight_threshold",
+    "pattern",
+    "bits",
+    "black_level_dn",
+    "white_level_dn",
+    "noise",
+    "a_dn",
+    "b_dn2",
+    "effects",
+    "skipped",
+    "accuracy",
+    "methods",
+    "clean_xxh3",
+    "noisy_xxh3",
+    "clean_clipped_low",
+    "clean_clipped_high",
+    "noisy_clipped_low",
+    "noisy_clipped_high",
+    "saturated",
+]
+
+PHYSICAL = dataclasses.replace(
+    PLAN, effects=("prnu", "shot", "read", "quantise"), skipped=("row: hidden",), physics=PHYSICS
+)
+
+
+def csv_text(rows: Iterable[Row]) -> str:
+    stream = io.StringIO(newline="")
+    write_rows(stream, rows)
+    return stream.getvalue()
+
+
+def row_of(plan: Plan = PLAN, source: Source = SOURCE) -> Row:
+    return pair_row(key_text(source.index), source, SHA256, 1, 0, plan, PAIR, ("1" * 32, "2" * 32), PATCH)
+
+
+def through_csv(rows: list[Row], folder: Path) -> list[Row]:
+    path = folder / "manifest.csv"
+    path.write_text(csv_text(rows), encoding="utf-8", newline="")
+    return list(read_rows(path))
+
+
+BY_NAME = {column.name: column for column in COLUMNS}
+
+
+def number(name: str) -> st.SearchStrategy[float]:
+    """Return any number that a column allows."""
+    allowed = BY_NAME[name].allowed
+    assert isinstance(allowed, Range)
+    return st.floats(allowed.low, allowed.high)
+
+
+def levels(bits: int) -> st.SearchStrategy[tuple[int, int, int]]:
+    """Return bits, black level and white level of a sensor."""
+    black = st.integers(0, 2**bits - 2)
+    return black.flatmap(lambda low: st.tuples(st.just(bits), st.just(low), st.integers(low + 1, 2**bits - 1)))
+
+
+word = st.text(st.characters(codec="ascii", categories=["Ll", "Nd"]), min_size=1, max_size=9)
+physics = st.builds(
+    Physics,
+    iso=number("iso"),
+    exposure_s=number("exposure_s"),
+    temperature_c=number("temperature_c"),
+    dn_per_e=st.floats(1e-9, 1e20),
+    prnu_std=number("prnu_std"),
+    dark_e=number("dark_e"),
+    dark_offset=st.sampled_from(["removed", "kept"]),
+    hot_pixel_share=number("hot_pixel_share"),
+    hot_pixel_e=number("hot_pixel_e"),
+    full_well_e=number("full_well_e"),
+    read_law=st.sampled_from(["gaussian", "tukey"]),
+    read_shape=number("read_shape"),
+    read_std_dn=number("read_std_dn"),
+    row_std_dn=number("row_std_dn"),
+    column_std_dn=number("column_std_dn"),
+    black_error_dn=st.tuples(*[number("black_error_dn_00")] * 4),
+    dead_pixel_share=number("dead_pixel_share"),
+    sensor_unit=st.integers(0, 2**64 - 1).map("{:016x}".format) | st.integers(0, 10**6).map(str),
+    body_key=st.integers(0, 2**64 - 1),
+    fixed_pattern_in_clean=st.booleans(),
+)
+plans = st.builds(
+    lambda sensor, **values: Plan(bits=sensor[0], black_level_dn=sensor[1], white_level_dn=sensor[2], **values),
+    sensor=st.integers(1, 16).flatmap(levels),
+    seed=st.integers(0, 2**63 - 1),
+    stream_key=st.integers(0, 2**64 - 1),
+    downscale=st.integers(1, 64),
+    dequantize=st.sampled_from(["off", "dither"]),
+    level=st.integers(0, 99),
+    draw=st.integers(0, 99),
+    frame=st.integers(0, 10**9),
+    scene=word,
+    exposure_ratio=number("exposure_ratio"),
+    camera=word,
+    weights=st.tuples(*[number("w_nexus_6p")] * 4),
+    rgb2cam=st.tuples(*[number("rgb2cam_00")] * 9),
+    red_gain=number("red_gain"),
+    blue_gain=number("blue_gain"),
+    inverse_rgb_gain=number("inverse_rgb_gain"),
+    tone=st.sampled_from(["smoothstep", "none"]),
+    gamma=st.just("srgb") | st.floats(0.1, 10),
+    highlight=st.sampled_from(["per_channel", "gray_mean", "none"]),
+    highlight_threshold=number("highlight_threshold"),
+    pattern=st.sampled_from(["RGGB", "BGGR", "GRBG", "GBRG"]),
+    sensor_clip=st.sampled_from(["sensor", "black"]),
+    saturated=st.sampled_from(["noisy", "pinned"]),
+    noise=word,
+    noise_law=st.sampled_from(["gaussian", "poisson"]),
+    a_dn=number("a_dn"),
+    b_dn2=number("b_dn2"),
+    effects=st.lists(word, max_size=3).map(tuple),
+    skipped=st.lists(word, max_size=3).map(tuple),
+    accuracy=word,
+    methods=st.lists(word, max_size=3).map(tuple),
+    physics=st.none() | physics,
+)
+names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40)
+
+
+# Columns --------------------------------------------------------------------------------------------------------------
+
+
+def test_columns_of_the_contract_are_there_in_its_order() -> None:
+    assert [name for name in NAMES if name in CONTRACT] == CONTRACT
+
+
+def test_column_names_are_unique() -> None:
+    assert len(set(NAMES)) == len(NAMES) == len(COLUMNS)
+
+
+def test_every_column_has_a_meaning() -> None:
+    assert all(column.meaning for column in COLUMNS)
+
+
+def test_every_value_of_a_row_has_the_type_of_its_column() -> None:
+    for plan in (PLAN, PHYSICAL):
+        row = row_of(plan)
+        assert list(row) == list(NAMES)
+        assert_typed(row)
+
+
+def assert_typed(row: Row) -> None:
+    for column in COLUMNS:
+        expected = float if column.name == "gamma" else column.type
+        assert type(row[column.name]) is expected, column.name
+
+
+def test_no_value_of_a_pair_is_none() -> None:
+    assert None not in row_of(PLAN).values()
+    assert None not in row_of(PHYSICAL).values()
+
+
+def test_physical_columns_of_another_profile_are_0_or_none() -> None:
+    values = {name: row_of(PLAN)[name] for name in PHYSICAL_NAMES}
+    assert values == {column.name: "none" if column.type is str else 0 for column in COLUMNS if column.name in values}
+
+
+@pytest.mark.parametrize(("gamma", "value"), [(2.2, 2.2), (1.0, 1), ("srgb", "srgb")])
+def test_gamma_is_a_number_or_srgb(gamma: float | str, value: float | str) -> None:
+    assert row_of(dataclasses.replace(PLAN, gamma=gamma))["gamma"] == value
+
+
+def test_a_failed_row_has_the_columns_of_any_row() -> None:
+    row = failed_row(SOURCE, None, 0, 7, "empty")
+    assert list(row) == list(NAMES)
+    assert (row["status"], row["reason"], row["seed"], row["source_sha256"]) == ("failed", "empty", 7, "")
+
+
+@pytest.mark.parametrize(("index", "key"), [(0, "00000000"), (12345678, "12345678"), (123456789, "123456789")])
+def test_keys_have_eight_digits_or_more(index: int, key: str) -> None:
+    assert key_text(index) == key
+
+
+# A row is a plan ------------------------------------------------------------------------------------------------------
+
+
+@given(plans)
+def test_a_row_holds_its_plan(plan: Plan) -> None:
+    assert plan_from_row(row_of(plan)) == plan
+
+
+@given(plan=plans, name=names)
+def test_row_read_from_csv_holds_the_same_plan_bit_for_bit(
+    plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    (row,) = through_csv([row_of(plan, dataclasses.replace(SOURCE, name=name))], tmp_path_factory.mktemp("csv"))
+    assert repr(plan_from_row(row)) == repr(plan)
+    assert row["source"] == name
+
+
+@given(plans)
+def test_a_row_read_back_from_json_holds_the_same_plan(plan: Plan) -> None:
+    assert repr(plan_from_row(json.loads(row_json([row_of(plan)])))) == repr(plan)
+
+
+@given(plan=plans)
+def test_a_row_read_back_from_csv_is_the_row(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> None:
+    (row,) = through_csv([row_of(plan)], tmp_path_factory.mktemp("csv"))
+    assert repr(row) == repr(dict(row_of(plan)))
+
+
+@pytest.mark.parametrize("reason", REASONS)
+def test_a_failed_row_read_back_from_csv_is_the_row(reason: str, tmp_path: Path) -> None:
+    row = failed_row(SOURCE, SHA256, 2, 5, reason)
+    assert through_csv([row], tmp_path) == [dict(row)]
+
+
+def test_drawn_plans_survive_csv(settings: Callable[..., Any], tmp_path: Path) -> None:
+    for noise in ("brooks2019", "imx385_iso3200_rvdd", "none"):
+        for camera in ("convex", "choice", "identity"):
+            plan = plan_image(settings(f"noise={noise}", f"camera={camera}", "isp=srgb"), SHA256)
+            assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
+
+
+@pytest.mark.parametrize("noise", ["sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x"])
+def test_drawn_physical_plans_survive_csv(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
+    for scene in ("daylight", "night"):
+        plan = plan_image(settings(f"noise={noise}", f"scene={scene}"), SHA256, facts=FACTS)
+        assert plan.physics is not None
+        assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}])
+def test_a_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
+    with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
+        plan_from_row({**row_of(), name: None})
+
+
+PHYSICAL_NAMES = NAMES[NAMES.index("iso") : NAMES.index("level")]
+NUMBERED = ("level", "draw", "frame", "downscale", "dequantize")
+
+
+@pytest.mark.parametrize(
+    "name", [*("scene", "exposure_ratio", "saturated_as", "noise_law"), *PHYSICAL_NAMES, *NUMBERED]
+)
+def test_a_physical_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
+    with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
+        plan_from_row({**row_of(PHYSICAL), name: None})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("stream_key", "xyz"), ("red_gain", "wide"), ("bits", "twelve"), ("gamma", "steep")]
+)
+def test_a_row_with_a_value_of_another_type_is_damage(name: str, value: str) -> None:
+    with pytest.raises(DamageError, match="row 00000003: not a plan"):
+        plan_from_row({**row_of(), name: value})
+
+
+@pytest.mark.parametrize("name", ["patch", "patch_y", "patch_x", "height", "width"])
+def test_row_without_its_place_in_the_full_frame_is_damage(name: str) -> None:
+    with pytest.raises(DamageError, match=f"row 00000003: not a patch \\({name} is empty"):
+        patch_from_row({**row_of(), name: None})
+
+
+# CSV ------------------------------------------------------------------------------------------------------------------
+
+
+def test_lines_end_with_a_line_feed() -> None:
+    text = csv_text([row_of(), row_of()])
+    assert (text.count("\n"), text.count("\r"), text[-1]) == (3, 0, "\n")
+
+
+def test_cells_are_quoted_only_if_needed() -> None:
+    text = csv_text([row_of()])
+    assert text.count('"') == 2
+    assert '"a, b.png"' in text
+
+
+def test_floats_are_spelled_as_pythons_shortest_repr() -> None:
+    cells = csv_text([row_of(dataclasses.replace(PLAN, a_dn=0.1, b_dn2=1e22))]).splitlines()[1].split(",")
+    assert {"0.1", "1e+22"} <= set(cells)
+
+
+def test_values_that_do_not_apply_are_empty() -> None:
+    cells = csv_text([failed_row(Source(0, "x", "x", None), None, 0, 0, "empty")]).splitlines()[1].split(",")
+    assert [cell for cell in cells if cell] == ["00000000", "x", "failed", "empty", "0", "0"]
+
+
+def test_unknown_columns_are_left_out(tmp_path: Path) -> None:
+    lines = csv_text([row_of()]).splitlines()
+    (tmp_path / "m.csv").write_text(f"{lines[0]},later\n{lines[1]},9\n", encoding="utf-8")
+    (row,) = read_rows(tmp_path / "m.csv")
+    assert list(row) == list(NAMES)
+
+
+def test_a_missing_manifest_is_damage(tmp_path: Path) -> None:
+    with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
+        list(read_rows(tmp_path / "manifest.csv"))
+
+
+HEADER = ",".join(NAMES)
+BROKEN = [
+    ("", "not a manifest, column key is missing"),
+    ("key,source\n", "not a manifest, column source_sha256 is missing"),
+    (HEADER.replace("saturated", "satiated") + "\n", "not a manifest, column saturated is missing"),
+    (HEADER + "\n00000000,x\n", "not a readable manifest"),
+    (HEADER + "\n" + "x," * len(NAMES) + "x\n", "not a readable manifest"),
+    (csv_text([row_of()]).replace(",1234,", ",many,"), "not a readable manifest"),
+    (csv_text([row_of()]).replace(",2.2,", ',2.2"x",').replace('"a, b.png"', '"a"b'), "not a readable manifest"),
+    (csv_text([row_of()])[:-60], "not a readable manifest"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "sentence"), BROKEN)
+def test_a_broken_manifest_is_damage(content: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(content, encoding="utf-8")
+    with pytest.raises(DamageError, match=r"m.csv: " + sentence):
+        list(read_rows(tmp_path / "m.csv"))
+
+
+def test_a_manifest_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_bytes(csv_text([row_of()]).encode("utf-8").replace(b"a, b", b"\xff, b"))
+    with pytest.raises(DamageError, match="not a readable manifest"):
+        list(read_rows(tmp_path / "m.csv"))
+
+
+# JSON -----------------------------------------------------------------------------------------------------------------
+
+
+@given(plans, names)
+def test_json_size_depends_on_the_source_name_only(plan: Plan, name: str) -> None:
+    assert len(row_json([row_of(plan, dataclasses.replace(SOURCE, name=name))])) == json_size(name)
+
+
+def test_json_is_typed() -> None:
+    loaded = json.loads(row_json([row_of()]))
+    row = row_of()
+    assert loaded == {column.name: row[column.name] for column in COLUMNS if column.in_json}
+    assert_typed(row | loaded)
+
+
+def test_json_is_ascii_and_one_line() -> None:
+    content = row_json([row_of(PLAN, dataclasses.replace(SOURCE, name="été \U0001f308.png"))])
+    assert content.isascii()
+    assert content.index(b"\n") == len(content) - 1
+
+
+LONGEST = -sys.float_info.min
+"""A double with the longest spelling: 24 characters."""
+
+
+LONGEST_NAME = "n" * 100
+"""Longest name of a camera, scene or noise profile (`test_config` refuses longer ones)."""
+
+
+def widened(reason: str) -> str:
+    """Return a reason of the planner with the longest numbers and the longest statistic."""
+    reason = re.sub(r"(?<![\w.])\d[\d.]*(e[+-]?\d+)?", f"{1.23456e-300:g}", reason)
+    return re.sub(f"in the ({'|'.join(STATISTICS)})", f"in the {max(STATISTICS, key=len)}", reason)
+
+
+def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
+    """The longest thing the planner says of each effect of a profile, of all that it has to say: what it predicts,
+    that it is switched off, that a number is assumed, that a profile with the longest name gives none.
+    """
+    lacking = settings("noise=oppo_reno10x", "effects.tolerance=1.23456")
+    for key in ("prnu_std", "dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s", "dead_pixel_share"):
+        setattr(lacking.noise, key, None)
+    half = settings("noise=oppo_reno10x")
+    half.noise.hot_pixel_e_per_s = None  # another number that is missing, with a longer name
+    lacking.noise.name = half.noise.name = LONGEST_NAME
+    all_given = settings("noise=nikon_d850", "noise.full_well_e=1e5", "noise.assumed=[]")
+    all_given.noise.branches[0].column_std_dn = 1.0
+    assumed = settings("noise=nikon_d850")
+    assumed.noise.assumed = [key for key, _, _ in PROFILE_RANGES]
+    for config in (lacking, half, all_given, assumed):
+        config.noise.iso = 3200
+    found: dict[str, list[str]] = {effect: [] for effect in EFFECTS}
+    for config in (lacking, half, all_given, assumed, settings("noise=nikon_d850", "effects.all=off")):
+        for one in plan_with_reasons(config, SHA256, facts=FACTS)[1]:
+            found[one.effect].append(widened(one.reason))
+    return {effect: max(reasons, key=len) for effect, reasons in found.items()}
+
+
+def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
+    """The longest rows that settings can lead to, of a profile of two numbers and of a physical one: the longest
+    spelling in every column, each effect named twice, as simulated and as skipped for the longest reason.
+    """
+    assert len(repr(LONGEST)) == 24
+    plan = dataclasses.replace(
+        PLAN, seed=2**63 - 1, stream_key=2**64 - 1, scene=LONGEST_NAME, exposure_ratio=LONGEST, camera=LONGEST_NAME,
+        weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
+        gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
+        saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, law_distance=LONGEST,
+        dtype="float32", layout="mosaic",
+        methods=tuple(max((one.spelled for one in methods_of_stage(stage)), key=len) for stage in STAGES),
+        effects=("heteroscedastic", "quantise"),
+        skipped=(f"heteroscedastic: noise={LONGEST_NAME} has no variance (a_dn={LONGEST!r}, b_dn2={LONGEST!r})",),
+    )  # fmt: skip
+    numbers = {field.name: LONGEST for field in dataclasses.fields(Physics) if field.type == "float"}
+    physics = dataclasses.replace(
+        PHYSICS, **numbers, dark_offset="removed", read_law="gaussian", black_error_dn=(LONGEST,) * 4,
+        sensor_unit="f" * 16, body_key=2**64 - 1,
+    )  # fmt: skip
+    skipped = tuple(f"{effect}: {reason}" for effect, reason in longest_reasons(settings).items())
+    physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics)
+    pair = Pair(PAIR.clean, PAIR.noisy, Counts(*[2**40] * 6))
+    for one in (plan, physical):
+        source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)
+        key = f"1000000000-p{patch.number}-l99d99"
+        row = pair_row(key, source, SHA256, 8, 10**9, one, pair, ("1" * 32, "2" * 32), patch)
+        yield {**row, "width": 2**40, "height": 2**40}
+
+
+def test_json_size_suffices_for_the_longest_rows(settings: Callable[..., Any]) -> None:
+    for row in longest_rows(settings):
+        text = json.dumps(dict(row), separators=(",", ":"))
+        assert len(text) + 64 < JSON_BYTES
+        assert len(row_json([row])) == json_size("")
+
+
+def test_row_longer_than_its_json_size_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"row 00000003 takes .* bytes as JSON, more than the"):
+        row_json([{**row_of(), "noise": "x" * JSON_BYTES}])
+
+
+@given(st.integers(0, 3000))
+def test_json_size_is_a_multiple_of_tar_blocks(length: int) -> None:
+    assert json_size("x" * length) % 512 == 0
+    assert json_size("x" * length) >= JSON_BYTES + 2 * (length + 2)
+
+
+def test_json_contains_no_nan(settings: Callable[..., Any]) -> None:
+    loaded = json.loads(
+        row_json([row_of(plan_image(settings(), SHA256))]), parse_constant=lambda text: pytest.fail(text)
+    )
+    assert all(math.isfinite(value) for value in loaded.values() if isinstance(value, float))
+
+
+def test_key_that_is_no_number_is_damage(dataset: Path, tmp_path: Path) -> None:
+    """Keys become part of file names."""
+    text = (dataset / "manifest.csv").read_text(encoding="utf-8")
+    (tmp_path / "manifest.csv").write_text(text.replace("\n00000001,", "\n../../x1,"), encoding="utf-8")
+    with pytest.raises(DamageError, match=r"the key is '../../x1', expected eight digits"):
+        list(read_rows(tmp_path / "manifest.csv"))

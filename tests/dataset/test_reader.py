@@ -1,0 +1,286 @@
+"""`RawPairs` reads datasets and sweeps without copying."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import pickle
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.photographs import fill
+
+import unprocess_gen
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.types import Source
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.sources.loader import load_source
+
+
+def test_package_exports_raw_pairs() -> None:
+    assert unprocess_gen.RawPairs.__module__ == "unprocess_gen.dataset.reader"
+
+
+def test_unknown_name_of_the_package_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'unprocess_gen' has no attribute 'RawPears'"):
+        unprocess_gen.RawPears  # noqa: B018
+
+
+def test_the_length_is_the_number_of_pairs(dataset: Path) -> None:
+    assert len(RawPairs(dataset)) == 13
+
+
+def test_a_path_may_be_a_string(dataset: Path) -> None:
+    assert len(RawPairs(str(dataset))) == 13
+
+
+def test_pairs_equal_those_made_from_photographs_and_plans(
+    dataset: Path, photos: Path, settings: Callable[..., Any]
+) -> None:
+    config = settings(f"source.root={photos}")
+    for sample in RawPairs(dataset):
+        name = str(sample.row["source"]).replace("%25", "%").replace("%3D", "=")
+        sha256, photograph = load_source(config.source, Source(0, name, name, sample.row["source_bytes"]))
+        expected = make_pair(photograph.srgb, plan_image(config, sha256))
+        assert np.array_equal(sample.clean, expected.clean)
+        assert np.array_equal(sample.noisy, expected.noisy)
+
+
+def test_arrays_are_uint16(dataset: Path) -> None:
+    assert {array.dtype for sample in RawPairs(dataset) for array in sample[:2]} == {np.dtype(np.uint16)}
+
+
+def test_iteration_goes_in_order_of_the_manifest(dataset: Path) -> None:
+    assert [sample.row["key"] for sample in RawPairs(dataset)] == [f"{i:08d}" for i in range(13)]
+
+
+def test_a_sample_unpacks_as_clean_noisy_row(dataset: Path) -> None:
+    clean, noisy, row = RawPairs(dataset)[0]
+    assert (array_xxh3(clean), array_xxh3(noisy)) == (row["clean_xxh3"], row["noisy_xxh3"])
+
+
+@pytest.mark.parametrize("number", [-1, -13])
+def test_negative_numbers_count_from_the_end(number: int, dataset: Path) -> None:
+    assert RawPairs(dataset)[number].row == RawPairs(dataset)[13 + number].row
+
+
+@pytest.mark.parametrize("number", [13, -14, 10**9])
+def test_a_number_out_of_range_is_an_index_error(number: int, dataset: Path) -> None:
+    with pytest.raises(IndexError):
+        RawPairs(dataset)[number]
+
+
+def test_numpy_integers_are_accepted(dataset: Path) -> None:
+    assert RawPairs(dataset)[np.int64(2)].row["key"] == "00000002"  # type: ignore[call-overload]
+
+
+def test_failed_photographs_are_left_out(make: Callable[..., Any], tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 4) / "001.png").write_bytes(b"")
+    make(tmp_path / "p", tmp_path / "ds", "output.pairs_per_shard=1")
+    assert [sample.row["source"] for sample in RawPairs(tmp_path / "ds")] == ["000.png", "002.png", "003.png"]
+
+
+# Mapped, not copied ---------------------------------------------------------------------------------------------------
+
+
+def test_arrays_are_mapped_from_the_file(dataset: Path) -> None:
+    sample = RawPairs(dataset)[3]
+    assert isinstance(sample.clean.base, mmap.mmap)
+    assert isinstance(sample.noisy.base, mmap.mmap)
+
+
+def test_arrays_start_at_a_multiple_of_64_bytes(dataset: Path) -> None:
+    assert {array.ctypes.data % 64 for sample in RawPairs(dataset) for array in sample[:2]} == {0}
+
+
+def test_writing_to_an_array_does_not_touch_the_file(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    before = [path.read_bytes() for path in sorted((dataset / "shards").iterdir())]
+    sample = pairs[2]
+    sample.clean[:] = 7
+    assert (sample.clean == 7).all()
+    assert [path.read_bytes() for path in sorted((dataset / "shards").iterdir())] == before
+    assert array_xxh3(pairs[2].clean) == sample.row["clean_xxh3"]
+
+
+def test_writing_to_a_row_does_not_touch_the_next_one(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    pairs[0].row["source"] = "mine"
+    assert pairs[0].row["source"] != "mine"
+
+
+def test_arrays_outlive_the_reader_and_the_file(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "ds")
+    sample = RawPairs(tmp_path / "ds")[0]
+    shutil.rmtree(tmp_path / "ds")
+    assert array_xxh3(sample.clean) == sample.row["clean_xxh3"]
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def test_no_file_stays_open(dataset: Path) -> None:
+    before = open_files()
+    pairs = RawPairs(dataset)
+    for i in range(len(pairs)):
+        assert pairs[i].clean.size
+    assert open_files() == before
+
+
+# Shared ---------------------------------------------------------------------------------------------------------------
+
+
+def digests(dataset: Path) -> list[Any]:
+    return [row["noisy_xxh3"] for row in read_rows(dataset / "manifest.csv")]
+
+
+def digest(pairs: RawPairs, number: int) -> str:
+    return array_xxh3(pairs[number].noisy)
+
+
+def test_it_can_be_pickled_before_and_after_use(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    for _ in range(2):
+        copy = pickle.loads(pickle.dumps(pairs))
+        assert [digest(copy, i) for i in range(13)] == digests(dataset)
+        assert digest(pairs, 0) == digests(dataset)[0]
+
+
+def test_several_processes_read_it(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        found = list(pool.map(digest, [pairs] * 13, range(13)))
+    assert found == digests(dataset)
+
+
+def test_several_threads_read_it(dataset: Path) -> None:
+    pairs = RawPairs(dataset)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda i: digest(pairs, i % 13), range(52)))
+    assert found == digests(dataset) * 4
+
+
+# Damage ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def copy(dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(dataset, tmp_path / "ds"))
+
+
+def test_a_folder_that_is_no_dataset_is_damage(tmp_path: Path) -> None:
+    with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
+        RawPairs(tmp_path)
+
+
+def test_deleted_manifest_is_damage(copy: Path) -> None:
+    pairs = RawPairs(copy)
+    (copy / "manifest.csv").unlink()
+    with pytest.raises(DamageError, match=r"manifest.csv: no row at byte"):
+        pairs[0]
+
+
+def test_a_missing_shard_is_damage(copy: Path) -> None:
+    (copy / "shards/shard-00001.tar").unlink()
+    pairs = RawPairs(copy)
+    assert pairs[0].clean.size
+    with pytest.raises(DamageError, match=r"shard-00001.tar: not a complete shard"):
+        pairs[5]
+
+
+def test_a_truncated_shard_is_damage(copy: Path) -> None:
+    path = copy / "shards/shard-00001.tar"
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(DamageError, match=r"shard-00001.tar: not a complete shard"):
+        RawPairs(copy)[5]
+
+
+def test_a_shard_of_other_images_is_damage(copy: Path) -> None:
+    shutil.copy(copy / "shards/shard-00000.tar", copy / "shards/shard-00001.tar")
+    with pytest.raises(DamageError, match=r"shard-00001.tar: member 00000005.clean.npy is missing"):
+        RawPairs(copy)[5]
+
+
+def test_shard_deleted_after_its_first_use_is_damage(copy: Path) -> None:
+    pairs = RawPairs(copy)
+    assert pairs[5].clean.size
+    (copy / "shards/shard-00001.tar").unlink()
+    with pytest.raises(DamageError):
+        pairs[6]
+
+
+# Slices and sweeps ----------------------------------------------------------------------------------------------------
+
+
+def test_slice_is_a_reader_of_its_pairs(dataset: Path) -> None:
+    part = RawPairs(dataset)[2:9:3]
+    assert isinstance(part, RawPairs)
+    assert [sample.row["key"] for sample in part] == ["00000002", "00000005", "00000008"]
+    assert [sample.row["key"] for sample in part[::-1]] == ["00000008", "00000005", "00000002"]
+    assert part[-1].row["key"] == "00000008"
+    assert len(RawPairs(dataset)[13:]) == 0
+    assert digest(pickle.loads(pickle.dumps(part)), 1) == digests(dataset)[5]
+
+
+@pytest.fixture(scope="module")
+def sweep(make: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of two datasets and a job that left none, in another order than their names."""
+    folder = tmp_path_factory.mktemp("sweep")
+    photos = fill(folder / "p", 3)
+    for name, count in (("seed=2", 2), ("seed=1", 3)):
+        make(photos, folder / "sweep" / name, name, f"source.limit={count}")
+    (folder / "sweep" / "sweep.csv").write_text(
+        "folder,overrides,seed,rows,failed,seconds,exit\nseed=2,seed=2,2,2,0,0.1,0\nseed=x,seed=x,x,,,,2\n"
+        "seed=1,seed=1,1,3,0,0.1,0\n"
+    )
+    return folder / "sweep"
+
+
+def test_sweep_is_read_in_the_order_of_its_table(sweep: Path) -> None:
+    pairs = RawPairs(sweep)
+    assert [(sample.dataset, sample.row["key"], sample.row["seed"]) for sample in pairs] == [
+        ("seed=2", "00000000", 2),
+        ("seed=2", "00000001", 2),
+        ("seed=1", "00000000", 1),
+        ("seed=1", "00000001", 1),
+        ("seed=1", "00000002", 1),
+    ]
+    assert pairs.dataset == ("seed=2", "seed=2", "seed=1", "seed=1", "seed=1")
+    assert pairs[3:].dataset == ("seed=1", "seed=1")
+    assert digest(pickle.loads(pickle.dumps(pairs)), 4) == RawPairs(sweep / "seed=1")[2].row["noisy_xxh3"]
+
+
+def test_dataset_of_a_sweep_is_read_alone(sweep: Path) -> None:
+    pairs = RawPairs(sweep / "seed=1")
+    assert (len(pairs), set(pairs.dataset)) == (3, {"seed=1"})
+
+
+def test_sample_keeps_its_dataset_when_pickled(sweep: Path) -> None:
+    sample = RawPairs(sweep)[0]
+    copy = pickle.loads(pickle.dumps(sample))
+    assert (copy.dataset, copy.row) == ("seed=2", sample.row)
+    assert len(sample) == 3
+
+
+def test_sweep_whose_dataset_was_deleted_is_damage(sweep: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweep, tmp_path / "sweep")
+    shutil.rmtree(tmp_path / "sweep" / "seed=1")
+    with pytest.raises(DamageError, match=r"seed=1/manifest\.csv: no such manifest"):
+        RawPairs(tmp_path / "sweep")
+
+
+def test_sweep_table_of_version_0_1_is_read(sweep: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweep, tmp_path / "sweep")
+    (tmp_path / "sweep" / "sweep.csv").write_text("folder,overrides,rows,failed,exit\nseed=1,seed=1,3,0,0\n")
+    assert len(RawPairs(tmp_path / "sweep")) == 3

@@ -1,0 +1,32 @@
+"""Calls of the command line, in this process and in others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+COMMAND = Path(sys.executable).with_name("gen-dataset")
+
+
+def environment(**changes: str) -> dict[str, str]:
+    """Return this process's environment with changes."""
+    return os.environ | {"HYDRA_FULL_ERROR": ""} | changes
+
+
+class Done(NamedTuple):
+    """Exit code, stdout and stderr of a call."""
+
+    code: int
+    out: str
+    err: str
+
+
+RunMain = Callable[..., Done]
+"""Type of the fixture `run_main`."""
+
+Cli = Callable[..., "subprocess.CompletedProcess[str]"]
+"""Type of the fixture `cli`."""

@@ -1,0 +1,343 @@
+r"""Run ``gen-dataset`` and report the libraries and kernels that it used, for the tests in `test_everywhere`.
+
+    python tests/helpers/everywhere.py FACTS.json [gen-dataset's arguments]    make a dataset, then write the facts
+    python tests/helpers/everywhere.py FACTS.json --code                       compile the kernels and run none of them
+
+The facts come from the process that did the work, so that a setting which a library ignores proves nothing.
+
+**Another processor, emulated** (optional): QEMU's user mode computes in software according to IEEE 754. On a Debian
+machine with another processor, in a folder with this package's wheel, photographs and this script, for 64-bit Arm:
+
+    apt-get download qemu-user-static; dpkg -x qemu-user-static_*.deb host
+    mkdir -p apt/lists/partial apt/archives/partial; touch apt/status
+    for_arm() { apt-get -o APT::Architecture=arm64 -o APT::Architectures=arm64 -o Dir::State="$PWD/apt" \
+                    -o Dir::State::status="$PWD/apt/status" -o Dir::Cache="$PWD/apt" "$@"; }
+    for_arm update; for_arm -dy --no-install-recommends install python3-minimal libpython3-stdlib libstdc++6 libgomp1
+    for package in apt/archives/*.deb; do dpkg -x "$package" arm; done
+    pip install --target site --no-deps antlr4-python3-runtime==4.9.3
+    pip install --target site --no-deps --only-binary :all: --python-version 3.11 --platform manylinux_2_28_aarch64 \
+        --platform manylinux_2_27_aarch64 --platform manylinux2014_aarch64 unprocess_gen-*.whl hydra-core==1.3.* \
+        omegaconf==2.3.* packaging pyyaml numpy numba llvmlite opencv-python-headless joblib cloudpickle tqdm xxhash
+    host/usr/bin/qemu-aarch64-static -L arm -E PYTHONPATH="$PWD/site" -E NUMBA_CACHE_DIR="$PWD/kernels" \
+        arm/usr/bin/python3.11 everywhere.py arm.json source.root=photos n_jobs=1 out=ds-arm
+
+Shards, manifest.csv, config.yaml and ``doubles`` in the facts must equal those of this machine. With eleven small
+photographs this took 85 seconds, most of them for compiling (20 with ``NUMBA_DISABLE_JIT=1``). To emulate an old x86-64
+for all libraries: ``host/usr/bin/qemu-x86_64-static -cpu Nehalem .venv/bin/python everywhere.py …`` (70 seconds).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+
+from unprocess_gen.cli import main as cli
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.core.lookup_tables import normal_table
+from unprocess_gen.core.random_streams import BLOCK
+from unprocess_gen.simulation import self_test as selftest
+from unprocess_gen.simulation.kernels import (
+    clean,
+    float_draws,
+    gaussian,
+    gaussian_float32,
+    philox,
+    physical,
+    poisson,
+    readout,
+    segments,
+)
+from unprocess_gen.simulation.kernels.normal import fill_coarse_normals, fill_fine_normals, normal_quantile_tables
+from unprocess_gen.simulation.kernels.simd import load, pointer_to
+from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.simulation.reference.poisson import poisson_tables
+
+KERNELS = {
+    f"{module_name}.{name}": value
+    for module_name, module in sorted(sys.modules.items())
+    if module_name.startswith("unprocess_gen.")
+    for name, value in vars(module).items()
+    if hasattr(value, "targetoptions") and value.__module__ == module_name
+}
+"""All compiled functions of the package."""
+
+FUSED = re.compile(r"\b(?:v?fn?m(?:add|sub|acc|sac|la|ls|ad|sb)|x[sv]n?m(?:add|sub))\w*")
+"""Instructions that multiply and add with one rounding: x86, Arm, RISC-V, Power."""
+
+GUESSED = re.compile(r"\b(?:v?r(?:sqrt|cp)|fr(?:sqrt|ecp)|xv?r(?:sqrt)?e|vfr(?:sqrt7|ec7))\w*")
+"""Instructions that give a reciprocal or a square root to a few digits."""
+
+TARGETS = {
+    "Arm": ("aarch64-unknown-linux-gnu", "neoverse-v1"),
+    "RISC-V": ("riscv64-unknown-linux-gnu", "sifive-p670"),
+}
+"""Processors that can fuse, as LLVM names them."""
+
+
+# Facts about the process ----------------------------------------------------------------------------------------------
+
+
+def facts(given: str) -> dict[str, Any]:
+    import cv2  # imported late: it reads its settings at import, and the run decides when
+
+    from unprocess_gen.pipeline import generate as runner
+
+    features = np._core._multiarray_umath.__cpu_features__
+    return {
+        "package": str(Path(cli.__file__).parent),
+        "versions": {name: version(name) for name in runner.PACKAGES},
+        "optimize": sys.flags.optimize,
+        "numpy": [name for name in np._core._multiarray_umath.__cpu_dispatch__ if features[name]],
+        "opencv": [one[1:] for one in cv2.getCPUFeaturesLine().split() if one[0] == "*" and one[-1] != "?"],
+        "ipp": cv2.ipp.useIPP(),
+        "product": product(),
+        "libm": digest(repr([function(k / 999) for k in range(1, 999) for function in LIBM]).encode()),
+        "kernels": kernels(),
+        "doubles": [given, doubles()],
+    }
+
+
+def hash_kernel_arguments() -> Any:
+    """Hash all arguments of later calls of the outer kernel, except the last three, which it fills."""
+    kernel, arguments_digest = gaussian._fill_pairs, hashlib.sha256()
+
+    def hash_and_call(*arguments: Any) -> None:
+        for argument in arguments[:-3]:
+            for one in argument if isinstance(argument, tuple) else (argument,):
+                arguments_digest.update(np.asarray(one).tobytes())
+        kernel(*arguments)
+
+    gaussian._fill_pairs = hash_and_call
+    return arguments_digest
+
+
+LIBM: tuple[Callable[[float], float], ...] = (math.sin, math.asin, math.exp, math.log, lambda x: x**2.2)
+
+
+def digest(*parts: Any) -> str:
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part)
+    return found.hexdigest()
+
+
+def product() -> str:
+    """Return the digest of a matrix product, which differs between libraries for linear algebra."""
+    matrix = np.random.default_rng(0).random((50, 50))
+    return digest(matrix @ matrix)
+
+
+def kernels() -> dict[str, Any]:
+    """Return how many kernels were loaded and compiled, and the digest of their machine code if none was loaded."""
+    loaded = sum(sum(one.stats.cache_hits.values()) for one in KERNELS.values())
+    code = "" if loaded else "".join(asm for one in KERNELS.values() for asm in one.inspect_asm().values())
+    return {
+        "loaded": loaded,
+        "compiled": sum(len(one.overloads) for one in KERNELS.values()) - loaded,
+        "code": digest(code.encode()) if code else None,
+        "ymm": "ymm" in code,
+    }
+
+
+# Doubles before they are rounded --------------------------------------------------------------------------------------
+
+
+@kernel
+def _draw(words: Any, rates: Any, normal: Any, tables: Any, buffers: Any, out: Any) -> None:
+    poisson.fill_counts(words, rates, normal, tables, buffers, out)
+
+
+@kernel
+def _digitise(counts: Any, words: Any, body: Any, buffers: Any, out: Any) -> None:
+    physical._convert_to_dn(counts, words, body, (0, 0), 64.0, buffers, out)
+
+
+@kernel
+def _light(
+    codes: Any, scene: Any, buffers: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean_dn: Any,
+    tally: Any,
+) -> None:  # fmt: skip
+    count, of_photograph, run = clean_dn.shape[0], clean.parameter_pointers(scene), segments.buffer_pointers(buffers)
+    gains, headroom = load(pointer_to(scene.site_gains, 0), 0), load(pointer_to(scene.site_headroom, 0), 0)
+    clean.fill_signal(pointer_to(codes, 0), True, 0, count, of_photograph, pointer_to(camera, 0))
+    clean._fill_gray_mean_signal(pointer_to(codes, 0), 0, count, of_photograph, pointer_to(gray, 0))
+    clean.fill_linear(count // BLOCK, gains, of_photograph, run, run.clean)
+    segments.copy_values(count, run.unrounded_dn, dim)
+    clean.recompute_bright(count // BLOCK, gains, headroom, of_photograph, run, run.clean)
+    clean.fill_scene_light(buffers.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
+    clean.fill_clean_from_light(lit, scene, unrounded, clean_dn, tally)
+
+
+@kernel
+def _draws(key: Any, words: Any) -> None:
+    philox.fill_segment_words(key, (3, 0), np.uint64(4), words.shape[0], words)
+
+
+@kernel
+def _round(dn: Any, noisy: Any, tally: Any) -> None:
+    readout.round_and_clip(dn, (0.0, 4095.0), noisy, tally)
+
+
+def doubles() -> str:
+    """Return the digest of the kernels' values before rounding to DN, which shows a change of one bit.
+
+    Frames would show such a change once in 10^12 sites. Kernels return the noisy frame rounded only, so its signals end
+    half-way between two DN.
+    """
+    count = segments.LONG_SEGMENT
+    n = np.arange(count)
+    tally = np.zeros(6, dtype=np.int64)
+    codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
+    camera, gray, lit, unrounded, counts, digitised, dim = (np.empty(count) for _ in range(7))
+    words = np.empty(count, dtype=np.uint32)
+    clean_dn, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
+
+    buffers, of_counts = segments.allocate_buffers(count), poisson.allocate_count_buffers(count)
+    buffers.signal[:count] = n / 999.0
+    plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
+    scene = clean.pair_parameters(plan, np.arange(256) / 255.0, (1, count), (0, 0))
+    _light(codes, scene, buffers, camera, gray, dim, lit, unrounded, clean_dn, tally)
+    key = philox.philox_key(2**33 + 1, 5, 6, 7)
+    _draws(key, words)
+    normals = float_draws.by_inverse_cdf(words[None], normal_table())[0]
+    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantile_tables(), poisson_tables(), of_counts, counts)
+    body = physical._sensor_parameters(plan, (1, count), (0, 0))
+    _digitise(counts, words, body, of_counts, digitised)
+    _round(n % 9 + 0.5, noisy, tally)
+    deep, fine, coarse = np.empty((3, count), dtype=np.float32)
+    fill_fine_normals(words, deep, fine)
+    fill_coarse_normals(words, deep, coarse)
+    return digest(
+        camera, gray, lit, unrounded, clean_dn, normals, counts, digitised, body.response, dim, words, fine, coarse,
+        noisy, tally, buffers.unrounded_dn[:count], buffers.bright_light[:count],
+    )  # fmt: skip
+
+
+# Machine code ---------------------------------------------------------------------------------------------------------
+
+
+def code() -> dict[str, Any]:
+    """Return facts about the kernels' code, compiled by Numba for this target and by LLVM for others.
+
+    Each entry is paired with that of a loop compiled with fast-math, which proves that the target can fuse operations
+    and that this is detected. Nothing is executed, so that targets can be other processors.
+    """
+    free = numba.njit(fastmath=True)(multiply_and_add)
+    free.compile((numba.float64[::1],) * 3)
+    compile_kernels()
+    kernels = [one for one in KERNELS.values() if one.signatures]
+    asm, free_asm = ("".join(code for one in of for code in one.inspect_asm().values()) for of in (kernels, [free]))
+    ir, free_ir = ([code for one in of for code in one.inspect_llvm().values()] for of in (kernels, [free]))
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    return {
+        "not compiled": [name for name, one in KERNELS.items() if not one.signatures],
+        "instructions": {
+            "Numba's own": [instructions(asm), instructions(free_asm)],
+            **{
+                name: [instructions(assembly(one, *target)) for one in (ir, free_ir)]
+                for name, target in TARGETS.items()
+            },
+        },
+        "fast-math flags": [fast_math_flags("".join(one)) for one in (ir, free_ir)],
+        "called": sorted(set(re.findall(r"call [^@\n]*double>? @([\w.]+)", "".join(ir)))),
+    }
+
+
+def compile_kernels() -> None:
+    """Compile the outer kernels, and with them all others, for the arguments of their calls; execute none."""
+    black = np.zeros((2, 2, 3), dtype=np.uint8)
+    outer = ((gaussian, "_fill_pairs"), (clean, "_fill_clean_frame"), (gaussian_float32, "_fill_pairs32"))
+    of_counts = (
+        "_fill_physical_pair",
+        "_fill_shot_read_pair",
+        "_fill_physical_noisy",
+        "_fill_prnu_response",
+    )
+    of_floats = ("_fill_words", "_fill_by_inverse_cdf", "_fill_poisson")
+    for module, name in (
+        *outer,
+        *((physical, name) for name in of_counts),
+        *((float_draws, name) for name in of_floats),
+    ):
+        setattr(module, name, compiler(getattr(module, name)))
+    for plan in selftest.GOLDEN_PLANS.values():
+        make_pair(black, plan)
+    for name in ("per_channel", "plain", "physical"):
+        plan = selftest.GOLDEN_PLANS[name]
+        plan = replace(plan, effects=tuple(one for one in plan.effects if one != "full_well"))
+        list(make_pairs(black, [plan] * 2))
+    for normals in (fill_fine_normals, fill_coarse_normals):
+        normals.compile((numba.uint32[::1], numba.float32[::1], numba.float32[::1]))
+    three = (numba.float64[::1],) * 3
+    selftest._product_and_sum.compile(three)
+    words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)
+    given = words, doubles, normal_quantile_tables(), poisson_tables(), poisson.allocate_count_buffers(8), doubles
+    _draw.compile(tuple(map(numba.typeof, given)))
+
+
+def compiler(kernel: Any) -> Callable[..., None]:
+    """Return a function that compiles a kernel for its arguments without executing it."""
+    return lambda *arguments: kernel.compile(tuple(map(numba.typeof, arguments))) and None
+
+
+def multiply_and_add(x: Any, y: Any, out: Any) -> None:
+    for i in range(out.size):
+        out[i] += math.sqrt(x[i]) * y[i]
+
+
+def assembly(modules: list[str], triple: str, cpu: str) -> str | None:
+    """Return LLVM's code for another processor; None if this LLVM was built without it."""
+    try:
+        machine = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, opt=3)
+    except RuntimeError:
+        return None
+    ir = "\f".join(modules)
+    ir = re.sub(r"target triple = .*", f'target triple = "{triple}"', ir)
+    ir = re.sub(r"target datalayout = .*", f'target datalayout = "{machine.target_data}"', ir)
+    ir = re.sub(r"(?:tail )?call i8 @llvm\.x86\.atomic.*", "add i8 0, 0", ir)  # a counter of references
+    return "".join(machine.emit_assembly(llvm.parse_assembly(one)) for one in ir.split("\f"))
+
+
+def instructions(asm: str | None) -> dict[str, list[str]] | None:
+    if asm is None:
+        return None
+    return {"fused": sorted(set(FUSED.findall(asm))), "guessed": sorted(set(GUESSED.findall(asm)))}
+
+
+def fast_math_flags(ir: str) -> list[str]:
+    """Return the flags on arithmetic that allow other results than those of IEEE 754."""
+    operations = re.findall(r"= (?:\w+ )?(?:f(?:add|sub|mul|div|neg|rem)|call) (.*)", ir)
+    return sorted({word for rest in operations for word in rest.split(" ")[:9] if word in FAST_MATH_FLAGS})
+
+
+FAST_MATH_FLAGS = {"fast", "nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
+
+
+def main(facts_path: str, *arguments: str) -> int:
+    report: dict[str, Any]
+    if arguments == ("--code",):
+        exit_code, report = 0, code()
+    else:
+        sys.argv[1:] = arguments
+        arguments_digest = hash_kernel_arguments()
+        exit_code = cli.main()
+        report = facts(arguments_digest.hexdigest())
+    Path(facts_path).write_text(json.dumps(report), encoding="utf-8")
+    return exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -1,0 +1,724 @@
+"""Real faults: kills at random moments, full and read-only disks, little memory, deleted folders, signals.
+
+Each fault costs one line and a few seconds and leaves no process. The same command then makes the dataset that an
+undisturbed run makes, to the byte. `test_resume` covers kills around each rename and refused reruns. Tests of disks
+mount small file systems; without permission to mount they are skipped, and run under ``unshare -Urm``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from helpers.commands import Cli, RunMain
+from helpers.datasets import Make, TreeHash
+from helpers.photographs import fill, pixels
+from helpers.processes import ONE, Killed, assert_whole, committed, running, session, wait_for, workers
+from PIL import Image
+
+from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.workspace import Workspace
+
+COUNT = 24
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill(tmp_path_factory.mktemp("faults") / "p", COUNT)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(photographs: Path, make: Make, tree_hash: TreeHash) -> str:
+    make(photographs, photographs.parent / "ds", ONE)
+    return tree_hash(photographs.parent / "ds")
+
+
+def own_lines(err: str) -> list[str]:
+    """Return the lines of stderr that are not progress."""
+    return [line for line in err.splitlines() if "images/s" not in line and "compiling kernels" not in line]
+
+
+def wait_for_the_end(leader: int) -> None:
+    """Wait until every process of a run has ended, ten seconds at most."""
+    wait_for(lambda: not session(leader), seconds=10)  # a worker that still imports has no watchdog
+
+
+def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Call ``action`` once a run of this process has committed ``number`` shards."""
+    commit, done = Workspace.commit, []
+
+    def commits(self: Workspace, made: Any) -> None:
+        commit(self, made)
+        done.append(made.shard)
+        if len(done) == number:
+            action()
+
+    monkeypatch.setattr(Workspace, "commit", commits)
+
+
+# Killed at random moments ---------------------------------------------------------------------------------------------
+
+
+class Course(NamedTuple):
+    """Hold when a run of two workers starts its first worker and when it ends, in seconds from its start."""
+
+    worker: float
+    done: float
+
+
+@pytest.fixture(scope="module")
+def course(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Course:
+    """Measure the second of two runs."""
+    for i in range(2):
+        out = tmp_path_factory.mktemp("course")
+        start = time.monotonic()
+        with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=out) as process:
+            wait_for(lambda pid=process.pid: workers_of(pid))
+            worker = time.monotonic() - start
+            assert process.wait(60) == 0, i
+    return Course(worker, time.monotonic() - start)
+
+
+def workers_of(leader: int) -> list[int]:
+    """Return the workers of a run that may be ending meanwhile."""
+    with suppress(OSError):
+        return workers(leader)
+    return []
+
+
+def moment_of(draw: random.Random, course: Course) -> float:
+    """Return a random moment: one in four anywhere in a run, imports included, the others while shards are made."""
+    return draw.uniform(0 if draw.random() < 0.25 else course.worker, course.done)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("whom", "kills"), [("coordinator", 34), ("group", 33)])
+def test_run_killed_at_random_moments_resumes_to_the_same_bytes(
+    whom: str, kills: int, photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: TreeHash,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """Workers of a killed coordinator end within ten seconds; within one if a core is free."""
+    draw, hits, unfinished = random.Random(whom), 0, 0
+    for kill in range(kills):
+        out = tmp_path / str(kill) / "ds"
+        out.parent.mkdir()
+        with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=out.parent) as process:
+            time.sleep(moment_of(draw, course))
+            hits += process.poll() is None
+            with suppress(ProcessLookupError):
+                (os.kill if whom == "coordinator" else os.killpg)(process.pid, signal.SIGKILL)
+            process.wait(5)
+            wait_for_the_end(process.pid)
+        unfinished += out.exists() and not (out / "dataset.json").exists()
+        make(photographs, out, ONE)
+        assert tree_hash(out) == undisturbed, kill
+        assert_whole(out)
+        shutil.rmtree(out)
+    print(f"{whom}: {hits} of {kills} kills hit a running process, {unfinished} left an unfinished folder")
+    assert hits >= kills / 2 and unfinished >= kills / 4
+
+
+@pytest.mark.slow
+def test_run_continues_when_a_worker_is_killed_at_random_moments(
+    photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    """The run ends with 0, or with 3 if the kill hit the retry of a photograph; a rerun then completes it."""
+    draw, kills, hits, codes = random.Random("worker"), 33, 0, Counter[int]()
+    for kill in range(kills):
+        out = tmp_path / str(kill) / "ds"
+        out.parent.mkdir()
+        with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=out.parent) as process:
+            found = wait_for(lambda pid=process.pid: workers_of(pid))
+            time.sleep(draw.uniform(0, 0.8 * (course.done - course.worker)))
+            found = workers_of(process.pid) or found
+            with suppress(ProcessLookupError):
+                os.kill(draw.choice(found), signal.SIGKILL)
+                hits += process.poll() is None
+            _, err = process.communicate(timeout=30)
+            codes[process.returncode] += 1
+            assert process.returncode in (0, 3), err
+            wait_for_the_end(process.pid)
+        lines = own_lines(err)
+        assert all("its worker died twice" in line for line in lines) and len(lines) <= 1, err
+        make(photographs, out, ONE)
+        assert tree_hash(out) == undisturbed, kill
+        assert_whole(out)
+        shutil.rmtree(out)
+    print(f"worker: {hits} of {kills} kills hit a running process; exit codes {dict(codes)}")
+    assert hits >= kills / 2
+
+
+def test_orphaned_workers_do_not_disturb_the_next_run(
+    photographs: Path,
+    undisturbed: str,
+    make: Make,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Workers are stopped (SIGSTOP) amid a shard, outlive their coordinator, and continue in the next run."""
+    out = tmp_path / "ds"
+    with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path) as process:
+        wait_for(lambda: committed(out) >= 2)
+        orphans = workers(process.pid)
+        for orphan in orphans:
+            os.kill(orphan, signal.SIGSTOP)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait(5)
+        done = committed(out)
+        assert set(orphans) <= set(session(process.pid))
+        after_commits(3, lambda: [os.kill(orphan, signal.SIGCONT) for orphan in orphans], monkeypatch)
+        assert make(photographs, out, ONE).made == COUNT - done
+        wait_for_the_end(process.pid)
+    assert tree_hash(out) == undisturbed
+    assert_whole(out)
+
+
+def test_file_added_by_an_orphan_at_the_start_is_harmless(
+    photographs: Path,
+    undisturbed: str,
+    make: Make,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = tmp_path / "ds"
+    (out / ".work/tmp").mkdir(parents=True)
+    rmdir = os.rmdir
+
+    def adds_first(path: Any, *, dir_fd: int | None = None) -> None:
+        monkeypatch.setattr(os, "rmdir", rmdir)
+        (out / ".work/tmp/shard-00000.tar.1.1").touch()
+        rmdir(path, dir_fd=dir_fd)
+
+    monkeypatch.setattr(os, "rmdir", adds_first)
+    make(photographs, out, ONE)
+    assert tree_hash(out) == undisturbed
+    assert_whole(out)
+
+
+# Workers --------------------------------------------------------------------------------------------------------------
+
+AT_ONE = """
+import hashlib, os, pathlib, resource, time
+
+marked, note, sha256 = pathlib.Path(os.environ["MARKED"]), pathlib.Path(os.environ["NOTE"]), hashlib.sha256
+
+
+def wait():
+    if not note.exists():
+        note.write_text(str(os.getpid()))
+        while note.exists():
+            time.sleep(0.01)
+
+
+def limit():
+    size = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + int(note.read_text()) * 2**20, -1))
+
+
+def acting(data=b"", **options):
+    if isinstance(data, bytes) and data == marked.read_bytes():
+        globals()[os.environ["ACTION"]]()
+    return sha256(data, **options)
+
+
+hashlib.sha256 = acting
+"""
+"""Module that every process of a run imports first: when it hashes one photograph, it acts."""
+
+
+def acting_at(folder: Path, photograph: Path, action: str) -> dict[str, str]:
+    """Return an environment in which processes act when they read ``photograph``.
+
+    ``wait``: the first one waits as long as the file ``note`` exists. ``limit``: every one gets a limit of memory.
+    """
+    (folder / "site").mkdir()
+    (folder / "site/sitecustomize.py").write_text(AT_ONE)
+    return {
+        "PYTHONPATH": os.pathsep.join([str(folder / "site"), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "MARKED": str(photograph),
+        "NOTE": str(folder / "note"),
+        "ACTION": action,
+    }
+
+
+def test_killed_worker_is_noticed_within_five_seconds(
+    photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The killed worker was at the last photograph, so no other work would reveal its death."""
+    for name, value in acting_at(tmp_path, photographs / f"{COUNT - 1:03d}.png", "wait").items():
+        monkeypatch.setenv(name, value)
+    with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path) as process:
+        wait_for(lambda: committed(tmp_path / "ds") == COUNT - 1 and (tmp_path / "note").exists())
+        idle = set(workers(process.pid)) - {asleep := int((tmp_path / "note").read_text())}
+        assert len(idle) == 1
+        os.kill(asleep, signal.SIGKILL)
+        wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # loky ends all workers
+        assert process.wait(20) == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+LARGE = 3000, 4000
+
+
+@pytest.fixture(scope="module")
+def with_large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make three small photographs and one of few bytes that takes 36 MB once decoded and 72 MB while decoding."""
+    source = fill(tmp_path_factory.mktemp("memory") / "p", 3)
+    Image.fromarray(np.full((*LARGE, 3), 90, np.uint8)).save(source / "large.png")
+    return source
+
+
+LEVELS = "noise.levels=5"
+"""Pairs of one photograph that are made together: 144 MB for the large one."""
+
+
+@pytest.fixture(scope="module")
+def with_large_undisturbed(with_large: Path, make: Make, tree_hash: TreeHash) -> str:
+    make(with_large, with_large.parent / "ds", ONE, LEVELS)
+    return tree_hash(with_large.parent / "ds")
+
+
+@pytest.mark.parametrize(
+    ("n_jobs", "megabytes"), [(1, 20), (1, 100), (2, 20), pytest.param(2, 100, marks=pytest.mark.slow)]
+)
+def test_out_of_memory_is_reported_and_rerun_completes_dataset(
+    n_jobs: int,
+    megabytes: int,
+    with_large: Path,
+    with_large_undisturbed: str,
+    cli: Cli,
+    make: Make,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+) -> None:
+    """With 20 MB left the large photograph cannot be decoded; with 100 MB its pairs cannot be simulated."""
+    env = acting_at(tmp_path, with_large / "large.png", "limit")
+    (tmp_path / "note").write_text(str(megabytes))
+    done = cli(f"source.root={with_large}", ONE, LEVELS, f"n_jobs={n_jobs}", **env)
+    assert done.returncode in (3, 5), done.stderr
+    assert len(own_lines(done.stderr)) == 1, done.stderr
+    assert "large.png" in own_lines(done.stderr)[0]
+    make(with_large, tmp_path / "ds", ONE, LEVELS)
+    assert tree_hash(tmp_path / "ds") == with_large_undisturbed
+
+
+# Disks ----------------------------------------------------------------------------------------------------------------
+
+
+class Disk(NamedTuple):
+    """Hold a small file system in memory."""
+
+    folder: Path
+
+    def remount(self, options: str) -> None:
+        """Change its size, or make it read-only or writable."""
+        subprocess.run(["mount", "-o", f"remount,{options}", self.folder], check=True, capture_output=True)
+
+    @property
+    def kilobytes(self) -> int:
+        """Kilobytes in use."""
+        status = os.statvfs(self.folder)
+        return (status.f_blocks - status.f_bfree) * status.f_frsize // 1024
+
+
+@pytest.fixture(scope="module")
+def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
+    folder = tmp_path_factory.mktemp("disk")
+    command = ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("needs the command mount")
+    if done.returncode:
+        pytest.skip(f"needs to mount a file system ({done.stderr.strip()}); run under: unshare -Urm")
+    try:
+        yield Disk(folder)
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+@pytest.fixture
+def empty_disk(disk: Disk) -> Iterator[Disk]:
+    yield disk
+    disk.remount("rw,size=4m")
+    for path in disk.folder.iterdir():
+        shutil.rmtree(path)
+
+
+FULL_COUNT = 6
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill(tmp_path_factory.mktemp("six") / "p", FULL_COUNT)
+
+
+@pytest.fixture(scope="module")
+def six_undisturbed(six: Path, make: Make, tree_hash: TreeHash) -> str:
+    make(six, six.parent / "ds", ONE)
+    return tree_hash(six.parent / "ds")
+
+
+class Full(NamedTuple):
+    """Hold what a run raised on a disk that was too small, what it left, and the hash of the resumed dataset."""
+
+    kilobytes: int
+    error: UnprocessGenError | None
+    place: str
+    intact: bool
+    rerun: str
+
+
+def place_of(out: Path) -> str:
+    """Return which kind of file met the full disk."""
+    if (out / "manifest.csv").exists():
+        return "dataset.json"
+    if committed(out) == FULL_COUNT:
+        return "manifest.csv"
+    if committed(out) < len(list((out / ".work/rows").glob("*.json"))):
+        return "commit"
+    return "shard or its rows" if (out / "shards").exists() else "first files"
+
+
+def intact(out: Path) -> bool:
+    """Return whether every committed shard has the recorded size and SHA-256."""
+    for shard in sorted((out / "shards").glob("*.tar")):
+        record = json.loads((out / ".work/rows" / f"{int(shard.stem[6:]):05d}.json").read_text())["entry"]
+        content = shard.read_bytes()
+        if (len(content), hashlib.sha256(content).hexdigest()) != (record["bytes"], record["sha256"]):
+            return False
+    return True
+
+
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.slow)], ids=["1 job", "2 jobs"])
+def fulls(request: pytest.FixtureRequest, disk: Disk, six: Path, make: Make, tree_hash: TreeHash) -> list[Full]:
+    """Run on disks of every size, in steps of 4 KB, from one block to enough."""
+    seen: list[Full] = []
+    out, kilobytes, error = disk.folder / "ds", 0, MachineError("")
+    while error:
+        kilobytes, error = kilobytes + 4, None
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        disk.remount(f"size={kilobytes}k")
+        try:
+            make(six, out, ONE, "check_disk=false", n_jobs=request.param)
+        except UnprocessGenError as raised:
+            error = raised
+            place, whole = place_of(out), intact(out)
+            disk.remount("size=4m")
+            make(six, out, ONE)
+            seen.append(Full(kilobytes, error, place, whole, tree_hash(out)))
+    shutil.rmtree(out)
+    disk.remount("size=4m")
+    return seen
+
+
+def test_full_disk_occurred_at_every_kind_of_file(fulls: list[Full]) -> None:
+    assert {full.place for full in fulls} >= {"first files", "shard or its rows", "manifest.csv", "dataset.json"}
+
+
+def test_full_disk_is_a_system_error_for_every_file(fulls: list[Full]) -> None:
+    assert [full for full in fulls if type(full.error) is not MachineError] == []
+
+
+def test_full_disk_is_reported_with_path_and_free_bytes(fulls: list[Full], disk: Disk) -> None:
+    for full in fulls:
+        assert f"{disk.folder}/" in str(full.error), full
+        assert "No space left on device (" in str(full.error) and " bytes free)" in str(full.error), full
+
+
+def test_full_disk_leaves_committed_shards_intact(fulls: list[Full]) -> None:
+    assert [full for full in fulls if not full.intact] == []
+
+
+def test_run_resumes_to_the_same_bytes_once_space_is_free(fulls: list[Full], six_undisturbed: str) -> None:
+    assert [full for full in fulls if full.rerun != six_undisturbed] == []
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_full_disk_ends_with_5_within_five_seconds(
+    n_jobs: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, empty_disk: Disk
+) -> None:
+    out = empty_disk.folder / "ds"
+    empty_disk.remount("size=320k")  # space for most shards
+    with running(
+        f"source.root={photographs}", f"out={out}", ONE, f"n_jobs={n_jobs}", "check_disk=false", cwd=tmp_path
+    ) as process:
+        said, err = process.communicate(timeout=30)
+        seconds = time.time() - (out / "shards").stat().st_mtime  # since the last commit
+        wait_for_the_end(process.pid)
+    assert (process.returncode, said) == (5, "")
+    assert len(own_lines(err)) == 1 and " bytes free)" in err, err
+    assert seconds < 5
+    assert 0 < committed(out) < COUNT and intact(out)
+    empty_disk.remount("size=4m")
+    make(photographs, out, ONE)
+    assert tree_hash(out) == undisturbed
+
+
+@pytest.mark.parametrize("name", ["ds", ""])
+def test_read_only_disk_is_refused_with_2(name: str, six: Path, empty_disk: Disk, run_main: RunMain) -> None:
+    empty_disk.remount("ro")
+    done = run_main(f"source.root={six}", f"out={empty_disk.folder / name}", "n_jobs=1")
+    assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
+    assert f"out={empty_disk.folder / name}: cannot be written (Read-only file system)" in done.err
+
+
+@pytest.mark.parametrize("number", [1, FULL_COUNT // 2, FULL_COUNT])
+def test_disk_that_becomes_read_only_ends_the_run_with_5(
+    number: int, six: Path, six_undisturbed: str, empty_disk: Disk, run_main: RunMain, make: Make, tree_hash: TreeHash,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """The kernel remounts a file system read-only if it finds an error in it."""
+    out = empty_disk.folder / "ds"
+    after_commits(number, lambda: empty_disk.remount("ro"), monkeypatch)
+    done = run_main(f"source.root={six}", f"out={out}", ONE, "n_jobs=1")
+    assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
+    assert "Read-only file system" in done.err
+    empty_disk.remount("rw")
+    make(six, out, ONE)
+    assert tree_hash(out) == six_undisturbed
+
+
+# Deleted folders ------------------------------------------------------------------------------------------------------
+
+
+def test_out_below_a_file_is_refused_with_2(six: Path, run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = run_main(f"source.root={six}", "out=file/ds", "n_jobs=1")
+    assert done == (2, "", "gen-dataset: out=file/ds: cannot be written (Not a directory)\n")
+
+
+@pytest.mark.parametrize("number", range(1, FULL_COUNT + 1))
+def test_out_deleted_after_any_shard_ends_the_run_with_5(
+    number: int, six: Path, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    after_commits(number, lambda: shutil.rmtree(tmp_path / "ds"), monkeypatch)
+    done = run_main(f"source.root={six}", ONE, "n_jobs=1")
+    assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
+    assert not (tmp_path / "ds").exists()
+
+
+@pytest.mark.parametrize("what", ["ds", "p"])
+def test_folder_deleted_under_two_workers_ends_the_run_with_5(
+    what: str, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """One worker is at the third photograph; the other has a few left."""
+    shutil.copytree(photographs, tmp_path / "p")
+    for name, value in acting_at(tmp_path, photographs / "002.png", "wait").items():
+        monkeypatch.setenv(name, value)
+    with running("source.root=p", ONE, "n_jobs=2", cwd=tmp_path) as process:
+        wait_for((tmp_path / "note").exists)
+        (tmp_path / what).rename(tmp_path / "away")
+        (tmp_path / "note").unlink()
+        said, err = process.communicate(timeout=10)
+        wait_for_the_end(process.pid)
+    assert (process.returncode, said, len(own_lines(err))) == (5, "", 1), err
+    monkeypatch.undo()
+    (tmp_path / "away").rename(tmp_path / what)
+    make(tmp_path / "p", tmp_path / "ds", ONE)
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+@pytest.mark.parametrize("what", ["folder", "photograph"])
+def test_deleted_source_ends_with_5_and_a_rerun_completes(
+    what: str, six: Path, six_undisturbed: str, run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """A network share that is away for a minute must not give a finished dataset without its photographs."""
+    shutil.copytree(six, tmp_path / "p")
+    gone = tmp_path / "p" if what == "folder" else tmp_path / "p/004.png"
+    after_commits(2, lambda: gone.rename(tmp_path / "away"), monkeypatch)
+    done = run_main("source.root=p", ONE, "n_jobs=1")
+    assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
+    (tmp_path / "away").rename(gone)
+    make(tmp_path / "p", tmp_path / "ds", ONE)
+    assert tree_hash(tmp_path / "ds") == six_undisturbed
+
+
+# Sources that change --------------------------------------------------------------------------------------------------
+
+
+def bitmap(path: Path, seed: int) -> bytes:
+    """Write a photograph in a format of constant size, and return its bytes."""
+    Image.fromarray(pixels(seed, 30, 40)).save(path)
+    return path.read_bytes()
+
+
+def begin(make: Make, source: Path, out: Path, shards: int) -> None:
+    """Make ``shards`` shards, then stop as if killed."""
+
+    def stop() -> None:
+        raise Killed
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        after_commits(shards, stop, patch)
+        make(source, out, ONE)
+
+
+def test_photograph_added_during_a_run_is_reported_by_the_next(
+    six: Path, six_undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(six, tmp_path / "p")
+    after_commits(2, lambda: bitmap(tmp_path / "p/000new.bmp", 1), monkeypatch)
+    make(tmp_path / "p", tmp_path / "ds", ONE, "source.include=['*']")
+    assert [row["source"] for row in read_rows(tmp_path / "ds/manifest.csv")] == [f"{i:03d}.png" for i in range(6)]
+    with pytest.raises(ConfigError, match=r"was begun with other sources: 000new\.bmp is new"):
+        make(tmp_path / "p", tmp_path / "ds", ONE, "source.include=['*']")
+
+
+def test_photograph_replaced_before_reading_gets_a_new_row(
+    six: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    source = shutil.copytree(six, tmp_path / "p")
+    bitmap(source / "zzz.bmp", 1)
+    begin(make, source, tmp_path / "ds", 2)
+    bitmap(source / "zzz.bmp", 2)
+    make(source, tmp_path / "ds", ONE)
+    make(source, tmp_path / "fresh", ONE)
+    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "fresh")
+
+
+def test_photograph_replaced_after_commit_is_found_by_replay(six: Path, make: Make, tmp_path: Path) -> None:
+    """The size is the same, and a resumed run reads no committed photograph; the row remains that of its pair."""
+    source = shutil.copytree(six, tmp_path / "p")
+    old = bitmap(source / "000.bmp", 1)
+    begin(make, source, tmp_path / "ds", 2)
+    shard = (tmp_path / "ds/shards/shard-00000.tar").read_bytes()
+    bitmap(source / "000.bmp", 2)
+    make(source, tmp_path / "ds", ONE)
+    rows = list(read_rows(tmp_path / "ds/manifest.csv"))
+    assert (rows[0]["source"], rows[0]["source_sha256"]) == ("000.bmp", hashlib.sha256(old).hexdigest())
+    assert (tmp_path / "ds/shards/shard-00000.tar").read_bytes() == shard
+    assert [one.source for one in replay(rows, str(source)) if one.complaint] == ["000.bmp"]
+
+
+@pytest.mark.parametrize("state", ["begun", "finished"])
+def test_photograph_replaced_among_files_of_one_size_is_refused(
+    state: str, six: Path, make: Make, tmp_path: Path
+) -> None:
+    """Files of one size are numbered by content, so that a changed one would move the noise of another."""
+    source = shutil.copytree(six, tmp_path / "p")
+    (source / "zzz.bmp").write_bytes(bitmap(source / "000.bmp", 1))
+    if state == "begun":
+        begin(make, source, tmp_path / "ds", 2)
+    else:
+        make(source, tmp_path / "ds", ONE)
+    bitmap(source / "000.bmp", 2)
+    with pytest.raises(ConfigError, match=r"was begun with other sources: 000\.bmp has other bytes"):
+        make(source, tmp_path / "ds", ONE)
+
+
+# Signals --------------------------------------------------------------------------------------------------------------
+
+
+AT_THE_END = """
+import os, signal, threading
+
+shutdown, leader = threading._shutdown, os.getpid() == os.getsid(0)
+
+
+def signalled():
+    if leader:
+        os.kill(os.getpid(), int(os.environ["SIGNAL"]))
+    shutdown()
+
+
+threading._shutdown = signalled
+"""
+"""Module that a run imports first: it sends a signal while Python waits for its threads at exit."""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_signal_at_exit_prints_nothing(
+    sent: signal.Signals, photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Pressing Ctrl-C twice has the same effect."""
+    (tmp_path / "sitecustomize.py").write_text(AT_THE_END)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("SIGNAL", str(int(sent)))
+    with running(f"source.root={photographs}", ONE, "n_jobs=1", cwd=tmp_path) as process:
+        _, err = process.communicate(timeout=20)
+    assert process.returncode in (0, 128 + sent, -sent)
+    assert own_lines(err) == []
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+IN_A_CALLBACK = """
+import ctypes, os, signal, sys, time
+from unprocess_gen.cli import main as cli
+
+def slow(arguments):
+    @ctypes.CFUNCTYPE(None)
+    def callback():
+        os.kill(os.getpid(), int(sys.argv[1]))
+        time.sleep(0.01)
+    callback()
+    time.sleep(20)
+    return 0
+
+cli.run = slow
+sys.exit(cli.main())
+"""
+"""A run whose signal arrives while C calls Python, as LLVM does when it compiles; C drops exceptions."""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", IN_A_CALLBACK, str(int(sent))]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=10, restore_signals=True)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (128 + sent, "", 1)
+    assert "finished shards are kept; rerun to resume" in done.stderr
+
+
+@pytest.mark.parametrize("number", [6, pytest.param(40, marks=pytest.mark.slow)])
+def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
+    number: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    """The moments begin 0.3 s after the start, when the command handles signals.
+
+    A run may also complete if it was nearly done, or if SIGINT arrives in the hundredths of a second for which it is
+    ignored while workers start.
+    """
+    draw, codes = random.Random(number), Counter[int]()
+    for kill in range(number):
+        out = tmp_path / str(kill) / "ds"
+        out.parent.mkdir()
+        sent, n_jobs, group = draw.choice([signal.SIGINT, signal.SIGTERM]), draw.choice([1, 2]), draw.random() < 0.5
+        with running(f"source.root={photographs}", ONE, f"n_jobs={n_jobs}", cwd=out.parent) as process:
+            time.sleep(draw.uniform(0.3, 1.6 * n_jobs))
+            with suppress(ProcessLookupError):
+                (os.killpg if group else os.kill)(process.pid, sent)
+            _, err = process.communicate(timeout=5)
+            wait_for_the_end(process.pid)
+        codes[process.returncode] += 1
+        if (out / "dataset.json").exists():
+            assert process.returncode in (0, 128 + sent, -sent), err
+        else:
+            assert process.returncode == 128 + sent, err
+        assert [line for line in own_lines(err) if not line.startswith("gen-dataset: ")] == []
+        make(photographs, out, ONE)
+        assert tree_hash(out) == undisturbed, kill
+        assert_whole(out)
+    print(f"exit codes of {number} signals: {dict(codes)}")
+    assert codes[130] + codes[143] >= number / 2

@@ -1,0 +1,481 @@
+"""Runs: what the data depend on, shards, failed photographs, ``dataset.json``, progress."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import json
+import os
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.commands import Cli
+from helpers.datasets import Make, TreeHash
+from helpers.photographs import PHOTOS, fill, pixels
+from PIL import Image
+
+from unprocess_gen import RawPairs
+from unprocess_gen.cli.messages import logging_to
+from unprocess_gen.config.serialization import dataset_yaml
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.types import Source
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.executors import local
+
+SHARDS_OF_5 = "output.pairs_per_shard=5"
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    return [dict(row) for row in read_rows(out / "manifest.csv")]
+
+
+def facts(out: Path) -> dict[str, Any]:
+    return dict(json.loads((out / "dataset.json").read_text(encoding="utf-8")))
+
+
+def sha256(path: Path) -> str:
+    return subprocess.run(["sha256sum", path], capture_output=True, text=True, check=True).stdout.split()[0]
+
+
+# What the data do not depend on ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_number_of_workers_changes_no_byte(
+    n_jobs: int, make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    make(photos, tmp_path / "ds", SHARDS_OF_5, n_jobs=n_jobs)
+    assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+
+
+class Backwards:
+    """List a folder's entries in reverse order."""
+
+    scandir = staticmethod(os.scandir)
+
+    def __init__(self, path: Any = ".") -> None:
+        with self.scandir(path) as entries:
+            self.entries = list(entries)[::-1]
+
+    def __enter__(self) -> Any:
+        return iter(self.entries)
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def test_order_of_directory_entries_changes_no_byte(
+    make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "scandir", Backwards)
+    make(photos, tmp_path / "ds", SHARDS_OF_5)
+    assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+
+
+def test_order_of_file_creation_changes_no_byte(
+    make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    for path in sorted(photos.rglob("*"), reverse=True):
+        if path.is_file():
+            copy = tmp_path / "p" / path.relative_to(photos)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    make(tmp_path / "p", tmp_path / "ds", SHARDS_OF_5)
+    assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+
+
+def test_place_locale_clock_and_hash_seed_change_no_byte(
+    cli: Cli, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    (tmp_path / "a/b").mkdir(parents=True)
+    root = os.path.relpath(photos, tmp_path / "a/b")
+    done = cli(
+        f"source.root='{root}'", f"out={tmp_path}/ds", SHARDS_OF_5, "n_jobs=1", cwd=tmp_path / "a/b",
+        TZ="Asia/Kathmandu", PYTHONHASHSEED="77", LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+
+
+def test_umask_changes_no_byte(make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        make(photos, tmp_path / "ds", SHARDS_OF_5)
+    finally:
+        os.umask(before)
+    assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+
+
+def test_seed_changes_every_noisy_frame(make: Make, photos: Path, dataset: Path, tmp_path: Path) -> None:
+    make(photos, tmp_path / "ds", SHARDS_OF_5, "seed=1")
+    for mine, theirs in zip(rows(tmp_path / "ds"), rows(dataset), strict=True):
+        assert mine["stream_key"] != theirs["stream_key"]
+        assert mine["noisy_xxh3"] != theirs["noisy_xxh3"]
+
+
+# Images are independent -----------------------------------------------------------------------------------------------
+
+
+def by_source(out: Path) -> dict[str, Any]:
+    """Return row and arrays of each image, without its place in the listing."""
+    return {
+        str(sample.row["source"]): (
+            {name: value for name, value in sample.row.items() if name not in ("key", "shard")},
+            sample.clean.tobytes(),
+            sample.noisy.tobytes(),
+        )
+        for sample in RawPairs(out)
+    }
+
+
+@pytest.mark.parametrize("shard", [1, 3])
+def test_adding_a_file_leaves_other_images_unchanged(shard: int, make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 5)
+    make(source, tmp_path / "before", f"output.pairs_per_shard={shard}", "camera=choice", "noise=brooks2019")
+    Image.fromarray(pixels(99, 14, 14)).save(source / "000-first.png")
+    make(source, tmp_path / "after", f"output.pairs_per_shard={shard}", "camera=choice", "noise=brooks2019")
+    before, after = by_source(tmp_path / "before"), by_source(tmp_path / "after")
+    assert after.keys() - before.keys() == {"000-first.png"}
+    assert {name: after[name] for name in before} == before
+
+
+def test_removing_a_file_leaves_other_images_unchanged(make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 5)
+    make(source, tmp_path / "before", "noise=brooks2019")
+    (source / "001.png").unlink()
+    make(source, tmp_path / "after", "noise=brooks2019")
+    before, after = by_source(tmp_path / "before"), by_source(tmp_path / "after")
+    assert before.keys() - after.keys() == {"001.png"}
+    assert {name: before[name] for name in after} == after
+
+
+def test_shard_size_leaves_images_unchanged(make: Make, dataset: Path, photos: Path, tmp_path: Path) -> None:
+    make(photos, tmp_path / "ds", "output.pairs_per_shard=2")
+    assert by_source(tmp_path / "ds") == by_source(dataset)
+
+
+def test_source_limit_leaves_kept_images_unchanged(make: Make, dataset: Path, photos: Path, tmp_path: Path) -> None:
+    make(photos, tmp_path / "ds", "source.limit=4")
+    kept, whole = by_source(tmp_path / "ds"), by_source(dataset)
+    assert list(kept) == list(PHOTOS[:4])
+    assert kept == {name: whole[name] for name in kept}
+
+
+def test_another_noise_profile_leaves_other_draws_unchanged(
+    make: Make, photos: Path, dataset: Path, tmp_path: Path
+) -> None:
+    make(photos, tmp_path / "ds", SHARDS_OF_5, "noise=brooks2019")
+    for mine, theirs in zip(rows(tmp_path / "ds"), rows(dataset), strict=True):
+        for name in ("red_gain", "blue_gain", "inverse_rgb_gain", "rgb2cam_00", "w_sony_a7r", "clean_xxh3"):
+            assert mine[name] == theirs[name]
+
+
+@pytest.fixture
+def twins(tmp_path: Path) -> Path:
+    source = fill(tmp_path / "p", 3)
+    for name in ("z.png", "a.png"):
+        (source / name).write_bytes((source / "001.png").read_bytes())
+    return source
+
+
+def test_identical_files_get_different_parameters_and_noise(twins: Path, make: Make, tmp_path: Path) -> None:
+    make(twins, tmp_path / "ds")
+    same = [row for row in rows(tmp_path / "ds") if row["source"] in ("001.png", "a.png", "z.png")]
+    assert len({row["source_sha256"] for row in same}) == 1
+    assert len({row["stream_key"] for row in same}) == 3
+    assert len({row["noisy_xxh3"] for row in same}) == 3
+
+
+def test_first_of_identical_files_by_name_is_as_if_alone(twins: Path, make: Make, tmp_path: Path) -> None:
+    make(twins, tmp_path / "three")
+    for name in ("a.png", "z.png"):
+        (twins / name).unlink()
+    make(twins, tmp_path / "one")
+    assert by_source(tmp_path / "three")["001.png"] == by_source(tmp_path / "one")["001.png"]
+
+
+def test_identical_files_are_numbered_in_name_order(twins: Path, make: Make, tmp_path: Path) -> None:
+    make(twins, tmp_path / "before")
+    (twins / "a.png").rename(twins / "m.png")
+    make(twins, tmp_path / "after")
+    before, after = by_source(tmp_path / "before"), by_source(tmp_path / "after")
+    assert after["m.png"][1:] == before["a.png"][1:]
+    assert after["z.png"] == before["z.png"]
+
+
+# Rows, shards, failures -----------------------------------------------------------------------------------------------
+
+
+def test_rows_are_in_source_order_with_consecutive_keys(dataset: Path) -> None:
+    assert [row["source"] for row in rows(dataset)] == list(PHOTOS)
+    assert [row["key"] for row in rows(dataset)] == [f"{i:08d}" for i in range(len(PHOTOS))]
+
+
+def test_shard_s_contains_sources_from_index_s_n(dataset: Path) -> None:
+    assert [row["shard"] for row in rows(dataset)] == [i // 5 for i in range(13)]
+
+
+def test_recorded_digests_equal_those_of_the_arrays(dataset: Path) -> None:
+    for sample in RawPairs(dataset):
+        assert sample.row["clean_xxh3"] == array_xxh3(sample.clean)
+        assert sample.row["noisy_xxh3"] == array_xxh3(sample.noisy)
+        assert sample.clean.shape == sample.noisy.shape == (sample.row["height"], sample.row["width"])
+
+
+def test_recorded_source_digests_equal_those_of_the_files(dataset: Path, photos: Path) -> None:
+    files = sorted(
+        (path for path in photos.rglob("*.*") if path.name != "notes.txt"), key=lambda p: bytes(p.relative_to(photos))
+    )
+    assert [row["source_sha256"] for row in rows(dataset)] == [sha256(path) for path in files]
+    assert [row["source_bytes"] for row in rows(dataset)] == [path.stat().st_size for path in files]
+
+
+def test_recorded_saturated_sites_equal_those_of_the_array(dataset: Path) -> None:
+    for sample in RawPairs(dataset):
+        assert sample.row["saturated"] == int((sample.clean == sample.row["white_level_dn"]).sum())
+
+
+def test_orientation_is_applied_and_recorded(dataset: Path) -> None:
+    found = {row["source"]: (row["orientation"], row["width"], row["height"]) for row in rows(dataset)}
+    assert found["turned.jpg"] == (6, 16, 24)
+    assert found["comma, and space.jpg"] == (1, 37, 23)
+
+
+def test_file_names_survive_the_csv(dataset: Path) -> None:
+    with (dataset / "manifest.csv").open(encoding="utf-8", newline="") as stream:
+        assert [row["source"] for row in csv.DictReader(stream)] == list(PHOTOS)
+
+
+def test_unsafe_file_names_are_percent_encoded(make: Make, tmp_path: Path) -> None:
+    source = fill(tmp_path / "p", 1)
+    names = [b"@at.png", b"a\nb.png", b"bad\xff.png", b'quote".png', "right\u202eleft.png".encode()]
+    for i, name in enumerate(names):
+        Image.fromarray(pixels(i + 50, 10, 11)).save(str(tmp_path / "x.png"))
+        (tmp_path / "x.png").rename(source / os.fsdecode(name))
+    make(source, tmp_path / "ds")
+    assert [row["source"] for row in rows(tmp_path / "ds")] == [
+        "000.png", "%40at.png", "a%0Ab.png", "bad%FF.png", 'quote".png', "right%E2%80%AEleft.png",
+    ]  # fmt: skip
+    assert [row["status"] for row in rows(tmp_path / "ds")] == ["ok"] * 6
+
+
+@pytest.fixture(scope="module")
+def broken(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a dataset of 9 photographs in shards of 2; all of shard 1 and one of shard 2 fail."""
+    source = fill(tmp_path_factory.mktemp("broken") / "p", 9)
+    whole = (source / "002.png").read_bytes()
+    (source / "002.png").write_bytes(whole[: len(whole) // 2])
+    (source / "003.png").write_bytes(b"")
+    (source / "005.png").write_bytes(b"not a photograph")
+    (source / "006.png").unlink()
+    (source / "006.png").mkdir()
+    (source / "008.png").unlink()
+    (source / "008.png").symlink_to("nowhere")
+    make(source, source.parent / "ds", "output.pairs_per_shard=2")
+    return source.parent / "ds"
+
+
+def test_failed_photographs_have_rows_with_a_reason(broken: Path) -> None:
+    assert [row["reason"] for row in rows(broken)] == [
+        "", "", "truncated", "empty", "", "unsupported", "not_a_file", "", "unreadable",
+    ]  # fmt: skip
+    assert [row["status"] == "failed" for row in rows(broken)] == [row["reason"] != "" for row in rows(broken)]
+
+
+def test_failed_rows_have_no_values_of_a_pair(broken: Path) -> None:
+    row = rows(broken)[2]
+    filled = {name for name, value in row.items() if value not in (None, "")}
+    assert filled == {
+        *("key", "source", "source_sha256", "source_bytes", "status", "reason", "shard", "seed", "detail")
+    }
+
+
+def test_unreadable_files_have_no_digest(broken: Path) -> None:
+    assert [i for i, row in enumerate(rows(broken)) if not row["source_sha256"]] == [3, 6, 8]
+
+
+def test_failed_photographs_leave_gaps(broken: Path) -> None:
+    assert [row["key"] for row in rows(broken)] == [f"{i:08d}" for i in range(9)]
+    assert [row["shard"] for row in rows(broken)] == [0, 0, 1, 1, 2, 2, 3, 3, 4]
+
+
+def test_shard_without_pairs_has_an_entry_and_no_file(broken: Path) -> None:
+    assert facts(broken)["shards"][1] == {"file": None, "pairs": 0, "failed": 2, "bytes": 0, "sha256": None}
+    assert sorted(path.name for path in (broken / "shards").iterdir()) == [
+        "shard-00000.tar", "shard-00002.tar", "shard-00003.tar",
+    ]  # fmt: skip
+
+
+def test_failures_are_counted_by_reason(broken: Path) -> None:
+    assert facts(broken)["failed"] == {"empty": 1, "not_a_file": 1, "truncated": 1, "unreadable": 1, "unsupported": 1}
+    assert facts(broken)["pairs"] == 4
+
+
+def test_entries_count_pairs_and_failures_of_each_shard(broken: Path) -> None:
+    entries = facts(broken)["shards"]
+    assert [(entry["pairs"], entry["failed"]) for entry in entries] == [(2, 0), (0, 2), (1, 1), (1, 1), (0, 1)]
+
+
+def test_dataset_without_pairs_is_complete(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p/empty.png").touch()
+    summary = make(tmp_path / "p", tmp_path / "ds")
+    assert (summary.pairs, summary.failed, summary.shards, summary.bytes) == (0, {"empty": 1}, 1, 0)
+    assert len(RawPairs(tmp_path / "ds")) == 0
+
+
+def test_source_that_changes_during_a_run_stops_it(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = fill(tmp_path / "p", 2)
+    make_shard = local.make_shard
+
+    def changed_before(*arguments: Any) -> Any:
+        (source / "001.png").write_bytes(b"shorter")
+        return make_shard(*arguments)
+
+    monkeypatch.setattr(local, "make_shard", changed_before)
+    with pytest.raises(MachineError, match=r"source 001.png changed since it was listed: \d+ bytes then, 7 now"):
+        make(source, tmp_path / "ds")
+    assert not (tmp_path / "ds/dataset.json").exists()
+
+
+@pytest.mark.parametrize("key", ["camera.name", "noise.name"])
+def test_option_name_with_a_line_end_is_refused(key: str, make: Make, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=rf"{key}='my name\\n': expected up to 100 letters, digits"):
+        make(fill(tmp_path / "p", 2), tmp_path / "ds", f'{key}="my name\n"')
+
+
+@pytest.mark.parametrize("key", ["camera.name", "noise.name"])
+def test_long_option_name_is_refused_or_fits_its_row(key: str, make: Make, tmp_path: Path) -> None:
+    with contextlib.suppress(ConfigError):
+        make(fill(tmp_path / "p", 1), tmp_path / "ds", f"{key}={'n' * 3000}")
+
+
+def test_infinite_plan_values_are_refused(make: Make, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"noise.b"):
+        make(fill(tmp_path / "p", 1), tmp_path / "ds", "sensor=generic_16bit", "noise.b=1e308")
+
+
+# The three files ------------------------------------------------------------------------------------------------------
+
+
+def test_dataset_json_records_the_digests_of_sha256sum(dataset: Path) -> None:
+    known = facts(dataset)
+    assert known["manifest_sha256"] == sha256(dataset / "manifest.csv")
+    assert known["config_sha256"] == sha256(dataset / "config.yaml")
+    assert [entry["sha256"] for entry in known["shards"]] == [
+        sha256(dataset / entry["file"]) for entry in known["shards"]
+    ]
+
+
+def test_dataset_json_records_bytes_and_pairs_of_every_shard(dataset: Path) -> None:
+    entries = facts(dataset)["shards"]
+    assert [entry["file"] for entry in entries] == [f"shards/shard-{i:05d}.tar" for i in range(3)]
+    assert [entry["bytes"] for entry in entries] == [(dataset / entry["file"]).stat().st_size for entry in entries]
+    assert [(entry["pairs"], entry["failed"]) for entry in entries] == [(5, 0), (5, 0), (3, 0)]
+
+
+def test_fingerprint_is_the_digest_of_config_and_manifest(dataset: Path) -> None:
+    known = facts(dataset)
+    text = f"{known['config_sha256']}\n{known['manifest_sha256']}\n"
+    assert known["fingerprint"] == hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_dataset_json_counts_unmatched_files(dataset: Path) -> None:
+    assert (facts(dataset)["not_matched"], facts(dataset)["skipped_links"]) == (1, 0)
+
+
+def test_dataset_json_records_source_and_versions(dataset: Path, photos: Path) -> None:
+    known = facts(dataset)
+    assert known["source"] == {"kind": "folder", "root": str(photos)}
+    assert set(runner.PACKAGES) == set(known["versions"])
+    assert known["versions"]["numpy"] == np.__version__
+
+
+def test_config_yaml_is_the_resolved_config(dataset: Path, settings: Callable[..., Any]) -> None:
+    config = settings(SHARDS_OF_5, "source.root=photos")
+    assert (dataset / "config.yaml").read_text(encoding="utf-8") == dataset_yaml(config)
+
+
+def test_finished_folder_contains_only_the_dataset(dataset: Path) -> None:
+    assert sorted(os.listdir(dataset)) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "manifest.csv"])
+def test_data_contain_no_path_host_or_version(name: str, dataset: Path, photos: Path) -> None:
+    text = (dataset / name).read_text(encoding="utf-8")
+    for word in (str(photos), str(dataset), os.uname().nodename + ".", np.__version__):
+        assert word not in text
+
+
+# Synthetic scenes -----------------------------------------------------------------------------------------------------
+
+
+def test_built_in_scenes_are_the_source_without_a_root(make: Make, tmp_path: Path) -> None:
+    summary = make(None, tmp_path / "ds", "source.limit=3")
+    assert (summary.pairs, summary.made, summary.rows) == (3, 3, 3)
+    assert [row["source"] for row in rows(tmp_path / "ds")] == ["dead_leaves-0", "colour_chart-0", "gradients-0"]
+    assert [row["source_bytes"] for row in rows(tmp_path / "ds")] == [0] * 3
+    assert facts(tmp_path / "ds")["source"] == {"kind": "synthetic", "root": None}
+
+
+# Work -----------------------------------------------------------------------------------------------------------------
+
+
+def sources(count: int) -> list[Source]:
+    return [Source(i, f"{i}.png", f"{i}.png", 1) for i in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("count", "per_shard", "lengths"), [(5, 2, [2, 2, 1]), (4, 2, [2, 2]), (1, 8, [1]), (3, 1, [1] * 3)]
+)
+def test_shard_tasks_split_the_listing_in_order(count: int, per_shard: int, lengths: list[int]) -> None:
+    tasks = runner.shard_tasks(sources(count), per_shard)
+    assert [len(task.sources) for task in tasks] == lengths
+    assert [source for task in tasks for source in task.sources] == sources(count)
+    assert [task.shard for task in tasks] == list(range(len(tasks)))
+
+
+def test_no_more_workers_than_tasks_and_at_least_one() -> None:
+    assert [local.effective_jobs(4, tasks) for tasks in (0, 1, 3, 9)] == [1, 1, 3, 4]
+
+
+def test_n_jobs_minus_one_uses_all_allowed_cores() -> None:
+    assert local.effective_jobs(-1, 10**6) == len(os.sched_getaffinity(0))
+
+
+def test_progress_is_plain_lines_without_a_terminal(make: Make, photos: Path, tmp_path: Path, capfd: Any) -> None:
+    with logging_to():
+        make(photos, tmp_path / "ds")
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)
+
+
+def test_only_the_first_run_reports_compiling(cli: Cli, tmp_path: Path) -> None:
+    line = "gen-dataset: 0/1 images, compiling kernels, once per machine and version"
+    said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
+
+    assert [line in one for one in said] == [True, False]
+
+
+def test_summary_adds_up_the_counts_of_the_manifest(dataset: Path) -> None:
+    rows = [sample.row for sample in RawPairs(dataset)]
+    known = facts(dataset)["sites"]
+    assert known["all"] == sum(row["width"] * row["height"] for row in rows)
+    assert {name: sum(row[name] for row in rows) for name in runner.COUNTS} == {
+        name: known[name] for name in runner.COUNTS
+    }
+
+
+def test_summary_counts_sites_without_noise_variance(make: Make, tmp_path: Path) -> None:
+    """The variance of the RVDD profile is below 0 up to 15.33 DN above black."""
+    Image.fromarray(np.zeros((10, 10, 3), np.uint8)).save(tmp_path / "black.png")
+    summary = make(tmp_path, tmp_path / "ds", "noise=imx385_iso3200_rvdd")
+    assert (summary.sites["all"], summary.sites["zero_variance"]) == (100, 100)

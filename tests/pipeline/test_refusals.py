@@ -1,0 +1,418 @@
+"""Refused folders, true reasons of errors, changed sources, sweeps, progress without a terminal's width."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import hashlib
+import json
+import logging
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.commands import COMMAND, RunMain, environment
+from helpers.datasets import Make
+from helpers.photographs import fill
+
+from unprocess_gen.cli.messages import logging_to
+from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
+from unprocess_gen.core.files import RESUME, machine_error
+from unprocess_gen.core.limits import LEAST_ADDRESS_SPACE
+from unprocess_gen.dataset.columns import HEADERS
+from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.pipeline import progress as progress_module
+from unprocess_gen.pipeline.generate import generate
+from unprocess_gen.pipeline.progress import Progress
+from unprocess_gen.pipeline.repair import repair
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import have_same_rows, verify, verify_sweep
+from unprocess_gen.pipeline.workspace import Workspace, dataset_facts, dataset_text, read_dataset
+
+Settings = Callable[..., Any]
+ONE = "output.pairs_per_shard=1"
+
+
+@pytest.fixture(scope="module")
+def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with photographs ``p`` (one fails) and their dataset ``ds``."""
+    folder = tmp_path_factory.mktemp("made")
+    (fill(folder / "p", 4) / "003.png").write_bytes(b"not a photograph")
+    make(folder / "p", folder / "ds", ONE, "source.max_failed=1")
+    return folder
+
+
+@pytest.fixture
+def copy(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+# Folders --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inside", ["ds/other", "ds/shards/other", "ds/shards/a/b", "link/other"])
+def test_out_inside_a_finished_dataset_is_refused_with_2(
+    inside: str, copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(copy)
+    (copy / "link").symlink_to("ds")
+    before = sorted(copy.rglob("*"))
+    done = run_main("source.limit=1", f"out={inside}")
+    assert (done.code, done.out) == (2, "")
+    assert (
+        done.err == f"gen-dataset: out={inside}: is inside the dataset {copy}/ds; expected a folder outside of it; "
+        "choose another out\n"
+    )
+    assert sorted(copy.rglob("*")) == before
+    assert verify(copy / "ds") == []
+
+
+def test_out_inside_an_unfinished_dataset_is_refused(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(Workspace, "finish", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make(fill(tmp_path / "p", 1), tmp_path / "ds", ONE)
+    with pytest.raises(ConfigError, match="is inside the dataset"):
+        make(tmp_path / "p", tmp_path / "ds/inner", ONE)
+
+
+# Reasons --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("number", "exists", "wanted"),
+    [
+        (errno.EACCES, True, "Permission denied"),
+        (errno.EROFS, False, "Read-only file system"),
+        (errno.ENOENT, False, "No such file or directory ({path} was deleted or moved)"),
+        (errno.ENOENT, True, "No such file or directory"),
+        (errno.EIO, True, "Input/output error"),
+    ],
+)
+def test_file_error_reports_its_true_reason(number: int, exists: bool, wanted: str, tmp_path: Path) -> None:
+    path = tmp_path / ("" if exists else "missing")
+    error = machine_error(OSError(number, os.strerror(number)), path)
+    assert str(error) == f"{path}: {wanted.format(path=path)}"
+
+
+def test_file_error_reports_free_space_on_a_full_disk(tmp_path: Path) -> None:
+    text = str(machine_error(OSError(errno.ENOSPC, "No space left on device"), tmp_path / "a/b", RESUME))
+    assert text.startswith(f"{tmp_path}/a/b: No space left on device (")
+    assert text.endswith(" bytes free); finished shards are kept; rerun to resume")
+
+
+def test_unreadable_shard_is_a_system_error(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = Path.open
+
+    def refuse(self: Path, *given: Any, **options: Any) -> Any:
+        if self.suffix == ".tar":
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return opened(self, *given, **options)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(MachineError, match=r"shard-00000.tar: Permission denied$"):
+        verify(copy / "ds")
+
+
+@pytest.mark.parametrize("kilobytes", [60_000, 150_000, 300_000, LEAST_ADDRESS_SPACE // 1024 - 1])
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_small_address_space_ends_with_5_and_one_line(kilobytes: int, n_jobs: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "unprocess_gen", "source.limit=2", ONE, f"n_jobs={n_jobs}"]
+    limit = kilobytes * 1024
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=60, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (5, "")
+    assert done.stderr == (
+        f"gen-dataset: ulimit -v {kilobytes}: not enough address space; expected at least "
+        f"{LEAST_ADDRESS_SPACE // 1024} (KiB); raise the limit\n"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kilobytes", [LEAST_ADDRESS_SPACE // 1024, 900_000, 1_500_000])
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_smallest_accepted_address_space_compiles_and_runs(kilobytes: int, n_jobs: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "unprocess_gen", "source.limit=2", ONE, f"n_jobs={n_jobs}", "noise=sony_a7s2"]
+    limit = kilobytes * 1024
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment(NUMBA_CACHE_DIR=str(tmp_path / "cache")), capture_output=True,
+        text=True, timeout=600, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+# Changed sources ------------------------------------------------------------------------------------------------------
+
+
+def change(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-20] ^= 1
+    path.write_bytes(content)
+
+
+HARMS = [change, os.unlink, lambda path: os.truncate(path, 9)]
+
+
+@pytest.mark.parametrize("harm", HARMS, ids=["changed", "deleted", "cut"])
+@pytest.mark.parametrize("verb", [("replay", "ds"), ("verify", "ds", "--regenerate", "9")])
+def test_changed_source_ends_with_5_and_advice(
+    harm: Callable[[Path], None], verb: tuple[str, ...], copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(copy)
+    harm(copy / "p/001.png")
+    done = run_main(*verb, "source.root=p")
+    assert done.code == 5
+    (line,) = [line for line in done.err.splitlines() if "00000001" in line]
+    assert line.endswith("; restore the file, or regenerate the dataset")
+
+
+@pytest.mark.parametrize("harm", HARMS, ids=["changed", "deleted", "cut"])
+def test_repair_with_a_changed_source_ends_with_5(
+    harm: Callable[[Path], None], copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(copy)
+    harm(copy / "p/001.png")
+    (copy / "ds/shards/shard-00001.tar").unlink()
+    done = run_main("verify", "ds", "--repair", "source.root=p")
+    assert done.code == 5
+    assert "cannot be repaired" in done.err and "restore the file, or regenerate the dataset" in done.err
+
+
+def test_edited_row_is_damage_and_no_changed_source(copy: Path) -> None:
+    row = dict(next(read_rows(copy / "ds/manifest.csv")))
+    (result,) = replay([row | {"red_gain": 1.0}], str(copy / "p"))
+    assert (result.exit_code, result.source_changed) == (4, False)
+
+
+# Version 0.1 ----------------------------------------------------------------------------------------------------------
+
+
+def as_version_01(folder: Path) -> dict[str, bytes]:
+    """Rewrite a dataset as version 0.1 wrote it, without newer columns; return its files."""
+    rows = list(read_rows(folder / "manifest.csv"))
+    with (folder / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, rows, HEADERS[0])
+    facts = read_dataset(folder / "dataset.json")
+    digest = hashlib.sha256((folder / "manifest.csv").read_bytes()).hexdigest()
+    known = dataset_facts((folder / "config.yaml").read_text(), digest, facts["shards"], {})
+    (folder / "dataset.json").write_text(dataset_text(facts | known))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("lost", ["manifest.csv", "dataset.json", "shards/shard-00001.tar", "config.yaml"])
+def test_repair_restores_the_bytes_of_a_01_dataset(lost: str, copy: Path) -> None:
+    before = as_version_01(copy / "ds")
+    assert verify(copy / "ds") == []
+    (copy / "ds" / lost).unlink()
+    assert [step.exit_code for step in repair(copy / "ds", str(copy / "p"))] == [0]
+    for name, content in before.items():
+        assert name == lost == "dataset.json" or (copy / "ds" / name).read_bytes() == content
+
+
+def test_lost_01_manifest_is_regenerated_from_the_sources(copy: Path) -> None:
+    before = as_version_01(copy / "ds")
+    for name in ("manifest.csv", "shards/shard-00000.tar"):
+        (copy / "ds" / name).unlink()
+    assert {step.exit_code for step in repair(copy / "ds", str(copy / "p"))} == {0}
+    assert {name: (copy / "ds" / name).read_bytes() for name in before} == before
+
+
+def test_01_dataset_is_replayed(copy: Path) -> None:
+    as_version_01(copy / "ds")
+    results = list(replay(read_rows(copy / "ds/manifest.csv"), str(copy / "p")))
+    assert [result.exit_code for result in results] == [0, 0, 0]
+
+
+def test_finished_01_dataset_is_complete(copy: Path, make: Make) -> None:
+    as_version_01(copy / "ds")
+    assert make(copy / "p", copy / "ds", ONE, "source.max_failed=1").made == 0
+
+
+def test_unfinished_01_run_is_resumed(
+    made: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The records of committed shards lack the newer columns; the failure was not committed yet."""
+    with monkeypatch.context() as patch:
+        patch.setattr(Workspace, "finish", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make(made / "p", tmp_path / "ds", ONE)
+    (tmp_path / "ds/.work/rows/00003.json").unlink()
+    for path in (tmp_path / "ds/.work/rows").iterdir():
+        record = json.loads(path.read_text())
+        record["rows"] = [values[: len(HEADERS[0])] for values in record["rows"]]
+        path.write_text(json.dumps(record))
+    assert make(made / "p", tmp_path / "ds", ONE).made == 1
+    assert tree_hash(tmp_path / "ds") == tree_hash(made / "ds")
+
+
+def test_manifests_of_two_versions_have_the_same_rows(copy: Path) -> None:
+    new = copy / "new.csv"
+    shutil.copy(copy / "ds/manifest.csv", new)
+    as_version_01(copy / "ds")
+    assert have_same_rows(copy / "ds/manifest.csv", new)
+    assert not have_same_rows(new, copy / "ds/manifest.csv")
+    text = new.read_text()
+    new.write_text(text.replace(",ok,", ",failed,", 1))
+    assert not have_same_rows(copy / "ds/manifest.csv", new)
+    new.write_text(text + text.splitlines(keepends=True)[-1])
+    assert not have_same_rows(copy / "ds/manifest.csv", new)
+
+
+# Failures -------------------------------------------------------------------------------------------------------------
+
+
+def test_failed_row_records_its_explanation(made: Path) -> None:
+    row = list(read_rows(made / "ds/manifest.csv"))[3]
+    assert (row["status"], row["reason"]) == ("failed", "unsupported")
+    assert row["detail"] and str(made) not in str(row["detail"])
+
+
+# Sweeps ---------------------------------------------------------------------------------------------------------------
+
+
+def sweep(folder: Path, copy: Path, *rows: tuple[str, str]) -> Path:
+    folder.mkdir()
+    with (folder / "sweep.csv").open("w", newline="") as stream:
+        csv.writer(stream).writerows([("folder", "exit"), *rows])
+    for name, code in rows:
+        if code == "0":
+            shutil.copytree(copy / "ds", folder / name)
+    return folder
+
+
+def test_every_dataset_of_a_sweep_is_verified(copy: Path, tmp_path: Path) -> None:
+    folder = sweep(tmp_path / "sweep", copy, ("camera=sony_a7r", "0"), ("camera=convex", "0"), ("seed=1", "5"))
+    (folder / "camera=convex/shards/shard-00001.tar").unlink()
+    results = [(result.folder, [str(damage) for damage in result.damages]) for result in verify_sweep(folder)]
+    assert results == [
+        ("camera=sony_a7r", []),
+        ("camera=convex", ["shards/shard-00001.tar: is missing"]),
+        ("seed=1", ["dataset.json: is missing: the job ended with exit code 5; rerun the sweep to finish it"]),
+    ]
+
+
+def test_unfinished_dataset_of_an_interrupted_sweep_is_named(copy: Path, tmp_path: Path) -> None:
+    folder = sweep(tmp_path / "sweep", copy, ("seed=1", "0"))
+    (folder / "seed=2/.work").mkdir(parents=True)
+    (folder / "notes").mkdir()
+    results = [(result.folder, [str(damage) for damage in result.damages]) for result in verify_sweep(folder)]
+    assert results == [
+        ("seed=1", []),
+        ("seed=2", ["dataset.json: is missing: the sweep ended before this job; rerun the sweep to finish it"]),
+    ]
+
+
+@pytest.mark.parametrize("name", ["../ds", "/etc", "", "..", "a/b"])
+def test_sweep_table_naming_a_folder_elsewhere_is_refused(name: str, copy: Path, tmp_path: Path) -> None:
+    folder = sweep(tmp_path / "sweep", copy, (name, "1"))
+    with pytest.raises(DamageError, match=r"sweep.csv: "):
+        list(verify_sweep(folder))
+
+
+# Progress -------------------------------------------------------------------------------------------------------------
+
+
+class Terminal:
+    """Collect what is written to a terminal that reports no width."""
+
+    encoding = "utf-8"
+
+    def __init__(self, error: OSError | None = None) -> None:
+        self.text, self.error = "", error
+
+    def write(self, text: str) -> None:
+        self.text += text
+        if self.error:
+            raise self.error
+
+    def flush(self) -> None: ...
+
+    def isatty(self) -> bool:
+        return True
+
+
+def run_progress(monkeypatch: pytest.MonkeyPatch, terminal: Terminal, quiet: bool = False, label: str = "") -> str:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr(os, "get_terminal_size", lambda *_: os.terminal_size((0, 0)))
+    with logging_to(quiet=quiet), monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", terminal)
+        with Progress(4, label=label) as progress:
+            progress.advance(2, failed=1)
+            progress.warn("a warning")
+            progress.advance(2)
+    return terminal.text
+
+
+def test_bar_is_shown_without_a_terminal_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = run_progress(monkeypatch, Terminal())
+    assert "4/4" in text and "100%" in text and "failed=1" in text and "gen-dataset: a warning\n" in text
+
+
+def test_bar_names_the_job_of_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = run_progress(monkeypatch, Terminal(), label="3/20 camera=sony_a7r")
+    assert "3/20 camera=sony_a7r: " in text and "gen-dataset: 3/20 camera=sony_a7r: a warning" in text
+
+
+def test_quiet_hides_the_bar_and_keeps_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run_progress(monkeypatch, Terminal(), quiet=True) == "gen-dataset: a warning\n"
+
+
+def test_closed_terminal_does_not_end_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal(OSError(errno.EIO, "Input/output error"))
+    monkeypatch.setattr(progress_module.LOGGER, "warning", lambda *_: None)
+    assert run_progress(monkeypatch, terminal)
+
+
+def test_lines_name_the_job_of_a_sweep(capfd: pytest.CaptureFixture[str]) -> None:
+    with logging_to(), Progress(2, label="3/20 camera=sony_a7r") as progress:
+        progress.advance(2)
+    assert capfd.readouterr().err.startswith("gen-dataset: 3/20 camera=sony_a7r: 2/2 images, ")
+
+
+# Python ---------------------------------------------------------------------------------------------------------------
+
+
+def test_generate_prints_nothing_and_keeps_signal_handlers(
+    settings: Settings, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = settings(ONE)
+    config.source.root, config.out, config.n_jobs = str(fill(tmp_path / "p", 3)), str(tmp_path / "ds"), 2
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    assert not logging.getLogger("unprocess_gen").isEnabledFor(logging.INFO)
+    assert generate(config).pairs == 3
+    assert capfd.readouterr() == ("", "")
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before
+
+
+def test_generate_restores_the_threads_of_opencv(settings: Settings, tmp_path: Path) -> None:
+    import cv2
+
+    config = settings(ONE)
+    config.source.root, config.out, config.n_jobs = str(fill(tmp_path / "p", 1)), str(tmp_path / "ds"), 1
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        generate(config)
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
+
+
+def test_run_into_a_full_stderr_completes(tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        command = [str(COMMAND), "source.limit=1", "n_jobs=1"]
+        done = subprocess.run(command, cwd=tmp_path, env=environment(), stderr=full, timeout=60, check=False)
+    assert done.returncode == 0 and verify(tmp_path / "ds") == []

@@ -1,0 +1,286 @@
+"""Verify finds and names any damage; replay regenerates any pair from its row and its source."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make
+from helpers.photographs import fill
+
+from unprocess_gen import RawPairs
+from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.dataset.shards import read_index
+from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay
+from unprocess_gen.pipeline.verify import verify
+
+FILES = ("config.yaml", "manifest.csv", "dataset.json", "shards/shard-00000.tar", "shards/shard-00001.tar")
+
+
+@pytest.fixture(scope="module")
+def intact(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
+    """Make a dataset of three pairs in two shards, next to its photographs."""
+    folder = tmp_path_factory.mktemp("intact")
+    make(fill(folder / "p", 3), folder / "ds", "output.pairs_per_shard=2")
+    return folder / "ds"
+
+
+@pytest.fixture
+def copy(intact: Path, tmp_path: Path) -> Path:
+    shutil.copytree(intact, tmp_path / "ds")
+    return tmp_path / "ds"
+
+
+def damage_texts(folder: Path) -> list[str]:
+    return [str(damage) for damage in verify(folder)]
+
+
+def test_intact_dataset_has_no_damage(intact: Path) -> None:
+    assert damage_texts(intact) == []
+
+
+def flip(path: Path, at: int, bit: int) -> None:
+    with path.open("r+b") as stream:
+        stream.seek(at)
+        (byte,) = stream.read(1)
+        stream.seek(at)
+        stream.write(bytes([byte ^ 1 << bit]))
+
+
+def flips_found(intact: Path, folder: Path, count: int, seed: int) -> int:
+    """Return how many of ``count`` random flips are found; half of the files are drawn by size."""
+    rng, found = random.Random(seed), 0
+    sizes = [(folder / name).stat().st_size for name in FILES]
+    for _ in range(count):
+        (name,) = rng.choices(FILES, sizes if rng.random() < 0.5 else None)
+        at, bit = rng.randrange((folder / name).stat().st_size), rng.randrange(8)
+        flip(folder / name, at, bit)
+        found += bool(verify(folder))
+        flip(folder / name, at, bit)
+    assert damage_texts(folder) == []
+    return found
+
+
+def test_every_flipped_bit_is_found(intact: Path, copy: Path) -> None:
+    assert flips_found(intact, copy, 150, seed=1) == 150
+
+
+@pytest.mark.slow
+def test_a_thousand_flipped_bits_are_found(intact: Path, copy: Path) -> None:
+    assert flips_found(intact, copy, 1000, seed=2) == 1000
+
+
+def boundaries(shard: Path) -> list[int]:
+    """Return where members begin, where their data begin and end, and the last byte of the file."""
+    places = [
+        (member.offset - 512, member.offset, member.offset + member.size) for member in read_index(shard).values()
+    ]
+    return sorted({at for three in places for at in three} | {shard.stat().st_size - 1})
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_truncation_is_found(name: str, copy: Path) -> None:
+    content = (copy / name).read_bytes()
+    rng = random.Random(name)
+    cuts = {0, 1, len(content) - 1, *(rng.randrange(len(content)) for _ in range(40))}
+    cuts |= set(boundaries(copy / name)) if name.endswith(".tar") else set()
+    for cut in sorted(cuts - {len(content)}):
+        (copy / name).write_bytes(content[:cut])
+        assert damage_texts(copy), f"{name} cut to {cut} of {len(content)} bytes"
+
+
+@pytest.mark.slow
+def test_a_thousand_truncations_are_found(copy: Path) -> None:
+    rng = random.Random(3)
+    for _ in range(1000):
+        path = copy / rng.choice(FILES)
+        content = path.read_bytes()
+        path.write_bytes(content[: rng.randrange(len(content))])
+        assert damage_texts(copy), path
+        path.write_bytes(content)
+
+
+def test_damage_is_named_by_shard_key_and_member(copy: Path) -> None:
+    shard = copy / "shards/shard-00000.tar"
+    member = read_index(shard)["00000001.noisy.npy"]
+    flip(shard, member.offset + member.size - 1, 0)
+    (damage,) = damage_texts(copy)
+    assert damage.startswith("shards/shard-00000.tar: 00000001.noisy.npy: the XXH3-128 of its data is ")
+
+
+@pytest.mark.parametrize(
+    ("member", "at", "what"),
+    [
+        ("clean.npy", -512, "its tar header differs from what the manifest records, from byte 0 on"),
+        ("clean.npy", 60, "its npy header differs from what the manifest records, from byte 60 on"),
+        ("json", 5, "its member differs from what the manifest records, from byte 517 on"),
+    ],
+)
+def test_damage_of_headers_and_json_is_named(member: str, at: int, what: str, copy: Path) -> None:
+    shard = copy / "shards/shard-00000.tar"
+    flip(shard, read_index(shard)[f"00000000.{member}"].offset + at, 3)
+    assert damage_texts(copy) == [f"shards/shard-00000.tar: 00000000.{member}: {what}"]
+
+
+def test_bytes_after_the_end_are_named(copy: Path) -> None:
+    with (copy / "shards/shard-00001.tar").open("ab") as stream:
+        stream.write(b"\0")
+    assert damage_texts(copy) == ["shards/shard-00001.tar: something follows the end"]
+
+
+def test_missing_and_foreign_shards_are_named(copy: Path) -> None:
+    (copy / "shards/shard-00001.tar").rename(copy / "shards/shard-00007.tar")
+    assert damage_texts(copy) == [
+        "shards/shard-00007.tar: is not part of this dataset",
+        "shards/shard-00001.tar: is missing",
+    ]
+
+
+def test_swapped_shards_are_named(copy: Path) -> None:
+    (copy / "shards/shard-00000.tar").rename(copy / "aside")
+    (copy / "shards/shard-00001.tar").rename(copy / "shards/shard-00000.tar")
+    (copy / "aside").rename(copy / "shards/shard-00001.tar")
+    places = {line.split(":")[0] for line in damage_texts(copy)}
+    assert places == {"shards/shard-00000.tar", "shards/shard-00001.tar"}
+
+
+def test_a_shard_of_a_dataset_with_another_seed_is_found(copy: Path, intact: Path, make: Make, tmp_path: Path) -> None:
+    make(intact.parent / "p", tmp_path / "other", "output.pairs_per_shard=2", "seed=1")
+    shutil.copy(tmp_path / "other/shards/shard-00000.tar", copy / "shards/shard-00000.tar")
+    assert "00000000.noisy.npy: the XXH3-128 of its data is" in "\n".join(damage_texts(copy))
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "manifest.csv", "dataset.json"])
+def test_a_missing_file_is_named(name: str, copy: Path) -> None:
+    (copy / name).unlink()
+    assert any(line.startswith(f"{name}: ") for line in damage_texts(copy))
+
+
+def test_edited_manifest_is_found_by_its_digest(copy: Path) -> None:
+    text = (copy / "manifest.csv").read_text()
+    (copy / "manifest.csv").write_text(text.replace(",ok,,", ",ok,empty,", 1))
+    assert any(line.startswith("manifest.csv: its SHA-256 is") for line in damage_texts(copy))
+
+
+def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DamageError, match=r"contains neither dataset.json nor manifest.csv"):
+        verify(tmp_path)
+
+
+def test_command_ends_with_4_and_a_line_for_each_damage(copy: Path, run_main: RunMain) -> None:
+    (copy / "shards/shard-00001.tar").unlink()
+    done = run_main("verify", copy)
+    assert (done.code, done.out) == (4, "")
+    assert done.err == f"gen-dataset: {copy}: shards/shard-00001.tar: is missing\n"
+
+
+def test_command_reports_an_intact_dataset(copy: Path, run_main: RunMain) -> None:
+    assert run_main("verify", copy) == (0, f"{copy} is intact\n", "")
+
+
+# Replay ---------------------------------------------------------------------------------------------------------------
+
+
+def test_replay_regenerates_the_pair_of_every_row(intact: Path) -> None:
+    root = str(intact.parent / "p")
+    replayed = list(replay(read_rows(intact / "manifest.csv"), root))
+    assert [(one.key, one.complaint) for one in replayed] == [(f"{i:08d}", "") for i in range(3)]
+
+
+def test_rows_of_built_in_scenes_need_no_folder(tmp_path: Path, make: Make) -> None:
+    make(None, tmp_path / "ds", "source.limit=2")
+    replayed = list(replay(read_rows(tmp_path / "ds/manifest.csv"), root=None))
+    assert [one.complaint for one in replayed] == ["", ""]
+
+
+def test_replay_needs_only_the_row_and_the_source(intact: Path, run_main: RunMain, tmp_path: Path) -> None:
+    shutil.copy(intact / "manifest.csv", tmp_path / "rows.csv")
+    shutil.copytree(intact.parent / "p", tmp_path / "moved")
+    done = run_main("replay", "rows.csv", "source.root=moved", "--to", "arrays")
+    assert (done.code, done.out) == (0, "3 pairs are the same, bit for bit; 0 are not; arrays in arrays\n")
+    for sample in RawPairs(intact):
+        assert np.array_equal(np.load(tmp_path / f"arrays/{sample.row['key']}.clean.npy"), sample.clean)
+        assert np.array_equal(np.load(tmp_path / f"arrays/{sample.row['key']}.noisy.npy"), sample.noisy)
+
+
+def changed(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-20] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("harm", "complaint"),
+    [
+        (changed, "its source has changed: SHA-256 is "),
+        (os.unlink, "its source cannot be used (unreadable: "),
+        (lambda path: os.truncate(path, 9), "changed since it was listed"),
+    ],
+    ids=["changed", "gone", "cut"],
+)
+def test_changed_or_deleted_source_is_named(
+    harm: Callable[[Path], None], complaint: str, intact: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(intact.parent / "p", tmp_path / "p")
+    rows = list(read_rows(intact / "manifest.csv"))
+    harm(tmp_path / "p" / str(rows[1]["source"]))
+    replayed = list(replay(rows, str(tmp_path / "p")))
+    assert [bool(one.complaint) for one in replayed] == [False, True, False]
+    assert complaint in replayed[1].complaint
+
+
+def test_a_row_whose_plan_was_edited_gives_other_arrays(intact: Path) -> None:
+    row = dict(next(read_rows(intact / "manifest.csv")))
+    (one,) = replay([row | {"red_gain": 1.0}], str(intact.parent / "p"))
+    assert "the XXH3-128 of clean is" in one.complaint
+
+
+def test_a_row_of_a_file_needs_a_folder(intact: Path) -> None:
+    with pytest.raises(ConfigError, match=r"row 00000000 was generated from the file .*; give source.root="):
+        list(replay(read_rows(intact / "manifest.csv"), root=None))
+
+
+def test_verify_regenerates_pairs_on_request(intact: Path, run_main: RunMain) -> None:
+    done = run_main("verify", intact, "--regenerate", "2")
+    assert (done.code, done.out) == (0, f"{intact} is intact; 2 pairs regenerated, bit for bit\n")
+
+
+def test_verify_reports_a_changed_source_with_5(intact: Path, run_main: RunMain, tmp_path: Path) -> None:
+    shutil.copytree(intact.parent / "p", tmp_path / "q")
+    changed(sorted((tmp_path / "q").iterdir())[0])
+    done = run_main("verify", intact, "--regenerate=99", "source.root=q")
+    assert done.code == 5
+    assert "its source has changed" in done.err
+
+
+def test_rows_are_selected_by_number_or_key(intact: Path) -> None:
+    manifest = intact / "manifest.csv"
+    assert [row["key"] for row in select_rows(manifest, "1:", None)] == ["00000001", "00000002"]
+    assert [row["key"] for row in select_rows(manifest, "0:1", None)] == ["00000000"]
+    assert [row["key"] for row in select_rows(manifest, None, "00000002,00000000")] == ["00000000", "00000002"]
+    assert len(list(select_rows(manifest, None, None))) == 3
+
+
+@pytest.mark.parametrize(("rows", "keys"), [("1", None), ("a:b", None), ("-1:2", None), (None, "7"), (None, "")])
+def test_selection_of_missing_rows_is_refused(rows: str | None, keys: str | None, intact: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--rows|--keys"):
+        list(select_rows(intact / "manifest.csv", rows, keys))
+
+
+def test_regenerated_rows_are_spread_over_the_manifest(intact: Path) -> None:
+    manifest = intact / "manifest.csv"
+    assert [row["key"] for row in evenly_spaced_rows(manifest, 2)] == ["00000000", "00000001"]
+    assert len(list(evenly_spaced_rows(manifest, 99))) == 3
+
+
+def test_dataset_json_ends_with_its_own_digest(intact: Path) -> None:
+    assert list(json.loads((intact / "dataset.json").read_text()))[-1] == "dataset_sha256"

@@ -1,0 +1,778 @@
+"""Selection of effects: omitted effects stay within the tolerance of the masking noise, in every statistic."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.omissions import SCENES, omission
+from helpers.photographs import fill
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
+from unprocess_gen.pipeline import generate
+from unprocess_gen.planning.effect_contributions import SignalRange, signal_range
+from unprocess_gen.planning.effect_selection import Prediction, facts_of, select_effects
+from unprocess_gen.planning.plan import plan_image, plan_with_reasons
+from unprocess_gen.simulation.reference.colour import IDENTITY
+from unprocess_gen.simulation.reference.noise import EFFECTS, black_error, noise_variance, response
+from unprocess_gen.simulation.reference.poisson import poisson
+from unprocess_gen.simulation.reference.sensor import to_dn
+from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
+from unprocess_gen.sources.scenes import synthetic
+
+Settings = Callable[..., Config]
+
+PROFILES = ("imx385", "sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")
+ASSUMED = frozenset({"prnu", "dark_current", "hot_pixels", "dead_pixels"})
+TOLERANCE = 0.1
+
+
+def limit(tolerance: float, count: int) -> float:
+    """Return an upper limit of the RMS of ``count`` normals of standard deviation ``tolerance``; exceeded once in 5e8.
+
+    Laurent and Massart's inequality (Annals of Statistics 2000, lemma 1).
+    """
+    t = 20.0
+    return tolerance * math.sqrt(1 + 2 * math.sqrt(t / count) + 2 * t / count)
+
+
+def independent(statistic: str, count: int, srgb: Srgb) -> int:
+    """Return how many of ``count`` values of a statistic are independent: all pixels of a row can be correlated.
+
+    Row offsets correlate the means of all columns, or of two planes; column offsets those of all rows.
+    """
+    per_frame = {"pixel": min(srgb.shape[:2]), "row mean": 1, "column mean": 1, "plane mean": 1}[statistic]
+    sites = {"pixel": srgb.shape[0] * srgb.shape[1], "row mean": srgb.shape[0], "column mean": srgb.shape[1]}
+    return per_frame * count // sites.get(statistic, min(4, srgb.shape[0] * srgb.shape[1]))
+
+
+@functools.cache
+def cut(name: str, height: int, width: int) -> Srgb:
+    return np.ascontiguousarray(synthetic.scene(name)[100 : 100 + height, 200 : 200 + width])
+
+
+def flat(*colour: int, height: int = 40, width: int = 56) -> Srgb:
+    return np.broadcast_to(np.array(colour, dtype=np.uint8), (height, width, 3)).copy()
+
+
+@pytest.fixture(scope="module")
+def pictures() -> dict[str, Srgb]:
+    """Return crops of scenes, gray flats, and flats of colours with a dark channel."""
+    cuts = {name: cut(name, 40, 56) for name in ("highlights-0", "night_lamps-0", "gradients-0")}
+    grays = {f"gray {code}": flat(code, code, code, height=30, width=40) for code in (0, 255)}
+    return cuts | grays | {"cyan": flat(0, 200, 200, height=31, width=41)}
+
+
+def configured(settings: Settings, *overrides: str) -> Config:
+    """Return a config; if the profile lacks the ISO of the scene, at an ISO that it has."""
+    config = settings(*overrides)
+    for iso in (None, 1600, 3200):
+        config.noise.iso = config.noise.iso if iso is None else iso
+        try:
+            validate_config(config)
+            return config
+        except ConfigError:
+            continue
+    raise AssertionError(overrides)
+
+
+def switched(config: Config, switch: str, srgb: Srgb, number: int) -> Plan:
+    config.effects.all = switch
+    return plan_image(config, f"{number:064x}", 0, facts_of(srgb))
+
+
+def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset[str]) -> int:
+    """Assert that the noise masks the effects that ``auto`` omits; return the number of images with such effects."""
+    held = 0
+    for name, srgb in pictures.items():
+        found: dict[str, list[np.ndarray]] = {}
+        for number in range(frames):
+            everything, auto = (switched(config, switch, srgb, number) for switch in ("on", "auto"))
+            everything = replace(
+                everything, effects=tuple(one for one in everything.effects if one in free or one in auto.effects)
+            )
+            if everything.effects == auto.effects:
+                continue
+            for statistic, squares in omission(srgb, everything, auto).items():
+                found.setdefault(statistic, []).append(squares)
+        for statistic, parts in found.items():
+            squares = np.concatenate(parts)
+            rms = float(np.sqrt(squares.mean()))
+            most = limit(config.effects.tolerance, independent(statistic, squares.size, srgb))
+            assert rms <= most, f"{name}, {statistic}: {rms} of the noise, at most {most}"
+            held += 1
+    return held
+
+
+# Omitted effects are masked -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("noise", PROFILES)
+def test_omitted_effects_are_masked_by_the_noise(
+    settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
+) -> None:
+    config = configured(settings, f"noise={noise}", f"scene={scene}")
+    hold(config, {name: pictures[name] for name in ("gradients-0", "gray 255")}, 1, frozenset(EFFECTS) - ASSUMED)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("noise", PROFILES)
+def test_omitted_effects_are_masked_if_auto_decides_about_all(
+    settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
+) -> None:
+    """No number is marked as assumed, and a full well cuts bright signals."""
+    config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
+    some = {name: pictures[name] for name in ("night_lamps-0", "gradients-0", "gray 255", "cyan")}
+    assert hold(config, some, 1, frozenset(EFFECTS)) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("noise", PROFILES)
+def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: str, scene: str) -> None:
+    """Means over more sites reveal smaller effects."""
+    config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
+    names = ("highlights-0", "night_lamps-0", "gradients-0", "dead_leaves-0")
+    pictures = {name: cut(name, 380, 440) for name in names} | {"cyan": flat(0, 200, 200, height=381, width=441)}
+    hold(config, pictures, 1, frozenset(EFFECTS))
+
+
+def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
+    """Return a sensor whose effects are within a few powers of ten of the tolerance."""
+
+    def around(middle: float, decades: float = 1.5) -> float:
+        return float(middle * 10 ** rng.uniform(-decades, decades))
+
+    gain, read = around(1.0), around(2.0)
+    return replace(
+        physics,
+        dn_per_e=gain,
+        prnu_std=min(around(0.01), 0.3),
+        dark_e=around(0.05),
+        dark_offset=str(rng.choice(["kept", "removed"])),
+        hot_pixel_share=min(around(0.003), 0.5),
+        hot_pixel_e=around(0.3),
+        full_well_e=around(3000.0),
+        read_std_dn=read,
+        read_law="gaussian",
+        row_std_dn=around(0.03 * read),
+        column_std_dn=around(0.03 * read),
+        black_error_dn=tuple(float(one) for one in rng.normal(0, around(0.01 * read), 4)),
+        dead_pixel_share=around(1e-5),
+    )
+
+
+@pytest.mark.parametrize("frames", [1, 12])
+def test_omitted_effects_are_masked_for_any_sensor(settings: Settings, pictures: dict[str, Srgb], frames: int) -> None:
+    """For single frames, and for the mean over the frames of a clip."""
+    config = configured(settings, "noise=nikon_d850", "scene=night", "noise.assumed=[]", "noise.full_well_e=1000")
+    rng = np.random.default_rng(5)
+    left_out: set[str] = set()
+    names = list(pictures)
+    for number in range(40 if frames == 1 else 16):
+        srgb = pictures[names[number % len(names)]]
+        plan = replace(switched(config, "on", srgb, number), exposure_ratio=float(10 ** rng.uniform(-0.5, 2.5)))
+        assert plan.physics is not None
+        plan = of_sensor(plan, sensor(rng, plan.physics))
+        effects = decided(config, plan, srgb, frames)
+        left_out |= set(EFFECTS) - set(effects)
+        found: dict[str, list[np.ndarray]] = {}
+        for body in range(4 if frames == 1 else 2):
+            everything = replace(plan, stream_key=body, physics=replace(plan.physics, body_key=body + 1000))
+            auto = replace(everything, effects=effects)
+            if "dead_pixels" not in effects:  # counted instead
+                everything = replace(everything, effects=tuple(one for one in EFFECTS if one != "dead_pixels"))
+            for statistic, squares in omission(srgb, everything, auto, frames).items():
+                found.setdefault(statistic, []).append(squares)
+        for statistic, parts in found.items():
+            values = np.concatenate(parts)
+            most = limit(TOLERANCE, independent(statistic, values.size, srgb))
+            assert math.sqrt(values.mean()) <= most, (number, statistic, effects)
+    assert left_out == set(EFFECTS) - {"quantise"}
+
+
+def of_sensor(plan: Plan, physics: Physics) -> Plan:
+    """Return the plan with the numbers of another sensor and every effect."""
+    b_dn2 = physics.read_std_dn * physics.read_std_dn
+    return replace(plan, physics=physics, a_dn=physics.dn_per_e, b_dn2=b_dn2, effects=EFFECTS)
+
+
+def decided(config: Config, plan: Plan, srgb: Srgb, frames: int = 1) -> tuple[str, ...]:
+    """Return the effects that ``auto`` simulates with the numbers of a plan."""
+    assert plan.physics is not None
+    facts, span_dn = facts_of(srgb, frames), float(plan.white_level_dn - plan.black_level_dn)
+    light = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    return chosen(automatic(config), plan.physics, facts, light)
+
+
+def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
+    """Return the config with every effect on ``auto`` and a number for each."""
+    effects = replace(config.effects, all="auto", tolerance=tolerance)
+    branches = [
+        replace(branch, column_std_dn=0.1, row_std_dn=0.1, black_error_dn=0.1) for branch in config.noise.branches
+    ]
+    noise = replace(config.noise, assumed=[], full_well_e=1000.0, branches=branches)
+    return replace(config, effects=effects, noise=noise)
+
+
+def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:
+    return tuple(one.effect for one in select_effects(config, physics, facts, light) if one.simulated)
+
+
+def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, pictures: dict[str, Srgb]) -> None:
+    """The mean of many frames has no other noise."""
+    overrides = ("scene=night", "noise=nikon_d850", "noise.assumed=[]", "clean.includes_fixed_pattern=true")
+    fixed = ("prnu", "black_error")
+    left_out = 0
+    for share in (1e-5, 1e-4, 1e-3, 1e-2):
+        config = configured(settings, *overrides, f"noise.prnu_std={share}")
+        for branch in config.noise.branches:
+            branch.black_error_dn = [10 * share] * 4
+        for srgb in pictures.values():
+            auto = switched(config, "auto", srgb, 1)
+            physics = auto.physics
+            assert physics is not None
+            light = unprocess(srgb, auto) * auto.exposure
+            levels = (auto.black_level_dn, auto.white_level_dn)
+            part = np.zeros(light.shape)
+            if "prnu" not in auto.effects:
+                patterned = light * response(physics, light.shape)
+                part += to_dn(patterned, *levels) - to_dn(light, *levels)
+            if "black_error" not in auto.effects:
+                part += black_error(physics, light.shape)
+            left_out += len(set(fixed) - set(auto.effects))
+            for statistic, count in ((part, 1), (part.mean(1), part.shape[1]), (part.mean(0), part.shape[0])):
+                rms = math.sqrt(float((statistic**2).mean()) * count * 12)
+                assert rms <= limit(TOLERANCE, statistic.size)
+    assert left_out > 0
+
+
+# One effect -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def base(settings: Settings) -> tuple[Config, Physics]:
+    """Return a config with every effect on ``auto``, and a sensor on which only shot and read noise are simulated."""
+    config = configured(settings, "noise=nikon_d850", "scene=daylight", "noise.assumed=[]", "noise.full_well_e=1000")
+    plan = switched(config, "on", flat(9, 9, 9), 0)
+    assert plan.physics is not None
+    physics = replace(
+        plan.physics,
+        dn_per_e=1.0,
+        prnu_std=1e-5,
+        dark_e=1e-4,
+        hot_pixel_share=1e-6,
+        hot_pixel_e=1e-3,
+        full_well_e=1e6,
+        read_std_dn=3.0,
+        row_std_dn=1e-4,
+        column_std_dn=1e-4,
+        black_error_dn=(1e-4, 1e-4, 1e-4, 1e-4),
+        dead_pixel_share=1e-9,
+    )
+    return automatic(config), physics
+
+
+FACTS = Facts(768, 512, 256, 10, 255)
+LIGHT = SignalRange(10.0, 3000.0)
+
+
+def test_weak_effects_are_omitted(base: tuple[Config, Physics]) -> None:
+    assert chosen(*base, FACTS, LIGHT) == ("shot", "read", "quantise")
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers"),
+    [
+        ("prnu", {"prnu_std": 0.2}),
+        ("dark_current", {"dark_e": 1e4}),
+        ("hot_pixels", {"hot_pixel_share": 0.01, "hot_pixel_e": 30.0}),
+        ("full_well", {"full_well_e": 2000.0}),
+        ("full_well", {"full_well_e": 3010.0}),
+        ("row", {"row_std_dn": 5e-3 * 50}),
+        ("column", {"column_std_dn": 5e-3 * 50}),
+        ("black_error", {"black_error_dn": (0.0, 0.0, -50.0, 0.0)}),
+        ("dead_pixels", {"dead_pixel_share": 1e-3}),
+    ],
+)
+def test_only_the_strong_effect_is_simulated(
+    base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
+) -> None:
+    """Strong dark current can mask even read noise."""
+    config, physics = base
+    on = set(chosen(config, replace(physics, **numbers), FACTS, LIGHT))
+    assert effect in on
+    assert on - {"read"} == {"shot", "quantise", effect}
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers"),
+    [
+        ("prnu", {"prnu_std": 1e-4}),
+        ("hot_pixels", {"hot_pixel_share": 1e-5, "hot_pixel_e": 0.3}),
+        ("column", {"column_std_dn": 1e-3}),
+        ("black_error", {"black_error_dn": (0.0, 0.0, 1e-3, 0.0)}),
+    ],
+)
+def test_pattern_masked_in_one_frame_is_simulated_for_a_clip(
+    base: tuple[Config, Physics], effect: str, numbers: dict[str, float]
+) -> None:
+    config, physics = base
+    physics = replace(physics, **numbers)
+    assert effect not in chosen(config, physics, FACTS, LIGHT)
+    predictions = select_effects(config, physics, replace(FACTS, frames=100_000), LIGHT)
+    found = next(one for one in predictions if one.effect == effect)
+    assert found.simulated
+    assert found.statistic.startswith("clip's")
+
+
+def test_temporal_noise_is_no_stronger_in_a_clip(base: tuple[Config, Physics]) -> None:
+    config, physics = base
+    physics = replace(physics, row_std_dn=0.01, dark_e=0.01)
+    for one, many in zip(
+        select_effects(config, physics, FACTS, LIGHT),
+        select_effects(config, physics, replace(FACTS, frames=100), LIGHT),
+        strict=True,
+    ):
+        if one.effect in ("shot", "dark_current", "read", "row"):
+            assert (many.statistic, many.ratio) == (one.statistic, pytest.approx(one.ratio))
+
+
+STRONG = {
+    "prnu": {"prnu_std": 0.2},
+    "dark_current": {"dark_e_per_s": 1e6},
+    "hot_pixels": {"hot_pixel_share": 0.01, "hot_pixel_e_per_s": 1e5},
+    "full_well": {"full_well_e": 50.0},
+    "row": {"row_std_dn": ["root", 1e4]},
+    "column": {"column_std_dn": 100},
+    "black_error": {"black_error_dn": [0, 0, 50, 0]},
+    "dead_pixels": {"dead_pixel_share": 0.01},
+}
+"""For each effect, numbers at which no image masks it."""
+
+
+@pytest.mark.parametrize("scene", ["daylight", "night"])
+@pytest.mark.parametrize("profile", PROFILES)
+def test_strong_effect_is_in_the_plan_of_every_camera(settings: Settings, profile: str, scene: str) -> None:
+    for effect, numbers in STRONG.items():
+        config = configured(settings, f"noise={profile}", f"scene={scene}", "noise.assumed=[]")
+        for key, value in numbers.items():
+            for holder in (config.noise, *config.noise.branches):
+                if hasattr(holder, key):
+                    setattr(holder, key, value)
+        validate_config(config)
+        for srgb in (cut("highlights-0", 40, 56), flat(200, 200, 200)):
+            plan = switched(config, "auto", srgb, 0)
+            if not (effect == "full_well" and scene == "night"):  # 50 electrons are more than there are
+                assert effect in plan.effects, plan.skipped
+
+
+def expected_hot(physics: Physics, facts: Facts, dark_dn: float) -> float:
+    """Return the share of hot pixels above one standard deviation: their counts are geometrically distributed."""
+    variance_dn2 = 1 / 12 + physics.read_std_dn**2 + physics.dn_per_e * dark_dn
+    least = math.floor(math.sqrt(variance_dn2) / physics.dn_per_e) + 1
+    ratio = physics.hot_pixel_e / (1 + physics.hot_pixel_e)
+    return facts.width * facts.height * physics.hot_pixel_share * math.exp(least * math.log(ratio))
+
+
+@given(share=st.floats(-9, -4), electrons=st.floats(-2, 3), side=st.integers(10, 4000), dark=st.floats(0, 100))
+def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
+    base: tuple[Config, Physics], share: float, electrons: float, side: int, dark: float
+) -> None:
+    config, physics = base
+    physics = replace(physics, hot_pixel_share=10**share, hot_pixel_e=10**electrons)
+    facts = replace(FACTS, width=side, height=side)
+    expected = expected_hot(physics, facts, dark)
+    hot = next(
+        one for one in select_effects(config, physics, facts, SignalRange(dark, 3000.0)) if one.effect == "hot_pixels"
+    )
+    assert hot.simulated == (expected >= 0.1)
+    assert math.isclose(hot.outliers, expected, rel_tol=0.01)  # what else is left out hid a little of it
+
+
+@pytest.mark.parametrize("mean_e", [0.05, 2.0, 40.0])
+def test_hot_pixel_outliers_are_as_frequent_as_predicted(mean_e: float) -> None:
+    """Counts that the sampler draws from exponential means, against the geometric distribution."""
+    rng = np.random.default_rng(1)
+    words = rng.integers(0, 2**32, 10**5, dtype=np.uint32)
+    counts = poisson(words, rng.exponential(mean_e, 10**5))
+    for least in (1, 4, 60):
+        share = (mean_e / (1 + mean_e)) ** least
+        margin = 6 * math.sqrt(share * (1 - share) / 1e5) + 1e-4
+        assert abs(float((counts >= least).mean()) - share) <= margin
+
+
+@given(share=st.floats(-12, -4), side=st.integers(10, 4000))
+def test_dead_pixels_are_simulated_from_a_tenth_of_an_outlier(
+    base: tuple[Config, Physics], share: float, side: int
+) -> None:
+    config, physics = base
+    physics, facts = replace(physics, dead_pixel_share=10**share), replace(FACTS, width=side, height=side)
+    assert ("dead_pixels" in chosen(config, physics, facts, LIGHT)) == (side * side * 10**share >= 0.1)
+
+
+def test_dead_pixels_of_black_images_differ_by_the_black_level(base: tuple[Config, Physics]) -> None:
+    config, physics = base
+    physics = replace(physics, dead_pixel_share=1e-4)
+    dark = SignalRange(0.0, 0.0)
+    assert "dead_pixels" in chosen(config, physics, FACTS, dark)
+    config = replace(config, sensor=replace(config.sensor, black_level_dn=0))
+    assert "dead_pixels" not in chosen(config, physics, FACTS, dark)
+
+
+@given(rate=st.floats(0, 1e6))
+def test_no_poisson_count_exceeds_the_limit_used_for_full_wells(rate: float) -> None:
+    """For the largest random word."""
+    most = poisson(np.array([0, 2**31], dtype=np.uint32), np.full(2, rate)).max()
+    assert most <= (rate + 7 * math.sqrt(rate) + 12 if rate else 0)
+
+
+def test_omitted_offsets_add_linearly(base: tuple[Config, Physics]) -> None:
+    """0.07 and 0.07 of the noise would stay within the tolerance in quadrature."""
+    config, physics = base
+    plane_dn = math.sqrt((9 + 10 + 1 / 12) / (384 * 256))
+    one = {"black_error_dn": (0.07 * plane_dn,) * 4}
+    other = {"dark_offset": "kept", "dark_e": 0.07 * plane_dn}
+    assert "black_error" not in chosen(config, replace(physics, **one), FACTS, LIGHT)
+    assert "dark_current" not in chosen(config, replace(physics, **other), FACTS, LIGHT)
+    both = chosen(config, replace(physics, **one, **other), FACTS, LIGHT)
+    assert len({"black_error", "dark_current"} & set(both)) == 1
+
+
+# Facts and signal range -----------------------------------------------------------------------------------------------
+
+
+def test_facts_are_the_extremes_of_all_codes() -> None:
+    srgb = np.array([[[9, 7, 3], [250, 8, 8]], [[5, 5, 5], [6, 6, 6]]], dtype=np.uint8)
+    assert facts_of(srgb) == Facts(2, 2, 256, 3, 250)
+
+
+def test_facts_of_a_single_pixel() -> None:
+    assert facts_of(np.array([[[1, 2, 65535]]], dtype=np.uint16)) == Facts(1, 1, 65536, 1, 65535)
+
+
+def test_facts_include_a_single_bright_pixel_at_any_place() -> None:
+    srgb = flat(10, 10, 10)
+    srgb[3, 5, 2] = 255
+    assert (facts_of(srgb).dark_code, facts_of(srgb).bright_code) == (10, 255)
+
+
+@given(seed=st.integers(0, 10**6), more=st.integers(0, 55))
+def test_facts_increase_with_the_codes(seed: int, more: int) -> None:
+    srgb = np.random.default_rng(seed).integers(0, 200, (9, 11, 3)).astype(np.uint8)
+    before, after = facts_of(srgb), facts_of(srgb + np.uint8(more))
+    assert (after.dark_code, after.bright_code) == (before.dark_code + more, before.bright_code + more)
+
+
+@pytest.mark.parametrize("highlight", ["per_channel", "gray_mean", "none"])
+@pytest.mark.parametrize("camera", ["nexus_6p", "sony_a7r", "convex"])
+def test_all_sites_are_within_the_signal_range(settings: Settings, highlight: str, camera: str) -> None:
+    """For light up to white; highlights above it are clipped."""
+    config = configured(settings, "noise=sony_a7s2", "scene=night", f"camera={camera}", f"gains.highlight={highlight}")
+    for number, (low, high) in enumerate([(0, 255), (40, 255), (40, 200), (3, 60)]):
+        srgb = np.random.default_rng(number).integers(low, high + 1, (40, 40, 3)).astype(np.uint8)
+        srgb[0, 0], srgb[0, 1] = (high, high, low), (high, low, high)
+        plan = switched(config, "auto", srgb, number)
+        light = signal_range(
+            *(facts_of(srgb), plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, 1.0, plan.rgb2cam)
+        )
+        found = np.clip(camera_light(srgb, plan), 0, 1) * plan.exposure
+        assert light.dark_dn <= found.min() * (1 + 1e-12)
+        assert found.max() <= light.bright_dn * (1 + 1e-12)
+
+
+def test_signal_range_of_gray_by_hand() -> None:
+    curve = linear_table("none", 1, 256)
+    light = signal_range(Facts(4, 4, 256, 51, 102), "none", 1, (0.5, 2.0, 0.25), 0.5, 1000.0, IDENTITY)
+    assert light == SignalRange(curve[51] * 0.25 * 0.5 * 1000, curve[102] * 2.0 * 0.5 * 1000)
+
+
+def test_equal_images_of_8_and_16_bits_have_equal_effects(settings: Settings, pictures: dict[str, Srgb]) -> None:
+    config = configured(settings, "noise=nikon_d850", "scene=indoor", "noise.assumed=[]", "noise.full_well_e=20000")
+    for srgb in pictures.values():
+        deep = srgb.astype(np.uint16) * np.uint16(257)
+        narrow, wide = (switched(config, "auto", one, 0) for one in (srgb, deep))
+        assert (narrow.effects, narrow.skipped) == (wide.effects, wide.skipped)
+
+
+def test_selection_does_not_depend_on_order_of_pixels(settings: Settings) -> None:
+    """Only facts enter the selection, and they do not depend on order."""
+    config = configured(settings, "noise=sony_a7s2", "scene=low_light", "noise.assumed=[]")
+    srgb = cut("gradients-0", 40, 56)
+    assert switched(config, "auto", srgb, 0) == switched(config, "auto", np.ascontiguousarray(srgb[::-1, ::-1]), 0)
+
+
+def test_number_of_workers_does_not_change_the_selection(
+    make: Callable[..., generate.Summary], tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    photos = fill(tmp_path / "photos", 4)
+    chosen = ("noise=oppo_reno10x", "scene=indoor", "noise.assumed=[]", "output.pairs_per_shard=2")
+    for n_jobs in (1, 2):
+        make(photos, tmp_path / f"{n_jobs}", *chosen, n_jobs=n_jobs)
+    assert tree_hash(tmp_path / "1") == tree_hash(tmp_path / "2")
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (3, 3), (1, 500)])
+@pytest.mark.parametrize("code", [0, 255])
+def test_smallest_images_have_a_plan(settings: Settings, shape: tuple[int, int], code: int) -> None:
+    config = configured(settings, "noise=canon_70d", "scene=night", "noise.assumed=[]", "noise.full_well_e=3000")
+    srgb = np.full((*shape, 3), code, dtype=np.uint8)
+    _, predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(srgb))
+    assert [one.effect for one in predictions] == list(EFFECTS)
+    assert all(math.isfinite(one.predicted_dn) and one.ratio >= 0 for one in predictions)
+
+
+# The tolerance --------------------------------------------------------------------------------------------------------
+
+numbers = st.floats(-4, 3).map(lambda power: 10.0**power)
+sensors = st.fixed_dictionaries(
+    dict.fromkeys(("dn_per_e", "read_std_dn", "row_std_dn", "column_std_dn", "dark_e", "hot_pixel_e"), numbers)
+    | dict.fromkeys(("hot_pixel_share", "dead_pixel_share"), st.floats(0, 0.1))
+    | {
+        "prnu_std": st.floats(0, 0.5),
+        "full_well_e": st.floats(1, 1e5),
+        "black_error_dn": st.tuples(*[st.floats(-2, 2)] * 4),
+    }
+)
+tolerances = st.floats(-6, 1).map(lambda power: 10.0**power)
+
+
+@given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), one=tolerances, other=tolerances)
+def test_larger_tolerance_never_simulates_more(
+    base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, one: float, other: float
+) -> None:
+    config, physics = base
+    physics, light = replace(physics, **sensor), SignalRange(dark, dark + more)
+    narrow, wide = (chosen(automatic(config, tolerance), physics, FACTS, light) for tolerance in sorted((one, other)))
+    assert set(wide) <= set(narrow)
+
+
+@given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(1, 3000))
+def test_tiny_tolerance_simulates_every_contribution(
+    base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float
+) -> None:
+    config, physics = base
+    physics = replace(physics, **sensor)
+    for one in select_effects(automatic(config, 1e-12), physics, FACTS, SignalRange(dark, dark + more)):
+        assert one.simulated == (one.predicted_dn > 1e-9 * one.masking_dn) or 1e-15 < one.ratio < 1e-9
+
+
+@given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)
+def test_effect_above_tolerance_alone_is_always_simulated(
+    base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
+) -> None:
+    config, physics = base
+    physics = replace(physics, **sensor)
+    for one in select_effects(automatic(config, tolerance), physics, FACTS, SignalRange(dark, dark + more)):
+        assert one.simulated or (one.ratio <= tolerance * (1 + 1e-9) and one.outliers < 0.1)
+
+
+# Decisions of the config ----------------------------------------------------------------------------------------------
+
+
+def predictions_of(settings: Settings, *overrides: str) -> dict[str, Prediction]:
+    config = configured(settings, "noise=sony_a7s2", "scene=indoor", *overrides)
+    predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(cut("highlights-0", 40, 56)))[1]
+    return {one.effect: one for one in predictions}
+
+
+@pytest.mark.parametrize("switch", ["auto", "on", "off"])
+@pytest.mark.parametrize("effect", ["read", "prnu", "dark_current"])
+def test_switch_of_an_effect_takes_precedence_over_all(settings: Settings, effect: str, switch: str) -> None:
+    named = predictions_of(settings, f"effects.all={switch}", f"effects.{effect}=on")[effect]
+    assert (named.simulated, named.reason) == (True, "switched on")
+    named = predictions_of(settings, f"effects.all={switch}", f"effects.{effect}=off")[effect]
+    assert (named.simulated, named.reason) == (False, "switched off")
+
+
+def test_all_off_keeps_rounding(settings: Settings) -> None:
+    predictions = predictions_of(settings, "effects.all=off")
+    assert [name for name, one in predictions.items() if one.simulated] == ["quantise"]
+    assert {one.reason for name, one in predictions.items() if name != "quantise"} == {"switched off"}
+
+
+def test_auto_by_name_lets_the_image_decide(settings: Settings) -> None:
+    assert predictions_of(settings, "effects.all=off", "effects.shot=auto")["shot"].simulated
+    assert not predictions_of(settings, "effects.all=on", "effects.prnu=auto")["prnu"].simulated
+
+
+def test_assumed_numbers_are_off_under_auto_with_reason(settings: Settings) -> None:
+    predictions = predictions_of(settings)
+    for effect in ASSUMED:
+        assert not predictions[effect].simulated
+        assert "is assumed, no source gives it" in predictions[effect].reason
+        assert predictions_of(settings, f"effects.{effect}=on")[effect].simulated
+
+
+def test_all_on_simulates_known_numbers_and_lists_missing_ones(settings: Settings) -> None:
+    predictions = predictions_of(settings, "effects.all=on")
+    lacking = {name: one.reason for name, one in predictions.items() if not one.simulated}
+    assert lacking == {
+        "full_well": "noise=sony_a7s2 gives no full_well_e",
+        "column": "noise=sony_a7s2 gives no column_std_dn",
+        "black_error": "noise=sony_a7s2 gives no black_error_dn",
+    }
+
+
+@pytest.mark.parametrize("effect", ["full_well", "column", "black_error"])
+def test_effect_without_a_number_cannot_be_switched_on(settings: Settings, effect: str) -> None:
+    with pytest.raises(ConfigError, match=rf"effects.{effect}=on: noise=sony_a7s2 gives no {effect}_"):
+        validate_config(settings("noise=sony_a7s2", "scene=indoor", f"effects.{effect}=on"))
+
+
+@given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)
+def test_reasons_contain_numbers_and_fit_a_row(
+    base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
+) -> None:
+    config, physics = base
+    for one in select_effects(
+        automatic(config, tolerance), replace(physics, **sensor), FACTS, SignalRange(dark, dark + more)
+    ):
+        assert not {";", "\n"} & set(one.reason)
+        assert one.forced or (" DN in the " in one.reason and f"tolerance {tolerance:g}" in one.reason)
+
+
+def test_reasons_of_the_config_fit_a_row(settings: Settings) -> None:
+    for switch in ("auto", "on", "off"):
+        for one in predictions_of(settings, f"effects.all={switch}").values():
+            assert one.reason
+            assert not {";", "\n"} & set(one.reason)
+
+
+def test_plan_lists_skipped_effects_with_reasons(settings: Settings) -> None:
+    config = configured(settings, "noise=nikon_d850", "scene=daylight", "noise.assumed=[]")
+    plan, predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(flat(200, 200, 200)))
+    assert plan.effects == tuple(one.effect for one in predictions if one.simulated)
+    assert plan.skipped == tuple(f"{one.effect}: {one.reason}" for one in predictions if not one.simulated)
+    dark = next(reason for reason in plan.skipped if reason.startswith("dark_current"))
+    assert "of the noise there (tolerance 0.1)" in dark
+
+
+# Predictions against measurements -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect", "numbers", "slack"),
+    [
+        ("prnu", {"prnu_std": 0.01}, 1.2),  # an upper limit for counts of equal uniforms
+        ("shot", {}, 1.0),
+        ("dark_current", {"dark_e": 4.0}, 1.0),
+        ("hot_pixels", {"hot_pixel_share": 0.05, "hot_pixel_e": 0.2}, 1.0),
+        ("read", {}, 1.0),
+        ("row", {"row_std_dn": 0.5}, 1.0),
+        ("column", {"column_std_dn": 0.5}, 1.0),
+        ("black_error", {"black_error_dn": (0.3, 0.3, 0.3, 0.3)}, 1.0),
+    ],
+)
+def test_predictions_match_measurements(
+    base: tuple[Config, Physics], effect: str, numbers: dict[str, float], slack: float
+) -> None:
+    """On a gray frame, in the statistic where the effect is strongest, within 5 standard errors of a mean square."""
+    config, physics = base
+    physics = replace(physics, **numbers)
+    srgb = flat(120, 120, 120, height=64, width=96)
+    config = replace(config, camera=replace(config.camera, law="identity", name="identity"))
+    config = replace(config, gains=replace(config.gains, red=1.0, blue=1.0, inverse_rgb=1.0))
+    plan = of_sensor(switched(config, "auto", srgb, 0), physics)
+    rest = replace(plan, effects=tuple(one for one in EFFECTS if one != effect))
+    facts, span_dn = facts_of(srgb), float(plan.white_level_dn - plan.black_level_dn)
+    light = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
+    everything = replace(config, effects=replace(config.effects, all="on"))
+    predicted = next(one for one in select_effects(everything, physics, facts, light) if one.effect == effect)
+    squares = np.concatenate(
+        [
+            omission(
+                srgb,
+                *(replace(one, stream_key=n, physics=replace(physics, body_key=n + 1000)) for one in (plan, rest)),
+            )[predicted.statistic]
+            for n in range(12)
+        ]
+    )
+    measured = math.sqrt(float(squares.mean()))
+    error = 0.0 if squares.std() == 0 else 5 * float(squares.std()) / math.sqrt(squares.size) / (2 * measured)
+    assert measured <= predicted.ratio + error + 1e-9
+    assert measured >= predicted.ratio / slack - error - 1e-9
+
+
+def test_masking_noise_is_the_noise_of_the_plan(base: tuple[Config, Physics]) -> None:
+    """The predicted variance of a dark pixel is that of the effects that stay on."""
+    config, physics = base
+    plan = replace(switched(config, "auto", flat(0, 0, 0), 0), physics=physics, a_dn=1.0, b_dn2=9.0)
+    column = next(
+        one for one in select_effects(config, physics, FACTS, SignalRange(0.0, 3000.0)) if one.effect == "column"
+    )
+    variance = float(noise_variance(np.full((1, 1), float(plan.black_level_dn)), plan)[0, 0]) + 1 / 12
+    assert math.isclose(column.masking_dn, math.sqrt(variance / FACTS.height), rel_tol=1e-12)
+
+
+# The table ------------------------------------------------------------------------------------------------------------
+
+
+def test_plan_prints_a_table_of_all_effects(run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "photos", 3)
+    done = run_main("plan", "source.root=photos", "noise=nikon_d850", "scene=video_night", "noise.assumed=[prnu_std]")
+    assert (done.code, done.err) == (0, "")
+    lines = done.out.splitlines()
+    assert max(map(len, lines)) <= 160
+    words = {line.split()[0]: line for line in lines if line.split()}
+    assert words["scene"].startswith("scene     video_night: ISO 6400, 0.04 s, 35 °C, light divided by ")
+    assert " to " in words["scene"]
+    assert (
+        "nikon_d850: in DN of black 400, white 16383; on this sensor (black 240, white 4095) times 0.241194" in done.out
+    )
+    assert "system gain 6.407 DN per electron, read noise " in done.out
+    assert "assumed, without a source: prnu_std" in done.out
+    for effect in EFFECTS:
+        assert " of 3 " in words[effect]
+    assert "3 of 3" in words["shot"]
+    assert "0 of 3" in words["prnu"]
+    assert "prnu_std is assumed" in words["prnu"]
+    assert "outliers" in words["hot_pixels"]
+
+
+def test_table_counts_images_in_which_effects_are_simulated(run_main: RunMain, tmp_path: Path) -> None:
+    """A black image has no shot noise."""
+    import cv2
+
+    (tmp_path / "photos").mkdir()
+    for name, code in (("black", 0), ("gray", 100), ("white", 255)):
+        cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), flat(code, code, code))
+    done = run_main("plan", "source.root=photos", "noise=sony_a7s2", "scene=indoor")
+    assert done.code == 0
+    shot = next(line for line in done.out.splitlines() if line.startswith("shot"))
+    assert "2 of 3" in shot
+
+
+def test_longest_table_fits_160_columns(run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "photos", 1)
+    for overrides in (
+        ("effects.all=auto",),
+        ("effects.all=on",),
+        ("effects.all=off",),
+        ("effects.tolerance=0.000123",),
+    ):
+        done = run_main("plan", "source.root=photos", "noise=canon_700d", "scene=long_exposure", *overrides)
+        assert done.code == 0
+        assert max(map(len, done.out.splitlines())) <= 160
+
+
+def test_profile_with_two_numbers_is_printed_without_table(run_main: RunMain, tmp_path: Path) -> None:
+    fill(tmp_path / "photos", 1)
+    done = run_main("plan", "source.root=photos", "noise=imx385_iso3200")
+    assert done.code == 0
+    assert "effect    heteroscedastic: on; " in done.out
+    assert "ns/pixel" not in done.out

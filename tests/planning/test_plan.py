@@ -1,0 +1,411 @@
+"""Plans: each parameter follows its distribution, moves no other, and is reproducible."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+from helpers.moments import bernstein
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.config.distributions import draw_parameter as draw
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
+from unprocess_gen.core.types import Distribution, Plan
+from unprocess_gen.planning.plan import PARAMETERS, plan_camera, plan_image, plan_noise
+from unprocess_gen.simulation.reference import colour
+
+Settings = Callable[..., Config]
+
+SHA = hashlib.sha256(b"a photograph").hexdigest()
+FIRST, LAST = 2.0**-53, 1 - 2.0**-53
+"""Smallest and largest uniform of a stream."""
+
+UNIFORMS = [FIRST, 1e-9, 0.25, 0.5, LAST, *parameter_uniforms(12345, 200)]
+uniforms = st.integers(0, 2**52 - 1).map(lambda k: (k + 0.5) / 2**52)
+
+
+def plan_of(settings: Settings, *overrides: str, sha: str = SHA, occurrence: int = 0) -> Plan:
+    config = settings(*overrides)
+    validate_config(config)
+    return plan_image(config, sha, occurrence)
+
+
+def named(uniform: float = 0.5, **chosen: float) -> dict[str, float]:
+    return dict.fromkeys(PARAMETERS, uniform) | chosen
+
+
+def images(count: int) -> list[dict[str, float]]:
+    """Return the draws of a number of images, without plans."""
+    return [
+        dict(zip(PARAMETERS, parameter_uniforms(stream_key(0, f"{image:064x}"), len(PARAMETERS)), strict=True))
+        for image in range(count)
+    ]
+
+
+# Distributions --------------------------------------------------------------------------------------------------------
+
+GAIN = Distribution("truncated_normal", (0.8, 0.1, 0.5, 1.1))
+LITERAL = Distribution("inverse_truncated_normal", (0.8, 0.1, 0.5, 1.1))
+SHOT = Distribution("log_uniform", (0.0001, 0.012))
+READ = Distribution("log_linear_in_a", (2.18, 1.2, 0.26))
+
+
+def normal_cdf(z: mpmath.mpf) -> mpmath.mpf:
+    return mpmath.erfc(-z / mpmath.sqrt(2)) / 2
+
+
+def normal_quantile(p: mpmath.mpf) -> mpmath.mpf:
+    return mpmath.sqrt(2) * mpmath.erfinv(2 * p - 1)
+
+
+def by_mpmath(law: Distribution, uniform: float, a: float) -> mpmath.mpf:
+    """Evaluate a distribution with mpmath, to 40 digits."""
+    u = mpmath.mpf(uniform)
+    numbers = [mpmath.mpf(number) for number in law.numbers]
+    if law.kind == "log_uniform":
+        low, high = numbers
+        return low * (high / low) ** u
+    if law.kind == "log_linear_in_a":
+        slope, intercept, std = numbers
+        return mpmath.exp(slope * mpmath.log(mpmath.mpf(a)) + intercept + std * normal_quantile(u))
+    mean, std, low, high = numbers
+    bottom, top = (normal_cdf((limit - mean) / std) for limit in (low, high))
+    value = mean + std * normal_quantile(bottom + u * (top - bottom))
+    return 1 / value if law.kind == "inverse_truncated_normal" else value
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        GAIN,
+        LITERAL,
+        SHOT,
+        READ,
+        Distribution("truncated_normal", (1.0, 0.25, 0.9, 2.5)),
+        Distribution("truncated_normal", (2.0, 0.1, 1.4, 2.6)),
+        Distribution("log_uniform", (1e-12, 3.0)),
+        Distribution("log_linear_in_a", (-1.5, 0.0, 2.0)),
+        Distribution("log_linear_in_a", (2.18, 1.2, 0.0)),
+    ],
+    ids=lambda law: f"{law.kind} {law.numbers}",
+)
+def test_draw_is_correctly_rounded_quantile_of_its_distribution(law: Distribution) -> None:
+    """Half a unit in the last place; both sides have 24 digits or more, so only near ties could differ."""
+    with mpmath.workdps(40):
+        for uniform in UNIFORMS:
+            exact = by_mpmath(law, uniform, a=0.0037)
+            found = draw(law, uniform, 0.0037)
+            assert abs(mpmath.mpf(found) - exact) <= mpmath.mpf(math.ulp(found)) * (0.5 + 1e-8), uniform
+
+
+@given(uniforms, st.floats(0.01, 10), st.floats(1e-6, 10))
+def test_uniform_draw_is_linear_within_three_roundings(uniform: float, low: float, width: float) -> None:
+    high = low + width
+    exact = Fraction(low) + Fraction(uniform) * (Fraction(high) - Fraction(low))
+    slack = (2 * (Fraction(high) - Fraction(low)) + exact) / 2**53
+    assert abs(Fraction(draw(Distribution("uniform", (low, high)), uniform)) - exact) <= slack * (
+        1 + Fraction(1, 10**6)
+    )
+
+
+@given(uniforms)
+def test_constant_ignores_the_uniform(uniform: float) -> None:
+    assert draw(Distribution("constant", (2.15,)), uniform) == 2.15
+
+
+@pytest.mark.parametrize("uniform", [FIRST, 0.5, LAST])
+@pytest.mark.parametrize(
+    ("law", "low", "high"),
+    [
+        (Distribution("uniform", (1.9, 2.4)), 1.9, 2.4),
+        (Distribution("uniform", (1.5, 1.9)), 1.5, 1.9),
+        (GAIN, 0.5, 1.1),
+        (LITERAL, 1 / 1.1, 2.0),
+        (SHOT, 0.0001, 0.012),
+        (Distribution("log_uniform", (1e-300, 1e300)), 1e-300, 1e300),
+        (Distribution("truncated_normal", (1.0, 0.1, 1.5, 1.6)), 1.5, 1.6),
+        (Distribution("truncated_normal", (1.0, 0.1, 0.4, 0.5)), 0.4, 0.5),
+    ],
+    ids=lambda value: f"{value.kind} {value.numbers}" if isinstance(value, Distribution) else "",
+)
+def test_draw_is_within_limits_for_any_uniform(law: Distribution, low: float, high: float, uniform: float) -> None:
+    assert low <= draw(law, uniform) <= high
+
+
+@given(uniforms)
+def test_paper_literal_gain_is_inverse_of_brooks_gain(uniform: float) -> None:
+    """Both are rounded once, so their product is within two half units in the last place of 1."""
+    product = Fraction(draw(GAIN, uniform)) * Fraction(draw(LITERAL, uniform))
+    assert abs(product - 1) <= Fraction(2, 2**53) * (1 + Fraction(1, 10**6))
+
+
+@pytest.mark.parametrize("law", [Distribution("uniform", (1.9, 2.4)), GAIN, SHOT, READ], ids=lambda law: law.kind)
+def test_draw_increases_with_its_uniform(law: Distribution) -> None:
+    drawn = [draw(law, uniform, 0.01) for uniform in sorted(UNIFORMS)]
+    assert all(a <= b for a, b in itertools.pairwise(drawn))
+
+
+def test_median_of_brooks_read_noise_is_the_published_line() -> None:
+    """At u = ½ the scatter is 0: e^1.2 · 0.01^2.18."""
+    with mpmath.workdps(40):
+        exact = mpmath.exp(mpmath.mpf(1.2)) * mpmath.mpf(0.01) ** mpmath.mpf(2.18)
+        assert draw(READ, 0.5, 0.01) == float(exact)
+
+
+# Cameras --------------------------------------------------------------------------------------------------------------
+
+
+@given(st.tuples(uniforms, uniforms, uniforms, uniforms))
+def test_weights_are_four_uniforms_divided_by_their_sum(drawn: tuple[float, ...]) -> None:
+    _, weights, matrix = plan_camera(Config().camera, named(**{f"weight_{i}": u for i, u in enumerate(drawn)}))
+    total = sum(Fraction(u) for u in drawn)
+    for weight, u in zip(weights, drawn, strict=True):
+        assert 0 <= weight <= 1
+        # Three additions and a quotient.
+        assert abs(Fraction(weight) - Fraction(u) / total) <= 4 * Fraction(u) / total / 2**53 * (1 + Fraction(1, 10**6))
+    assert abs(sum(Fraction(weight) for weight in weights) - 1) <= Fraction(4, 2**53) * (1 + Fraction(1, 10**6))
+    assert matrix == colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
+
+
+def test_every_camera_is_equally_likely_to_have_largest_weight() -> None:
+    """The distribution is symmetric: a quarter of 4000 images each."""
+    heaviest = Counter(int(np.argmax(plan_camera(Config().camera, drawn)[1])) for drawn in images(4000))
+    for camera in range(4):
+        assert abs(heaviest[camera] / 4000 - 1 / 4) <= bernstein(3 / 16, 1, 4000)
+
+
+def test_choice_takes_each_camera_equally_often(settings: Settings) -> None:
+    camera = settings("camera=choice").camera
+    chosen = Counter(plan_camera(camera, drawn)[0] for drawn in images(4000))
+    assert set(chosen) == set(colour.CAMERAS)
+    for count in chosen.values():
+        assert abs(count / 4000 - 1 / 4) <= bernstein(3 / 16, 1, 4000)
+
+
+@pytest.mark.parametrize(
+    ("uniform", "camera"),
+    [
+        (FIRST, 0),
+        (0.25 - FIRST, 0),
+        (0.25 + FIRST, 1),
+        (0.5 + FIRST, 2),
+        (0.75 - FIRST, 2),
+        (0.75 + FIRST, 3),
+        (LAST, 3),
+    ],
+)
+def test_choice_is_the_quarter_that_contains_the_uniform(settings: Settings, uniform: float, camera: int) -> None:
+    name, weights, _ = plan_camera(settings("camera=choice").camera, named(choice=uniform))
+    assert name == list(colour.CAMERAS)[camera]
+    assert weights.index(1.0) == camera
+
+
+@pytest.mark.parametrize("name", colour.CAMERAS)
+def test_fixed_camera_has_weight_1(settings: Settings, name: str) -> None:
+    plan = plan_of(settings, f"camera={name}")
+    assert plan.camera == name
+    assert plan.weights == tuple(float(name == other) for other in colour.CAMERAS)
+    assert plan.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
+
+
+def test_chosen_camera_equals_the_fixed_camera(settings: Settings) -> None:
+    plan = plan_of(settings, "camera=choice")
+    assert plan == plan_of(settings, f"camera={plan.camera}")
+
+
+def test_mixed_camera_is_named_convex(settings: Settings) -> None:
+    plan = plan_of(settings)
+    assert plan.camera == "convex"
+    assert all(0 < weight < 1 for weight in plan.weights)
+
+
+def test_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
+    plan = plan_of(settings, "camera=identity")
+    assert (plan.camera, plan.weights, plan.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
+
+
+def test_custom_matrix_has_no_weights(settings: Settings) -> None:
+    own = list(colour.CAMERAS["sony_a7r"])
+    plan = plan_of(settings, "camera=custom", f"camera.xyz2cam={own}")
+    assert (plan.camera, plan.weights) == ("custom", (0.0,) * 4)
+    assert plan.rgb2cam == colour.rgb2cam(colour.CAMERAS["sony_a7r"])
+
+
+# Draws and names ------------------------------------------------------------------------------------------------------
+
+
+def test_counters_of_parameters_never_change() -> None:
+    names = ("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b")
+    assert PARAMETERS[: len(names)] == names
+    assert len(set(PARAMETERS)) == len(PARAMETERS)
+
+
+def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None:
+    plan = plan_of(settings, "noise=brooks2019")
+    u = dict(zip(PARAMETERS, parameter_uniforms(plan.stream_key, len(PARAMETERS)), strict=True))
+    assert plan.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u["red"])
+    assert plan.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u["blue"])
+    assert plan.inverse_rgb_gain == draw(GAIN, u["inverse_rgb"])
+    a = draw(SHOT, u["a"])
+    assert plan.a_dn == a * 3855.0
+    assert plan.b_dn2 == draw(READ, u["b"], a) * 3855.0 * 3855.0
+    assert plan.weights[0] == u["weight_0"] / (u["weight_0"] + u["weight_1"] + u["weight_2"] + u["weight_3"])
+
+
+GAIN_DRAWS = ("red_gain", "blue_gain", "inverse_rgb_gain")
+NOISE_DRAWS = ("a_dn", "b_dn2")
+CAMERA_DRAWS = ("camera", "weights", "rgb2cam")
+
+
+@pytest.mark.parametrize(
+    ("override", "unmoved"),
+    [
+        ("camera=sony_a7r", GAIN_DRAWS + NOISE_DRAWS),
+        ("camera=choice", GAIN_DRAWS + NOISE_DRAWS),
+        ("camera=identity", GAIN_DRAWS + NOISE_DRAWS),
+        ("gains=unity", CAMERA_DRAWS + NOISE_DRAWS),
+        ("gains.red=2.0", ("blue_gain", "inverse_rgb_gain", *CAMERA_DRAWS, *NOISE_DRAWS)),
+        ("gains.inverse_rgb=0.8", ("red_gain", "blue_gain", *CAMERA_DRAWS, *NOISE_DRAWS)),
+        ("noise=none", CAMERA_DRAWS + GAIN_DRAWS),
+        ("noise.b=0.001", ("a_dn", *CAMERA_DRAWS, *GAIN_DRAWS)),
+        ("sensor=generic_14bit", CAMERA_DRAWS + GAIN_DRAWS),
+        ("isp=srgb", CAMERA_DRAWS + GAIN_DRAWS + NOISE_DRAWS),
+    ],
+)
+def test_unused_draw_moves_no_other(settings: Settings, override: str, unmoved: tuple[str, ...]) -> None:
+    before = plan_of(settings, "noise=brooks2019")
+    after = plan_of(settings, *([] if override.startswith("noise=") else ["noise=brooks2019"]), override)
+    assert after != before
+    for name in unmoved:
+        assert getattr(after, name) == getattr(before, name), name
+
+
+DRAWN = (*GAIN_DRAWS, *NOISE_DRAWS, "weights", "stream_key")
+
+
+@pytest.mark.parametrize("other", ["seed", "photograph", "occurrence"])
+def test_other_seed_source_or_occurrence_changes_every_draw(settings: Settings, other: str) -> None:
+    before = plan_of(settings, "noise=brooks2019")
+    after = plan_of(
+        settings,
+        "noise=brooks2019",
+        *(["seed=1"] if other == "seed" else []),
+        sha=hashlib.sha256(b"another").hexdigest() if other == "photograph" else SHA,
+        occurrence=int(other == "occurrence"),
+    )
+    for name in DRAWN:
+        assert getattr(after, name) != getattr(before, name), name
+
+
+def test_equal_config_and_source_give_equal_plans(settings: Settings) -> None:
+    assert plan_of(settings, "noise=brooks2019") == plan_of(settings, "noise=brooks2019")
+
+
+def test_stream_key_is_derived_from_seed_and_source(settings: Settings) -> None:
+    plan = plan_of(settings, "seed=7", occurrence=2)
+    assert (plan.seed, plan.stream_key) == (7, stream_key(7, SHA, 2))
+
+
+def test_draws_of_many_images_are_within_their_distributions(settings: Settings) -> None:
+    config = settings("noise=brooks2019")
+    for image in range(300):
+        plan = plan_image(config, f"{image:064x}")
+        assert 1.9 <= plan.red_gain <= 2.4
+        assert 1.5 <= plan.blue_gain <= 1.9
+        assert 0.5 <= plan.inverse_rgb_gain <= 1.1
+        assert 0.0001 * 3855 <= plan.a_dn <= 0.012 * 3855
+        a = plan.a_dn / 3855
+        assert abs(math.log(plan.b_dn2 / 3855**2) - (2.18 * math.log(a) + 1.2)) <= 8.21 * 0.26  # of u = 2**-53
+
+
+# Noise ----------------------------------------------------------------------------------------------------------------
+
+
+def test_profile_is_unchanged_on_its_own_sensor(settings: Settings) -> None:
+    plan = plan_of(settings, "noise=imx385_iso3200")
+    assert (plan.noise, plan.a_dn, plan.b_dn2) == ("imx385_iso3200", 6.955588, 38.117816)
+
+
+def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
+    """Slope times s, intercept times s², s = 15359/3855; two conversions would give s² and s⁴."""
+    config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
+    s = Fraction(15359, 3855)
+    a, b = plan_noise(config, named())
+    assert abs(Fraction(a) / (Fraction(6.955588) * s) - 1) <= Fraction(21, 10) / 2**53
+    assert abs(Fraction(b) / (Fraction(38.117816) * s * s) - 1) <= Fraction(41, 10) / 2**53
+    plan = plan_image(config, SHA)
+    assert (plan.a_dn, plan.b_dn2) == (a, b)
+
+
+def test_profile_with_black_included_is_converted_before_recording(settings: Settings) -> None:
+    plan = plan_of(settings, "noise=imx385_iso3200_rvdd")
+    assert plan.a_dn == 8.0034
+    assert plan.b_dn2 == -2043.51144 + 8.0034 * 240
+
+
+def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> None:
+    for sensor in ("imx385_12bit", "generic_10bit", "generic_16bit"):
+        plan = plan_of(settings, "noise=heteroscedastic", "noise.a=1.25", "noise.b=7.5", f"sensor={sensor}")
+        assert (plan.a_dn, plan.b_dn2) == (1.25, 7.5)
+
+
+# Recorded values ------------------------------------------------------------------------------------------------------
+
+
+def test_simulated_noise_is_listed_among_effects(settings: Settings) -> None:
+    plan = plan_of(settings)
+    assert (plan.effects, plan.skipped) == (("heteroscedastic", "quantise"), ())
+
+
+@pytest.mark.parametrize("b", [0.0, -3.0])
+def test_noise_without_variance_is_skipped_with_reason(settings: Settings, b: float) -> None:
+    plan = plan_of(settings, "noise=none", f"noise.b={b}", "noise.negative_variance=clip")
+    assert plan.effects == ("quantise",)
+    (reason,) = plan.skipped
+    assert reason.startswith("heteroscedastic: noise=none has no variance")
+
+
+@pytest.mark.parametrize(("a", "b"), [(0.0, 0.1), (0.1, 0.0), (0.1, -5.0)])
+def test_noise_with_any_positive_variance_is_simulated(settings: Settings, a: float, b: float) -> None:
+    plan = plan_of(settings, "noise=heteroscedastic", f"noise.a={a}", f"noise.b={b}", "noise.negative_variance=clip")
+    assert "heteroscedastic" in plan.effects
+
+
+def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
+    plan = plan_of(
+        settings, "sensor=generic_10bit", "sensor.pattern=GBRG", "sensor.clip=black", "isp=srgb", "gains=unity",
+        "gains.threshold=0.75", "gains.highlight=gray_mean",
+    )  # fmt: skip
+    assert (plan.bits, plan.black_level_dn, plan.white_level_dn) == (10, 64, 1023)
+    assert (plan.pattern, plan.sensor_clip) == ("GBRG", "black")
+    assert (plan.tone, plan.gamma) == ("none", "srgb")
+    assert (plan.highlight, plan.highlight_threshold) == ("gray_mean", 0.75)
+
+
+@pytest.mark.parametrize(("isp", "gamma"), [("linear", 1.0), ("gamma22", 2.2), ("srgb", "srgb")])
+def test_gamma_is_number_or_srgb(settings: Settings, isp: str, gamma: float | str) -> None:
+    found = plan_of(settings, f"isp={isp}").gamma
+    assert found == gamma
+    assert type(found) is type(gamma)
+
+
+def test_noise_with_negative_variance_at_all_signals_is_skipped(settings: Settings) -> None:
+    plan = plan_of(settings, "noise=heteroscedastic", "noise.a=0.001", "noise.b=-1e6", "noise.negative_variance=clip")
+    assert plan.effects == ("quantise",)
+
+
+def test_planning_imports_neither_numba_nor_opencv() -> None:
+    code = "import sys, unprocess_gen.planning.plan; print({'numba', 'cv2', 'hydra', 'omegaconf'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"

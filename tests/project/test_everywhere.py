@@ -1,0 +1,487 @@
+"""Datasets are identical on other processors, with other libraries, compilers and environments.
+
+Each test makes one small dataset in a new process under a setting that changes the code path of a library, and compares
+every byte with a plain run. The process reports whether the setting took effect (`everywhere`); a setting that a
+library no longer knows proves nothing.
+
+A change in the last place of a double changes one DN in 10^12 sites, so that bytes alone could miss it. Doubles before
+rounding are therefore compared too, and the machine code of the kernels is inspected for x86-64 with AVX-512, Arm and
+RISC-V. `test_runner` covers order and time of creation, time zone, umask, working directory, hash seed, LC_ALL=C, one
+and two workers. For emulated 64-bit Arm and an old x86-64, see `everywhere`.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import json
+import math
+import platform
+import re
+import signal
+import subprocess
+import sys
+import tomllib
+import venv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from helpers import everywhere
+from helpers.commands import environment
+from helpers.photographs import pixels
+from packaging.requirements import Requirement
+from packaging.version import Version
+from PIL import Image
+
+from unprocess_gen.sources.image.decode import decode
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = Path(everywhere.__file__)
+
+
+class Made(NamedTuple):
+    """A dataset, and the facts that its process reported."""
+
+    tree: str
+    facts: dict[str, Any]
+    out: Path
+
+
+Make = Callable[..., Made]
+
+
+def damaged(form: str, **options: Any) -> bytes:
+    """Return a photograph with damaged content, half of which its codec guesses with a warning."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels(1, 64, 96)).save(stream, form, **options)
+    data = bytearray(stream.getvalue())
+    middle = len(data) // 2
+    data[middle : middle + 60] = b"\xff\x00" * 30 if form == "JPEG" else b"\xff" * 60
+    return bytes(data)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eleven small photographs: all JPEG colour samplings, 8 and 16 bits, lossy WebP, two damaged files."""
+    folder = tmp_path_factory.mktemp("photographs")
+    image = Image.fromarray
+    image(pixels(1, 40, 61)).save(folder / "a 420.jpg", quality=90, subsampling="4:2:0")
+    image(pixels(2, 33, 50)).save(folder / "été 422.jpg", quality=90, subsampling="4:2:2", progressive=True)
+    image(pixels(3, 33, 50)).save(folder / "444.jpg", quality=90, subsampling="4:4:4")
+    image(pixels(4, 33, 50)[..., 0]).save(folder / "gray.jpg", quality=90)
+    cv2.imwrite(str(folder / "deep.png"), pixels(5, 21, 43, np.uint16))
+    cv2.imwrite(str(folder / "deep.tif"), pixels(6, 9, 14, np.uint16))
+    image(pixels(7, 5, 1100)).save(folder / "wide.png")
+    image(pixels(8, 40, 40)).save(folder / "lossy.webp", quality=80)
+    image(pixels(9, 15, 25)).save(folder / "scan.tif", compression="tiff_lzw")
+    (folder / "torn.jpg").write_bytes(damaged("JPEG"))
+    (folder / "torn.tif").write_bytes(damaged("TIFF", compression="tiff_lzw"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Make:
+    """Return a function that makes the dataset in a new process: Python and its flags, n_jobs, environment."""
+    shared_cache = tmp_path_factory.mktemp("kernels")
+
+    def made(*python: str | Path, n_jobs: int = 1, **env: str) -> Made:
+        folder = tmp_path_factory.mktemp("made")
+        settings = ("output.pairs_per_shard=1", "noise=brooks2019", "source.max_failed=2", f"n_jobs={n_jobs}")
+        command = [
+            *(python or (sys.executable,)),
+            SCRIPT,
+            "facts.json",
+            f"source.root={photographs}",
+            "out=ds",
+            *settings,
+        ]
+        done = subprocess.run(
+            [str(part) for part in command],
+            cwd=folder,
+            env=environment(**{"NUMBA_CACHE_DIR": str(shared_cache), **env}),
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
+        return Made(tree_hash(folder / "ds"), facts, folder / "ds")
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def plain(make: Make) -> Made:
+    """The plain dataset, made by freshly compiled kernels, which the other tests load from the cache."""
+    made = make()
+    assert made.facts["kernels"]["compiled"]
+    statuses = re.findall(",(ok|failed),(?:corrupt)?,", (made.out / "manifest.csv").read_text(encoding="utf-8"))
+    assert sorted(statuses) == ["failed"] * 2 + ["ok"] * 9
+    return made
+
+
+def files(made: Made) -> dict[str, bytes]:
+    return {str(path.relative_to(made.out)): path.read_bytes() for path in made.out.rglob("*.*")}
+
+
+def assert_same(made: Made, plain: Made) -> None:
+    mine, theirs = files(made), files(plain)
+    differing = sorted(name for name in mine | theirs if mine.get(name) != theirs.get(name))
+    assert differing in (["dataset.json"], [])
+    assert made.tree == plain.tree
+    assert made.facts["doubles"] == plain.facts["doubles"]
+
+
+# Surroundings ---------------------------------------------------------------------------------------------------------
+
+
+def test_more_workers_than_cores_change_no_byte(make: Make, plain: Made) -> None:
+    made = make(n_jobs=8)
+
+    assert json.loads((made.out / "dataset.json").read_text(encoding="utf-8"))["run"]["n_jobs"] == 8
+    assert made.tree == plain.tree
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("LC_ALL", "C.UTF-8"),
+        ("LC_ALL", "tr_TR.UTF-8"),
+        pytest.param("LANG", "tr_TR.UTF-8", marks=pytest.mark.slow),
+    ],
+)
+def test_no_locale_changes_a_byte(name: str, value: str, make: Make, plain: Made) -> None:
+    assert_same(make(**{"LC_ALL": "", name: value}), plain)
+
+
+@pytest.mark.parametrize(("flag", "level"), [("-O", 1), pytest.param("-OO", 2, marks=pytest.mark.slow)])
+def test_python_without_assertions_changes_no_byte(flag: str, level: int, make: Make, plain: Made) -> None:
+    made = make(sys.executable, flag)
+
+    assert made.facts["optimize"] == level
+    assert_same(made, plain)
+
+
+def test_the_content_of_fresh_memory_changes_no_byte(make: Make, plain: Made) -> None:
+    assert_same(make(MALLOC_PERTURB_="165"), plain)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_IO_MAX_IMAGE_PIXELS", "100")],
+)
+def test_no_opencv_setting_changes_a_byte(name: str, value: str, make: Make, plain: Made) -> None:
+    assert_same(make(**{name: value}), plain)
+
+
+SHORT_OF_MEMORY = """
+import resource, sys
+from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.core.errors import SourceError
+small, large = (open(path, "rb").read() for path in sys.argv[1:])
+decode(small, max_pixels=2**26, icc="ignore")
+taken = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (taken + 2**24, resource.RLIM_INFINITY))
+try:
+    decode(large, max_pixels=2**26, icc="ignore")
+except SourceError as error:
+    print(f"a row that says {error.reason}")
+except Exception as error:
+    print(type(error).__name__)
+else:
+    print("decoded")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the memory of a process is limited as on Linux")
+def test_a_photograph_is_not_corrupt_when_memory_is_short(photographs: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "large.jpg"), np.full((4000, 4000, 3), 99, dtype=np.uint8))
+
+    command = [sys.executable, "-c", SHORT_OF_MEMORY, photographs / "444.jpg", tmp_path / "large.jpg"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+
+    assert done.stdout.strip() in ("MachineError", "MemoryError")
+
+
+# Processors, as libraries see them ------------------------------------------------------------------------------------
+
+ENABLED = [
+    name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
+]
+"""What NumPy chooses between on this machine, under the names of this NumPy, lowest first."""
+
+
+@pytest.mark.parametrize("kept", [ENABLED[:i] for i in range(len(ENABLED))], ids=lambda kept: "+".join(kept) or "none")
+def test_numpys_instruction_sets_change_no_byte(kept: list[str], make: Make, plain: Made) -> None:
+    made = make(NPY_DISABLE_CPU_FEATURES=" ".join(name for name in ENABLED if name not in kept))
+
+    assert made.facts["numpy"] == kept
+    assert_same(made, plain)
+
+
+@pytest.mark.parametrize(
+    "core",
+    ["Prescott", *(pytest.param(core, marks=pytest.mark.slow) for core in ("Nehalem", "Haswell", "Zen", "SkylakeX"))],
+)
+def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made) -> None:
+    product = "import numpy; numpy.ones((50, 50)) @ numpy.ones((50, 50))"
+    tried = subprocess.run([sys.executable, "-c", product], env=environment(OPENBLAS_CORETYPE=core), check=False)
+    if tried.returncode == -signal.SIGILL:
+        pytest.skip(f"this processor lacks instructions of {core}")
+
+    made = make(OPENBLAS_CORETYPE=core)
+
+    if made.facts["product"] == plain.facts["product"]:
+        pytest.skip(f"a matrix product for {core} is the same as here")
+    assert_same(made, plain)
+
+
+def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made) -> None:
+    if not plain.facts["opencv"]:
+        pytest.skip("this OpenCV has one kind of code only")
+
+    made = make(OPENCV_CPU_DISABLE=",".join(plain.facts["opencv"]), OPENCV_IPP="disabled")
+
+    assert made.facts["opencv"] == []
+    assert not made.facts["ipp"]
+    assert_same(made, plain)
+
+
+def test_a_c_library_without_fma_changes_no_byte(make: Make, plain: Made) -> None:
+    hidden = ",".join(f"-{name}" for name in ("AVX2", "FMA", "FMA4", "AVX2_Usable", "FMA_Usable"))
+
+    made = make(GLIBC_TUNABLES=f"glibc.cpu.hwcaps={hidden}")
+
+    if made.facts["libm"] == plain.facts["libm"]:
+        pytest.skip("the C library computes sines, powers and logarithms as before")
+    assert_same(made, plain)
+
+
+WITHOUT_VECTOR_CODE = """
+import hashlib, sys
+from PIL import Image
+import numpy as np
+print(*(hashlib.sha256(np.asarray(Image.open(path).convert("RGB"))).hexdigest() for path in sys.argv[1:]))
+mapped = {line.split()[-1] for line in open("/proc/self/maps") if "jpeg" in line or "_imaging" in line}
+print(any(b"JSIMD_FORCENONE" in open(path, "rb").read() for path in mapped))
+"""
+
+
+def test_jpegs_have_the_same_pixels_without_vector_code(photographs: Path) -> None:
+    """OpenCV's libjpeg-turbo takes no orders from the environment, so Pillow's decodes without vector code."""
+    jpegs = sorted(path for path in photographs.glob("*.jpg") if path.name != "torn.jpg")
+    command = [sys.executable, "-c", WITHOUT_VECTOR_CODE, *jpegs]
+    done = subprocess.run(command, env=environment(JSIMD_FORCENONE="1"), capture_output=True, text=True, check=True)
+    digests, obeyed = done.stdout.splitlines()
+    if obeyed != "True":
+        pytest.skip("this Pillow's libjpeg takes no orders from the environment either")
+
+    decoded = [decode(path.read_bytes(), max_pixels=2**26, icc="ignore").srgb for path in jpegs]
+
+    assert digests.split() == [hashlib.sha256(srgb.tobytes()).hexdigest() for srgb in decoded]
+
+
+# Compilers ------------------------------------------------------------------------------------------------------------
+
+GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_INTEL_SVML": "1"}
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        pytest.param(GENERIC, id="for any processor"),
+        pytest.param({"NUMBA_OPT": "0"}, id="not optimised", marks=pytest.mark.slow),
+        pytest.param({"NUMBA_OPT": "1"}, id="hardly optimised", marks=pytest.mark.slow),
+        pytest.param({"NUMBA_LOOP_VECTORIZE": "0"}, id="not vectorised", marks=pytest.mark.slow),
+        pytest.param({"NUMBA_BOUNDSCHECK": "1"}, id="within bounds", marks=pytest.mark.slow),
+    ],
+)
+def test_other_compiler_options_change_no_byte(env: dict[str, str], make: Make, plain: Made, tmp_path: Path) -> None:
+    made = make(NUMBA_CACHE_DIR=str(tmp_path), **env)
+
+    assert made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
+    assert made.facts["kernels"]["code"] != plain.facts["kernels"]["code"]
+    assert env is not GENERIC or not made.facts["kernels"]["ymm"]
+    assert_same(made, plain)
+
+
+def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
+    made = make(NUMBA_DISABLE_JIT="1")
+
+    assert not made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
+    assert_same(made, plain)
+
+
+@pytest.fixture(scope="module")
+def code(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Return facts about the kernels' machine code; on an x86-64 it is compiled for AVX-512."""
+    folder = tmp_path_factory.mktemp("code")
+    other = {"NUMBA_CPU_NAME": "znver4", "NUMBA_CPU_FEATURES": ""} if platform.machine() == "x86_64" else {}
+    subprocess.run(
+        [sys.executable, SCRIPT, "code.json", "--code"],
+        cwd=folder,
+        env=environment(NUMBA_CACHE_DIR=str(folder), **other),
+        timeout=120,
+        check=True,
+    )
+    return dict(json.loads((folder / "code.json").read_text(encoding="utf-8")))
+
+
+@pytest.mark.slow
+def test_the_machine_code_of_every_kernel_is_inspected(code: dict[str, Any]) -> None:
+    assert code["not compiled"] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["Numba's own", *everywhere.TARGETS])
+def test_no_kernel_contains_a_fused_multiply_add(target: str, code: dict[str, Any]) -> None:
+    kernels, free_to_fuse = code["instructions"][target]
+    if kernels is None:
+        pytest.skip("this LLVM was built without that target")
+
+    assert free_to_fuse["fused"]
+    assert kernels["fused"] == []
+    assert kernels["guessed"] == []
+
+
+@pytest.mark.slow
+def test_no_kernel_has_fast_math_flags(code: dict[str, Any]) -> None:
+    kernels, free = code["fast-math flags"]
+
+    assert free
+    assert kernels == []
+
+
+@pytest.mark.slow
+def test_kernels_call_only_exact_functions(code: dict[str, Any]) -> None:
+    called = {re.sub(r"^llvm\.|\.v?\d*f(?:32|64)$", "", name) for name in code["called"]}
+
+    assert "sqrt" in called
+    loads = {name for name in called if re.match(r"masked\.(load|gather)\.v\d+f(32|64)\.", name)}
+    read = {"PyFloat_AsDouble", "PyNumber_Float"}  # arguments
+    assert called - loads - read <= {"sqrt", "floor", "fabs"}
+
+
+# Functions that modules may call --------------------------------------------------------------------------------------
+
+EXACT_FUNCTIONS = {
+    *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc"),
+    *("minimum", "maximum", "copysign", "isfinite", "isnan", "fabs", "frexp", "ldexp", "gcd", "nextafter", "prod"),
+}
+"""Functions of NumPy and `math` whose results IEEE 754 or integer arithmetic determines."""
+
+UNORDERED_SUMS = {
+    *("dot", "vdot", "inner", "matmul", "tensordot", "einsum", "linalg", "fft", "convolve", "correlate", "interp"),
+    *("sum", "mean", "average", "var", "std", "polyval", "polyfit"),
+}
+ALLOWED_IN_OPENCV = {"imdecode", "error", "getNumThreads", "setNumThreads", "utils"}
+
+OUTSIDE_OUTPUT = {
+    *("core/exact_distributions.py", "core/lookup_tables.py", "core/tone_curves.py"),
+    *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
+    "config/noise_validation.py",  # a logarithm decides only whether a config is refused
+    *("dataset/dng.py", "reports"),
+}
+"""Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables
+with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""
+
+PACKAGE = ROOT / "unprocess_gen"
+MODULES = [
+    path
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if not any(path.is_relative_to(PACKAGE / outside) for outside in OUTSIDE_OUTPUT)
+]
+
+
+def inexact_operations(source: str) -> list[str]:
+    """Return the expressions of a module that machines may round differently."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.BinOp(op=ast.MatMult()) | ast.Call(func=ast.Name(id="pow")):
+                found.append(node)
+            case ast.BinOp(op=ast.Pow(), left=ast.Constant()) | ast.BinOp(op=ast.Pow(), right=ast.Constant(value=2)):
+                pass
+            case ast.BinOp(op=ast.Pow()):
+                found.append(node)
+            case ast.Attribute(value=ast.Name(id="np"), attr=name) if name not in EXACT_FUNCTIONS:
+                found += [node] * (isinstance(getattr(np, name, None), np.ufunc) or name in UNORDERED_SUMS)
+            case ast.Attribute(value=ast.Name(id="math"), attr=name) if name not in EXACT_FUNCTIONS:
+                found += [node] * callable(getattr(math, name))
+            case ast.Attribute(value=ast.Name(id="cv2"), attr=name) if not name.startswith("IMREAD_"):
+                found += [node] * (name not in ALLOWED_IN_OPENCV)
+    return [ast.unparse(node) for node in found]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_modules_call_no_function_that_machines_round_differently(path: Path) -> None:
+    assert inexact_operations(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "a @ b",
+        "np.exp(a)",
+        "np.einsum('ij,j', a, b)",
+        "math.log(2)",
+        "a ** 2.2",
+        "a ** b",
+        "pow(a, b)",
+        "cv2.resize(a)",
+    ],
+)
+def test_functions_that_round_differently_are_found(line: str) -> None:
+    assert inexact_operations(line)
+
+
+# Versions -------------------------------------------------------------------------------------------------------------
+
+
+def pip(*arguments: str | Path) -> str:
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    if done.returncode:
+        pytest.fail(f"pip {arguments[0]} failed; this test needs a package index:\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def oldest(requirement: Requirement) -> str:
+    """Return the oldest version that ``requirement`` allows and that has a wheel for this Python."""
+    listed = pip("index", "versions", "--only-binary", ":all:", requirement.name)
+    versions = re.findall(r"^Available versions: (.*)$", listed, re.MULTILINE)[0].split(", ")
+    return f"{requirement.name}=={min(Version(one) for one in versions if one in requirement.specifier)}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["oldest", "newest"])
+def test_library_versions_change_no_byte(which: str, make: Make, plain: Made, tmp_path: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    requirements = [Requirement(one) for one in project["dependencies"]]
+    venv.create(tmp_path, with_pip=False, symlinks=True)
+    python = tmp_path / "bin" / "python"
+    pinned = [oldest(one) for one in requirements] if which == "oldest" else []
+    pip("--python", python, "install", "--upgrade", "--upgrade-strategy", "eager", ROOT, *pinned)
+
+    made = make(python, PYTHONPATH="")
+    plainest = make(
+        python,
+        PYTHONPATH="",
+        NPY_DISABLE_CPU_FEATURES=" ".join(made.facts["numpy"]),
+        OPENCV_CPU_DISABLE=",".join(made.facts["opencv"]),
+        OPENCV_IPP="disabled",
+    )
+
+    assert Path(made.facts["package"]).is_relative_to(tmp_path)
+    assert {f"{name}=={version}" for name, version in made.facts["versions"].items()} >= {
+        one for one in pinned if one.split("==")[0] in made.facts["versions"]
+    }
+    assert (plainest.facts["numpy"], plainest.facts["opencv"]) == ([], [])
+    assert_same(made, plain)
+    assert_same(plainest, plain)

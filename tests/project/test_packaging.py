@@ -1,0 +1,91 @@
+"""The wheel built from the sdist contains conf/ and manifests/, and runs without a source tree."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CURVES = "unprocess_gen/core/data/curves_16bit.npz"
+OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
+
+
+def run(*command: str | Path, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env=os.environ | env,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with the sdist and the wheel built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    done = run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the bin folder of a new environment with the dependencies of this one but without its package."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False, symlinks=True)
+    python = folder / "bin" / "python"
+    (wheel,) = built.glob("*.whl")
+    installing = run(
+        *(sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python),
+        *("install", "--no-deps", "--no-index", wheel),
+        cwd=folder,
+    )
+    assert installing.returncode == 0, installing.stderr
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    (folder / "lib" / version / "site-packages" / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return folder / "bin"
+
+
+def test_the_sdist_holds_options_tests_and_readme(built: Path) -> None:
+    (archive,) = built.glob("*.tar.gz")
+    with tarfile.open(archive) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+
+    assert {*OPTIONS, "README.md", "pyproject.toml", "tests/project/test_packaging.py", CURVES} <= names
+
+
+def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
+    (wheel,) = built.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+
+    assert {f"unprocess_gen/{option}" for option in OPTIONS} <= set(names)
+    assert CURVES in names
+    assert not any(name.startswith(("conf/", "tests/")) for name in names)
+    assert "unprocess_gen/py.typed" in names
+
+
+def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path: Path) -> None:
+    code = "import unprocess_gen; print(unprocess_gen.__file__)"
+    where = run(installed / "python", "-c", code, cwd=tmp_path, PYTHONPATH="")
+    done = run(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path, PYTHONPATH="")
+
+    assert Path(where.stdout.strip()).is_relative_to(installed.parent)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ds"]
+
+
+def test_the_editable_installation_sees_the_source_tree(tmp_path: Path) -> None:
+    done = run(sys.executable, "-m", "unprocess_gen", "--cfg", "job", "camera=choice", cwd=tmp_path)
+
+    assert done.returncode == 0, done.stderr
+    assert "law: choice" in done.stdout

@@ -1,0 +1,190 @@
+"""Words and docstrings: plain technical English, and numpydoc where one package calls another.
+
+``python tests/project/test_style.py [PATH …]`` lists every violation below the given paths.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+from numpydoc.validate import validate
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "unprocess_gen"
+
+BANNED = {
+    r"rooms?": "module, buffers, space",
+    r"the run_main|doorstep": "command line, argument check",
+    r"the hall|the house": "package",
+    r"desks?": "buffers",
+    r"(made|make|makes|making|read|written|tried|drawn) again": "regenerate, recompute, retry",
+    r"anew": "again, from scratch",
+    r"(is|are|was|were) gone": "was deleted, does not exist",
+    r"want of": "out of, missing",
+    r"beside|besides": "next to, compared with, in addition to",
+    r"nobody|as ever|beforehand|of old": "no one named; say who",
+    r"stands?|stood": "is, contains, is defined",
+    r"tells?|told": "reports, returns, identifies",
+    r"says? (it|so|that)|said": "reports, states, is set to",
+    r"but for": "except",
+    r"whole": "complete, intact, entire; integer",
+    r"machine failed us": "system error",
+    r"(?-i:us|our|ours|we)": "no first person",
+    r"(?-i:TODO|FIXME|XXX)": "unfinished work",
+}
+"""Words of the 0.1 dialect, as regular expressions that match complete words, and what to write instead."""
+
+RECORDED = "  # recorded: decides bytes of datasets"
+"""Marks a line whose text is data of 0.1 datasets and therefore stays as it is."""
+
+BAD_STARTS = re.compile(r"(As|Of|Do so|The same|By|Where|What|Whether|Which|How|That)\b")
+NUMPYDOC_CODES = {"PR01", "PR02", "PR03", "RT01", "GL06", "GL07", "SS03"}
+"""Parameters documented, known and in order; returns documented; sections known and in order; summary with a period."""
+
+WITHOUT_SECTIONS = ("simulation.kernels",)
+"""Packages whose functions are called by code of the same stage only: one sentence with shapes and dtypes is enough."""
+
+
+def python_files() -> list[Path]:
+    return sorted([*PACKAGE.rglob("*.py"), *(ROOT / "tests").rglob("*.py")])
+
+
+def prose(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield line number and text of comments, docstrings, messages and names of tests; of other files every line."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        yield from enumerate(text.splitlines(), start=1)
+        return
+    lines = text.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT or (token.type == tokenize.STRING and " " in token.string):
+            for offset, line in enumerate(token.string.splitlines()):
+                if not lines[token.start[0] - 1 + offset].endswith(RECORDED):
+                    yield token.start[0] + offset, line
+        elif token.type == tokenize.NAME and token.string.startswith("test_"):
+            yield token.start[0], token.string.replace("_", " ")
+
+
+def banned_words(path: Path) -> list[str]:
+    pattern = re.compile(
+        rf"(?<![\w.\-/`{{])(?:{'|'.join(f'(?P<w{i}>{word})' for i, word in enumerate(BANNED))})(?![\w`=])", re.I
+    )
+    return [
+        f"{path.relative_to(ROOT)}:{number}: {match[0]!r} ({list(BANNED.values())[int((match.lastgroup or 'w0')[1:])]})"
+        for number, line in prose(path)
+        for match in pattern.finditer(line)
+    ]
+
+
+def docstrings(path: Path) -> Iterator[tuple[int, str, str]]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
+            text = ast.get_docstring(node)
+            if text:
+                yield getattr(node, "lineno", 1), getattr(node, "name", path.stem), text
+
+
+def bad_first_lines(path: Path) -> list[str]:
+    return [
+        f"{path.relative_to(ROOT)}:{line}: {name}: {text.splitlines()[0][:60]}"
+        for line, name, text in docstrings(path)
+        if BAD_STARTS.match(text)
+    ]
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def public_functions() -> tuple[str, ...]:
+    """Return the functions that another package imports, and those of the public API, by their full names."""
+    import unprocess_gen
+
+    functions = {
+        f"{module_of(path)}.{node.name}"
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
+    }
+    used = set()
+    for path in PACKAGE.rglob("*.py"):
+        own = module_of(path).split(".")[1:2]
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[1:2] != own:
+                used |= {f"{node.module}.{alias.name}" for alias in node.names}
+    for name in unprocess_gen.__all__:
+        value = getattr(unprocess_gen, name)
+        used.add(f"{getattr(value, '__module__', '')}.{name}")
+    public = functions & used
+    return tuple(
+        sorted(
+            name for name in public if not name.startswith(tuple(f"unprocess_gen.{one}" for one in WITHOUT_SECTIONS))
+        )
+    )
+
+
+def numpydoc_errors(name: str) -> list[str]:
+    module, _, function = name.rpartition(".")
+    importlib.import_module(module)
+    return [
+        f"{name}: {code} {text}" for code, text in validate(f"{module}.{function}")["errors"] if code in NUMPYDOC_CODES
+    ]
+
+
+@pytest.mark.parametrize("path", python_files(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_words_are_plain(path: Path) -> None:
+    if path == Path(__file__):
+        return
+    assert banned_words(path) == []
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_docstrings_begin_with_their_subject(path: Path) -> None:
+    assert bad_first_lines(path) == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("conf/**/*.yaml")]),
+    ids=lambda path: str(path.relative_to(ROOT)),
+)
+def test_words_of_texts_are_plain(path: Path) -> None:
+    assert banned_words(path) == []
+
+
+def test_public_functions_follow_numpydoc() -> None:
+    assert [error for name in public_functions() for error in numpydoc_errors(name)] == []
+
+
+def test_banned_words_are_found(tmp_path: Path) -> None:
+    assert re.search(next(iter(BANNED)), "a room")
+
+
+if __name__ == "__main__":
+    below = [Path(one).resolve() for one in sys.argv[1:]] or [ROOT]
+    files = [
+        path
+        for path in [*python_files(), ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("conf/**/*.yaml")]
+        if any(path.is_relative_to(one) for one in below) and path != Path(__file__).resolve()
+    ]
+    for file in files:
+        print(
+            *banned_words(file),
+            *(bad_first_lines(file) if file.is_relative_to(PACKAGE) and file.suffix == ".py" else ()),
+            sep="\n",
+            end="\n" if banned_words(file) else "",
+        )
+    modules = tuple(module_of(file) for file in files if file.is_relative_to(PACKAGE) and file.suffix == ".py")
+    for function in public_functions():
+        if function.rpartition(".")[0] in modules:
+            print(*numpydoc_errors(function), sep="\n", end="\n" if numpydoc_errors(function) else "")

@@ -1,0 +1,430 @@
+"""The benchmark of accuracy: a row for every method, errors within the stated limits, and a complete report."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.photographs import fill
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
+from unprocess_gen.config.interpretation import accuracy_budget
+from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig
+from unprocess_gen.config.serialization import read_option
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.reports import formatting, report_files
+from unprocess_gen.reports.benchmark import figure, measure, method_errors, report, session, tables
+from unprocess_gen.reports.benchmark.measure import (
+    BENCHMARKS_BY_NAME,
+    METHOD_BENCHMARKS,
+    TIER_STAGES,
+    BenchmarkReport,
+    Measurement,
+)
+from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, BenchmarkProfiles, SampleSizes
+from unprocess_gen.reports.estimate import estimate_run, format_estimate
+from unprocess_gen.simulation.reference import noise
+from unprocess_gen.simulation.reference.poisson import gaussian_distance
+
+Settings = Callable[..., Config]
+
+LITTLE = SampleSizes(
+    photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32), compiled=(48, 64), flat=128, positions=16
+)
+TIERS = {
+    name: read_option(conf_dir() / "accuracy" / f"{name}.yaml", AccuracyConfig) for name in (REFERENCE, EXACT, "fast")
+}
+
+
+def option(group: str, name: str, schema: type) -> Any:
+    return read_option(conf_dir() / group / f"{name}.yaml", schema)
+
+
+@pytest.fixture(scope="session")
+def profiles() -> BenchmarkProfiles:
+    two_numbers, electrons = (option("noise", name, NoiseConfig) for name in ("imx385_iso3200", "sony_a7s2"))
+    return BenchmarkProfiles(TIERS, two_numbers, electrons, option("sensor", "generic_14bit", SensorConfig))
+
+
+@pytest.fixture(scope="session")
+def found(settings: Settings, profiles: BenchmarkProfiles) -> BenchmarkReport:
+    return measure.measure_accuracy(settings("scene=low_light"), profiles, LITTLE, "gen-dataset accuracy")
+
+
+def rows_of(found: BenchmarkReport, *stages: str) -> dict[str, Measurement]:
+    return {f"{row.stage}:{row.method}": row for row in found.rows if row.stage in stages}
+
+
+# Rows -----------------------------------------------------------------------------------------------------------------
+
+
+def test_every_method_has_a_benchmark() -> None:
+    assert [one.spelled for one in METHOD_BENCHMARKS] == [method.spelled for method in METHODS]
+
+
+def test_every_method_and_tier_has_one_row(found: BenchmarkReport) -> None:
+    expected = [(method.stage, method.name) for method in METHODS]
+    expected += [(stage, tier) for stage in TIER_STAGES for tier in TIERS]
+
+    assert [(row.stage, row.method) for row in found.rows] == expected
+
+
+def test_measurable_errors_and_times_have_values(found: BenchmarkReport) -> None:
+    for row in found.rows:
+        measured = BENCHMARKS_BY_NAME.get(f"{row.stage}:{row.method}")
+        assert (row.error_max is None) == (measured is not None and measured.error is None)
+        assert (row.ns_per_pixel is None) == (measured is not None and measured.ns is None)
+        assert (row.ns_per_pixel is None) == (row.ratio_to_reference is None)
+        assert row.ns_per_pixel is None or row.ns_per_pixel > 0
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
+def test_budget_for_a_method_chooses_it(method: Any) -> None:
+    assert method.spelled in session.chosen_methods(accuracy_budget(session.budget_for(method, TIERS)))
+
+
+def test_budget_for_a_method_changes_no_other_method() -> None:
+    exact = set(choose_methods(accuracy_budget(TIERS[EXACT]), counts_electrons=True))
+    for method in METHODS:
+        if method.implementation == "float64":
+            chosen = set(choose_methods(accuracy_budget(session.budget_for(method, TIERS)), counts_electrons=True))
+            assert len(chosen - exact) <= 1
+
+
+def test_tiers_of_a_method_are_those_that_choose_it(found: BenchmarkReport) -> None:
+    assert rows_of(found, "curve")["curve:exact_table"].tier.split() == [EXACT, "fast"]  # fast: for physical noise
+    assert rows_of(found, "curve")["curve:float32_table"].tier.split() == ["fast"]
+    assert rows_of(found, "curve")["curve:numpy_table"].tier.split() == [REFERENCE]
+    assert rows_of(found, "tier")["tier:fast"].tier == "fast"
+
+
+def test_reference_has_ratio_one_and_no_error(found: BenchmarkReport) -> None:
+    for row in found.rows:
+        if row.method == REFERENCE or (row.stage not in TIER_STAGES and row.tier == REFERENCE):
+            assert row.ratio_to_reference == 1
+            assert row.stage == "normal" or (row.error_max, row.error_rms) == (0, 0)
+
+
+# Stated errors --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
+def test_measured_errors_are_within_the_stated_limits(found: BenchmarkReport, method: Any) -> None:
+    row = rows_of(found, method.stage)[method.spelled]
+    if row.error_max is None:
+        pytest.skip("kernel cannot be called separately")
+    if method.stage == "normal":
+        assert 0 < row.error_max <= method.normal_error
+    elif method.stage == "shot":
+        by_chance = 0.9 / LITTLE.flat  # left by common uniforms: one site in twenty on either side, four sigma
+        assert row.error_max <= (TIERS["fast"].law_distance + by_chance if method.approximates_law else 0)
+    else:
+        changed_by_chance = 5 * math.sqrt(method.clean_changed_share / (3 * math.prod(LITTLE.sampled)))
+        assert row.error_max <= method.clean_dn
+        assert (row.changed_share or 0) <= method.clean_changed_share + changed_by_chance
+
+
+@pytest.mark.parametrize("stage", TIER_STAGES)
+def test_exact_tier_changes_no_dn(found: BenchmarkReport, stage: str) -> None:
+    row = rows_of(found, stage)[f"{stage}:exact"]
+
+    assert (row.error_max, row.error_rms, row.changed_share) == (0, 0, 0)
+
+
+# Errors ---------------------------------------------------------------------------------------------------------------
+
+
+def test_error_is_taken_over_all_frames() -> None:
+    reference = [np.array([[5, 5]], dtype=np.uint16), np.array([[9, 9]], dtype=np.uint16)]
+    ours = [np.array([[5, 8]], dtype=np.uint16), np.array([[5, 9]], dtype=np.uint16)]
+
+    assert method_errors.compare_frames(ours, reference, "DN") == (4, 2.5, "DN", 0.5)
+    assert method_errors.compare_frames(ours, reference, "σ", [np.full((1, 2), 2.0)] * 2) == (2, 1.25, "σ", 0.5)
+
+
+def test_cdf_difference_is_the_largest_over_all_frames() -> None:
+    one, other = np.array([[1, 1, 2, 3]], dtype=np.uint16), np.array([[2, 2, 2, 3]], dtype=np.uint16)
+
+    assert method_errors.cdf_difference([one, one], [one, other]) == 0.5
+
+
+def test_gaussian_approximation_has_the_stated_cdf_difference(
+    settings: Settings, profiles: BenchmarkProfiles, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = settings("noise=sony_a7s2", "scene=night", "source.limit=1")
+    opened = session.open_session(config, profiles, LITTLE)
+    plans = [plan for _, plan in opened.flat_plans(TIERS[REFERENCE])]
+    counted = opened.flat_frames(TIERS[REFERENCE])
+    near = noise.REFERENCE_DRAWS._replace(poisson=lambda words, rate: rate + np.sqrt(rate) * noise.normals(words))
+    monkeypatch.setattr(noise, "REFERENCE_DRAWS", near)
+    opened.clear()
+    drawn = opened.flat_frames(TIERS[REFERENCE])
+
+    for plan, one, other in zip(plans, drawn, counted, strict=True):
+        physics = plan.physics
+        rate_e = (plan.white_level_dn - plan.black_level_dn) / plan.exposure_ratio / physics.dn_per_e
+        if rate_e >= 10:  # the formula is the first term of an expansion
+            stated = gaussian_distance(rate_e, physics.read_std_dn / physics.dn_per_e)
+            assert method_errors.cdf_difference([one], [other]) == pytest.approx(stated, rel=0.2, abs=0.9 / LITTLE.flat)
+
+
+def test_normal_words_include_both_ends_of_every_segment() -> None:
+    words, weights = method_errors.normal_words(positions=4)
+    index = (words & 0x7FFFFFFF).astype(np.int64)
+
+    assert weights.sum() == 2**31
+    assert len(set(index.tolist())) == index.size
+    assert {0, 1, 2**31 - 1, 2**30, 2**30 - 1, 2**30 + 2**25 - 1, 2**30 + 2**25} <= set(index.tolist())
+    assert 0.4 < (words >> 31).mean() < 0.6
+
+
+def test_exact_normals_are_quantiles(found: BenchmarkReport) -> None:
+    words = np.array([0, 2**31 - 1, 2**31, 2**32 - 1], dtype=np.uint32)
+
+    assert method_errors.exact_normals(words) == pytest.approx([6.337957, 2.918e-10, -6.337957, -2.918e-10], rel=1e-4)
+
+
+@given(read_std_e=st.floats(0, 20), distance=st.sampled_from([0.0, 1e-3, 5e-3]))
+def test_flat_fields_surround_the_limits_of_the_approximation(read_std_e: float, distance: float) -> None:
+    rates = session.flat_rates(read_std_e, distance)
+
+    assert rates == sorted(set(rates))
+    assert 0.01 < rates[0] <= 1
+    assert 1000 <= rates[-1] < session.MOST_FLAT_E
+
+
+# Settings -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("noise=sony_a7s2", "scene=night", "effects.prnu=on"),
+        ("noise=brooks2019", "sensor=generic_10bit", "gains.highlight=gray_mean"),
+        ("noise.law=poisson", "accuracy.name=mine", "accuracy.normal_error=1e-4"),
+        ("noise=none", "accuracy=fast", "source.dequantize=dither"),
+        ("noise.levels=[{a: 1, b: 2}, {a: 3, b: 4}]", "effects.heteroscedastic=on"),
+    ],
+    ids=lambda overrides: overrides[0],
+)
+def test_any_config_can_be_measured(
+    overrides: tuple[str, ...], settings: Settings, profiles: BenchmarkProfiles, tmp_path: Path
+) -> None:
+    config = settings(*overrides)
+    config.source.root = str(fill(tmp_path / "photos", 2))
+    validate_config(config)
+    found = measure.measure_accuracy(config, profiles, SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2))
+
+    assert all(row.error_max == 0 for row in found.rows if row.stage in TIER_STAGES and row.method == EXACT)
+    assert ("mine" in {row.method for row in found.rows}) == ("accuracy.name=mine" in overrides)
+
+
+def test_budget_that_is_no_tier_has_its_own_name(settings: Settings, profiles: BenchmarkProfiles) -> None:
+    config = settings("accuracy.law_distance=1e-3")
+
+    assert list(session.compared_tiers(config, profiles)) == [*TIERS, "exact_changed"]
+
+
+def test_unreadable_photographs_are_ignored(settings: Settings, profiles: BenchmarkProfiles, tmp_path: Path) -> None:
+    (fill(tmp_path, 2) / "000.png").write_bytes(b"")
+    found = measure.measure_accuracy(
+        settings(f"source.root={tmp_path}"), profiles, SampleSizes(2, 1, (8, 8), (8, 8), (8, 8), 4, 2)
+    )
+
+    assert found.conditions["photographs"].startswith("1 photographs")
+
+
+def test_no_readable_photograph_is_an_error(settings: Settings, profiles: BenchmarkProfiles, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"none of 1 photographs tried can be read"):
+        measure.measure_accuracy(settings(f"source.root={tmp_path}"), profiles, LITTLE)
+
+
+# The report -----------------------------------------------------------------------------------------------------------
+
+
+def test_csv_has_the_documented_columns(found: BenchmarkReport) -> None:
+    lines = list(csv.DictReader(tables.csv_text(found.rows).splitlines()))
+
+    assert list(lines[0]) == [
+        *("stage", "method", "tier", "error_max", "error_rms", "error_unit", "changed_share"),
+        *("ns_per_pixel", "ratio_to_reference"),
+    ]
+    assert len(lines) == len(found.rows)
+    assert {line["stage"] for line in lines} == {*STAGES, *TIER_STAGES}
+
+
+@pytest.mark.parametrize(
+    ("points", "front"),
+    [
+        ([], []),
+        ([(1, 1)], [0]),
+        ([(1, 9), (2, 5), (3, 7), (4, 0)], [0, 1, 3]),
+        ([(1, 0), (2, 0)], [0]),
+        ([(1, 0), (1, 0)], [0, 1]),
+        ([(2, 1), (1, 2), (2, 2)], [0, 1]),
+    ],
+)
+def test_front_contains_points_that_no_other_dominates(points: list[tuple[float, float]], front: list[int]) -> None:
+    assert figure.pareto_front(points) == front
+
+
+def test_figure_has_the_size_of_a_page(found: BenchmarkReport) -> None:
+    content = figure.benchmark_figure(found.rows)
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+
+    assert 700 <= picture.shape[0] <= 1200
+    assert 800 <= picture.shape[1] <= 1200
+    assert len(content) < 200_000
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_figure_can_be_drawn_for_any_errors_and_times() -> None:
+    rows = [
+        Measurement(stage, name, tier, error, error, "DN", 0.0, ns, 1.0)
+        for stage in (*STAGES, *TIER_STAGES)
+        for name, tier, error, ns in (("a", "fast", 1e-3, 0.01), ("b", "mine", 2.0, 4000.0), ("c", "", None, None))
+    ]
+
+    assert figure.benchmark_figure(rows)[:4] == b"\x89PNG"
+
+
+def test_page_has_no_script_and_escapes_names() -> None:
+    name = "<script>alert('&\")</script>"
+    page = report.benchmark_page(
+        BenchmarkReport((Measurement(name, name, name, 1.0, 1.0, name, 0.5, 1.0, 1.0),), {name: name}), b"png"
+    )
+
+    assert "<script" not in page
+    assert "&lt;script&gt;alert(&#39;&amp;&#34;)" in page
+    assert 'src="data:image/png;base64,cG5n"' in page
+    assert not re.search(r"(href|src)=\"(?!data:)", page)
+
+
+def test_page_lists_the_conditions(found: BenchmarkReport) -> None:
+    page = report.benchmark_page(found, b"")
+
+    for fact in ("gen-dataset accuracy", "numpy ", "dead_leaves-0", "imx385_iso3200", "sony_a7s2", "low_light"):
+        assert fact in page
+    assert all(row.method in page for row in found.rows)
+
+
+def test_lines_of_the_text_table_are_aligned(found: BenchmarkReport) -> None:
+    lines = tables.text_table(found.rows).splitlines()
+
+    assert len(lines) == len(found.rows) + 1
+    assert len({line.index(name) for line in lines for name in ("method", "exact_table") if name in line}) == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [(None, "–"), (0.0, "0"), (1.234e-7, "1.2e-07"), (293.4, "290"), (5.33, "5.3")]
+)
+def test_short_numbers_have_few_digits(value: float | None, expected: str) -> None:
+    assert formatting.short_number(value) == expected
+
+
+# The verb accuracy ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the verb measure little."""
+    little = SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2)
+    true = measure.measure_accuracy
+    monkeypatch.setattr(
+        measure, "measure_accuracy", lambda config, profiles, command: true(config, profiles, little, command)
+    )
+
+
+@pytest.mark.usefixtures("quick")
+def test_accuracy_writes_three_files_and_reports_them(run_main: RunMain, tmp_path: Path) -> None:
+    for _ in range(2):  # an earlier report is overwritten
+        done = run_main("accuracy", f"source.root={fill(tmp_path / 'photos', 2)}", "out=new/report")
+
+        assert done.code == 0
+        assert sorted(path.name for path in (tmp_path / "new/report").iterdir()) == sorted(report.FILES)
+        assert re.search(r"^tier_electrons +fast ", done.out, re.MULTILINE)
+        assert "measurements" in done.err
+    assert "gen-dataset accuracy source.root=" in (tmp_path / "new/report/accuracy.html").read_text()
+
+
+@pytest.mark.parametrize("name", report_files.DATASET_ENTRIES)
+def test_dataset_folder_is_refused(run_main: RunMain, tmp_path: Path, name: str) -> None:
+    (tmp_path / "ds").mkdir()
+    (tmp_path / "ds" / name).mkdir()
+    done = run_main("accuracy", "out=ds")
+
+    assert done.code == 2
+    assert done.err == (
+        f"gen-dataset: out=ds: contains a dataset ({name}); expected a folder without one; choose another out\n"
+    )
+
+
+def test_existing_file_is_refused(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = run_main("accuracy", "out=file")
+
+    assert (done.code, done.err) == (
+        2,
+        "gen-dataset: out=file: is a file; expected a folder\n",
+    )
+
+
+def test_missing_library_is_reported_before_measuring(
+    run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
+    done = run_main("accuracy", "out=new")
+
+    assert done.code == 2
+    assert (
+        done.err
+        == "gen-dataset: accuracy: drawing needs matplotlib; in the source folder, run: pip install '.[figures]'\n"
+    )
+    assert not (tmp_path / "new").exists()
+
+
+# Times in a plan ------------------------------------------------------------------------------------------------------
+
+
+def test_plan_compares_the_time_with_the_tiers(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 2)}")
+    line = next(
+        line
+        for line in format_estimate(config, estimate_run(config, 1, True, TIERS)).splitlines()
+        if "accuracy" in line
+    )
+
+    assert re.fullmatch(
+        r"accuracy  exact: clean 0 DN, normals within 1e-06 σ, exact shot noise; [\d.e+]+ ns per pixel here "
+        r"\(reference [\d.e+]+, fast [\d.e+]+\)",
+        line,
+    )
+
+
+def test_plan_describes_a_loose_budget(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "accuracy=fast")
+
+    assert (
+        "accuracy  fast: clean within 1 DN, a fraction of 0.001 changed, normals within 0.001 σ, "
+        "shot noise within 0.005 (CDF); " in format_estimate(config, estimate_run(config, 1, True))
+    )
+
+
+def test_plan_without_readable_sources_has_no_time(settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"")
+    config = settings(f"source.root={tmp_path}")
+
+    assert "exact shot noise;" not in format_estimate(config, estimate_run(config, 1, True, TIERS))

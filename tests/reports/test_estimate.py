@@ -1,0 +1,183 @@
+"""The estimate of `plan`: which sources are read, when numbers are exact, and the text."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.commands import RunMain
+from helpers.photographs import fill
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.types import Source
+from unprocess_gen.reports.estimate import SAMPLE, estimate_run, format_estimate
+from unprocess_gen.simulation.reference.noise import EFFECTS
+
+Settings = Callable[..., Any]
+
+
+def listing(count: int) -> tuple[Source, ...]:
+    return tuple(Source(i, f"{i}.png", f"{i}.png", 1) for i in range(count))
+
+
+@given(total=st.integers(1, 500), count=st.integers(1, 50))
+def test_spaced_sources_are_different_and_in_order(total: int, count: int) -> None:
+    indices = [source.index for source in evenly_spaced(listing(total), count)]
+    assert len(indices) == min(total, count)
+    assert indices == sorted(set(indices))
+
+
+@given(total=st.integers(1, 500), count=st.integers(1, 50))
+def test_spaced_sources_have_even_distances(total: int, count: int) -> None:
+    indices = [source.index for source in evenly_spaced(listing(total), count)]
+    gaps = [after - before for before, after in zip(indices, [*indices[1:], total], strict=True)]
+    assert max(gaps) - min(gaps) <= 1
+    assert indices[0] == 0
+
+
+def test_few_sources_are_all_read_and_bytes_are_exact(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE)}"), 1, read_all=False)
+    assert (estimate.exact, len(estimate.source_estimates)) == (True, SAMPLE)
+
+
+def test_many_sources_are_sampled(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=False)
+    assert (estimate.exact, len(estimate.source_estimates), estimate.sources, estimate.shards) == (
+        False,
+        SAMPLE,
+        SAMPLE + 1,
+        3,
+    )
+
+
+def test_all_sources_are_read_on_request(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=True)
+    assert (estimate.exact, len(estimate.source_estimates)) == (True, SAMPLE + 1)
+
+
+def test_sampled_estimate_says_about(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}")
+    assert "about" in next(
+        line
+        for line in format_estimate(config, estimate_run(config, 1, False)).splitlines()
+        if line.startswith("bytes")
+    )
+    assert "about" not in next(
+        line for line in format_estimate(config, estimate_run(config, 1, True)).splitlines() if line.startswith("bytes")
+    )
+
+
+def test_time_is_divided_by_the_number_of_workers(settings: Settings, tmp_path: Path) -> None:
+    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', 3)}"), 4, read_all=True)
+    assert estimate.seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / 4)
+
+
+def test_failed_source_has_no_bytes_and_a_reason(settings: Settings, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
+    estimate = estimate_run(settings(f"source.root={tmp_path / 'p'}"), 1, read_all=True)
+    assert (estimate.bytes, estimate.source_estimates[0].reason, estimate.source_estimates[0].levels) == (
+        0,
+        "empty",
+        (),
+    )
+
+
+def test_free_bytes_are_measured_at_the_nearest_existing_folder(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", f"out={tmp_path}/not/yet/there")
+    assert estimate_run(config, 1, True).free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
+
+
+def test_estimate_without_readable_sources_has_a_text(settings: Settings, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
+    config = settings(f"source.root={tmp_path / 'p'}")
+    assert "fails     000.png: empty" in format_estimate(config, estimate_run(config, 1, True))
+
+
+def test_skipped_effects_are_listed_with_their_reason(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=none")
+    assert "skipped   heteroscedastic: noise=none has no variance" in format_estimate(
+        config, estimate_run(config, 1, True)
+    )
+
+
+def test_shadows_without_noise_are_reported(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=imx385_iso3200_rvdd")
+    assert "no noise up to 15.33 DN above black" in format_estimate(config, estimate_run(config, 1, True))
+
+
+def test_every_noise_level_is_listed(run_main: RunMain, tmp_path: Path) -> None:
+    levels = "noise.levels=[{a: 1, b: 2},{a: 30, b: 900}]"
+    estimate = run_main("plan", "source.limit=1", "noise=heteroscedastic", levels, f"out={tmp_path}/ds").out
+    assert "a=1, b=2; a=30, b=900 (" in estimate
+    assert "a_dn 1 to 30, b_dn2 2 to 900" in estimate
+
+    estimate = run_main(
+        "plan", "source.limit=1", "noise=nikon_d850", "noise.levels=[100,6400]", f"out={tmp_path}/ds"
+    ).out
+    assert "ISO 100 to 6400" in estimate
+    assert " of 2 " in estimate
+
+
+def test_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no file matches source.include="):
+        estimate_run(settings(f"source.root={tmp_path}"), 1, read_all=False)
+
+
+def test_negative_b_without_slope_has_a_text(settings: Settings, tmp_path: Path) -> None:
+    overrides = ("noise.a=0", "noise.b=-5", "noise.negative_variance=clip")
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", *overrides)
+    assert "b_dn2 -5" in format_estimate(config, estimate_run(config, 1, True))
+
+
+def test_every_effect_of_a_physical_profile_has_a_line_and_a_reason(settings: Settings, tmp_path: Path) -> None:
+    config = settings("noise=sony_a7s2", "scene=night", f"source.root={fill(tmp_path / 'p', 2)}")
+    estimate = format_estimate(config, estimate_run(config, 1, True))
+    assert "scene     night: ISO 6400" in estimate
+    assert "noise     sony_a7s2: " in estimate
+    for effect in EFFECTS:
+        assert re.search(rf"^{effect} .* [0-2] of 2 +[\d.]+ +\S", estimate, re.MULTILINE), effect
+
+
+def test_unmatched_files_are_counted_by_suffix_with_advice(settings: Settings, tmp_path: Path) -> None:
+    folder = fill(tmp_path / "p", 1)
+    for name in ("a.heic", "b.heic", "c.txt"):
+        (folder / name).touch()
+    config = settings(f"source.root={folder}")
+    estimate = estimate_run(config, 1, True)
+
+    assert estimate.unmatched == {".heic": 2, ".txt": 1}
+    line = format_estimate(config, estimate).splitlines()[1]
+    assert "3 files are not matched by source.include (2 .heic, 1 .txt); convert " in line
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_compiling_kernels_is_announced_unless_they_are_compiled(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, compiled: bool
+) -> None:
+    monkeypatch.setattr("unprocess_gen.simulation.self_test.are_compiled", lambda kernels: compiled)
+    caplog.set_level("INFO", "unprocess_gen")
+    estimate_run(settings("source.limit=1"), 1, True)
+    assert caplog.messages == ([] if compiled else ["compiling kernels, once per machine and version"])
+
+
+def test_failed_source_is_listed_with_its_explanation(settings: Settings, tmp_path: Path) -> None:
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"no picture")
+    config = settings(f"source.root={tmp_path / 'p'}")
+    estimate = estimate_run(config, 1, True)
+
+    detail = estimate.source_estimates[0].detail
+    assert detail
+    assert f"fails     000.png: unsupported\n          {detail}" in format_estimate(config, estimate)
+
+
+def test_pairs_are_extrapolated_from_the_sample(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 4)}", "noise.draws=2")
+    assert estimate_run(config, 1, False).pairs == 2 * (SAMPLE + 4)
+    assert estimate_run(config, 1, True).pairs == 2 * (SAMPLE + 4)

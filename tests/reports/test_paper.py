@@ -1,0 +1,219 @@
+"""The figures of the article: counts computed independently, captions, and errors of the verb."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Settings
+from helpers.photographs import pixels
+from PIL import Image
+
+from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+from unprocess_gen.config.serialization import read_option
+from unprocess_gen.reports import report_files
+from unprocess_gen.reports.paper import figures as paper_figures
+from unprocess_gen.reports.paper import pictures as figure_pictures
+from unprocess_gen.reports.paper import sources as paper_sources
+from unprocess_gen.reports.paper.pictures import PaperFigure
+from unprocess_gen.reports.paper.sources import (
+    INTERPRETATIONS,
+    ImageSaturation,
+    PaperOptions,
+    SaturationCounts,
+)
+from unprocess_gen.simulation.pair import reference_pair
+from unprocess_gen.simulation.reference.cfa import PATTERNS
+from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.sources.scenes import synthetic
+
+FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
+
+
+@pytest.fixture(scope="module")
+def options() -> PaperOptions:
+    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_sources.GAINS}
+    return PaperOptions(gains, read_option(conf_dir() / "noise" / f"{paper_sources.AUTHORS_NOISE}.yaml", NoiseConfig))
+
+
+@pytest.fixture(scope="module")
+def drawn(settings: Settings, options: PaperOptions) -> list[PaperFigure]:
+    """The figures for two built-in scenes."""
+    return paper_figures.draw_figures(settings("source.limit=2"), options)
+
+
+def colours(png: bytes) -> int:
+    """Return the number of colours in a picture."""
+    rgb = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.uint32)
+    return len(np.unique(rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]))
+
+
+def test_every_figure_has_many_colours(drawn: list[PaperFigure]) -> None:
+    assert [one.file for one in drawn] == FILES[:-1]
+    least = {"fig4.png": 200, "fig6.png": 200, "fig7.png": 200}
+    found = {one.file: colours(one.png) for one in drawn}
+    assert {file: count for file, count in found.items() if count < least.get(file, 2000)} == {}
+
+
+def test_every_caption_compares_with_the_article(drawn: list[PaperFigure]) -> None:
+    assert [one.file for one in drawn if "Against the article: " not in " ".join(one.caption)] == []
+    assert [one.file for one in drawn if re.search(r"nan|inf\b|\{", " ".join(one.caption))] == []
+
+
+def test_counts_of_figure_6_agree_with_the_reference(
+    settings: Settings, options: PaperOptions, drawn: list[PaperFigure]
+) -> None:
+    (figure,) = (one for one in drawn if one.file == "fig6.png")
+    srgb = synthetic.scene("dead_leaves-0")
+    planes = srgb[0::2, 0::2, 0], srgb[0::2, 1::2, 1], srgb[1::2, 0::2, 1], srgb[1::2, 1::2, 2]
+    before = sum(int((plane == 255).sum()) for plane in planes)
+    subject = paper_sources.load_figure_source(
+        settings("source.limit=1"), options, list_photographs(settings().source).sources
+    )
+    after = {name: reference_pair(srgb, subject.plans[name]).counts.saturated for name in paper_sources.GAINS}
+
+    said = {line[0]: tuple(int(cell.split()[0].replace(",", "")) for cell in line[2:4]) for line in figure.table[1:]}
+    assert said == {name: (before, count) for name, count in after.items()}
+    assert len(set(after.values())) > 2
+
+
+def test_only_gains_above_one_add_saturation(drawn: list[PaperFigure]) -> None:
+    (figure,) = (one for one in drawn if one.file == "fig6.png")
+    before = {float(line[4].rstrip("%")) for line in figure.table[1:]}
+    after = {line[0]: float(line[5].rstrip("%")) for line in figure.table[1:]}
+    assert after["paper_max"] == after["fig6_top"] <= min(before)
+    assert after["fig6_bottom"] > after["paper_min"] > after["paper_max"] > 0
+
+
+@pytest.mark.parametrize(
+    ("top", "bottom", "fits"), [(5, 9, True), (4, 6, True), (6, 9, False), (5, 5, False), (9, 5, False)]
+)
+def test_match_means_more_saturation_in_the_bottom_row_only(top: int, bottom: int, fits: bool) -> None:
+    interpretation = INTERPRETATIONS[0]
+    counted = {
+        interpretation.top: [ImageSaturation(100, 5, top)],
+        interpretation.bottom: [ImageSaturation(100, 5, bottom)],
+    }
+    assert SaturationCounts(counted).count_matching(interpretation) == fits
+
+
+def test_multiplication_matches_the_caption_and_division_does_not(settings: Settings, options: PaperOptions) -> None:
+    config = settings("source.limit=5")
+    counted = paper_sources.count_saturation(config, options, list_photographs(config.source).sources)
+    by_formula, by_pictures = (counted.count_matching(interpretation) for interpretation in INTERPRETATIONS)
+    assert by_formula == 0
+    assert by_pictures >= 3
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("most", [8, 3])
+def test_saturated_sites_have_the_colour_of_their_filter(pattern: str, most: int) -> None:
+    sites = np.zeros((8, 12), dtype=bool)
+    at = pattern.index("B")
+    sites[at // 2 :: 2, at % 2 :: 2] = True
+    shares = figure_pictures.channel_fractions(sites, pattern, most)
+    assert shares.max(axis=(0, 1)).tolist() == [0, 0, 1]
+    assert most == 8 or shares[..., 2].min() == 1
+
+
+def test_block_means_keep_mean_and_cfa_sites() -> None:
+    image = pixels(1, 64, 96)
+    assert figure_pictures.block_means(image, 24).shape == (16, 24, 3)
+    np.testing.assert_allclose(
+        figure_pictures.block_means(image, 24).mean(axis=(0, 1)), image.mean(axis=(0, 1)), rtol=1e-12
+    )
+    board = np.indices((90, 90)).sum(axis=0) % 2
+    assert np.unique(figure_pictures.block_means(board, 30, is_mosaic=True)).tolist() == [0.5]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [(1, 1), (2, 2), (3, 40), (17, 131), (131, 17)])
+def test_photographs_of_any_shape_are_drawn(
+    shape: tuple[int, int], settings: Settings, options: PaperOptions, tmp_path: Path
+) -> None:
+    Image.fromarray(pixels(3, *shape)).save(tmp_path / "one.png")
+    config = settings()
+    config.source.root = str(tmp_path)
+    assert len(paper_figures.draw_figures(config, options)) == len(FILES) - 1
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch, drawn: list[PaperFigure]) -> None:
+    """Let the verb write figures that are already drawn."""
+    monkeypatch.setattr(paper_figures, "draw_figures", lambda config, options: drawn)
+
+
+@pytest.mark.usefixtures("quick")
+def test_figures_writes_pictures_and_a_page_that_shows_them(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("figures", "source.limit=2", "out=new/figs")
+    assert (done.code, done.err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "new/figs").iterdir()) == sorted(FILES)
+    page = (tmp_path / "new/figs/figures.html").read_text(encoding="utf-8")
+    assert re.findall(r'src="([^"]*)"', page) == FILES[:-1]
+    assert "gen-dataset figures source.limit=2 out=new/figs" in page
+    assert "<script" not in page
+
+
+@pytest.mark.usefixtures("quick")
+def test_default_folder_is_named_figures(run_main: RunMain, tmp_path: Path) -> None:
+    assert run_main("figures").code == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["figures"]
+
+
+@pytest.mark.parametrize("override", ["gains=unity", "gains.red=2", "noise=none", "isp=linear", "accuracy=fast"])
+def test_settings_fixed_by_the_article_are_refused(override: str, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("figures", override, "out=figs")
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert f"figures: {override}: the article sets it; expected source, " in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_patches_are_refused(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("figures", "source.patch=64", "out=figs")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "source.patch=64: the figures show complete photographs" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_library_gives_one_line_that_names_the_extra(
+    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(report_files, "find_spec", lambda name: None)
+    done = run_main("figures", "out=figs")
+    assert done.code == 2
+    assert (
+        done.err
+        == "gen-dataset: figures: drawing needs matplotlib; in the source folder, run: pip install '.[figures]'\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unreadable_photograph_is_named_and_the_next_one_shown(
+    settings: Settings, options: PaperOptions, tmp_path: Path
+) -> None:
+    (tmp_path / "<a>.png").write_bytes(b"no picture")
+    Image.fromarray(pixels(3, 1, 1)).save(tmp_path / "<b>.png")
+    config = settings()
+    config.source.root = str(tmp_path)
+    page = paper_figures.figures_page(paper_figures.draw_figures(config, options), "command")
+    assert "Photographs that cannot be read: &lt;a&gt;.png (unsupported)." in page
+    assert html.unescape(page).count("On <b>.png") == 5
+    assert "<a>" not in page and "<b>" not in page
+
+
+def test_no_readable_photograph_gives_one_line(run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/a.png").write_bytes(b"no picture")
+    done = run_main("figures", "source.root=photos", "out=figs")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "source.root=photos: none of 1 photographs can be read" in done.err
+    assert not (tmp_path / "figs").exists()

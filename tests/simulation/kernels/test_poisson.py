@@ -1,0 +1,514 @@
+"""Poisson counts: their distribution to one word in 2**32 at every rate; kernels equal to the reference."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+from helpers.moments import bernstein
+
+from unprocess_gen.core import lookup_tables as tables
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.simulation.kernels import poisson as kernels
+from unprocess_gen.simulation.kernels.normal import QuantileTables, fill_approximate_values, normal_quantile_tables
+from unprocess_gen.simulation.kernels.poisson import CountBuffers, allocate_count_buffers, fill_counts
+from unprocess_gen.simulation.reference import poisson as poissons
+from unprocess_gen.simulation.reference.noise import normals
+from unprocess_gen.simulation.reference.poisson import LIMIT, Tables, poisson, poisson_tables
+
+WORDS = 2**32
+SIGN = 2**31
+
+SMALL = (1e-12, 1e-9, 1e-6, 1e-3, 0.00999999, 0.01, 0.0400001, 0.3, 1.0, 3.7, 12.5, 30.25, 50.0, 63.99)
+BIG = (100.0, 1e3, 12345.678, 1e5, 1e6, 1e7, 1e9)
+PROFILE_RANGES = (*SMALL, math.nextafter(LIMIT, 0), LIMIT, math.nextafter(LIMIT, 99), *BIG)
+
+Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def fast(words: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """The compiled form, called as `poisson` is."""
+    out = np.full(words.shape, np.nan)
+    room = allocate_count_buffers((len(words) + 7) // 8 * 8)
+    _draw(words.astype(np.uint32), rates, normal_quantile_tables(), poisson_tables(), room, out)
+    return out
+
+
+@kernel
+def _draw(
+    words: np.ndarray, rates: np.ndarray, normal: QuantileTables, tables: Tables, room: CountBuffers, out: np.ndarray
+) -> None:
+    fill_counts(words, rates, normal, tables, room, out)
+
+
+def word(rank: np.ndarray) -> np.ndarray:
+    """The word whose normal is the ``rank``-th of all, counted from the least."""
+    rank = np.asarray(rank, dtype=np.int64)
+    return np.where(rank < SIGN, rank | SIGN, WORDS - 1 - rank).astype(np.uint32)
+
+
+def random_rates(count: int, seed: int) -> np.ndarray:
+    """Rates of all magnitudes: by their logarithm, by their square root where tables are, and around the limit."""
+    uniform = np.random.default_rng(seed).random((3, count // 3))
+    return np.concatenate([10 ** (21 * uniform[0] - 12), (8.1 * uniform[1]) ** 2, 50 + 150 * uniform[2]])
+
+
+# The law --------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def law(rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Counts that matter at this rate and P(K <= k), to 1e-12: the shares from the mode outwards, summed from the ends.
+
+    Each share is its neighbour's times k / rate or its inverse, and the mode's comes from `mpmath`. Terms are taken
+    until they fall below 1e-18 of it.
+    """
+    mode = math.floor(rate)
+    width = math.ceil(9 * math.sqrt(rate) + 20)
+    with mpmath.workdps(40):
+        mean = mpmath.mpf(rate)
+        top = float(mpmath.exp(mode * mpmath.log(mean) - mean - mpmath.loggamma(mode + 1)))
+    with np.errstate(under="ignore"):
+        up = top * np.cumprod(rate / np.arange(mode + 1, mode + width + 1))
+        down = top * np.cumprod(np.arange(mode, max(mode - width, 0), -1) / rate)
+    share = np.concatenate([down[::-1], [top], up])
+    counts = np.arange(mode - len(down), mode + width + 1)
+    from_below = np.cumsum(share)
+    from_above = 1 - (np.cumsum(share[::-1])[::-1] - share)
+    return counts, np.where(counts < mode, from_below, from_above)
+
+
+@pytest.mark.parametrize("rate", [1e-6, 0.3, 3.7, 63.99, 100.0, 12345.678])
+def test_the_tests_distribution_function_equals_mpmath(rate: float) -> None:
+    counts, cdf = law(rate)
+    with mpmath.workdps(40):
+        for k, share in list(zip(counts, cdf, strict=True))[:: max(len(counts) // 12, 1)]:
+            exact = mpmath.gammainc(int(k) + 1, mpmath.mpf(rate), mpmath.inf, regularized=True)
+            assert abs(share - float(exact)) < 1e-13, k
+
+
+def words_up_to(counts: np.ndarray, rate: np.ndarray, drawn: Draw) -> np.ndarray:
+    """How many of all 2**32 words give ``counts`` or less: bisection, since the draw rises with the rank."""
+    low, high = np.zeros(counts.shape, dtype=np.int64), np.full(counts.shape, WORDS)
+    while (low < high).any():
+        middle = np.minimum((low + high) // 2, WORDS - 1)
+        up = drawn(word(middle), rate) <= counts
+        low, high = np.where(up & (low < high), middle + 1, low), np.where(up, high, np.minimum(high, middle))
+    return low
+
+
+def error_in_words(rate: float, drawn: Draw = fast, most: int = 400) -> np.ndarray:
+    """Words that give k or less, minus what the law says, for up to ``most`` counts from one tail to the other."""
+    counts, cdf = law(rate)
+    chosen = np.unique(np.linspace(0, len(counts) - 1, most).astype(np.int64))
+    found = words_up_to(counts[chosen], np.full(len(chosen), rate), drawn)
+    return np.asarray(found - cdf[chosen] * WORDS)
+
+
+LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
+"""Integer words approximate a distribution function to half a word; computing adds a twentieth, 1e-11."""
+
+
+@pytest.mark.parametrize("rate", PROFILE_RANGES)
+def test_counts_follow_the_distribution_to_one_word(rate: float) -> None:
+    """The promise is one word in 2**32; what is kept is little more than half of one, the least there can be."""
+    assert np.abs(error_in_words(rate)).max() <= LEAST_ERROR + COMPUTED_ERROR
+
+
+@pytest.mark.parametrize("rate", [0.3, 12.5, LIMIT, 12345.678, 1e9])
+def test_reference_counts_follow_the_distribution(rate: float) -> None:
+    assert np.abs(error_in_words(rate, poisson, most=60)).max() <= LEAST_ERROR + COMPUTED_ERROR
+
+
+def test_the_distribution_holds_at_random_rates() -> None:
+    for rate in random_rates(180, seed=1):
+        assert np.abs(error_in_words(min(float(rate), 1e7), most=120)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
+
+
+@pytest.mark.parametrize("cell", range(80))
+def test_the_distribution_holds_at_the_ends_of_every_cell(cell: int) -> None:
+    for inside in (1e-9, 1 - 1e-9):
+        rate = ((cell + inside) / 10) ** 2
+        assert np.abs(error_in_words(rate, most=150)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
+
+
+@pytest.mark.slow
+def test_the_distribution_holds_at_thousands_of_rates() -> None:
+    for rate in random_rates(6000, seed=2):
+        assert np.abs(error_in_words(min(float(rate), 1e7), most=150)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
+
+
+@pytest.mark.parametrize("rate", [1e-12, 1e-6, 0.01, 0.3, 1.0, 3.7, 12.5, 20.0])
+def test_the_probability_of_zero_is_exp_of_minus_the_rate(rate: float) -> None:
+    none = int(words_up_to(np.zeros(1), np.array([rate]), fast)[0])
+    assert abs(none - math.exp(-rate) * WORDS) <= 1
+
+
+@pytest.mark.parametrize(("coefficients", "factor"), [("A", 1.001), ("B", 1.001), ("C", 1.001), ("D", 1.1), ("E", 2)])
+def test_a_wrong_coefficient_breaks_the_distribution(
+    coefficients: str, factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first of each; the last two count for so little that a thousandth of them is no error at all."""
+    first, *others = getattr(poissons, coefficients)
+    monkeypatch.setattr(poissons, coefficients, (first * factor, *others))
+    assert np.abs(error_in_words(LIMIT, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
+
+
+@pytest.mark.parametrize("n", range(8))
+def test_a_wrong_table_entry_breaks_the_distribution(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coefficient n of the middle row of a cell, off by the more the less it counts for."""
+    right = poisson_tables()
+    cell = 55
+    wrong = right.cdf.copy()
+    row = right.first[cell] + int(right.middle[cell])
+    wrong[row, n] *= 1 + 10.0 ** (n - 5)
+    monkeypatch.setattr(poissons, "poisson_tables", lambda: right._replace(cdf=wrong))
+    rate = ((cell + 1 - 1e-9) / 10) ** 2
+    assert np.abs(error_in_words(rate, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
+
+
+# Order and coupling ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", PROFILE_RANGES)
+def test_counts_increase_with_the_words_normal(rate: float) -> None:
+    """Around the words where the count changes, in both tails, and at random."""
+    counts, _ = law(rate)
+    chosen = counts[np.unique(np.linspace(0, len(counts) - 1, 100).astype(np.int64))]
+    edges = words_up_to(chosen, np.full(len(chosen), rate), fast)
+    rank = np.concatenate([(edges[:, None] + np.arange(-20, 21)).ravel(), np.arange(200), WORDS - 1 - np.arange(200)])
+    rank = np.concatenate([rank, np.random.default_rng(3).integers(0, WORDS, 20_000)])
+    rank = np.unique(np.clip(rank, 0, WORDS - 1))
+    for drawn in (fast, poisson):
+        assert (np.diff(drawn(word(rank), np.full(rank.shape, rate))) >= 0).all()
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e5, 1e7, 1e9])
+def test_a_count_follows_the_normal_of_its_word(rate: float) -> None:
+    """The count is within 1 below rate + √rate·z + (z² + 2) / 6, whose next term is -(z + z³/2) / (36 √rate)."""
+    words = np.random.default_rng(4).integers(0, WORDS, 100_000, dtype=np.uint32)
+    z = normals(words)
+    below = rate + math.sqrt(rate) * z + (z * z + 2) / 6 - fast(words, np.full(words.shape, rate))
+    slack = (6.4 + 6.4**3 / 2) / (36 * math.sqrt(rate)) * 1.1 + 2e-7 * math.sqrt(rate)
+    assert below.min() >= -slack
+    assert below.max() <= 1 + slack
+
+
+def test_a_larger_rate_never_gives_a_smaller_count() -> None:
+    words = np.repeat(np.random.default_rng(5).integers(0, WORDS, 300, dtype=np.uint32), 400)
+    rates = np.tile(np.sort(random_rates(400 // 3 * 3 + 3, seed=6)[:400]), 300)
+    assert (np.diff(fast(words, rates).reshape(300, 400), axis=1) >= 0).all()
+
+
+# The two forms --------------------------------------------------------------------------------------------------------
+
+EDGE_WORDS = [0, 1, 2, SIGN // 2, SIGN - 2, SIGN - 1, SIGN, SIGN + 1, SIGN + 2, 3 * (SIGN // 2), WORDS - 2, WORDS - 1]
+NO_RATES = [0.0, -0.0, -5e-324, -1.0, -1e300]
+TINY_RATES = [5e-324, 2.0**-1050, 2.3e-308, 1e-300, 1e-100, 1e-20, 2.0**-53, 2.0**-34]
+
+
+def pairs(words: list[int], rates: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Every word with every rate."""
+    return np.repeat(np.array(words, dtype=np.uint32), len(rates)), np.tile(np.array(rates), len(words))
+
+
+def test_kernels_equal_the_reference_for_all_magnitudes() -> None:
+    rng = np.random.default_rng(7)
+    rates = random_rates(999_999, seed=8)
+    words = rng.integers(0, WORDS, len(rates), dtype=np.uint32)
+    words[::4] = (2 ** (31 * rng.random(len(words[::4])))).astype(np.uint32) ^ (words[::4] & np.uint32(SIGN))  # tails
+    assert (fast(words, rates) == poisson(words, rates)).all()
+
+
+def test_kernels_equal_the_reference_at_the_edges() -> None:
+    rates = [
+        *NO_RATES,
+        *TINY_RATES,
+        *PROFILE_RANGES,
+        *(math.nextafter((c / 10) ** 2, s) for c in range(82) for s in (0, 99)),
+    ]
+    words, every = pairs(EDGE_WORDS, rates)
+    counts = fast(words, every)
+    assert (counts == poisson(words, every)).all()
+    assert np.isfinite(counts).all()
+    assert (counts >= 0).all()
+    assert (counts == np.rint(counts)).all()
+
+
+def test_kernels_equal_the_reference_where_counts_change() -> None:
+    rates = np.repeat(random_rates(1200, seed=9), 12)
+    counts = np.floor(rates + np.sqrt(rates) * np.tile(np.linspace(-5, 6, 12), 1200))
+    edges = words_up_to(counts, rates, fast)
+    for step in (-2, -1, 0, 1):
+        words = word(np.clip(edges + step, 0, WORDS - 1))
+        assert (fast(words, rates) == poisson(words, rates)).all()
+
+
+def test_the_guess_leaves_two_counts_in_every_cell() -> None:
+    """Rates at the ends of each cell of the table and within, normals at the edges of theirs and between."""
+    rng = np.random.default_rng(10)
+    z = np.clip(np.concatenate([np.arange(-51, 52) / 8, rng.uniform(-6.3, 6.3, 200)]), -6.33, 6.33)
+    indices = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in z]
+    words = [
+        min(max(round(i) + o, 0), SIGN - 1) | SIGN * (v < 0) for i, v in zip(indices, z, strict=True) for o in (-1, 0)
+    ]
+    within = np.array([1e-12, 0.2, 0.5, 0.8, 1 - 1e-12])
+    rates = ((np.arange(80)[:, None] + within) / 10) ** 2
+    every = pairs(words, rates.ravel().tolist())
+    assert (fast(*every) == poisson(*every)).all()
+
+
+def short(words: np.ndarray, rate: float) -> np.ndarray:
+    """Return x by the short form as compiled: approximate normals, float32, without the integer part of the rate."""
+    quick = np.empty(words.shape, dtype=np.float32)
+    _quick(words, normal_quantile_tables().lines, np.empty(words.shape, dtype=np.uint64), quick)
+    a, b = (np.array(one, dtype=np.float32) for one in (poissons.A, poissons.B))
+    root = np.sqrt(np.float32(rate))
+    s = quick * (np.float32(1) / root)
+    s2 = s * s
+    powers_a = (a[0] + s * a[1]) + s2 * ((a[2] + s * a[3]) + s2 * a[4])
+    powers_b = (b[0] + s * b[1]) + s2 * (b[2] + s * b[3])
+    x = (np.float32(rate - np.rint(rate)) + root * quick) + (quick * quick * powers_a + powers_b)
+    assert x.dtype == np.float32
+    return np.asarray(np.rint(rate) + x.astype(np.float64))
+
+
+@kernel
+def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
+    fill_approximate_values(words, lines, pairs, out)
+
+
+def real_quantile(rate: float, w: float) -> float:
+    """The x with Gamma(x, rate) / Gamma(x) = Phi(w), by an independent library."""
+    with mpmath.workdps(20):
+        share = mpmath.ncdf(w)
+        near = float(poissons.expansion(np.array([rate]), np.array([w]))[0])
+        return float(
+            mpmath.findroot(
+                lambda x: mpmath.gammainc(x, rate, mpmath.inf, regularized=True) - share, (near, near + 1e-4)
+            )
+        )
+
+
+@pytest.mark.parametrize(
+    "rate", [6.0, 6.7, 8.3, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
+)
+def test_the_short_form_is_within_its_error(rate: float) -> None:
+    """One and a half times over, so that what lies between the words that are tried is safe too."""
+    w = np.linspace(-poissons.SHORT_REACH, poissons.SHORT_REACH, 37 if rate < LIMIT else 4001)
+    index = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in w]
+    words = np.array([min(int(i), SIGN - 1) | SIGN * (v < 0) for i, v in zip(index, w, strict=True)], dtype=np.uint32)
+    z = normals(words)  # to 1.5e-7
+    exact = [real_quantile(rate, v) for v in z] if rate < LIMIT else poissons.expansion(np.full(z.shape, rate), z)
+    claimed = poissons.NORMAL_ERROR * (8 + math.sqrt(rate)) + poissons.SHORT_ERROR / rate
+    claimed += poissons.LOW_ERROR / rate**3
+    assert np.abs(short(words, rate) - exact).max() <= claimed / 1.5
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 7])
+def test_rows_of_any_length(count: int) -> None:
+    words, rates = word(np.arange(count) * 10**9), np.linspace(50, 80, count)
+    assert fast(words, rates).tolist() == poisson(words, rates).tolist()
+
+
+def test_reference_counts_have_the_shape_of_the_words() -> None:
+    words = np.arange(24, dtype=np.uint32).reshape(2, 3, 4)
+    counts = poisson(words, np.full((2, 3, 4), 70.0))
+    assert counts.shape == (2, 3, 4)
+    assert counts.dtype == np.float64
+
+
+# No light and hardly any ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("drawn", [fast, poisson])
+def test_no_light_gives_no_count(drawn: Draw) -> None:
+    words, rates = pairs(EDGE_WORDS, [*NO_RATES, math.nan])
+    assert (drawn(words, rates) == 0).all()
+
+
+@pytest.mark.parametrize("drawn", [fast, poisson])
+def test_a_rate_below_what_words_resolve_gives_no_count(drawn: Draw) -> None:
+    words, rates = pairs(EDGE_WORDS, [rate for rate in TINY_RATES if rate < 1e-11])
+    assert (drawn(words, rates) == 0).all()
+
+
+# Moments --------------------------------------------------------------------------------------------------------------
+
+COUNT = 2**20
+
+
+@pytest.mark.parametrize("rate", [0.01, 0.3, 3.7, 30.0, 64.0, 1e3, 1e6])
+def test_moments_are_those_of_the_distribution(rate: float) -> None:
+    """Mean, variance and third central moment are all the rate; bounds from those up to the sixth.
+
+    No count is farther out than the law's 2**-33; half a word at each of its counts moves a moment by that much less.
+    """
+    words = streams.words(2**61 + 7, "heteroscedastic", (1024, COUNT // 1024)).ravel()
+    offset = fast(words, np.full(COUNT, rate)) - rate
+    reach = 6.4 * math.sqrt(rate) + 9
+    spread = (rate, 2 * rate**2 + rate, 15 * rate**3 + 24 * rate**2 + rate)
+    for order, (expected, variance) in enumerate(zip((0, rate, rate), spread, strict=True), start=1):
+        systematic = 2 * (reach + 1) ** (order + 1) / WORDS
+        bound = bernstein(variance, reach**order + rate, COUNT) + systematic
+        assert abs(float((offset**order).mean()) - expected) <= bound, order
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------
+
+
+def test_the_tables_have_the_published_hash() -> None:
+    assert poissons.digest(poisson_tables()) == poissons.TABLES_SHA256
+
+
+def test_tables_with_another_hash_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    poisson_tables.cache_clear()
+    monkeypatch.setattr(poissons, "TABLES_SHA256", "0" * 64)
+    with pytest.raises(MachineError, match="expected 0000"):
+        poisson_tables()
+    poisson_tables.cache_clear()
+
+
+def test_poisson_tables_are_read_only() -> None:
+    assert not any(table.flags.writeable for table in poisson_tables())
+
+
+def test_the_hash_covers_every_table() -> None:
+    right = poisson_tables()
+    for name, table in right._asdict().items():
+        wrong = table.copy()
+        wrong.flat[wrong.size // 2] += 1
+        assert poissons.digest(right._replace(**{name: wrong})) != poissons.TABLES_SHA256
+
+
+def test_the_refined_normal_has_a_cdf_error_below_1e_12() -> None:
+    """Where the normal of the table was off by 1.5e-7; at the word's tail probability, with an independent library."""
+    rng = np.random.default_rng(11)
+    indices = [0, 1, 5, SIGN - 1, SIGN - 2, *rng.integers(0, SIGN, 60), *(2 ** (31 * rng.random(60))).astype(np.int64)]
+    tails = poisson_tables().tails
+    for index in indices:
+        tail = (int(index) + 0.5) / WORDS
+        w = kernels._refine_normal.py_func(tail, float(normals(np.array([index], dtype=np.uint32))[0]), tails)
+        with mpmath.workdps(30):
+            assert abs(mpmath.erfc(mpmath.mpf(w) / mpmath.sqrt(2)) / 2 - tail) < 1e-12
+
+
+def test_poisson_kernels_are_compiled_without_fast_math() -> None:
+    compiled = [value for value in vars(kernels).values() if hasattr(value, "targetoptions")]
+    assert len(compiled) >= 5
+    assert not any(kernel.targetoptions.get("fastmath") for kernel in compiled)
+
+
+# Independent derivation of the expansion ------------------------------------------------------------------------------
+
+ORDERS = 12
+Polynomial = list[Fraction]
+"""In the normal, lowest power first."""
+
+
+def times(p: Polynomial, q: Polynomial) -> Polynomial:
+    product = [Fraction(0)] * max(len(p) + len(q) - 1, 0)
+    for i, a in enumerate(p):
+        for j, b in enumerate(q):
+            product[i + j] += a * b
+    return product
+
+
+def combined(*terms: tuple[Fraction | int, Polynomial]) -> Polynomial:
+    total = [Fraction(0)] * max(len(p) for _, p in terms)
+    for factor, p in terms:
+        for i, a in enumerate(p):
+            total[i] += factor * a
+    return total
+
+
+def logarithm(series: list[Polynomial]) -> list[Polynomial]:
+    """Of a power series that starts with 1: n·l_n = n·u_n - the sum of i·l_i·u_(n-i)."""
+    logs: list[Polynomial] = [[]]
+    for n in range(1, len(series)):
+        mixed = [(-i, times(logs[i], series[n - i])) for i in range(1, n)]
+        logs.append(combined((Fraction(1), series[n]), *((Fraction(f, n), p) for f, p in mixed)))
+    return logs
+
+
+STIRLING = {2: Fraction(1, 12), 6: Fraction(-1, 360), 10: Fraction(1, 1260)}
+"""log Gamma(a) beyond Stirling's formula, by powers of a**-½."""
+
+
+def gamma_quantiles() -> list[Polynomial]:
+    """Return y_n(v): the quantile of Gamma(a) at Φ(v) is a + √a·(y_0 + y_1·e + y_2·e² + …) with e = a**-½.
+
+    Equal densities require (1/e² - 1)·log(1 + e·y) - y/e + log y' - (Stirling's rest) = -v²/2, order by order. Each
+    order contains the new y_n as y_n' - v·y_n; its polynomial solution is found from the highest power down.
+    """
+    ys: list[Polynomial] = [[Fraction(0), Fraction(1)]]
+    for n in range(1, ORDERS):
+        log_y = logarithm([[Fraction(1)], *ys, [], []])
+        slopes = [[i * a for i, a in enumerate(y)][1:] for y in ys]
+        log_slope = logarithm([*slopes, []])[n]
+        rest = combined((1, log_y[n + 2]), (-1, log_y[n]), (1, log_slope), (-1, [STIRLING.get(n, Fraction(0))]))
+        y = [Fraction(0)] * (len(rest) + 2)
+        for i in range(len(rest) - 1, 0, -1):
+            y[i - 1] = rest[i] + (i + 1) * y[i + 1]
+        assert y[1] == -rest[0]
+        ys.append(y)
+    return ys
+
+
+def derived() -> list[Polynomial]:
+    """b_n(w): x = rate·(1 + b_1·d + b_2·d² + …), d = rate**-½, by solving rate = quantile of Gamma(x) at Phi(-w)."""
+    ys = [[a * (-1) ** i for i, a in enumerate(y)] for y in gamma_quantiles()]
+    b: list[Polynomial] = [[Fraction(1)]]
+    powers = [[[Fraction(1)]] for _ in ys]  # of 1 + b_1·d + …, to the power (1 - n) / 2
+    for order in range(1, ORDERS + 1):
+        b.append(combined(*((-1, times(powers[n][order - 1 - n], ys[n])) for n in range(order))))
+        for n, power in enumerate(powers):
+            exponent = Fraction(1 - n, 2)
+            terms = ((exponent * i - order + i, times(b[i], power[order - i])) for i in range(1, order + 1))
+            power.append(combined(*((factor / order, p) for factor, p in terms)))
+    return b
+
+
+def test_the_coefficients_are_those_of_the_expansion() -> None:
+    b = derived()
+    for m, coefficients in enumerate((poissons.A, poissons.B, poissons.C, poissons.D, poissons.E)):
+        first = 2 if m == 0 else 0
+        for n, coefficient in enumerate(coefficients, start=first):
+            assert coefficient == float(b[n + 2 * m][n]), (m, n)
+    assert b[1] == [0, 1]
+
+
+@pytest.mark.parametrize("rate", [64.0, 100.0, 1e4])
+def test_the_expansion_solves_its_equation(rate: float) -> None:
+    """Gamma(x, rate) / Gamma(x) = Phi(w) to 5e-12, by an independent library."""
+    w = np.linspace(-6.2, 6.2, 21)
+    x = poissons.expansion(np.full(w.shape, rate), w)
+    with mpmath.workdps(30):
+        for at, normal in zip(x, w, strict=True):
+            share = mpmath.gammainc(mpmath.mpf(at), mpmath.mpf(rate), mpmath.inf, regularized=True)
+            assert abs(share - mpmath.ncdf(mpmath.mpf(normal))) < 5e-12
+
+
+def test_the_cdf_table_is_right_at_the_ends_of_every_cell() -> None:
+    found = poisson_tables()
+    for cell in range(80):
+        for rate in ((cell / 10) ** 2 or 1e-12, ((cell + 1) / 10) ** 2):
+            counts, cdf = law(rate)
+            k = np.arange(max(found.least[cell], counts[0]), min(found.most[cell], counts[-1]) + 1)
+            offset = rate - found.middle[cell]
+            tabulated = [kernels._cdf_at.py_func(found.cdf, found.first[cell] + n, offset) for n in k]
+            assert np.abs(tabulated - cdf[k - counts[0]]).max() < 1e-11
+
+
+def test_the_tail_table_and_the_normal_table_share_cells() -> None:
+    """The reference makes the normal of a word as `effects.normals` does, bit for bit."""
+    words = np.random.default_rng(12).integers(0, SIGN, 100_000, dtype=np.uint32)
+    assert (poissons._quantile(poissons._tail(words)) == normals(words)).all()
+    assert tables.SEGMENTS == 32

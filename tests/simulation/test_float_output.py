@@ -1,0 +1,462 @@
+"""Frames in float32 and packed planes: the pair without rounding, clipped or not, byte for byte reproducible."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make, Settings
+from hypothesis import given
+from hypothesis import strategies as st
+
+from unprocess_gen import RawPairs
+from unprocess_gen.config.accuracy import Budget, choose_methods
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.lookup_tables import tukey_table
+from unprocess_gen.core.types import REFERENCE_METHOD, Frame, Plan
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.plan import plan_image, plan_pairs
+from unprocess_gen.reports import photon_transfer as transfer
+from unprocess_gen.reports.estimate import estimate_run
+from unprocess_gen.simulation import self_test as selftest
+from unprocess_gen.simulation.kernels import float_draws as floats
+from unprocess_gen.simulation.pair import make_pair, make_pairs
+from unprocess_gen.simulation.reference import cfa as bayer
+from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.reference import poisson as reference_poisson
+from unprocess_gen.simulation.reference.sensor import in_dn
+
+FLOATS = ("output.dtype=float32", "output.layout=packed", "sensor.clip=none")
+ORIGIN = 1, 57
+GOLDEN = selftest.GOLDEN_PLANS
+PLANS = {
+    **{name: GOLDEN[name] for name in ("per_channel", "gray_mean", "plain", "physical")},
+    "pinned": replace(GOLDEN["physical"], saturated="pinned"),
+    "averaged": replace(GOLDEN["physical"], physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True)),
+    "poisson": replace(GOLDEN["per_channel"], noise_law="poisson"),
+    "silent": replace(GOLDEN["per_channel"], effects=()),
+}
+"""One plan for each set of kernels."""
+DISPATCHED = [
+    name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
+]
+"""Instruction sets that NumPy can use on this machine."""
+
+
+def normalised(plan: Plan, clip: str = "none", layout: str = "mosaic") -> Plan:
+    return replace(plan, dtype="float32", sensor_clip=clip, layout=layout)
+
+
+def dn(frame: Frame, plan: Plan) -> np.ndarray:
+    return in_dn(frame, (plan.black_level_dn, plan.white_level_dn))
+
+
+# Draws ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 63), (2, 65), (1, 1024), (2, 2100)])
+@pytest.mark.parametrize("origin", [(0, 0), (7, 1), (300, 63), (1, 5000)])
+def test_compiled_words_equal_the_streams(shape: tuple[int, int], origin: tuple[int, int]) -> None:
+    key = 0xFEDCBA9876543210
+    found = floats.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1)
+    assert np.array_equal(found, streams.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1))
+
+
+WORDS = np.concatenate(
+    [
+        np.arange(2000, dtype=np.uint32),
+        np.uint32(2**31) + np.arange(2000, dtype=np.uint32),
+        np.uint32(2**32 - 1) - np.arange(2000, dtype=np.uint32),
+        np.random.default_rng(0).integers(0, 2**32, 200_000, dtype=np.uint32),
+    ]
+).reshape(8, -1)
+
+
+@pytest.mark.parametrize("table", [effects.normal_table(), tukey_table(-0.2), tukey_table(0.0)], ids=["n", "t", "l"])
+def test_compiled_quantiles_equal_the_reference_bit_for_bit(table: np.ndarray) -> None:
+    assert floats.by_inverse_cdf(WORDS, table).tobytes() == effects.by_inverse_cdf(WORDS, table).tobytes()
+
+
+def test_compiled_counts_equal_the_reference() -> None:
+    rate = np.geomspace(1e-3, 1e6, WORDS.size).reshape(WORDS.shape)
+    rate[:, ::7] = 0.0
+    assert np.array_equal(floats.poisson(WORDS, rate), reference_poisson.poisson(WORDS, rate))
+
+
+# Pairs ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("clip", ["none", "sensor", "black"])
+@pytest.mark.parametrize("name", PLANS)
+def test_kernels_equal_the_reference_byte_for_byte(name: str, clip: str) -> None:
+    plan, picture = normalised(PLANS[name], clip), selftest.golden_image()
+    ours, theirs = (make_pair(picture, one, ORIGIN) for one in (plan, replace(plan, methods=(REFERENCE_METHOD,))))
+    assert ours.clean.tobytes() == theirs.clean.tobytes()
+    assert ours.noisy.tobytes() == theirs.noisy.tobytes()
+    assert ours.counts == theirs.counts
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_an_integer_frame_is_the_rounded_float_frame(name: str) -> None:
+    """Values within 6e-5 DN (at 10 bits) of a rounding boundary are excluded; the cast to float32 may move them."""
+    plan, picture = PLANS[name], selftest.golden_image()
+    whole, exact = make_pair(picture, plan, ORIGIN), make_pair(picture, normalised(plan), ORIGIN)
+    for rounded, frame in ((whole.clean, exact.clean), (whole.noisy, exact.noisy)):
+        assert frame.dtype == np.float32
+        value = dn(frame, plan)
+        near_a_half = abs(value - np.floor(value) - 0.5) < 1e-4
+        assert near_a_half.mean() < 0.01
+        assert np.array_equal(np.clip(np.rint(value), 0, 1023)[~near_a_half], rounded[~near_a_half])
+
+
+@pytest.mark.parametrize("name", ["per_channel", "physical"])
+def test_clipped_counts_do_not_depend_on_the_clipping_mode(name: str) -> None:
+    """With levels 64 and 1023 at 10 bits, values below DN 0 or above 1023 of the unclipped frame are counted."""
+    free, sensor, black = (
+        make_pair(selftest.golden_image(), normalised(PLANS[name], clip), ORIGIN)
+        for clip in ("none", "sensor", "black")
+    )
+    value = free.noisy
+    lowest = np.float32(-64 / 959)
+    assert (free.counts.noisy_clipped_low, free.counts.noisy_clipped_high) == (0, 0)
+    assert sensor.counts.noisy_clipped_low == int((value < lowest).sum())
+    assert sensor.counts.noisy_clipped_high == int((value > 1).sum()) > 0
+    assert sensor.counts.noisy_clipped_low + sensor.counts.noisy_clipped_high > 0
+    assert black.counts.noisy_clipped_low == int((value < 0).sum()) > sensor.counts.noisy_clipped_low
+    assert np.array_equal(sensor.noisy, np.clip(value, lowest, 1))
+    assert np.array_equal(black.noisy, np.clip(value, 0, 1))
+    assert free.clean.tobytes() == sensor.clean.tobytes() == black.clean.tobytes()
+
+
+def test_the_clean_frame_is_clipped_and_saturated_at_one() -> None:
+    """The clipping mode of the noisy frame does not matter, as in step 8 of Algorithm 1 and in Brooks et al."""
+    pair = make_pair(selftest.golden_image(), normalised(PLANS["per_channel"]), ORIGIN)
+    assert (pair.clean.min(), pair.clean.max()) == (0, 1)
+    assert pair.counts.saturated == int((pair.clean == 1).sum()) > 0
+
+
+def test_unclipped_noise_has_mean_zero_in_black() -> None:
+    """Tolerance: five standard errors. Clipped at black, the mean would be that of half a normal, σ/√(2π)."""
+    black = np.zeros((512, 512, 3), dtype=np.uint8)
+    plan = PLANS["per_channel"]
+    std = np.sqrt(plan.b_dn2) / 959
+    free, clipped = (make_pair(black, normalised(plan, clip)).noisy for clip in ("none", "black"))
+    assert abs(free.mean(dtype=np.float64)) < 5 * std / 512
+    assert abs(free.var(dtype=np.float64) / std**2 - 1) < 5 * np.sqrt(2) / 512
+    assert abs(clipped.mean(dtype=np.float64) - std / np.sqrt(2 * np.pi)) < 5 * 0.6 * std / 512
+
+
+@pytest.mark.parametrize("name", ["per_channel", "physical", "averaged"])
+def test_the_result_does_not_depend_on_bands(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan, picture = normalised(PLANS[name]), selftest.golden_image()
+    whole = make_pair(picture, plan, ORIGIN)
+    monkeypatch.setattr(floats, "BAND_SITES", 5 * picture.shape[1])
+    monkeypatch.setattr(floats, "PIECE_SITES", 2 * picture.shape[1])
+    pieces = make_pair(picture, plan, ORIGIN)
+    assert pieces.clean.tobytes() == whole.clean.tobytes()
+    assert pieces.noisy.tobytes() == whole.noisy.tobytes()
+    assert pieces.counts == whole.counts
+
+
+@pytest.mark.parametrize("name", ["per_channel", "physical"])
+def test_a_crop_is_the_crop_of_the_full_pair(name: str) -> None:
+    plan, picture = normalised(PLANS[name]), selftest.golden_image()
+    whole, part = make_pair(picture, plan), make_pair(picture[3:12, 5:70], plan, (3, 5))
+    assert np.array_equal(part.clean, whole.clean[3:12, 5:70])
+    assert np.array_equal(part.noisy, whole.noisy[3:12, 5:70])
+
+
+@pytest.mark.parametrize("overrides", [FLOATS, FLOATS[1:2]], ids=["both", "packed"])
+@pytest.mark.parametrize("noise", ["imx385_iso3200", "imx385"])
+def test_levels_and_draws_equal_separate_pairs(noise: str, overrides: tuple[str, ...], settings: Settings) -> None:
+    levels = "noise.levels=[1600,6400]" if noise == "imx385" else "noise.levels=[{a: 2, b: 3},{a: 4, b: 5}]"
+    config = settings(f"noise={noise}", levels, "noise.draws=2", *overrides)
+    picture = selftest.golden_image()[:18, :82]
+    plans = plan_pairs(config, "0" * 64, facts=facts_for(config, picture))
+    assert len(plans) == 4
+    for plan, ours in zip(plans, make_pairs(picture, plans), strict=True):
+        alone = make_pair(picture, plan)
+        assert ours.clean.tobytes() == alone.clean.tobytes()
+        assert ours.noisy.tobytes() == alone.noisy.tobytes()
+        assert (ours.noisy.shape, ours.counts) == (alone.noisy.shape, alone.counts)
+
+
+def test_numpys_instruction_sets_change_no_byte() -> None:
+    """A new process simulates the golden float32 pairs, whose formulas NumPy computes."""
+    code = (
+        "import numpy as np; from unprocess_gen.simulation import self_test as selftest; "
+        "print(selftest.failures('normalised_counts'), "
+        "sum(np._core._multiarray_umath.__cpu_features__[one] for one in np._core._multiarray_umath.__cpu_dispatch__))"
+    )
+    hidden = {"NPY_DISABLE_CPU_FEATURES": " ".join(DISPATCHED)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | hidden, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "() 0\n"
+
+
+# Planes ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("origin", [(0, 0), (0, 1), (1, 0), (1, 1)])
+@pytest.mark.parametrize("pattern", bayer.PATTERNS)
+def test_planes_are_ordered_r_gr_gb_b_for_every_pattern(pattern: str, origin: tuple[int, int]) -> None:
+    y, x = np.mgrid[0:6, 0:8]
+    sites = np.array(bayer.tile(pattern, origin))
+    channel = bayer.pack(sites[y % 2, x % 2].astype(np.uint16), pattern, origin)
+    row = bayer.pack((y % 2).astype(np.uint16), pattern, origin)
+    assert [set(np.unique(plane)) for plane in channel] == [{0}, {1}, {1}, {2}]
+    assert np.array_equal(row[0], row[1])  # the first green lies in the rows of red
+    assert np.array_equal(row[2], row[3])
+
+
+@given(st.sampled_from(bayer.PATTERNS), st.integers(1, 9), st.integers(1, 9), st.sampled_from(["uint16", "float32"]))
+def test_unpacking_is_the_inverse_of_packing(pattern: str, height: int, width: int, dtype: str) -> None:
+    mosaic = np.random.default_rng(0).integers(0, 65536, (2 * height, 2 * width)).astype(dtype)
+    planes = bayer.pack(mosaic, pattern)
+    assert (planes.shape, planes.dtype) == ((4, height, width), mosaic.dtype)
+    assert np.array_equal(bayer.unpack(planes, pattern), mosaic)
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (4, 3)])
+def test_an_odd_side_cannot_be_packed(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="even"):
+        bayer.pack(np.zeros(shape, dtype=np.uint16), "RGGB")
+    with pytest.raises(ValueError, match="even"):
+        make_pair(np.zeros((*shape, 3), dtype=np.uint8), replace(PLANS["silent"], layout="packed"))
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_packed_frames_contain_the_values_of_mosaics(name: str) -> None:
+    picture = selftest.golden_image()[:18, :82]
+    for plan in (PLANS[name], normalised(PLANS[name])):
+        mosaics, planes = make_pair(picture, plan, ORIGIN), make_pair(picture, replace(plan, layout="packed"), ORIGIN)
+        assert planes.noisy.shape == (4, 9, 41)
+        assert np.array_equal(bayer.unpack(planes.noisy, plan.pattern, ORIGIN), mosaics.noisy)
+        assert np.array_equal(bayer.unpack(planes.clean, plan.pattern, ORIGIN), mosaics.clean)
+
+
+# Plans ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("counts", [False, True])
+def test_all_budgets_except_reference_select_the_same_methods(counts: bool) -> None:
+    exact, fast = Budget("e", False, 0, 0, 1e-6, 0), Budget("f", False, 1, 1e-3, 1e-3, 5e-3)
+    assert choose_methods(exact, counts, normalised=True) == choose_methods(fast, counts, normalised=True)
+    assert not any(one.startswith("quantise:") for one in choose_methods(exact, counts, normalised=True))
+
+
+@pytest.mark.parametrize("noise", ["brooks2019", "none", "oppo_reno10x"])
+def test_float_frames_skip_quantisation(noise: str, settings: Settings) -> None:
+    picture = selftest.golden_image()
+    for overrides, rounded in ((FLOATS, False), ((), True)):
+        config = settings(f"noise={noise}", *overrides)
+        validate_config(config)
+        plan = plan_image(config, "0" * 64, facts=facts_for(config, picture))
+        assert ("quantise" in plan.effects) == rounded
+        assert ("quantise: float output is not rounded" in plan.skipped) != rounded
+
+
+def test_rounding_noise_masks_nothing_in_float_frames(settings: Settings) -> None:
+    """In a clean frame, only rounding masks a column pattern of 0.01 DN."""
+    noise = ("noise=nikon_d850", "clean.includes_fixed_pattern=true")
+    effects_of = {}
+    for dtype in ("uint16", "float32"):
+        config = settings(*noise, f"output.dtype={dtype}")
+        config.noise.branches[0].column_std_dn = 1e-4
+        effects_of[dtype] = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image())).effects
+    assert "column" not in effects_of["uint16"]
+    assert "column" in effects_of["float32"]
+
+
+def test_an_effect_without_masking_noise_is_decided(settings: Settings) -> None:
+    config = settings(
+        "noise=nikon_d850", "noise.full_well_e=1000", "noise.assumed=[]", "effects.shot=off", "effects.read=off",
+        "effects.dark_current=off", "output.dtype=float32",
+    )  # fmt: skip
+    plan = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image()))
+    assert "full_well" in plan.effects
+
+
+# Datasets -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def packed(photos: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Dataset of packed planes in float32, which tests do not modify."""
+    out = tmp_path_factory.mktemp("floats") / "ds"
+    make(photos, out, "output.pairs_per_shard=5", "noise=brooks2019", *FLOATS)
+    return out
+
+
+def test_items_have_the_dtype_and_layout_of_their_rows(packed: Path) -> None:
+    pairs = RawPairs(packed)
+    assert len(pairs) == 12
+    for clean, noisy, row in pairs:
+        assert (row["dtype"], row["layout"]) == ("float32", "packed")
+        assert clean.dtype == noisy.dtype == np.dtype("<f4")
+        assert clean.shape == noisy.shape == (4, row["height"] // 2, row["width"] // 2)
+        assert clean.min() >= 0
+        assert clean.max() <= 1
+
+
+def test_an_odd_side_loses_its_last_row_or_column(packed: Path) -> None:
+    sizes = {str(row["source"]): (row["height"], row["width"]) for _, _, row in RawPairs(packed)}
+    assert sizes["comma, and space.jpg"] == (22, 36)  # 23 x 37
+    assert sizes["strip.bmp"] == (2, 40)  # 3 x 40
+
+
+def test_an_image_without_a_complete_tile_is_unsupported(packed: Path) -> None:
+    rows = (packed / "manifest.csv").read_text(encoding="utf-8").splitlines()
+    assert [line for line in rows if ",unsupported," in line] == [line for line in rows if ",one.png," in line] != []
+
+
+def test_cropped_planes_equal_the_cropped_mosaic(packed: Path, photos: Path, make: Make) -> None:
+    mosaics = packed.parent / "mosaics"
+    make(photos, mosaics, "noise=brooks2019", FLOATS[0], FLOATS[2])
+    whole = {row["source"]: (noisy, row) for _, noisy, row in RawPairs(mosaics)}
+    for _, planes, row in RawPairs(packed):
+        noisy, of_mosaic = whole[row["source"]]
+        assert np.array_equal(bayer.unpack(planes, row["pattern"]), noisy[: row["height"], : row["width"]])
+        assert row["stream_key"] == of_mosaic["stream_key"]
+
+
+def test_every_byte_is_verified_and_every_pair_regenerated(packed: Path, photos: Path) -> None:
+    from unprocess_gen.dataset.manifest import read_rows
+
+    assert verify(packed) == []
+    again = list(replay(read_rows(packed / "manifest.csv"), str(photos)))
+    assert len(again) == 12
+    assert not any(one.complaint for one in again)
+
+
+def test_a_flipped_bit_is_found_and_repaired(packed: Path, photos: Path, run_main: RunMain, tmp_path: Path) -> None:
+    shutil.copytree(packed, tmp_path / "ds")
+    shard = tmp_path / "ds/shards/shard-00000.tar"
+    content = bytearray(shard.read_bytes())
+    content[700] ^= 1  # in the first array
+    shard.write_bytes(content)
+    done = run_main("verify", "ds", "--repair", f"source.root={photos}")
+    assert done.code == 0
+    assert "clean.npy: the XXH3-128 of its data is" in done.err
+    assert shard.read_bytes() == (packed / "shards/shard-00000.tar").read_bytes()
+
+
+@pytest.mark.parametrize("overrides", [FLOATS, FLOATS[:1], FLOATS[1:2]], ids=["both", "float32", "packed"])
+def test_the_estimated_bytes_are_exact(
+    overrides: tuple[str, ...], photos: Path, make: Make, settings: Settings, tmp_path: Path
+) -> None:
+    """Unpatched images of 13 photographs; some have odd sides and one fails."""
+    config = settings(*overrides, "noise.draws=2")
+    config.source.root = str(photos)
+    summary = make(photos, tmp_path / "ds", *overrides, "noise.draws=2")
+    told = estimate_run(config, 1, read_all=True)
+    assert told.bytes == summary.bytes == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
+
+
+def test_plan_reports_the_loss_of_odd_sides(photos: Path, run_main: RunMain) -> None:
+    done = run_main("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
+    assert done.code == 0
+    assert "packed    8 of 12 images have an odd side, whose last row or column is omitted: " in done.out
+    assert "one.png: unsupported\n          1 x 1 pixels contain no 2 x 2 tile" in done.out
+
+
+@pytest.mark.parametrize("accuracy", ["fast", pytest.param("reference", marks=pytest.mark.slow)])
+def test_arrays_are_the_same_in_every_tier(accuracy: str, packed: Path, photos: Path, make: Make) -> None:
+    out = packed.parent / accuracy
+    make(photos, out, f"accuracy={accuracy}", "noise=brooks2019", *FLOATS)
+    digests = [[(row["clean_xxh3"], row["noisy_xxh3"]) for *_, row in RawPairs(ds)] for ds in (packed, out)]
+    assert digests[0] == digests[1]
+
+
+def test_rerun_does_nothing_and_another_dtype_is_refused(
+    packed: Path, photos: Path, run_main: RunMain, tree_hash: Callable[[Path], str]
+) -> None:
+    before = tree_hash(packed)
+    same = ("output.pairs_per_shard=5", "noise=brooks2019", f"source.root={photos}", f"out={packed}", *FLOATS)
+    assert "nothing to do" in run_main(*same).out
+    done = run_main(*same, "sensor.clip=sensor", "output.dtype=uint16")
+    assert done.code == 2
+    assert "output.dtype=uint16 (there: float32)" in done.err
+    assert tree_hash(packed) == before
+
+
+@pytest.mark.slow
+def test_the_bytes_do_not_depend_on_the_number_of_workers(
+    packed: Path, photos: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    make(photos, tmp_path / "ds", "output.pairs_per_shard=5", "noise=brooks2019", *FLOATS, n_jobs=2)
+    assert tree_hash(tmp_path / "ds") == tree_hash(packed)
+
+
+def test_a_dataset_is_regenerated_from_its_config(packed: Path, photos: Path, run_main: RunMain) -> None:
+    done = run_main("again", packed, f"source.root={photos}", "out=again", "n_jobs=1", "source.max_failed=1")
+    assert done.code == 0
+    assert "the same as" in done.out
+
+
+def test_bytes_are_little_endian_and_match_the_digests(packed: Path) -> None:
+    import xxhash
+
+    clean, noisy, row = RawPairs(packed)[0]
+    assert xxhash.xxh3_128_hexdigest(clean.astype("<f4").tobytes()) == row["clean_xxh3"]
+    assert xxhash.xxh3_128_hexdigest(noisy.astype("<f4").tobytes()) == row["noisy_xxh3"]
+    assert hashlib.sha256((packed / "shards/shard-00000.tar").read_bytes()).hexdigest() in (
+        packed / "dataset.json"
+    ).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("noise=heteroscedastic", "noise.a=0.02", "noise.b=0.01", *FLOATS),  # which rounding would hide
+        ("output.layout=packed", "sensor.pattern=GRBG"),
+        pytest.param(("noise=brooks2019", *FLOATS), marks=pytest.mark.slow),
+        pytest.param(("noise=sony_a7s2", "scene=low_light", "sensor=generic_14bit", FLOATS[0]), marks=pytest.mark.slow),
+    ],
+)
+def test_the_noise_of_the_arrays_fits_the_rows(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.limit=1", *overrides)
+    found = list(transfer.iterate_fits(tmp_path / "ds"))
+    assert len(found) == 1
+    assert found[0].deviation < 5
+    clean, noisy, row = RawPairs(tmp_path / "ds")[0]
+    lying = transfer.fit_pair(clean, noisy, row | {"a_dn": row["a_dn"] * 1.1})
+    assert lying is not None
+    assert lying.deviation > transfer.ALARM
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (
+            ("sensor.clip=none",),
+            "output.dtype=uint16 holds no values beyond the sensor's range; set output.dtype=float32",
+        ),
+        (("output.dtype=float32", "effects.quantise=on"), "effects.quantise=on: output.dtype=float32 is not rounded"),
+    ],
+)
+def test_contradictory_output_settings_give_one_line(
+    arguments: tuple[str, ...], complaint: str, run_main: RunMain, tmp_path: Path
+) -> None:
+    done = run_main(*arguments)
+    assert (done.code, len(done.err.splitlines()), list(tmp_path.iterdir())) == (2, 1, [])
+    assert complaint in done.err
+
+
+def test_accuracy_requires_integer_frames(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("accuracy", "output.dtype=float32")
+    assert (done.code, list(tmp_path.iterdir())) == (2, [])
+    assert "errors are in integer DN; expected uint16; set output.dtype=uint16" in done.err

@@ -1,0 +1,265 @@
+"""The self-test detects a process that computes differently, and datasets record its result."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+
+from unprocess_gen.core import lookup_tables, tone_curves
+from unprocess_gen.core import random_streams as streams
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.simulation import self_test as selftest
+from unprocess_gen.simulation.kernels import clean, gaussian, normal, philox, readout, rounding, segments
+from unprocess_gen.simulation.pair import make_pair, reference_pair
+from unprocess_gen.simulation.reference import noise as effects
+
+
+@pytest.fixture(autouse=True)
+def _fresh() -> Iterator[None]:
+    selftest.failures.cache_clear()
+    yield
+    selftest.failures.cache_clear()
+
+
+@pytest.mark.parametrize("kernels", selftest.GOLDEN_PAIRS)
+def test_this_machine_passes_the_self_test(kernels: str) -> None:
+    assert selftest.failures(kernels) == ()
+
+
+@pytest.mark.parametrize("name", sorted(set(selftest.GOLDEN) - {"float32", "near"}))
+def test_the_golden_pair_equals_the_reference(name: str) -> None:
+    plan = selftest.GOLDEN_PLANS[name]
+    pair = reference_pair(selftest.golden_image(), plan, (1, 57))
+
+    assert (array_xxh3(pair.clean), array_xxh3(pair.noisy)) == selftest.GOLDEN[name]
+
+
+def test_the_float32_golden_pair_differs_from_float64() -> None:
+    """Equal pairs could not show that the float32 kernels are tested."""
+    plan = replace(selftest.GOLDEN_PLANS["float32"], methods=())
+
+    assert array_xxh3(make_pair(selftest.golden_image(), plan, (1, 57)).noisy) != selftest.GOLDEN["float32"][1]
+
+
+def test_every_golden_pair_belongs_to_a_set_of_kernels() -> None:
+    assert {name for names in selftest.GOLDEN_PAIRS.values() for name in names} == set(selftest.GOLDEN)
+
+
+@pytest.mark.parametrize("name", selftest.GOLDEN)
+def test_a_golden_pair_tests_the_kernels_that_simulate_it(name: str) -> None:
+    assert name in selftest.GOLDEN_PAIRS[selftest.kernels(selftest.GOLDEN_PLANS[name])]
+
+
+@pytest.mark.parametrize(
+    ("kernels", "settings"),
+    [
+        ("one_normal", ["noise=imx385_iso3200"]),
+        ("float32", ["noise=imx385_iso3200", "accuracy=fast"]),
+        ("reference", ["noise=imx385_iso3200", "accuracy=reference"]),
+        ("plain", ["noise=sony_a7s2", "scene=daylight"]),
+        ("physical", ["noise=sony_a7s2", "scene=daylight", "effects.all=on"]),
+    ],
+)
+def test_only_the_kernels_of_the_plans_are_tested(
+    kernels: str, settings: list[str], run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    proved: list[str] = []
+    monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
+
+    assert run_main("n_jobs=1", "source.limit=2", *settings).code == 0
+    assert set(proved) == {kernels}
+
+
+def test_kernels_are_tested_when_a_plan_first_needs_them(run_main: RunMain, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plans of all noise levels of an image count."""
+    proved: list[str] = []
+    monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
+    kinds = iter(["plain", "physical", "plain", "one_normal"])
+    monkeypatch.setattr(selftest, "kernels", lambda plan: next(kinds))
+
+    assert run_main("n_jobs=1", "source.limit=2", "noise.draws=2").code == 0
+    assert list(dict.fromkeys(proved)) == ["plain", "physical", "one_normal"]
+
+
+def test_the_golden_image_reaches_every_limit() -> None:
+    """Limits: clipped low and high, saturated, both kinds of highlights, every 8-bit code."""
+    picture = selftest.golden_image()
+    counts = reference_pair(picture, selftest.GOLDEN_PLAN, (1, 57)).counts
+
+    assert set(np.unique(picture)) == set(range(256))
+    assert min(counts.noisy_clipped_low, counts.noisy_clipped_high, counts.saturated) > 0
+
+
+def last_bit(table: np.ndarray) -> np.ndarray:
+    """Return the table with one central entry one unit in the last place larger."""
+    changed = table.copy()
+    changed.flat[changed.size // 2 + 1] = np.nextafter(changed.flat[changed.size // 2 + 1], np.inf)
+    return changed
+
+
+@pytest.mark.parametrize(("module", "build"), [(tone_curves, "compute_curve"), (lookup_tables, "_normal_row")])
+def test_a_table_one_unit_off_is_detected(module: ModuleType, build: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    true: Callable[..., object] = getattr(module, build)
+    monkeypatch.setattr(module, build, lambda *given: last_bit(np.array(true(*given)) * (1 + 2**-20)))
+    tone_curves._linear_table.cache_clear()
+    lookup_tables.normal_table.cache_clear()
+    try:
+        with pytest.raises(
+            MachineError, match=r"the self-test failed: results differ \(a table has SHA-256 [0-9a-f]{64}; expected"
+        ):
+            selftest.check("one_normal")
+    finally:
+        tone_curves._linear_table.cache_clear()
+        lookup_tables.normal_table.cache_clear()
+
+
+def test_a_wrong_philox_constant_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "ROUNDS", 9)
+
+    assert "Philox of 00000000 differs from Random123" in selftest.failures("one_normal")
+
+
+KERNEL_MODULES = (philox, rounding, segments, clean, normal, readout, gaussian)
+
+KERNELS = (
+    *("sum_products", "_fill_gray_mean_signal", "fill_linear", "recompute_bright", "fill_word_blocks"),
+    *("fill_depths", "_fill_noise", "_round_and_list", "_recompute_exact"),
+)
+
+
+@pytest.fixture
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Replace the kernels by plain Python functions."""
+    for module in KERNEL_MODULES:
+        for name, value in list(vars(module).items()):
+            if hasattr(value, "py_func"):
+                monkeypatch.setattr(module, name, value.py_func)
+    with np.errstate(over="ignore", invalid="ignore"):  # words wrap around; a nudge goes beyond a frame's numbers
+        yield
+
+
+@pytest.mark.usefixtures("uncompiled")
+def test_uncompiled_kernels_pass_the_self_test() -> None:
+    assert selftest.failures("one_normal") == ()
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_wrong_kernel_is_detected(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    holders = [module for module in KERNEL_MODULES if hasattr(module, kernel)]
+    other = nudged(getattr(holders[0], kernel))
+    for module in holders:
+        monkeypatch.setattr(module, kernel, other)
+
+    assert any("the golden" in one for one in selftest.failures("one_normal"))
+
+
+def test_a_fused_multiply_add_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fused_at_once(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+        out[:] = [float(Fraction(a) ** 2 + Fraction(b)) for a, b in zip(x, y, strict=True)]
+
+    monkeypatch.setattr(selftest, "_product_and_sum", fused_at_once)
+
+    assert "a kernel uses a fused multiply-add" in selftest.failures("one_normal")
+
+
+def nudged(kernel: Callable[..., object]) -> Callable[..., object]:
+    """Return the kernel with a slightly larger last output: one bit of the words, half a DN of signal or noise."""
+
+    def other(*given: object) -> object:
+        found = kernel(*given)
+        outputs = [one.noise_dn if isinstance(one, segments.SegmentBuffers) else one for one in given]
+        for output in reversed(outputs):
+            if isinstance(output, np.ndarray) and output.size > 9 and output.flags.writeable:
+                output += {"uint32": 2**28, "uint16": 1, "float32": 0.5, "float64": 0.5}[output.dtype.name]
+                break
+        return found
+
+    return other
+
+
+GOLDEN = {**selftest.GOLDEN, "per_channel": ("0" * 32, "0" * 32)}
+
+
+def test_a_failed_self_test_stops_the_run_before_the_first_pair(
+    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+
+    done = run_main("n_jobs=1", "source.limit=2")
+
+    assert done.code == 5
+    assert done.err.startswith(
+        "gen-dataset: the self-test failed: results differ (the golden clean frame (per_channel) is 443ea2ae"
+    )
+    assert done.err.endswith("or set self_test=go_on\n")
+    assert len(done.err.splitlines()) == 1
+    assert list((tmp_path / "ds" / "shards").iterdir()) == []
+    assert not (tmp_path / "ds" / "dataset.json").exists()
+
+
+def test_go_on_continues_and_records_the_failure(
+    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+
+    done = run_main("n_jobs=1", "source.limit=3", "output.pairs_per_shard=2", "self_test=go_on")
+
+    facts = json.loads((tmp_path / "ds" / "dataset.json").read_text())
+    assert done.code == 0
+    assert done.err.count("the self-test failed: the golden clean frame") == 1
+    assert facts["self_test"] == "failed"
+    assert all("the golden clean frame" in entry["self_test"] for entry in facts["shards"])
+
+
+def test_only_shards_of_the_failing_process_are_recorded(
+    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole = ("n_jobs=1", "source.limit=4", "output.pairs_per_shard=2", "self_test=go_on")
+    assert run_main(*whole, "out=other").code == 0
+    with monkeypatch.context() as patched:
+        patched.setattr("unprocess_gen.pipeline.workspace.Workspace.finish", interrupted)
+        assert run_main(*whole).code == 130
+    (tmp_path / "ds" / ".work" / "rows" / "00001.json").unlink()
+    (tmp_path / "ds" / "shards" / "shard-00001.tar").unlink()
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+    selftest.failures.cache_clear()
+
+    assert run_main(*whole).code == 0
+
+    shards = json.loads((tmp_path / "ds" / "dataset.json").read_text())["shards"]
+    assert [("self_test" in entry) for entry in shards] == [False, True]
+
+
+def interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_dataset_records_a_passed_self_test(dataset: Path) -> None:
+    assert json.loads((dataset / "dataset.json").read_text())["self_test"] == "passed"
+
+
+def test_replay_is_refused_after_a_failed_self_test(
+    dataset: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
+
+    assert run_main("replay", dataset / "manifest.csv").code == 5
+
+
+def test_the_golden_pair_depends_on_the_reference_normals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise a change of the sampler, which reference and kernels share, would not be detected."""
+    true = effects.normals
+    monkeypatch.setattr(effects, "normals", lambda *given: -true(*given))
+    pair = reference_pair(selftest.golden_image(), selftest.GOLDEN_PLAN, (1, 57))
+
+    assert array_xxh3(pair.noisy) != selftest.GOLDEN["per_channel"][1]

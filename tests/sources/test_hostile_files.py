@@ -1,0 +1,705 @@
+"""Files made to break a decoder: whatever lies in the folder, the run ends, within bounds, with a row for each file.
+
+Quick: generated photographs, damaged in the ways of `corpus`; headers that declare more than there is; deflated zeros;
+and folder entries that are not files. Slow: the test pictures of image libraries, some eight thousand with
+those derived from them, from the folder that ``CORPUS`` names, or fetched (minutes). What a file takes is measured in a
+process of its own, whose high-water mark of memory is set back before each.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import multiprocessing
+import os
+import random
+import re
+import socket
+import struct
+import subprocess
+import sys
+import time
+import tracemalloc
+import zlib
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from helpers.commands import COMMAND, environment
+from helpers.corpus import DAMAGES, MATCHED
+from helpers.datasets import Settings
+from helpers.photographs import pixels
+from PIL import Image
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.errors import REASONS, SourceError
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.tasks import RunContext, ShardTask
+from unprocess_gen.pipeline.worker import make_shard
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.sources.image.decode import decode
+from unprocess_gen.sources.listing import decode_name, encode_name, list_folder, read_bytes
+
+MAX_PIXELS = 2**26
+MAX_SECONDS = 10
+MAX_BYTES = 1.5e9
+
+Done = subprocess.CompletedProcess[str]
+Rows = dict[str, dict[str, str]]
+
+
+def gen_dataset(*arguments: object, timeout_s: float = 120) -> Done:
+    return subprocess.run(
+        [str(COMMAND), *map(str, arguments)],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout_s,
+        check=False,
+    )
+
+
+def rows_of(out: Path) -> Rows:
+    """The rows of a manifest by the path of their source, as Python's csv module reads them."""
+    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
+        return {decode_name(row["source"]): row for row in csv.DictReader(stream)}
+
+
+class Run(NamedTuple):
+    """One ``gen-dataset`` over a folder: how it ended, and what it wrote."""
+
+    root: Path
+    out: Path
+    done: Done
+    rows: Rows
+
+
+def run(root: Path, out: Path, *overrides: str, timeout_s: float = 120) -> Run:
+    done = gen_dataset(f"source.root={root}", f"out={out}", *overrides, timeout_s=timeout_s)
+    return Run(root, out, done, rows_of(out))
+
+
+def no_trouble(made: Run) -> bool:
+    return made.done.returncode == 3 and "Traceback" not in made.done.stderr and "died" not in made.done.stderr
+
+
+def undocumented(rows: Rows) -> dict[str, str]:
+    """The rows that are neither ok nor failed for a documented reason."""
+    allowed = {("ok", "")} | {("failed", reason) for reason in REASONS if reason != "worker_died"}
+    return {path: row["reason"] for path, row in rows.items() if (row["status"], row["reason"]) not in allowed}
+
+
+# Damaged generated photographs ----------------------------------------------------------------------------------------
+
+
+def encoded(kind: str, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels(len(kind), 48, 64)).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+OURS = {
+    "baseline.jpg": encoded("JPEG", quality=95),
+    "progressive.jpg": encoded("JPEG", quality=95, progressive=True),
+    "restarts.jpg": encoded("JPEG", restart_marker_blocks=2),
+    "8.png": encoded("PNG"),
+    "16.png": cv2.imencode(".png", pixels(16, 48, 64, np.uint16))[1].tobytes(),
+    "plain.tif": encoded("TIFF"),
+    "deflated.tif": encoded("TIFF", compression="tiff_deflate"),
+    "lossy.webp": encoded("WEBP"),
+    "lossless.webp": encoded("WEBP", lossless=True),
+    "24.bmp": encoded("BMP"),
+}
+KINDS = {"jpg": "jpeg", "png": "png", "tif": "tiff", "webp": "webp", "bmp": "bmp"}
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Run over `OURS`, intact and damaged in every way: ``good-8.png``, ``cut-0-8.png``, …, some 200 files."""
+    folder = tmp_path_factory.mktemp("hostile")
+    (folder / "photos").mkdir()
+    for name, data in OURS.items():
+        (folder / "photos" / f"good-{name}").write_bytes(data)
+        for damage, make in DAMAGES.items():
+            generator = random.Random(f"{damage} {name}")
+            for number, bad in enumerate(make(data, KINDS[name.rpartition(".")[2]], generator)):
+                (folder / "photos" / f"{damage}-{number}-{name}").write_bytes(bad)
+    limits = ("source.max_pixels=16777216", "output.pairs_per_shard=32")
+    return run(folder / "photos", folder / "ds", *limits)
+
+
+def test_damaged_photographs_end_the_run_with_3_and_no_traceback(damaged: Run) -> None:
+    assert no_trouble(damaged), damaged.done.stderr
+
+
+def test_every_damaged_photograph_has_a_row(damaged: Run) -> None:
+    assert sorted(damaged.rows) == sorted(os.listdir(damaged.root))
+
+
+def test_damaged_photographs_are_pairs_or_have_a_reason(damaged: Run) -> None:
+    assert undocumented(damaged.rows) == {}
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_intact_photographs_among_damaged_ones_are_pairs(name: str, damaged: Run) -> None:
+    assert damaged.rows[f"good-{name}"]["status"] == "ok"
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_every_cut_of_a_photograph_is_refused_as_broken(name: str, damaged: Run) -> None:
+    reasons = {path: row["reason"] for path, row in damaged.rows.items() if re.fullmatch(f"cut-.-{name}", path)}
+    assert len(reasons) >= 6
+    assert set(reasons.values()) <= {"truncated", "corrupt"}, reasons
+
+
+def test_dataset_of_damaged_photographs_is_intact(damaged: Run) -> None:
+    verified = gen_dataset("verify", damaged.out)
+    assert (verified.returncode, verified.stderr) == (0, "")
+
+
+# Headers that claim more than there is --------------------------------------------------------------------------------
+
+
+def png_head(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:
+    head = b"IHDR" + struct.pack(">IIBB3x", width, height, bits, colour)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+
+
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+
+
+def jpeg_head(frame: int) -> bytes:
+    size = struct.pack(">BHHBBBBBBBBBB", 8, 65535, 65535, 3, 1, 17, 0, 2, 17, 0, 3, 17, 0)
+    return b"\xff\xd8\xff" + bytes([frame]) + struct.pack(">H", len(size) + 2) + size + b"\xff\xd9"
+
+
+def tiff_head(width: int, height: int, *, compression: int = 8, big: bool = False) -> bytes:
+    """A TIFF of one strip that would take one byte, and has it."""
+    tags = ((256, width), (257, height), (258, 8), (259, compression), (262, 1), (273, 8), (278, height), (279, 1))
+    entries = b"".join(struct.pack("<HHQQ" if big else "<HHII", tag, 16 if big else 4, 1, value) for tag, value in tags)
+    if big:
+        return struct.pack("<2sHHHQQ", b"II", 43, 8, 0, 16, len(tags)) + entries + bytes(8)
+    return struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + entries + bytes(4)
+
+
+def webp_head(kind: bytes, payload: bytes) -> bytes:
+    chunk = kind + struct.pack("<I", len(payload)) + payload + bytes(len(payload) % 2)
+    return b"RIFF" + struct.pack("<I", 4 + len(chunk)) + b"WEBP" + chunk
+
+
+def bmp_head(width: int, height: int) -> bytes:
+    return struct.pack("<2sIHHIIiiHHIIiiII", b"BM", 54, 0, 0, 54, 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0)
+
+
+# A file of pixels that are not compressed, or a strip of no byte, shows that it is short before its size matters.
+CLAIMS = {
+    "png of 2^31 - 1 a side": (png_head(2**31 - 1, 2**31 - 1) + PNG_END, "too_large"),
+    "png of 2^32 - 1 a side": (png_head(2**32 - 1, 2**32 - 1) + PNG_END, "too_large"),
+    "png, 16 bits, alpha": (png_head(65535, 65535, 16, 6) + PNG_END, "too_large"),
+    "png of one row": (png_head(2**26 + 1, 1, 1, 0) + PNG_END, "too_large"),
+    "jpeg of 65535 a side": (jpeg_head(0xC0), "too_large"),
+    "jpeg, progressive": (jpeg_head(0xC2), "too_large"),
+    "tiff of 65535 a side": (tiff_head(65535, 65535), "too_large"),
+    "tiff of 2^32 - 1 a side": (tiff_head(2**32 - 1, 2**32 - 1), "too_large"),
+    "tiff of 2^64 - 1 a side": (tiff_head(2**64 - 1, 2**64 - 1, big=True), "too_large"),
+    "tiff, not compressed": (tiff_head(2**32 - 1, 2**32 - 1, compression=1), "corrupt"),
+    "webp of 2^24 a side": (webp_head(b"VP8X", bytes(4) + b"\xff" * 6), "too_large"),
+    "webp, lossy": (webp_head(b"VP8 ", b"\x10\0\0\x9d\x01\x2a\xff\x3f\xff\x3f"), "too_large"),
+    "webp, lossless": (webp_head(b"VP8L", b"\x2f\xff\xff\xff\x0f"), "too_large"),
+    "bmp of 2^31 - 1 a side": (bmp_head(2**31 - 1, 2**31 - 1), "truncated"),
+    "bmp, top down": (bmp_head(2**31 - 1, -(2**31)), "truncated"),
+}
+
+
+@pytest.fixture
+def no_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No pixel is decoded while a test runs."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("pixels were decoded"))
+
+
+@pytest.mark.usefixtures("no_decoder")
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_false_size_is_refused_from_the_header_within_50_ms(claim: str) -> None:
+    data, reason = CLAIMS[claim]
+    start = time.process_time()
+    with pytest.raises(SourceError) as caught:
+        decode(data, max_pixels=MAX_PIXELS, icc="ignore")
+    assert time.process_time() - start < 0.05
+    assert (len(data) < 200, caught.value.reason) == (True, reason)
+
+
+@pytest.mark.usefixtures("no_decoder")
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_refusing_a_claim_takes_no_memory_to_speak_of(claim: str) -> None:
+    tracemalloc.start()
+    with contextlib.suppress(SourceError):
+        decode(CLAIMS[claim][0], max_pixels=MAX_PIXELS, icc="ignore")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100_000
+
+
+# Folder entries that are not files ------------------------------------------------------------------------------------
+
+
+def bind_socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound, contextlib.chdir(path.parent):  # the name has 108 bytes at most
+        bound.bind(path.name)
+
+
+ENTRIES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "socket.jpg": (bind_socket, "not_a_file"),
+    "pipe.jpg": (os.mkfifo, "not_a_file"),
+    "folder.jpg": (Path.mkdir, "not_a_file"),
+    "endless.jpg": (lambda path: path.symlink_to("/dev/zero"), "not_a_file"),
+    "terminal.jpg": (lambda path: path.symlink_to("/dev/tty"), "not_a_file"),
+    "memory.jpg": (lambda path: path.symlink_to("/proc/self/mem"), "empty"),
+    "dangling.jpg": (lambda path: path.symlink_to("nowhere"), "unreadable"),
+    "itself.jpg": (lambda path: path.symlink_to(path.name), "unreadable"),
+    "round.jpg": (lambda path: path.symlink_to("about.jpg"), "unreadable"),
+    "about.jpg": (lambda path: path.symlink_to("round.jpg"), "unreadable"),
+    "nothing.jpg": (Path.touch, "empty"),
+}
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run over a folder of `ENTRIES` and one photograph; a hang would end it after a minute."""
+    folder = tmp_path_factory.mktemp("odd")
+    (folder / "photos").mkdir()
+    (folder / "photos" / "good.png").write_bytes(OURS["8.png"])
+    (folder / "photos" / "loop").symlink_to(".")
+    for name, (make, _) in ENTRIES.items():
+        make(folder / "photos" / name)
+    return run(folder / "photos", folder / "ds", timeout_s=60)
+
+
+def test_entries_other_than_files_exit_3_without_traceback(odd: Run) -> None:
+    assert no_trouble(odd), odd.done.stderr
+
+
+def test_what_is_no_file_has_a_row_with_its_reason(odd: Run) -> None:
+    wanted = {"good.png": ""} | {name: reason for name, (_, reason) in ENTRIES.items()}
+    assert {path: row["reason"] for path, row in odd.rows.items()} == wanted
+
+
+def test_folder_that_links_to_itself_is_listed_once(odd: Run) -> None:
+    assert json.loads((odd.out / "dataset.json").read_text())["skipped_links"] == 1
+
+
+@pytest.fixture
+def nobody() -> Iterator[None]:
+    """The tests run as a user whom permissions bind."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+def test_a_file_without_permission_to_read_is_unreadable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    tmp_path.chmod(0o755)
+    (tmp_path / "a.jpg").write_bytes(OURS["baseline.jpg"])
+    (tmp_path / "a.jpg").chmod(0)
+    monkeypatch.chdir(tmp_path)  # the folders above are not for everyone to walk through
+    request.getfixturevalue("nobody")
+    (source,) = list_folder(".", ["*.jpg"], True, None).sources
+    with pytest.raises(SourceError, match=r"^unreadable: a\.jpg: Permission denied"):
+        read_bytes(".", source)
+
+
+# What one file takes --------------------------------------------------------------------------------------------------
+
+
+class Weight(NamedTuple):
+    """What became of one file, and what it took from its first byte to its pair in a shard.
+
+    ``seconds`` are of the processors, of all threads; ``peak_bytes`` is the resident memory of the process.
+    """
+
+    outcome: str
+    seconds: float
+    peak_bytes: int
+
+
+def peak_bytes() -> int:
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    assert found is not None
+    return 1024 * int(found[1])
+
+
+def weigh_all(run_main: Connection, config: Config, tmp: str) -> None:
+    """Make a shard of each source that comes in, and send out what it took. Runs in a process of its own."""
+    for dtype in (np.uint8, np.uint16):  # compile and read once before measuring
+        make_pair(np.zeros((4, 4, 3), dtype), plan_image(config, "0" * 64, 0))
+    context = RunContext(config, tmp, os.getpid())
+    while True:
+        source: Source = run_main.recv()
+        Path("/proc/self/clear_refs").write_text("5")  # sets the high-water mark back
+        start = time.process_time()
+        made = make_shard(context, ShardTask(0, (source,)))
+        seconds = time.process_time() - start
+        if made.path is not None:
+            Path(made.path).unlink()
+        run_main.send(Weight(str(made.rows[0]["reason"] or "ok"), seconds, peak_bytes()))
+
+
+class Scales:
+    """Measure files one by one; its process is restarted if it dies or gives no answer for a minute.
+
+    The source folder of ``config`` is the root of the file system.
+    """
+
+    def __init__(self, config: Config, tmp: Path) -> None:
+        self._config, self._tmp = config, str(tmp)
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._door, theirs = context.Pipe()
+        self._process = context.Process(target=weigh_all, args=(theirs, self._config, self._tmp), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def weigh(self, path: Path) -> Weight:
+        self._door.send(Source(0, encode_name(path.name), str(path.relative_to("/")), path.stat().st_size))
+        try:
+            if self._door.poll(60):
+                weight = self._door.recv()
+                assert isinstance(weight, Weight)
+                return weight
+            outcome = "hangs"
+        except EOFError:
+            outcome = "dies"
+        self.close()
+        self._start()
+        return Weight(outcome, float("inf"), sys.maxsize)
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.join()
+        self._door.close()
+
+
+@pytest.fixture(scope="module")
+def scales(settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scales]:
+    """Scales at the default settings."""
+    config = settings("source.root=/")
+    made = Scales(config, tmp_path_factory.mktemp("weighed"))
+    yield made
+    made.close()
+
+
+def zlib_zeros(count: int) -> bytes:
+    packer = zlib.compressobj(1)
+    return b"".join(packer.compress(bytes(min(2**20, count - at))) for at in range(0, count, 2**20)) + packer.flush()
+
+
+def png_bomb(bits: int, colour: int, row_bytes: int) -> bytes:
+    """8192 x 8192 pixels of zeros, opaque ones where the colour type has an alpha."""
+    body = zlib_zeros(8192 * (1 + row_bytes))
+    data = struct.pack(">I", len(body)) + b"IDAT" + body + struct.pack(">I", zlib.crc32(b"IDAT" + body))
+    return png_head(8192, 8192, bits, colour) + data + PNG_END
+
+
+def tiff_bomb() -> bytes:
+    """8192 x 8192 pixels of zeros, RGB, deflated in one strip."""
+    body = zlib_zeros(3 * 2**26)
+    tags = ((256, 8192), (257, 8192), (258, 8), (259, 8), (262, 2), (273, 200), (277, 3), (278, 8192), (279, len(body)))
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    return (struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + entries).ljust(200, b"\0") + body
+
+
+def pillow_bomb(kind: str, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    Image.new("RGB", (8192, 8192), (200, 30, 90)).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "rgb, one strip.tif": (tiff_bomb, "ok"),
+    "rgba, 16 bits.png": (lambda: png_bomb(16, 6, 8 * 8192), "alpha"),
+}
+SLOW_BOMBS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "gray, 1 bit.png": (lambda: png_bomb(1, 0, 1024), "ok"),
+    "rgb.png": (lambda: png_bomb(8, 2, 3 * 8192), "ok"),
+    "rgb, 16 bits.png": (lambda: png_bomb(16, 2, 6 * 8192), "ok"),
+    "rgb, baseline.jpg": (lambda: pillow_bomb("JPEG"), "ok"),
+    "rgb, progressive.jpg": (lambda: pillow_bomb("JPEG", progressive=True, subsampling=0), "ok"),
+    "rgb.webp": (lambda: pillow_bomb("WEBP", lossless=True, method=0), "ok"),
+    "rgb, lossy.webp": (lambda: pillow_bomb("WEBP", method=0), "ok"),
+}
+
+
+def weigh_bomb(make: Callable[[], bytes], path: Path, scales: Scales) -> Weight:
+    path.write_bytes(make())
+    assert path.stat().st_size < MAX_PIXELS / 20, "no bomb"
+    return scales.weigh(path)
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_small_file_of_maximum_pixels_stays_within_bounds(name: str, tmp_path: Path, scales: Scales) -> None:
+    make, outcome = BOMBS[name]
+    weight = weigh_bomb(make, tmp_path / name, scales)
+    assert weight.outcome == outcome
+    assert weight.seconds < MAX_SECONDS
+    assert weight.peak_bytes < MAX_BYTES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SLOW_BOMBS)
+def test_maximum_pixels_stay_within_bounds_in_any_format(name: str, tmp_path: Path, scales: Scales) -> None:
+    make, outcome = SLOW_BOMBS[name]
+    weight = weigh_bomb(make, tmp_path / name, scales)
+    print(name, weight)
+    assert weight.outcome == outcome
+    assert weight.seconds < MAX_SECONDS
+    assert weight.peak_bytes < MAX_BYTES
+
+
+# The corpus -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Hostile pictures of others: the folder that CORPUS names, or one that is filled now."""
+    if "CORPUS" in os.environ:
+        return Path(os.environ["CORPUS"])
+    folder = tmp_path_factory.mktemp("corpus") / "pictures"
+    subprocess.run([sys.executable, Path(__file__).with_name("corpus.py"), folder], check=True, timeout=3600)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def corpus_run(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run over all of the corpus."""
+    return run(corpus, tmp_path_factory.mktemp("made") / "ds", timeout_s=3600)
+
+
+def matched_files(folder: Path) -> list[str]:
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name.lower().endswith(MATCHED))
+    return sorted(str(path.relative_to(folder)) for path in found)
+
+
+@pytest.mark.slow
+def test_the_corpus_has_3000_files_or_more(corpus: Path) -> None:
+    assert len(matched_files(corpus)) >= 3000
+
+
+@pytest.mark.slow
+def test_the_corpus_ends_the_run_with_3_and_no_traceback(corpus_run: Run) -> None:
+    assert no_trouble(corpus_run), corpus_run.done.stderr[-2000:]
+
+
+@pytest.mark.slow
+def test_every_file_of_the_corpus_has_a_row(corpus: Path, corpus_run: Run) -> None:
+    assert sorted(corpus_run.rows) == matched_files(corpus)
+
+
+@pytest.mark.slow
+def test_files_of_the_corpus_are_pairs_or_have_a_reason(corpus_run: Run) -> None:
+    assert undocumented(corpus_run.rows) == {}
+
+
+@pytest.mark.slow
+def test_dataset_of_the_corpus_is_intact(corpus_run: Run) -> None:
+    verified = gen_dataset("verify", corpus_run.out, timeout_s=600)
+    assert (verified.returncode, verified.stderr) == (0, "")
+
+
+@pytest.mark.slow
+def test_cut_files_of_the_corpus_are_truncated_or_corrupt(corpus: Path, corpus_run: Run) -> None:
+    def is_jpeg_or_png(path: str) -> bool:
+        with (corpus / path).open("rb") as file:
+            return file.read(4).startswith((b"\xff\xd8\xff", b"\x89PNG"))
+
+    rows = {path: row for path, row in corpus_run.rows.items() if path.startswith("derived/cut/")}
+    cut = {path: row["reason"] for path, row in rows.items() if is_jpeg_or_png(path)}
+    assert len(cut) >= 500
+    assert {path: reason for path, reason in cut.items() if reason not in ("truncated", "corrupt")} == {}
+
+
+@pytest.mark.slow
+def test_corpus_files_take_at_most_10_s_and_1500_mb(corpus: Path, scales: Scales) -> None:
+    weights = {path: scales.weigh(corpus / path) for path in matched_files(corpus)}
+    for measure in ("seconds", "peak_bytes"):
+        print(
+            measure, *sorted(((getattr(weight, measure), path) for path, weight in weights.items()), reverse=True)[:5]
+        )
+    over = {path: w for path, w in weights.items() if w.seconds > MAX_SECONDS or w.peak_bytes > MAX_BYTES}
+    assert over == {}
+
+
+# Small files of much work ---------------------------------------------------------------------------------------------
+
+
+def overlapping_directories(entries: int = 100_000) -> bytes:
+    """A BigTIFF of 64 directories that begin eight bytes after each other and share their entries."""
+    data = bytearray(16 + 8 * 64 + 20 * entries + 64)
+    struct.pack_into("<2sHHHQ", data, 0, b"II", 43, 8, 0, 16)
+    for at in range(16, 16 + 8 * 64, 8):
+        struct.pack_into("<Q", data, at, entries)
+    for at in range(16, 16 + 8 * 63, 8):
+        struct.pack_into("<Q", data, at + 8 + 20 * entries, at + 8)
+    return bytes(data)
+
+
+def tiff_of(tags: dict[int, tuple[int, int]], rest: bytes) -> bytes:
+    """A TIFF of 32-bit tags, each a count and a value or the place of its values; ``rest`` begins at byte 200."""
+    entries = b"".join(struct.pack("<HHII", tag, 4, count, value) for tag, (count, value) in tags.items())
+    return (struct.pack("<2sHIH", b"II", 42, 8, len(tags)) + entries).ljust(200, b"\0") + rest
+
+
+def strips(width: int, height: int, count: int, rest: bytes) -> bytes:
+    """A deflated gray TIFF whose lists of strips begin at byte 200, places first."""
+    sizes = {256: (1, width), 257: (1, height), 258: (1, 8), 259: (1, 8), 262: (1, 1)}
+    return tiff_of(sizes | {273: (count, 200), 277: (1, 1), 278: (1, 1), 279: (count, 200 + 4 * count)}, rest)
+
+
+def shared_strips(rows: int = 200_000, size_bytes: int = 10**6) -> bytes:
+    """Every row is a strip of a megabyte, and all of them are the same one."""
+    lists = struct.pack("<I", 200 + 8 * rows) * rows + struct.pack("<I", size_bytes) * rows
+    return strips(64, rows, rows, lists + zlib.compress(bytes(64)).ljust(size_bytes, b"\0"))
+
+
+def segment(marker: int, payload: bytes) -> bytes:
+    return bytes([0xFF, marker]) + struct.pack(">H", len(payload) + 2) + payload
+
+
+def empty_scans(count: int = 2000) -> bytes:
+    """A progressive gray JPEG of 8192 x 8192 pixels with scans that say in 32 symbols: nothing here."""
+    blocks = 1024 * 1024
+    head = segment(0xDB, b"\0" + bytes([1] * 64)) + segment(0xC2, struct.pack(">BHHBBBB", 8, 8192, 8192, 1, 1, 17, 0))
+    tables = segment(0xC4, b"\0\1" + bytes(16)) + segment(0xC4, b"\x10\1" + bytes(15) + b"\xe0")
+    first = segment(0xDA, bytes([1, 1, 0, 0, 0, 0])) + bytes(blocks // 8)
+    run = "0" + "1" * 14  # the end of a band, 32,767 blocks long
+    bits = run * -(-blocks // 32767)
+    bits += "1" * (-len(bits) % 8)
+    body = int(bits, 2).to_bytes(len(bits) // 8, "big").replace(b"\xff", b"\xff\0")
+    scan = segment(0xDA, bytes([1, 1, 0, 1, 63, 0])) + body
+    return b"\xff\xd8" + head + tables + first + scan * count + b"\xff\xd9"
+
+
+LABOURS: dict[str, Callable[[], bytes]] = {
+    "tiff of directories that overlap": overlapping_directories,
+    "tiff of rows that share a strip": shared_strips,
+    "tiff of a million depths": lambda: tiff_of({258: (10**6, 200)}, bytes(4 * 10**6)),
+    "jpeg of four million segments": lambda: b"\xff\xd8" + b"\xff\xe5\0\2" * 4 * 10**6 + b"\xff\xd9",
+    "jpeg of 2000 empty scans": empty_scans,
+    "png of two million chunks": lambda: png_head(8, 8) + b"\0\0\0\0abCd\0\0\0\0" * 2 * 10**6 + PNG_END,
+    "webp of four million chunks": lambda: webp_head(b"abcd", b"") + b"abcd\0\0\0\0" * 4 * 10**6,
+}
+
+
+@pytest.mark.usefixtures("no_decoder")
+@pytest.mark.parametrize("labour", LABOURS)
+def test_expensive_hostile_file_is_corrupt_within_2_s(labour: str) -> None:
+    data = LABOURS[labour]()
+    start = time.process_time()
+    with pytest.raises(SourceError, match=r"^corrupt"):
+        decode(data, max_pixels=MAX_PIXELS, icc="ignore")
+    assert time.process_time() - start < 2
+
+
+def test_impossible_number_of_strips_is_not_read() -> None:
+    data = strips(10, 10, 5 * 10**6, b"\1\2\3\4" * 10**7)
+    tracemalloc.start()
+    with pytest.raises(SourceError, match=r"^corrupt"):
+        decode(data, max_pixels=MAX_PIXELS, icc="ignore")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10**6
+
+
+def test_exif_directory_of_too_many_entries_is_broken() -> None:
+    block = struct.pack("<2sHIH", b"II", 42, 8, 5000) + bytes(12 * 5000 + 4)
+    data = encoded("JPEG", exif=b"Exif\0\0" + block)
+    assert decode(data, max_pixels=MAX_PIXELS, icc="ignore").orientation == 1
+
+
+def test_bytes_after_the_last_row_are_accepted() -> None:
+    """As some cameras write them: libjpeg passes them over."""
+    data = encoded("JPEG")
+    assert decode(data[:-2] + b"\0\0" + data[-2:], max_pixels=MAX_PIXELS, icc="ignore").srgb.shape == (48, 64, 3)
+
+
+# Damage reported by rare codec messages -------------------------------------------------------------------------------
+
+
+def cut_at_a_restart() -> bytes:
+    data = encoded("JPEG", restart_marker_blocks=1)
+    restarts = [found.start() for found in re.finditer(rb"\xff[\xd0-\xd7]", data)]
+    return data[: restarts[len(restarts) // 2]] + b"\xff\xd9"
+
+
+def rows_lost_between_restarts() -> bytes:
+    data = encoded("JPEG", restart_marker_blocks=1)
+    restarts = [found.start() for found in re.finditer(rb"\xff[\xd0-\xd7]", data)]
+    return data[: restarts[2]] + data[restarts[-3] :]
+
+
+def jpeg_of_height(height: int) -> bytes:
+    data = encoded("JPEG")
+    return data.replace(struct.pack(">HH", 48, 64), struct.pack(">HH", height, 64), 1)
+
+
+def half_behind(word: Callable[[bytes], bytes]) -> bytes:
+    """A JPEG without its second half, where the codec's one word is spent on something harmless."""
+    data = word(encoded("JPEG"))
+    return data[: 2 * len(data) // 3] + b"\xff\xd9"
+
+
+def jpeg_in_tiff_of_height(height: int) -> bytes:
+    data = bytearray(encoded("TIFF", compression="jpeg"))
+    (first,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, first)
+    for at in range(first + 2, first + 2 + 12 * count, 12):
+        if struct.unpack_from("<H", data, at)[0] in (257, 278):
+            struct.pack_into("<HII", data, at + 2, 4, 1, height)
+    return bytes(data)
+
+
+TOLD_OTHERWISE: dict[str, Callable[[], bytes]] = {
+    "jpeg cut at a restart": cut_at_a_restart,
+    "jpeg that lost rows between restarts": rows_lost_between_restarts,
+    "jpeg of fewer rows than it has": lambda: jpeg_of_height(16),
+    "half a jpeg of a strange version": lambda: half_behind(lambda data: data.replace(b"JFIF\0\1", b"JFIF\0\5", 1)),
+    "half a jpeg with bytes between segments": lambda: half_behind(lambda data: data[:20] + b"\0\0\0" + data[20:]),
+    "jpeg in tiff, of more rows than it has": lambda: jpeg_in_tiff_of_height(512),
+}
+
+
+@pytest.mark.parametrize("kind", TOLD_OTHERWISE)
+def test_damage_reported_by_rare_codec_messages_is_corrupt(kind: str) -> None:
+    with pytest.raises(SourceError, match=r"^corrupt"):
+        decode(TOLD_OTHERWISE[kind](), max_pixels=MAX_PIXELS, icc="ignore")
+
+
+@pytest.mark.parametrize("header_size", [40, 52])
+def test_bmp_with_unusual_masks_and_short_header_is_unsupported(header_size: int) -> None:
+    head = struct.pack("<IiiHHIIiiII", header_size, 1, 1, 1, 32, 3, 4, 0, 0, 0, 0)
+    masks = struct.pack("<III", 0xFF, 0xFF00, 0xFF0000)
+    data = struct.pack("<2sIHHI", b"BM", 70, 0, 0, 66) + head + masks + b"\1\2\3\0"
+    with pytest.raises(SourceError, match=r"^unsupported"):
+        decode(data, max_pixels=MAX_PIXELS, icc="ignore")
+
+
+@pytest.mark.parametrize("header_size", [40, 52])
+def test_bmp_with_usual_masks_and_short_header_is_read(header_size: int) -> None:
+    head = struct.pack("<IiiHHIIiiII", header_size, 1, 1, 1, 32, 3, 4, 0, 0, 0, 0)
+    masks = struct.pack("<III", 0xFF0000, 0xFF00, 0xFF)
+    data = struct.pack("<2sIHHI", b"BM", 70, 0, 0, 66) + head + masks + b"\3\2\1\0"
+    assert decode(data, max_pixels=MAX_PIXELS, icc="ignore").srgb.tolist() == [[[1, 2, 3]]]

@@ -1,0 +1,454 @@
+"""File and folder names that could break a list, a shell, a spreadsheet or a path.
+
+One dataset is generated from photographs with hostile names and folders; its files are read with Python's csv, json and
+tarfile. Every name must be encoded harmlessly and decoded to the same bytes. Folders with hostile names are used as
+``source.root``, as ``out`` and as the dataset of every verb. Hypothesis adds random names (10,000 with ``-m slow``).
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import tarfile
+import unicodedata
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from unprocess_gen import RawPairs
+from unprocess_gen.core.types import Source
+from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.sources.listing import decode_name, encode_name, list_folder, read_bytes
+
+FORMULA_STARTS = tuple("=+-@\t\r")
+UNSEEN = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+"""Control and bidirectional characters and line ends: a terminal would execute them, or a reader not see them."""
+
+NAMES: tuple[bytes, ...] = (
+    # ends of lines, separators, quotes
+    *(
+        b"line\nfeed.jpg",
+        b"carriage\rreturn.jpg",
+        b"both\r\n.jpg",
+        b"tab\t.jpg",
+        b"\n.jpg",
+        b"\x0b\x0c\x1c\x1d\x1e.jpg",
+    ),
+    *(
+        b"com,ma.jpg",
+        b'quo"te.jpg',
+        b'"quoted".jpg',
+        b'".jpg',
+        b'"".jpg',
+        b"semi;colon.jpg",
+        b"pipe|.jpg",
+        b"'single'.jpg",
+        b",.jpg",
+    ),
+    "next\u0085line.jpg".encode(),
+    "line\u2028and\u2029paragraph.jpg".encode(),
+    # formulas
+    *(
+        b"=1+1.jpg",
+        b"+1.jpg",
+        b"-1.jpg",
+        b"@SUM(1).jpg",
+        b"\t=1.jpg",
+        b"\r=1.jpg",
+        b"=cmd|' C'!A0.jpg",
+        b"==.jpg",
+        b"=.jpg",
+        b"-.jpg",
+    ),
+    # what a shell, Hydra or a glob would take for its own
+    *(b"-rf.jpg", b"--help.jpg", b"${x}.jpg", b"$(id).jpg", b"`id`.jpg", b"[x]*.jpg", b"?.jpg", b"{a,b}.jpg", b"~.jpg"),
+    *(b"back\\slash.jpg", b"n\\n.jpg", b"a&b.jpg", b"#.jpg", b"null.jpg", b"a=b.jpg", b"<a>.jpg"),
+    # dots, blanks, percent signs
+    *(b".jpg", b"..jpg", b"...jpg", b". .jpg", b" lead.jpg", b"trail .jpg", b" .jpg", b"%.jpg", b"%25.jpg"),
+    *(b"%2F.jpg", b"a%2Fb.jpg", b"..%2f..%2fb.jpg", b"%0A.jpg", b"%FF.jpg", b"%%.jpg", b"%s%n.jpg", b"%u202E.jpg"),
+    # bytes that are not UTF-8
+    *(
+        b"\xff.jpg",
+        b"\xc3.jpg",
+        b"\xc3(.jpg",
+        b"\xed\xa0\x80.jpg",
+        b"\xc0\xaf.jpg",
+        b"\xf5\x80\x80\x80.jpg",
+        b"\x80=.jpg",
+    ),
+    # directions, widths, looks
+    *("\u202egpj.jpg".encode(), "a\u202bb\u202c.jpg".encode(), "\u2066\u2067\u2068\u2069.jpg".encode()),
+    *("\u061c\u200e\u200f.jpg".encode(), "zero\u200bwidth.jpg".encode(), "zero\u200dwidth.jpg".encode()),
+    *(b"zerowidth.jpg", "\ufeffbom.jpg".encode(), b"bom.jpg", "soft\u00adhyphen.jpg".encode()),
+    *(
+        "שלום.jpg".encode(),
+        "مرحبا.jpg".encode(),
+        "日本語.jpg".encode(),
+        "👩‍👩‍👧‍👦.jpg".encode(),
+        "\U000e0041.jpg".encode(),
+    ),
+    # twins: by case, by normal form, by look
+    *(b"case.jpg", b"CASE.jpg", b"Case.JPG", "ß.jpg".encode(), b"ss.jpg", "ı.jpg".encode(), b"i.jpg", b"I.jpg"),
+    *(unicodedata.normalize(form, "é.jpg").encode() for form in ("NFC", "NFD")),
+    *(unicodedata.normalize(form, "각Å.jpg").encode() for form in ("NFC", "NFD")),
+    *("\u0430.jpg".encode(), b"a.jpg"),
+    # control characters, names of devices elsewhere, and the longest there are
+    *(
+        b"\x1b[31m.jpg",
+        b"\x1b]0;title\x07.jpg",
+        b"\x7f.jpg",
+        b"\x01.jpg",
+        b"con.jpg",
+        b"NUL.jpg",
+        b"aux.h.png",
+        b"COM1.jpg",
+    ),
+    *(b"x" * 251 + b".jpg", b"\xff" * 251 + b".jpg", b"%" * 251 + b".jpg", "\u202e".encode() * 83 + b".jpg"),
+)
+FOLDERS: tuple[bytes, ...] = (
+    *(b"=dir", b"new\nline", b"\xff", b"...", b"  ", b"--", b"%2e%2e", b"a\tb", b'"d', b",,", b"~", b"$x", b"\\"),
+    *(
+        "\u202e".encode(),
+        "\u0065\u0301".encode(),
+        "\u00e9".encode(),
+        b"\xff" * 255,
+        b"\xff" * 255 + b"/" + b"\xfe" * 255,
+    ),
+)
+
+
+def photograph(number: int) -> bytes:
+    """Return a PNG of 3 x 4 pixels that depend on ``number``."""
+    stream = io.BytesIO()
+    rgb = np.frombuffer(hashlib.sha256(b"%d" % number).digest() + bytes(4), np.uint8).reshape(3, 4, 3)
+    Image.fromarray(rgb).save(stream, "PNG")
+    return stream.getvalue()
+
+
+class HostileDataset(NamedTuple):
+    """Hold a dataset of hostile names: contents of the files by path, and every other path next to the dataset."""
+
+    root: Path
+    out: Path
+    contents: dict[bytes, bytes]
+    others: list[tuple[bytes, int, int]]
+
+
+def paths_except(top: Path, out: Path) -> list[tuple[bytes, int, int]]:
+    """Return every path below ``top`` except those in ``out``, with size and time."""
+    found = []
+    for folder, folders, files in os.walk(os.fsencode(top)):
+        folders[:] = [name for name in folders if os.path.join(folder, name) != os.fsencode(out)]
+        for name in files:
+            status = os.lstat(os.path.join(folder, name))
+            found.append((os.path.join(folder, name), status.st_size, status.st_mtime_ns))
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def made(make: Make, tmp_path_factory: pytest.TempPathFactory) -> HostileDataset:
+    """A dataset of photographs that bear `NAMES`, and of one in each of `FOLDERS`."""
+    top = tmp_path_factory.mktemp("names")
+    root, out = top / "photos", top / "ds"
+    paths = [*NAMES, *(folder + b"/=x,\n.jpg" for folder in FOLDERS)]
+    contents = {path: photograph(number) for number, path in enumerate(paths)}
+    for path, content in contents.items():
+        full = Path(os.fsdecode(os.path.join(os.fsencode(root), path)))
+        full.parent.mkdir(parents=True, exist_ok=True)
+        full.write_bytes(content)
+    before = paths_except(top, out)
+    make(root, out, "output.pairs_per_shard=16")
+    return HostileDataset(root, out, contents, before)
+
+
+def cells(out: Path) -> list[list[str]]:
+    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
+        return list(csv.reader(stream, strict=True))
+
+
+def table(out: Path) -> list[dict[str, str]]:
+    head, *rows = cells(out)
+    return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+# In the manifest ------------------------------------------------------------------------------------------------------
+
+
+def test_every_hostile_name_gives_a_pair(made: HostileDataset) -> None:
+    rows = table(made.out)
+    assert (len(rows), {row["status"] for row in rows}) == (len(made.contents), {"ok"})
+
+
+def test_manifest_preserves_bytes_of_every_name(made: HostileDataset) -> None:
+    assert [os.fsencode(decode_name(row["source"])) for row in table(made.out)] == sorted(made.contents)
+
+
+def test_encoded_names_are_distinct(made: HostileDataset) -> None:
+    assert len({row["source"] for row in table(made.out)}) == len(made.contents)
+
+
+def test_each_row_has_the_digest_of_its_file(made: HostileDataset) -> None:
+    stated = {os.fsencode(decode_name(row["source"])): row["source_sha256"] for row in table(made.out)}
+    assert stated == {path: hashlib.sha256(content).hexdigest() for path, content in made.contents.items()}
+
+
+def test_each_row_is_one_line_for_str_splitlines(made: HostileDataset) -> None:
+    text = (made.out / "manifest.csv").read_bytes().decode("utf-8")
+    assert len(text.splitlines()) == len(made.contents) + 1
+
+
+def test_only_numbers_begin_like_a_formula(made: HostileDataset) -> None:
+    suspicious = [cell for row in cells(made.out) for cell in row if cell.startswith(FORMULA_STARTS)]
+    assert suspicious, "some entries of rgb2cam are negative"
+    for cell in suspicious:
+        float(cell)
+
+
+def test_no_source_begins_like_a_formula(made: HostileDataset) -> None:
+    assert not [row["source"] for row in table(made.out) if row["source"].startswith(FORMULA_STARTS)]
+
+
+def test_no_cell_has_control_or_bidirectional_characters(made: HostileDataset) -> None:
+    assert not [cell for row in cells(made.out) for cell in row if UNSEEN.search(cell)]
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_outside_the_dataset_is_written_or_changed(made: HostileDataset) -> None:
+    assert paths_except(made.root.parent, made.out) == made.others
+
+
+def test_no_dataset_file_is_named_after_a_source(made: HostileDataset) -> None:
+    own = re.compile(r"(config\.yaml|dataset\.json|manifest\.csv|\.\w+|shards/shard-\d{5}\.tar)")
+    files = [str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()]
+    assert [name for name in files if not own.fullmatch(name)] == []
+
+
+def test_shard_members_are_named_by_key(made: HostileDataset) -> None:
+    found: list[str] = []
+    for shard in sorted((made.out / "shards").iterdir()):
+        with tarfile.open(shard) as opened:
+            found += opened.getnames()
+    kinds = ("clean.npy", "noisy.npy", "json")
+    assert found == [f"{number:08d}.{kind}" for number in range(len(made.contents)) for kind in kinds]
+
+
+def test_json_members_have_the_names_of_the_manifest(made: HostileDataset) -> None:
+    found: list[str] = []
+    for shard in sorted((made.out / "shards").iterdir()):
+        with tarfile.open(shard) as opened:
+            for member in opened.getmembers():
+                if member.name.endswith(".json"):
+                    found.append(json.loads(opened.extractfile(member).read())["source"])  # type: ignore[union-attr]
+    assert found == [row["source"] for row in table(made.out)]
+
+
+# Replay, verify, read -------------------------------------------------------------------------------------------------
+
+
+def test_replay_finds_each_source_by_its_key(made: HostileDataset) -> None:
+    for row in table(made.out):
+        (one,) = replay(select_rows(made.out / "manifest.csv", None, row["key"]), str(made.root))
+        assert (one.key, one.source, one.complaint) == (row["key"], row["source"], "")
+
+
+def test_replay_names_arrays_by_key(made: HostileDataset, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("replay", made.out, "--keys", "00000000,00000007", "--to", tmp_path / "kept")
+    assert done.code == 0
+    kept = sorted(path.name for path in (tmp_path / "kept").iterdir())
+    assert kept == [f"0000000{key}.{kind}.npy" for key in (0, 7) for kind in ("clean", "noisy")]
+
+
+def test_verify_regenerates_every_pair(made: HostileDataset, run_main: RunMain) -> None:
+    count = len(made.contents)
+    done = run_main("verify", made.out, "--regenerate", count)
+    assert (done.code, done.out) == (0, f"{made.out} is intact; {count} pairs regenerated, bit for bit\n")
+
+
+def test_raw_pairs_returns_every_name(made: HostileDataset) -> None:
+    assert [sample.row["source"] for sample in RawPairs(made.out)] == [row["source"] for row in table(made.out)]
+
+
+def test_rerun_on_a_finished_dataset_does_nothing(made: HostileDataset, run_main: RunMain) -> None:
+    done = run_main(f"source.root={made.root}", f"out={made.out}", "output.pairs_per_shard=16")
+    assert (done.code, "nothing to do" in done.out) == (0, True)
+
+
+# On the terminal ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def broken(tmp_path: Path) -> Path:
+    """Return a folder of files with hostile names that are no pictures."""
+    folder = tmp_path / "broken"
+    folder.mkdir()
+    for name in NAMES:
+        Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(b"no picture")
+    return folder
+
+
+@pytest.mark.parametrize("verb", [(), ("plan", "--all")], ids=["a run", "plan"])
+def test_control_characters_of_names_do_not_reach_the_terminal(
+    verb: tuple[str, ...], broken: Path, run_main: RunMain
+) -> None:
+    done = run_main(*verb, f"source.root={broken}", "out=made", "n_jobs=1")
+    shown = (done.out + done.err).replace("\n", "")
+    assert done.code in (0, 3)
+    assert UNSEEN.findall(shown) == []
+
+
+# Folders on the command line ------------------------------------------------------------------------------------------
+
+FOLDER_NAMES = (
+    *(" a b ", "apo's", 'quo"te', "a'b\"c'", "=", "eq=ual", "a,b", "[1,2]", "{a:1}", "(x)", "$HOME", "${oc.env:HOME}"),
+    *("$(id)", "back\\slash", "trail\\", "\\'", "new\nline", "\x1b[31m", "a #b", "%41", "a: b", "-x", "true", "1e3"),
+    *("e\u0301te\u0301", "日本 😀", "\u202egnp", "\u2028", "\udcff\udcfe", "x" * 255),
+)
+
+
+@pytest.mark.parametrize("name", FOLDER_NAMES, ids=ascii)
+def test_folders_of_any_name_are_used_or_refused_in_one_line(name: str, run_main: RunMain, tmp_path: Path) -> None:
+    root, out = tmp_path / name, tmp_path / f"{name[:254]}2"
+    root.mkdir()
+    (root / "a.png").write_bytes(photograph(0))
+    before = paths_except(tmp_path, tmp_path / "nowhere")
+    escaped = [folder.name.replace("${", "\\${") for folder in (root, out)]  # "${" starts an interpolation
+    done = run_main(f"source.root={escaped[0]}", f"out={escaped[1]}", "n_jobs=1")
+    if done.code == 0:
+        assert [(row["source"], row["status"]) for row in table(out)] == [("a.png", "ok")]
+        assert paths_except(tmp_path, out) == before
+    else:
+        assert (done.code, done.out, len(done.err.strip("\n").split("\n"))) == (2, "", 1)
+        assert paths_except(tmp_path, tmp_path / "nowhere") == before
+
+
+@pytest.mark.parametrize("mark", ["'", '"'])
+def test_quotes_around_a_folder_name_are_removed(mark: str, run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "a b").mkdir()
+    (tmp_path / "a b" / "a.png").write_bytes(photograph(0))
+    done = run_main(f"source.root={mark}a b{mark}", f"out={mark}c d{mark}", "n_jobs=1")
+    assert (done.code, len(table(tmp_path / "c d"))) == (0, 1)
+
+
+VERB_ARGUMENTS = {
+    "verify": ["--regenerate", "1", "--source", "SOURCE"],
+    "replay": ["--keys", "0", "source.root=SOURCE"],
+    "report": ["--to", "page.html", "--source=SOURCE"],
+    "preview": ["--keys", "0", "--to", "sheets", "--source", "SOURCE"],
+    "dng": ["--keys", "0", "--clean", "--to", "dngs"],
+    "again": ["out=copy", "n_jobs=1", "source.root=SOURCE"],
+}
+DATASET_NAMES = ("camera=sony_a7r,seed=1", "source.root=x", "out=2", "-x", "--to", "a b", "verify", "~x")
+
+
+@pytest.mark.parametrize("name", DATASET_NAMES)
+@pytest.mark.parametrize("verb", VERB_ARGUMENTS)
+def test_every_verb_takes_a_dataset_of_any_name(
+    verb: str, name: str, wide: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    shutil.copytree(wide, tmp_path / name)
+    arguments = [argument.replace("SOURCE", str(wide.parent / "photos")) for argument in VERB_ARGUMENTS[verb]]
+    done = run_main(verb, *arguments, "--", name)
+    assert done.code == 0, done.err
+    if not name.startswith("-"):
+        assert run_main("verify", name).out == f"{name} is intact\n"
+
+
+@pytest.fixture(scope="module")
+def wide(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of one photograph that a DNG file can hold."""
+    folder = tmp_path_factory.mktemp("wide")
+    (folder / "photos").mkdir()
+    Image.fromarray(np.arange(32 * 32 * 3, dtype=np.uint8).reshape(32, 32, 3)).save(folder / "photos/a.png")
+    make(folder / "photos", folder / "ds")
+    return folder / "ds"
+
+
+# Random names -----------------------------------------------------------------------------------------
+
+HARD_TEXT = st.text(st.characters(exclude_characters="\0/", exclude_categories=["Cs"]))
+HARD_BYTES = st.binary().map(lambda raw: raw.translate(None, b"\0/"))
+TROUBLE = st.lists(
+    st.sampled_from(["=", "+", "-", "@", "%", "%2", "%0A", "\n", "\r", "\t", ",", '"', "é", "e\u0301", "."])
+)
+PARTS = st.one_of(HARD_TEXT.map(str.encode), HARD_BYTES, TROUBLE.map("".join).map(str.encode))
+PATHS = st.lists(PARTS, min_size=1, max_size=3).map(b"/".join).map(os.fsdecode)
+
+
+def check_spelling(path: str) -> None:
+    """Check that a name is encoded harmlessly, on one line of a CSV file, and decoded to the same bytes."""
+    name = encode_name(path)
+    assert decode_name(name) == path
+    assert not name.startswith(FORMULA_STARTS)
+    assert not UNSEEN.search(name)
+    stream = io.StringIO(newline="")
+    csv.writer(stream, lineterminator="\n").writerow([name, "x"])
+    line = stream.getvalue().encode("utf-8").decode("utf-8")
+    assert len(line.splitlines()) == 1
+    assert list(csv.reader([line], strict=True)) == [[name, "x"]]
+    assert json.loads(json.dumps(name)) == name
+
+
+@given(PATHS)
+@settings(max_examples=200, deadline=None)
+def test_random_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
+    check_spelling(path)
+
+
+@pytest.mark.slow
+@given(PATHS)
+@settings(max_examples=10_000, deadline=None)
+def test_ten_thousand_names_are_encoded_harmlessly_and_decoded(path: str) -> None:
+    check_spelling(path)
+
+
+@given(PATHS, PATHS)
+@settings(max_examples=100, deadline=None)
+def test_two_names_have_different_encodings(one: str, other: str) -> None:
+    assert (encode_name(one) == encode_name(other)) == (one == other)
+
+
+@given(PATHS)
+@settings(max_examples=100, deadline=None)
+def test_encoded_names_can_be_encoded_again(path: str) -> None:
+    name = encode_name(path)
+    assert decode_name(encode_name(name)) == name
+
+
+@pytest.fixture(scope="module")
+def playground(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[bytes], Path]]:
+    """Return a function that creates a folder with one file of the given name."""
+    top = tmp_path_factory.mktemp("playground")
+    count = iter(range(10**6))
+
+    def created(name: bytes) -> Path:
+        folder = top / str(next(count))
+        folder.mkdir()
+        Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).write_bytes(name)
+        return folder
+
+    yield created
+
+
+@given(PARTS.map(lambda raw: raw[:255]).filter(lambda raw: raw not in (b"", b".", b"..")))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_files_of_any_name_are_listed_and_read(playground: Callable[[bytes], Path], name: bytes) -> None:
+    root = playground(name)
+    (source,) = list_folder(str(root), ["*"], True, None).sources
+    found_again = Source(0, source.name, decode_name(source.name), source.size_bytes)
+    assert read_bytes(str(root), found_again) == name

@@ -1,0 +1,553 @@
+"""Patches: each is the cut-out of its full frame's pair, bit for bit, wherever it lies and however it was made."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import tarfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from helpers.commands import RunMain
+from helpers.datasets import Make, TreeHash
+from helpers.photographs import fill, pixels
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from unprocess_gen import RawPairs
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError, SourceError
+from unprocess_gen.core.types import Patch, PatchRule
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline import repair, worker
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.reports import photon_transfer as transfer
+from unprocess_gen.reports.estimate import estimate_run, format_estimate
+from unprocess_gen.sources import loader as photographs
+from unprocess_gen.sources import patches as patches_module
+from unprocess_gen.sources.patches import list_patches, pixels_in_none
+
+Settings = Callable[..., Config]
+
+GRID, STRIDE, RANDOM = "source.patch=32", "source.patch=[grid,32,18]", "source.patch=[random,30,5]"
+LEVELS = ("noise=brooks2019", "noise.levels=2", "noise.draws=2")
+BRANCH = "{iso:[100,6400],dn_per_e:2,read_std_dn:3,row_std_dn:2,column_std_dn:2,black_error_dn:[1,-2,3,-4]}"
+EVERY_EFFECT = (
+    *("noise=nikon_d850", "noise.iso=3200", "effects.all=on", f"noise.branches=[{BRANCH}]", "noise.prnu_std=0.03"),
+    *("noise.dark_e_per_s=1000", "noise.hot_pixel_share=0.01", "noise.hot_pixel_e_per_s=100000"),
+    *("noise.dead_pixel_share=0.01", "noise.full_well_e=1500", "scene.exposure_s=0.02"),
+)
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photographs of even and odd sides, one of 16 bits, and one that no photograph can be made of."""
+    folder = tmp_path_factory.mktemp("patches") / "photos"
+    folder.mkdir()
+    Image.fromarray(pixels(1, 64, 96)).save(folder / "a.png")
+    Image.fromarray(pixels(2, 71, 67)).save(folder / "b.png")
+    (folder / "c.jpg").write_bytes(b"\xff\xd8\xff")
+    Image.fromarray(pixels(4, 33, 140)).save(folder / "d.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(sources: Path, make: Make) -> Path:
+    make(sources, sources.parent / "whole", *LEVELS)
+    return sources.parent / "whole"
+
+
+@pytest.fixture(scope="module")
+def cut_up(sources: Path, make: Make) -> Path:
+    """Random patches of two levels and two draws; a shard holds two photographs."""
+    make(sources, sources.parent / "cut_up", *LEVELS, RANDOM, "output.pairs_per_shard=2")
+    return sources.parent / "cut_up"
+
+
+def rows(out: Path) -> list[dict[str, str]]:
+    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def pair_of(row: dict[str, Any]) -> tuple[Any, ...]:
+    return row["source"], int(row["level"]), int(row["draw"])
+
+
+def assert_cut_outs(patched: Path, whole: Path) -> int:
+    """Compare every pair of a dataset of patches with the crop of the full image's pair; return their number."""
+    frames = {pair_of(sample.row): sample for sample in RawPairs(whole)}
+    for clean, noisy, row in RawPairs(patched):
+        frame, (height, width), (y, x) = frames[pair_of(row)], clean.shape, (row["patch_y"], row["patch_x"])
+        np.testing.assert_array_equal(clean, frame.clean[y : y + height, x : x + width])
+        np.testing.assert_array_equal(noisy, frame.noisy[y : y + height, x : x + width])
+    assert {pair_of(sample.row) for sample in RawPairs(patched)} == frames.keys()
+    return len(RawPairs(patched))
+
+
+# A patch is the cut-out of its full frame's pair ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        LEVELS,
+        ("noise.law=poisson", "source.dequantize=dither", "gains.highlight=gray_mean"),
+        ("noise=nikon_d850", "noise.iso=6400", "effects.prnu=on"),
+        (*EVERY_EFFECT, "noise.draws=2", "sensor.saturated=pinned"),
+        (*EVERY_EFFECT, "clean.includes_fixed_pattern=true"),
+        ("scene.exposure_ratio=20", "sensor.clip=black"),
+    ],
+    ids=["levels", "poisson", "physical", "every effect", "averaged", "dark"],
+)
+@pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
+def test_patch_equals_the_crop_of_its_full_pair(
+    patch: str, overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
+) -> None:
+    make(sources, tmp_path / "whole", *overrides)
+    make(sources, tmp_path / "patched", *overrides, patch)
+    assert assert_cut_outs(tmp_path / "patched", tmp_path / "whole") >= 14
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_patch_has_the_pattern_of_its_full_frame(pattern: str, sources: Path, make: Make, tmp_path: Path) -> None:
+    for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=[grid,32,14]")):
+        make(sources, tmp_path / name, patch, f"sensor.pattern={pattern}", "gains=fixed")
+    assert_cut_outs(tmp_path / "patched", tmp_path / "whole")
+    assert {row["pattern"] for row in rows(tmp_path / "patched") if row["status"] == "ok"} == {pattern}
+
+
+def test_frames_of_a_clip_have_patches_at_the_same_places(make: Make, tmp_path: Path) -> None:
+    for clip, frame in ((clip, frame) for clip in ("one", "two") for frame in range(3)):
+        (tmp_path / "clips" / clip).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels(frame + 7 * len(clip), 60, 80)).save(tmp_path / "clips" / clip / f"{clip}{frame}.png")
+    for name, patch in (("whole", "source.patch=null"), ("patched", RANDOM)):
+        make(tmp_path / "clips", tmp_path / name, "source.clips=true", *EVERY_EFFECT, "noise.draws=2", patch)
+    assert assert_cut_outs(tmp_path / "patched", tmp_path / "whole") == 6 * 5 * 2
+    corners = {
+        (row["clip"], row["frame"], row["patch"], row["patch_y"], row["patch_x"]) for row in rows(tmp_path / "patched")
+    }
+    assert len(corners) == 30
+    assert len({(clip, *corner) for clip, _, *corner in corners}) == 10
+
+
+def test_patches_are_cut_after_downscaling(sources: Path, make: Make, tmp_path: Path) -> None:
+    for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=[grid,16,8]")):
+        make(sources, tmp_path / name, "source.downscale=2", "source.dequantize=dither", patch)
+    assert assert_cut_outs(tmp_path / "patched", tmp_path / "whole") > 0
+
+
+OWN = {
+    *("key", "shard", "width", "height", "patch", "patch_y", "patch_x", "clean_xxh3", "noisy_xxh3", "saturated"),
+    *("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy_clipped_high", "zero_variance"),
+}
+"""What a patch does not share with its full frame."""
+
+
+@pytest.mark.parametrize("overrides", [LEVELS, ("noise=nikon_d850", "scene=night")])
+def test_patches_share_the_plan_of_their_image(
+    overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
+) -> None:
+    for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=16")):
+        make(sources, tmp_path / name, *overrides, patch, "source.limit=1")
+    shared = {pair_of(row): {name: row[name] for name in row if name not in OWN} for row in rows(tmp_path / "whole")}
+    for row in rows(tmp_path / "patched"):
+        assert {name: row[name] for name in row if name not in OWN} == shared[pair_of(row)]
+
+
+def test_counts_of_tiling_patches_add_up_to_the_image(sources: Path, make: Make, tmp_path: Path) -> None:
+    """64 x 96 pixels, all of them in one patch of 32 x 32."""
+    settings = ("source.limit=1", "noise=imx385_iso25600")
+    one = make(sources, tmp_path / "whole", *settings)
+    many = make(sources, tmp_path / "patched", *settings, GRID)
+    assert many.sites == one.sites
+    assert min(many.sites["saturated"], many.sites["noisy_clipped_high"]) > 0
+
+
+# Places ---------------------------------------------------------------------------------------------------------------
+
+lengths = st.integers(1, 100).map(lambda half: 2 * half)
+sizes = st.integers(0, 300)
+
+
+@given(lengths, lengths, sizes, sizes)
+def test_grid_contains_every_place_at_its_stride(side: int, stride: int, down: int, right: int) -> None:
+    height, width = side + down, side + right
+    found = list_patches(PatchRule("grid", side, stride=stride), 0, height, width)
+    wanted = [(y, x) for y in range(0, down + 1, stride) for x in range(0, right + 1, stride)]
+    assert [patch.origin for patch in found] == wanted
+    assert [patch.number for patch in found] == list(range(len(wanted)))
+
+
+@given(lengths, sizes, sizes, st.integers(0, 2**64 - 1))
+def test_random_places_are_even_and_inside(side: int, down: int, right: int, key: int) -> None:
+    for patch in list_patches(PatchRule("random", side, count=20), key, side + down, side + right):
+        assert (patch.y % 2, patch.x % 2, patch.height, patch.width) == (0, 0, side, side)
+        assert 0 <= patch.y <= down
+        assert 0 <= patch.x <= right
+
+
+def test_random_places_include_the_first_and_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(patches_module, "patch_words", lambda key, count: [(0, 2**32 - 1), (2**32 - 1, 0)])
+    found = list_patches(PatchRule("random", 10, count=2), 0, 31, 40)
+    assert [patch.origin for patch in found] == [(0, 30), (20, 0)]
+
+
+def test_more_random_patches_leave_the_first_unchanged() -> None:
+    few, many = (list_patches(PatchRule("random", 8, count=count), 5, 200, 300) for count in (10, 100))
+    assert many[:10] == few
+
+
+def test_random_places_are_uniform() -> None:
+    """64 x 64 places, 16 cells a side, 10,000 patches: no count is six standard deviations from the mean of 625."""
+    found = np.array([patch.origin for patch in list_patches(PatchRule("random", 2, count=10_000), 3, 128, 128)])
+    for axis in found.T:
+        counts = np.bincount(axis // 8, minlength=16)
+        assert np.abs(counts - 625).max() < 6 * np.sqrt(625)
+    assert abs(np.corrcoef(found.T)[0, 1]) < 6 / 100
+
+
+def test_random_places_are_the_same_on_every_machine() -> None:
+    """The words are Philox's (`test_streams`); the rest is integer arithmetic."""
+    found = list_patches(PatchRule("random", 128, count=3), 0x0123456789ABCDEF, 2160, 2880)
+    assert [patch.origin for patch in found] == [(1662, 92), (166, 2310), (1910, 72)]
+
+
+def test_image_without_patches_is_its_only_patch() -> None:
+    assert list_patches(None, 7, 5, 9) == (Patch(0, 0, 0, 5, 9),)
+
+
+@pytest.mark.parametrize(
+    ("law", "left_out"),
+    [
+        (None, 0),
+        (PatchRule("grid", 10, stride=10), 25 * 32 - 20 * 30),
+        (PatchRule("grid", 10, stride=8), 25 * 32 - 18 * 26),
+        (PatchRule("grid", 4, stride=20), 25 * 32 - 4 * 16),
+    ],
+)
+def test_pixels_in_no_patch_are_counted(law: PatchRule | None, left_out: int) -> None:
+    assert pixels_in_none(list_patches(law, 0, 25, 32), 25, 32) == left_out
+
+
+# The setting ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("spellings", "canonical"),
+    [
+        (("null",), None),
+        (("128", "[grid,128]", "[grid,128,128]"), ["grid", 128, 128]),
+        (("[grid,128,64]",), ["grid", 128, 64]),
+        (("[random,128,16]",), ["random", 128, 16]),
+    ],
+)
+def test_spellings_of_a_patch_setting_give_one_config_yaml(
+    spellings: tuple[str, ...], canonical: object, settings: Settings, tmp_path: Path
+) -> None:
+    texts = {dataset_yaml(settings(f"source.patch={spelling}")) for spelling in spellings}
+    assert len(texts) == 1
+    assert yaml.safe_load(texts.copy().pop())["source"]["patch"] == canonical
+    (tmp_path / "config.yaml").write_text(next(iter(texts)))
+    assert dataset_yaml(read_dataset_yaml(tmp_path / "config.yaml")[0]) == texts.pop()
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("0", "1", "127", "-2", "32770", "2.0", "true", "''", "wide", "[]", "{a:1}", "[128]", "[grid]"),
+        *("[grid,127]", "[grid,8,3]", "[grid,8,0]", "[grid,8,8,8]", "[grid,8.0]", "[grid,null]", "[[grid,8]]"),
+        *("[random,8]", "[random,7,1]", "[random,8,0]", "[random,8,10001]", "[random,8,1.5]", "[random,8,true]"),
+        "[spiral,8,8]",
+    ],
+)
+def test_impossible_patch_settings_are_refused(value: str, settings: Settings) -> None:
+    with pytest.raises(ConfigError, match=r"^source\.patch=.*: expected null, a side, \[grid, side\], ") as caught:
+        validate_config(settings(f"source.patch={value}"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", ["2", "32768", "[grid,2,32768]", "[random,2,1]", "[random,32768,10000]"])
+def test_limits_of_the_patch_settings_are_accepted(value: str, settings: Settings) -> None:
+    validate_config(settings(f"source.patch={value}"))
+
+
+def test_refused_setting_prints_one_line_and_writes_nothing(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("source.patch=[grid,127]")
+    assert (done.code, done.err.count("\n"), list(tmp_path.iterdir())) == (2, 1, [])
+    assert done.err.startswith("gen-dataset: source.patch=[grid, 127]: expected null, a side, ")
+
+
+# Too small ------------------------------------------------------------------------------------------------------------
+
+
+def test_image_smaller_than_a_patch_is_unsupported(make: Make, tmp_path: Path) -> None:
+    for name, size in (("fits.png", (40, 40)), ("high.png", (90, 39)), ("wide.png", (39, 90))):
+        (tmp_path / "p").mkdir(exist_ok=True)
+        Image.fromarray(pixels(len(name), *size)).save(tmp_path / "p" / name)
+    made = make(tmp_path / "p", tmp_path / "ds", "source.patch=[random,40,2]")
+    assert [(row["key"], row["status"], row["reason"], row["patch"]) for row in rows(tmp_path / "ds")] == [
+        *(("00000000-p0000", "ok", "", "0"), ("00000000-p0001", "ok", "", "1")),
+        *(("00000001", "failed", "unsupported", ""), ("00000002", "failed", "unsupported", "")),
+    ]
+    assert (made.pairs, made.failed) == (2, {"unsupported": 2})
+
+
+def test_failure_of_a_small_image_is_explained(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "source.patch=14")
+    (source,) = photographs.list_photographs(config.source).sources
+    why = r"unsupported: 16 x 12 pixels contain no patch of 14 x 14 \(source.patch\)$"
+    with pytest.raises(SourceError, match=f"^{why}"):
+        photographs.load_source(config.source, source)
+    assert "fails     000.png: unsupported\n          16 x 12 pixels contain no patch" in format_estimate(
+        config, estimate_run(config, 1, True)
+    )
+
+
+# The dataset ----------------------------------------------------------------------------------------------------------
+
+
+def test_every_pair_of_every_patch_has_a_row(cut_up: Path) -> None:
+    pairs = [f"-p{patch:04d}-l{level:02d}d{draw:02d}" for patch in range(5) for level in range(2) for draw in range(2)]
+    assert [row["key"] for row in rows(cut_up)] == [
+        *(f"00000000{pair}" for pair in pairs),
+        *(f"00000001{pair}" for pair in pairs),
+        "00000002",
+        *(f"00000003{pair}" for pair in pairs),
+    ]
+
+
+def test_every_patch_is_one_sample(cut_up: Path) -> None:
+    with tarfile.open(cut_up / "shards" / "shard-00001.tar") as shard:
+        names = shard.getnames()
+    members = ("clean.npy", "noisy.npy", "noisy.l00d01.npy", "noisy.l01d00.npy", "noisy.l01d01.npy", "json")
+    assert names == [f"00000003-p{patch:04d}.{member}" for patch in range(5) for member in members]
+
+
+@pytest.mark.filterwarnings("ignore")  # those of another library
+def test_the_webdataset_library_loads_every_patch_as_a_sample(cut_up: Path) -> None:
+    wds = pytest.importorskip("webdataset")
+    urls = [str(path) for path in sorted((cut_up / "shards").iterdir())]
+    samples = list(wds.WebDataset(urls, shardshuffle=False, empty_check=False).decode())
+    assert [sample["__key__"] for sample in samples] == [f"0000000{i}-p000{n}" for i in (0, 1, 3) for n in range(5)]
+    pairs = iter(RawPairs(cut_up))
+    for sample in samples:
+        assert [sample["json"]["key"], *(row["key"] for row in sample["json"]["others"])] == [
+            f"{sample['__key__']}-l{level:02d}d{draw:02d}" for level in range(2) for draw in range(2)
+        ]
+        for member in ("noisy.npy", "noisy.l00d01.npy", "noisy.l01d00.npy", "noisy.l01d01.npy"):
+            clean, noisy, _ = next(pairs)
+            np.testing.assert_array_equal(sample["clean.npy"], clean)
+            np.testing.assert_array_equal(sample[member], noisy)
+
+
+def test_rows_of_patches_have_no_empty_number(cut_up: Path) -> None:
+    for row in read_rows(cut_up / "manifest.csv"):
+        assert row["status"] == "failed" or None not in row.values()
+
+
+def test_the_bytes_do_not_depend_on_the_number_of_workers(
+    sources: Path, cut_up: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    make(sources, tmp_path / "ds", *LEVELS, RANDOM, "output.pairs_per_shard=2", n_jobs=2)
+    assert tree_hash(tmp_path / "ds") == tree_hash(cut_up)
+
+
+def test_adding_a_photograph_moves_no_other_patches(sources: Path, cut_up: Path, make: Make, tmp_path: Path) -> None:
+    more = Path(shutil.copytree(sources, tmp_path / "more"))
+    Image.fromarray(pixels(9, 50, 50)).save(more / "0.png")
+    make(more, tmp_path / "ds", *LEVELS, RANDOM)
+    names = ("source", "patch", "patch_y", "patch_x", "level", "draw", "noisy_xxh3")
+    before, after = ([tuple(row[name] for name in names) for row in rows(out)] for out in (cut_up, tmp_path / "ds"))
+    assert [row for row in after if row[0] != "0.png"] == before
+
+
+def test_more_patches_leave_the_first_bytes_unchanged(sources: Path, cut_up: Path, make: Make, tmp_path: Path) -> None:
+    make(sources, tmp_path / "ds", *LEVELS, "source.patch=[random,30,9]")
+    more = {row["key"]: row["noisy_xxh3"] for row in rows(tmp_path / "ds")}
+    assert {row["key"]: row["noisy_xxh3"] for row in rows(cut_up)}.items() < more.items()
+
+
+def test_stopped_run_resumes_to_the_same_bytes(
+    sources: Path, cut_up: Path, make: Make, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = sources, tmp_path / "ds", *LEVELS, RANDOM, "output.pairs_per_shard=2"
+    run_tasks = runner.run_tasks
+
+    def stopped(*given: Any) -> Iterator[Any]:
+        yield next(iter(run_tasks(*given)))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(runner, "run_tasks", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            make(*arguments)
+    assert make(*arguments).made == 21
+    assert tree_hash(tmp_path / "ds") == tree_hash(cut_up)
+
+
+def test_changed_patch_setting_is_refused(sources: Path, cut_up: Path, make: Make) -> None:
+    with pytest.raises(ConfigError, match=r"source.patch=\[grid, 8, 8\] \(there: \[random, 30, 5\]\)"):
+        make(sources, cut_up, *LEVELS, "source.patch=8", "output.pairs_per_shard=2")
+
+
+def test_progress_counts_images_and_the_summary_pairs(sources: Path, run_main: RunMain) -> None:
+    done = run_main(f"source.root={sources}", GRID, "source.max_failed=1", "n_jobs=1")
+    assert "gen-dataset: 4/4 images, " in done.err
+    assert done.out.startswith("ds: 14 pairs in 1 shard")
+    assert "; 15 of 15 rows generated in this run, " in done.out
+    assert json.loads(Path("ds/dataset.json").read_text())["pairs"] == 14
+
+
+def test_photograph_is_decoded_once_for_all_its_patches(
+    sources: Path, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[int] = []
+    made: list[int] = []
+    decode, make_pairs = photographs.decode.decode, worker.make_pairs
+    monkeypatch.setattr(photographs.decode, "decode", lambda *a, **b: (decoded.append(1), decode(*a, **b))[1])
+    monkeypatch.setattr(
+        worker, "make_pairs", lambda srgb, *a: (made.append(srgb[..., 0].size), make_pairs(srgb, *a))[1]
+    )
+    make(sources, tmp_path / "ds", "source.patch=[random,10,4]")
+    assert (len(decoded), made) == (4, [100] * 12)
+
+    decoded.clear()
+    assert len(list(replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(sources)))) == 12
+    assert len(decoded) == 3
+
+
+# Verify, replay, repair -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
+def test_every_patch_is_replayed_from_its_row(patch: str, sources: Path, make: Make, tmp_path: Path) -> None:
+    make(sources, tmp_path / "ds", patch, *EVERY_EFFECT, "source.downscale=1", "noise.draws=2")
+    assert verify(tmp_path / "ds") == []
+    replayed = list(replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(sources)))
+    assert len(replayed) == len(RawPairs(tmp_path / "ds"))
+    assert [one for one in replayed if one.complaint] == []
+
+
+def test_row_with_a_moved_patch_differs(cut_up: Path, sources: Path) -> None:
+    row = next(read_rows(cut_up / "manifest.csv"))
+    (moved,) = replay([{**row, "patch_x": int(row["patch_x"] or 0) ^ 2}], str(sources))
+    (outside,) = replay([{**row, "patch_y": 36}], str(sources))
+    assert moved.complaint.startswith("the XXH3-128 of clean is ")
+    assert "its patch of 30 x 30 pixels at row 36, column " in outside.complaint
+
+
+@pytest.mark.parametrize(
+    ("keys", "pairs"),
+    [("00000003", 20), ("00000003-p0002", 4), ("00000003-p0002-l01d00", 1), ("00000000,00000001", 40)],
+)
+def test_key_selects_pairs_of_an_image_or_a_patch(keys: str, pairs: int, cut_up: Path, run_main: RunMain) -> None:
+    assert run_main("replay", cut_up, "--keys", keys).out.startswith(f"{pairs} pair")
+
+
+def test_replayed_patches_are_written_under_their_keys(cut_up: Path, run_main: RunMain, tmp_path: Path) -> None:
+    assert run_main("replay", cut_up, "--keys", "00000001-p0004", "--to", tmp_path / "to").code == 0
+    found = {sample.row["key"]: sample for sample in RawPairs(cut_up)}
+    names = {path.name.partition(".")[0] for path in (tmp_path / "to").iterdir()}
+    assert names == {f"00000001-p0004-l{level:02d}d{draw:02d}" for level in range(2) for draw in range(2)}
+    for name in names:
+        np.testing.assert_array_equal(np.load(tmp_path / "to" / f"{name}.noisy.npy"), found[name].noisy)
+        np.testing.assert_array_equal(np.load(tmp_path / "to" / f"{name}.clean.npy"), found[name].clean)
+
+
+def test_damaged_patch_is_named_and_repaired_alone(cut_up: Path, run_main: RunMain, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(cut_up, tmp_path / "ds"))
+    path = copy / "shards" / "shard-00000.tar"
+    content = bytearray(path.read_bytes())
+    content[content.index(b"00000001-p0003.noisy.l01d01.npy") + 512 + 200] ^= 1
+    path.write_bytes(content)
+
+    assert [(one.key, one.member) for one in verify(copy)] == [("00000001-p0003", "noisy.l01d01.npy")]
+    assert "shards/shard-00000.tar: 1 of 40 pairs regenerated" in run_main("verify", copy, "--repair").out
+    assert path.read_bytes() == (cut_up / "shards" / "shard-00000.tar").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        ("shards/shard-00001.tar",),
+        ("manifest.csv",),
+        ("manifest.csv", "shards/shard-00000.tar"),
+        ("dataset.json",),
+        ("config.yaml",),
+    ],
+)
+def test_missing_files_of_patches_are_restored(
+    lost: tuple[str, ...], cut_up: Path, sources: Path, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(cut_up, tmp_path / "ds"))
+    for name in lost:
+        (copy / name).unlink()
+    assert run_main("verify", copy, "--repair", f"source.root={sources}").code == 0
+    assert tree_hash(copy) == tree_hash(cut_up)
+
+
+def test_rows_of_more_than_ten_thousand_patches_keep_their_order(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Number 10000 comes after 9999, which text would not say."""
+    inside = [{"key": f"00000001-p{number:04d}"} for number in (9998, 9999, 10000, 10001)]
+    failures = [{"key": f"0000000{index}", "status": "failed", "shard": 0} for index in (0, 2)]
+    monkeypatch.setattr(repair, "_is_intact", lambda *_: True)
+    monkeypatch.setattr(repair, "_rows_inside", lambda *_: inside)
+    monkeypatch.setattr(repair, "readable_rows", lambda *_: failures)
+    kept = list(repair._readable_rows_in_order(tmp_path, {"shards": [{"file": "shards/shard-00000.tar"}]}))
+    assert kept == [failures[0], *inside, failures[1]]
+
+
+def test_dataset_of_patches_is_regenerated_from_its_config(cut_up: Path, sources: Path, run_main: RunMain) -> None:
+    done = run_main("again", cut_up, f"source.root={sources}", "out=ds2", "source.max_failed=1", "n_jobs=1")
+    assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {cut_up}, bit for bit")
+
+
+@pytest.mark.parametrize("side", [16, 64])
+def test_fitted_noise_of_small_patches_matches_their_rows(side: int, make: Make, tmp_path: Path) -> None:
+    """Few sites give large errors of the fit. The largest of 800 standard normal values is below 5."""
+    make(None, tmp_path / "ds", "source.limit=2", f"source.patch=[random,{side},400]")
+    found = list(transfer.iterate_fits(tmp_path / "ds"))
+    assert len(found) > 300
+    assert max(one.deviation for one in found) < 5
+
+
+# Foretold -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
+def test_plan_reports_bytes_and_pairs_exactly(patch: str, sources: Path, make: Make, tmp_path: Path) -> None:
+    made = make(sources, tmp_path / "ds", patch, *LEVELS, "output.pairs_per_shard=2")
+    config, _ = read_dataset_yaml(tmp_path / "ds" / "config.yaml")
+    config.source.root = str(sources)
+    told = estimate_run(config, 1, read_all=True)
+    assert (told.bytes, told.pairs) == (made.bytes, made.pairs)
+    assert f"pairs     {made.pairs}, in 2 shards of 2" in format_estimate(config, told)
+
+
+@pytest.mark.parametrize(
+    ("patch", "line"),
+    [
+        (GRID, "patches   32 x 32, a grid, 32 apart: 4 to 6 per image; 7.6% of the pixels unused"),
+        ("source.patch=[random,32,7]", "patches   32 x 32, 7 at random places: 7 per image; "),
+    ],
+)
+def test_plan_reports_patches_and_unused_pixels(patch: str, line: str, sources: Path, settings: Settings) -> None:
+    config = settings(f"source.root={sources}", patch)
+    assert line in format_estimate(config, estimate_run(config, 1, True))
+
+
+def test_plan_without_patches_reports_none(sources: Path, settings: Settings) -> None:
+    config = settings(f"source.root={sources}")
+    assert "\npatches " not in format_estimate(config, estimate_run(config, 1, True))
