@@ -1,13 +1,14 @@
-"""Write the parts of the documentation that follow from the code: manifest columns, drawing of the packages.
+"""Write the parts of the documentation that follow from the code: manifest columns, drawing and table of packages.
 
 ``python docs/update_reference.py`` rewrites the text between the markers ``<!-- NAME: from the code -->`` and
-``<!-- end of NAME -->`` of each page; a test compares the pages with the code.
+``<!-- end of NAME -->`` of each page, and the files of `GENERATED_FILES`; a test compares them with the code.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import grimp
@@ -39,24 +40,76 @@ def columns() -> str:
     return "\n".join(rows)
 
 
-def drawing() -> str:
-    """Return a Mermaid graph of the packages, an arrow for every import, and the modules of each package."""
+PACKAGES = tuple(package for layer in LAYERS for package in layer)
+
+
+@cache
+def package_imports() -> dict[str, list[str]]:
+    """Return the packages that each package imports, in the order of `LAYERS`."""
     graph = grimp.build_graph(PACKAGE, cache_dir=None)
-    modules = [module for module in sorted(graph.modules) if module.count(".") >= 2 and not graph.find_children(module)]
-    lines = ["```mermaid", "flowchart TD"]
-    for layer in LAYERS:
-        lines.append(f"    subgraph {'_'.join(layer)}_layer[ ]\n        " + "\n        ".join(layer) + "\n    end")
-    for importer in (package for layer in LAYERS for package in layer):
-        for imported in (package for layer in LAYERS for package in layer):
-            if importer != imported and graph.direct_import_exists(
+    return {
+        importer: [
+            imported
+            for imported in PACKAGES
+            if importer != imported
+            and graph.direct_import_exists(
                 importer=f"{PACKAGE}.{importer}", imported=f"{PACKAGE}.{imported}", as_packages=True
-            ):
-                lines.append(f"    {importer} --> {imported}")
-    lines += ["```", "", "| package | purpose | modules |", "|---|---|---|"]
-    for package in (package for layer in LAYERS for package in layer):
-        names = [module.removeprefix(f"{PACKAGE}.{package}.") for module in modules if module.split(".")[1] == package]
-        lines.append(f"| `{package}` | {purpose(package)} | {', '.join(f'`{name}`' for name in names)} |")
+            )
+        ]
+        for importer in PACKAGES
+    }
+
+
+def package_table() -> str:
+    """Return the table of the packages: purpose, imported packages and modules."""
+    lines = ["| package | purpose | imports | modules |", "|---|---|---|---|"]
+    for package, imported in package_imports().items():
+        folder = ROOT / PACKAGE / package
+        paths = sorted(path for path in folder.rglob("*.py") if path.name != "__init__.py")
+        names = [f"`{'.'.join(path.relative_to(folder).with_suffix('').parts)}`" for path in paths]
+        lines.append(f"| `{package}` | {purpose(package)} | {', '.join(imported) or '–'} | {', '.join(names)} |")
     return "\n".join(lines)
+
+
+def package_drawing() -> str:
+    """Return an SVG of the packages by layer, without the arrows that follow from other arrows.
+
+    Code hosts and Sphinx show an SVG without a script; a Mermaid graph needs one, which is loaded from a server.
+    """
+    width, row, box_width, box_height = 640, 76, 128, 36
+    centre = {
+        package: (width * (2 * place + 1) // (2 * len(layer)), row * number + 32)
+        for number, layer in enumerate(LAYERS)
+        for place, package in enumerate(layer)
+    }
+    imports = package_imports()
+    height = row * (len(LAYERS) - 1) + 64
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
+        ' font-family="sans-serif" font-size="15" text-anchor="middle">',
+        "<title>Packages and their imports</title>",
+        '<marker id="tip" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" orient="auto">'
+        '<path d="M0 0L8 4L0 8z" fill="#555"/></marker>',
+        f'<rect width="{width}" height="{height}" fill="#fff"/>',
+    ]
+    for importer, imported in imports.items():
+        implied = {further for package in imported for further in _reachable(package)}
+        for package in imported:
+            if package not in implied:
+                (x1, y1), (x2, y2) = centre[importer], centre[package]
+                ends = f'x1="{x1}" y1="{y1 + box_height // 2}" x2="{x2}" y2="{y2 - box_height // 2}"'
+                lines.append(f'<line {ends} stroke="#555" marker-end="url(#tip)"/>')
+    for package, (x, y) in centre.items():
+        corner = f'x="{x - box_width // 2}" y="{y - box_height // 2}" width="{box_width}" height="{box_height}"'
+        lines.append(f'<rect {corner} rx="5" fill="#eef3f8" stroke="#345"/>')
+        lines.append(f'<text x="{x}" y="{y + 5}" fill="#123">{package}</text>')
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def _reachable(package: str) -> set[str]:
+    """Return all packages that a package imports, directly or through others."""
+    imported = package_imports()[package]
+    return {*imported, *(further for one in imported for further in _reachable(one))}
 
 
 def purpose(package: str) -> str:
@@ -67,9 +120,12 @@ def purpose(package: str) -> str:
 
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
     "columns": ("docs/dataset.md", columns),
-    "packages": ("docs/design/architecture.md", drawing),
+    "packages": ("docs/design/architecture.md", package_table),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
+
+GENERATED_FILES: dict[str, Callable[[], str]] = {"docs/design/packages.svg": package_drawing}
+"""Generated files, and the functions that return their text."""
 
 
 def updated(name: str) -> tuple[Path, str, str]:
@@ -88,3 +144,8 @@ if __name__ == "__main__":
         page, before, after = updated(part)
         page.write_text(after, encoding="utf-8")
         print(f"{page.relative_to(ROOT)}: {part} {'unchanged' if before == after else 'updated'}")
+    for name, generate_file in GENERATED_FILES.items():
+        path, text = ROOT / name, generate_file()
+        unchanged = path.exists() and path.read_text(encoding="utf-8") == text
+        path.write_text(text, encoding="utf-8")
+        print(f"{name}: {'unchanged' if unchanged else 'updated'}")

@@ -34,6 +34,11 @@ def test_generated_parts_follow_from_the_code(name: str) -> None:
     assert before == after, f"{page.name} is out of date: run python docs/update_reference.py"
 
 
+@pytest.mark.parametrize("name", update_reference.GENERATED_FILES)
+def test_generated_files_follow_from_the_code(name: str) -> None:
+    assert (ROOT / name).read_text(encoding="utf-8") == update_reference.GENERATED_FILES[name]()
+
+
 def test_readme_is_short() -> None:
     assert len(README.splitlines()) <= 200
 

@@ -219,7 +219,7 @@ MOSAIC, PACKED = "mosaic", "packed"
 class Plan:
     """All parameters of a pair; with the pixels it determines the pair completely.
 
-    A plan is drawn once (`planning.plan.plan_image`) or read from a manifest row.
+    A plan is drawn once (`unprocess_gen.plan_image`) or read from a manifest row.
 
     Attributes
     ----------

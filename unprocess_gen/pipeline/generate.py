@@ -59,7 +59,7 @@ class Summary:
     failed : dict of str to int
         Failed rows by reason.
     sites : dict of str to int
-        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
+        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (``COUNTS``).
     shards, bytes : int
         Number of shards and the sum of their sizes.
     made : int
