@@ -76,7 +76,7 @@ def package_drawing() -> str:
 
     Code hosts and Sphinx show an SVG without a script; a Mermaid graph needs one, which is loaded from a server.
     """
-    width, row, box_width, box_height = 640, 76, 128, 36
+    width, row, box_width, box_height = 520, 72, 104, 36
     centre = {
         package: (width * (2 * place + 1) // (2 * len(layer)), row * number + 32)
         for number, layer in enumerate(LAYERS)

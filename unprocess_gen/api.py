@@ -125,6 +125,18 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
         If ``config`` is not a config.
     ValueError
         If ``srgb`` has another dtype or shape.
+
+    Examples
+    --------
+    A plan keeps gains, matrix and noise for other pixels:
+
+    >>> import numpy as np
+    >>> import unprocess_gen as ug
+    >>> srgb = np.full((64, 96, 3), 128, np.uint8)
+    >>> plan = ug.plan_image(srgb, ug.load_config(), seed=7)
+    >>> darker = ug.make_pair(srgb // 2, plan)
+    >>> darker.row["red_gain"] == plan.red_gain
+    True
     """
     pixels = _pixels_of(srgb)
     return _planned(pixels, _identity(pixels, key), config, seed)
@@ -166,8 +178,15 @@ def make_pair(
 
     Examples
     --------
-    >>> config = load_config(["camera=sony_a7r", "noise=imx385_iso3200"])  # doctest: +SKIP
-    >>> pair = make_pair(srgb, config)  # doctest: +SKIP
+    >>> import numpy as np
+    >>> import unprocess_gen as ug
+    >>> srgb = np.full((64, 96, 3), 128, np.uint8)
+    >>> config = ug.load_config(["camera=sony_a7r", "noise=imx385_iso3200"])
+    >>> pair = ug.make_pair(srgb, config)
+    >>> pair
+    RawPair(uint16 [64, 96], noise=imx385_iso3200)
+    >>> pair.row["black_level_dn"], pair.row["white_level_dn"]
+    (240, 4095)
     """
     pixels = _pixels_of(srgb)
     identity = _identity(pixels, key)
@@ -212,6 +231,15 @@ def generate(config: Config) -> _generate.Summary:
         If the disk is full or fails, or a source was changed or deleted.
     TypeError
         If ``config`` is not a config.
+
+    Examples
+    --------
+    Two of the built-in scenes, in one process:
+
+    >>> import unprocess_gen as ug
+    >>> summary = ug.generate(ug.load_config(["source.limit=2", "n_jobs=1", "out=ds"]))
+    >>> summary.pairs, summary.shards
+    (2, 1)
     """
     _check_complete(config)
     validate_config(config)
@@ -237,6 +265,14 @@ def verify(folder: PathLike) -> list[_verify.Damage]:
         If the folder contains no finished dataset.
     MachineError
         If a file exists but cannot be read.
+
+    Examples
+    --------
+    The dataset of the example of `generate`:
+
+    >>> import unprocess_gen as ug
+    >>> ug.verify("ds")
+    []
     """
     path = Path(folder)
     if not _verify.is_sweep(path):
@@ -281,6 +317,14 @@ def replay(
         If the manifest cannot be read.
     MachineError
         If the self-test fails or the arrays cannot be written.
+
+    Examples
+    --------
+    The dataset of the example of `generate`:
+
+    >>> import unprocess_gen as ug
+    >>> [(result.key, result.complaint) for result in ug.replay("ds", keys="0-1")]
+    [('00000000', ''), ('00000001', '')]
     """
     manifest = Path(folder)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
@@ -312,6 +356,14 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
         If the row is not the row of a pair.
     ValueError
         If the frame has fewer than 2 x 2 sites or another shape.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import unprocess_gen as ug
+    >>> pair = ug.make_pair(np.full((64, 96, 3), 128, np.uint8), ug.load_config())
+    >>> ug.develop(pair.noisy, pair.row).shape
+    (64, 96, 3)
     """
     plan = row if isinstance(row, Plan) else plan_from_row(row)
     recorded: Row = {

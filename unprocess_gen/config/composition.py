@@ -96,6 +96,13 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
     ------
     ConfigError
         If an override, an option file or a value is not allowed. The message names key, value and what is allowed.
+
+    Examples
+    --------
+    >>> import unprocess_gen as ug
+    >>> config = ug.load_config(["camera=sony_a7r", "sensor=generic_14bit", "seed=7"])
+    >>> config.sensor.bits, config.sensor.white_level_dn
+    (14, 16383)
     """
     if isinstance(overrides, str):
         raise ConfigError(f"overrides={overrides!r}: one string; expected a list of strings; write [{overrides!r}]")

@@ -113,8 +113,15 @@ class RawPairs:
 
     Examples
     --------
-    >>> pairs = RawPairs("ds")  # doctest: +SKIP
-    >>> clean, noisy, row = pairs[0]  # doctest: +SKIP
+    The dataset of the example of `unprocess_gen.generate`:
+
+    >>> import unprocess_gen as ug
+    >>> pairs = ug.RawPairs("ds")
+    >>> len(pairs)
+    2
+    >>> clean, noisy, row = pairs[0]
+    >>> noisy.dtype, row["key"]
+    (dtype('uint16'), '00000000')
     """
 
     def __init__(self, path: str | Path) -> None:
