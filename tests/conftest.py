@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
+import hypothesis
 import numpy as np
 import pytest
 from helpers.commands import COMMAND, Cli, Done, RunMain, environment
@@ -28,6 +29,12 @@ from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline import generate as runner
+
+# the same examples in every run, and none refused because the machine is busy
+hypothesis.settings.register_profile(
+    "tests", derandomize=True, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("tests")
 
 np.seterr(all="raise")  # in every test: no NaN, overflow, underflow or division by zero goes by unseen
 

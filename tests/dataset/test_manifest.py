@@ -187,7 +187,9 @@ plans = st.builds(
     methods=st.lists(word, max_size=3).map(tuple),
     physics=st.none() | physics,
 )
-names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40)
+names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(
+    BY_NAME["source"].allowed.__contains__
+)
 
 
 # Columns --------------------------------------------------------------------------------------------------------------
