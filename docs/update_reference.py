@@ -1,4 +1,4 @@
-"""Write the parts of the documentation that follow from the code: manifest columns, drawing and table of packages.
+"""Write the parts of the documentation that follow from the code: columns, packages, table of promises.
 
 ``python docs/update_reference.py`` rewrites the text between the markers ``<!-- NAME: from the code -->`` and
 ``<!-- end of NAME -->`` of each page, and the files of `GENERATED_FILES`; a test compares them with the code.
@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,9 @@ import grimp
 from unprocess_gen.dataset.columns import COLUMNS
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from helpers.promises import evidence_table  # noqa: E402
+
 PACKAGE = "unprocess_gen"
 LAYERS = (
     ("cli",),
@@ -121,6 +125,7 @@ def purpose(package: str) -> str:
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
     "columns": ("docs/dataset.md", columns),
     "packages": ("docs/design/architecture.md", package_table),
+    "promises": ("docs/evidence.md", evidence_table),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
 

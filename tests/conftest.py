@@ -30,6 +30,8 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline import generate as runner
 
+pytest_plugins = ["helpers.promise_report"]
+
 # the same examples in every run, and none refused because the machine is busy
 hypothesis.settings.register_profile(
     "tests", derandomize=True, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
