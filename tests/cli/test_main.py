@@ -17,6 +17,7 @@ import yaml
 from helpers.commands import COMMAND, Cli, RunMain
 from helpers.datasets import Make
 from helpers.photographs import fill, pixels
+from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs, __version__
@@ -96,13 +97,14 @@ REFUSED = [
 
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
 def test_mistake_gives_one_line_and_exit_code_2_and_writes_nothing(
-    arguments: list[str], sentence: str, run_main: RunMain, tmp_path: Path
+    arguments: list[str], sentence: str, run_main: RunMain, tmp_path: Path, figure: Figure
 ) -> None:
     done = run_main(*arguments)
     assert (done.code, done.out) == (2, "")
     assert re.match("gen-dataset: " + sentence, done.err), done.err
     assert done.err.count("\n") == 1 and done.err.endswith("\n")
     assert list(tmp_path.iterdir()) == []
+    figure("mistakes", f"exit code {done.code}, {done.err.count(chr(10))} line, {len(list(tmp_path.iterdir()))} files")
 
 
 GROUP_VALUES = ["camera=null", "noise=3200", "sensor=12", "gains=2.0", "isp=true"]

@@ -75,9 +75,8 @@ def measured_figures(reports: list[tuple[str, pytest.TestReport]]) -> Figures:
     for outcome, report in reports:
         if outcome == "passed" and report.when == "call":
             for promise, text in (value for name, value in report.user_properties if name == PROPERTY):
-                texts = figures.setdefault(promise, {}).setdefault(report.nodeid.split("[")[0], [])
-                if text not in texts:
-                    texts.append(text)
+                cases = figures.setdefault(promise, {}).setdefault(report.nodeid.split("[")[0], {})
+                cases[text] = cases.get(text, 0) + 1
     return figures
 
 

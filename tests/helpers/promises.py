@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -229,8 +230,11 @@ BY_ID = {promise.id: promise for promise in PROMISES}
 
 _REPORTED = re.compile(r'\bfigure\(\s*"([a-z0-9-]+)"')
 
-Figures = dict[str, dict[str, list[str]]]
-"""Distinct figures by promise and test function (``file::function``)."""
+_NUMBER = re.compile(r"(?<![\w^.])\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?(?![\w^])")
+"""A number of a figure, but no part of a name and no power such as 2^32."""
+
+Figures = dict[str, dict[str, dict[str, int]]]
+"""Number of cases with each figure, by promise, test function (``file::function``) and figure."""
 
 
 def reporting_files() -> dict[str, set[str]]:
@@ -248,7 +252,7 @@ def recorded_figures() -> Figures:
         return {}
     figures: Figures = json.loads(RECORDED.read_text(encoding="utf-8"))
     return {
-        promise: {test: texts for test, texts in tests.items() if _exists(test)}
+        promise: {test: cases for test, cases in tests.items() if _exists(test)}
         for promise, tests in figures.items()
         if promise in BY_ID
     }
@@ -260,9 +264,26 @@ def _exists(test: str) -> bool:
     return (ROOT / path).exists() and f"def {function}(" in (ROOT / path).read_text(encoding="utf-8")
 
 
-def one_line(figures: dict[str, list[str]]) -> str:
-    """Return the distinct figures of a promise's tests in one line."""
-    return "; ".join(dict.fromkeys(text for texts in figures.values() for text in texts))
+def one_line(figures: dict[str, dict[str, int]]) -> str:
+    """Return the figures of a promise's tests in one line.
+
+    Figures that differ only in their numbers become one, with the range of each number and the number of cases.
+    """
+    alike: dict[tuple[str, ...], Counter[str]] = {}
+    for texts in figures.values():
+        for text, cases in texts.items():
+            alike.setdefault(tuple(_NUMBER.split(text)), Counter())[text] += cases
+    return "; ".join(_with_ranges(words, texts) for words, texts in alike.items())
+
+
+def _with_ranges(words: tuple[str, ...], texts: Counter[str]) -> str:
+    """Return one figure for all ``texts``, which have the same words between their numbers."""
+    shown = words[0]
+    for word, numbers in zip(words[1:], zip(*map(_NUMBER.findall, texts), strict=True), strict=True):
+        low, high = (choose(numbers, key=lambda text: float(text.replace(",", ""))) for choose in (min, max))
+        shown += (low if low == high else f"{low} to {high}") + word
+    cases = texts.total()
+    return shown if cases == 1 else f"{shown} (in each of {cases} cases)"
 
 
 def evidence_table() -> str:

@@ -28,6 +28,7 @@ from helpers.commands import Cli, RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.processes import ONE, Killed, assert_whole, committed, running, session, wait_for, workers
+from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen.core.errors import ConfigError, MachineError, UnprocessGenError
@@ -111,7 +112,7 @@ def moment_of(draw: random.Random, course: Course) -> float:
 @pytest.mark.parametrize(("whom", "kills"), [("coordinator", 34), ("group", 33)])
 def test_run_killed_at_random_moments_resumes_to_the_same_bytes(
     whom: str, kills: int, photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: TreeHash,
-    tmp_path: Path,
+    tmp_path: Path, figure: Figure,
 ) -> None:  # fmt: skip
     """Workers of a killed coordinator end within ten seconds; within one if a core is free."""
     draw, hits, unfinished = random.Random(whom), 0, 0
@@ -132,11 +133,12 @@ def test_run_killed_at_random_moments_resumes_to_the_same_bytes(
         shutil.rmtree(out)
     print(f"{whom}: {hits} of {kills} kills hit a running process, {unfinished} left an unfinished folder")
     assert hits >= kills / 2 and unfinished >= kills / 4
+    figure("resume", f"{whom} killed: same bytes in {kill + 1} of {kills} runs, {hits} hit while running")
 
 
 @pytest.mark.slow
 def test_run_continues_when_a_worker_is_killed_at_random_moments(
-    photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: TreeHash, tmp_path: Path
+    photographs: Path, undisturbed: str, course: Course, make: Make, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
     """The run ends with 0, or with 3 if the kill hit the retry of a photograph; a rerun then completes it."""
     draw, kills, hits, codes = random.Random("worker"), 33, 0, Counter[int]()
@@ -162,6 +164,7 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
         shutil.rmtree(out)
     print(f"worker: {hits} of {kills} kills hit a running process; exit codes {dict(codes)}")
     assert hits >= kills / 2
+    figure("resume", f"worker killed: same bytes in {kill + 1} of {kills} runs, {hits} hit while running")
 
 
 def test_orphaned_workers_do_not_disturb_the_next_run(
@@ -260,7 +263,12 @@ def acting_at(folder: Path, photograph: Path, action: str) -> dict[str, str]:
 
 
 def test_killed_worker_is_noticed_within_five_seconds(
-    photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    photographs: Path,
+    undisturbed: str,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    figure: Figure,
 ) -> None:
     """The killed worker was at the last photograph, so no other work would reveal its death."""
     for name, value in acting_at(tmp_path, photographs / f"{COUNT - 1:03d}.png", "wait").items():
@@ -270,9 +278,12 @@ def test_killed_worker_is_noticed_within_five_seconds(
         idle = set(workers(process.pid)) - {asleep := int((tmp_path / "note").read_text())}
         assert len(idle) == 1
         os.kill(asleep, signal.SIGKILL)
+        killed = time.monotonic()
         wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # loky ends all workers
+        noticed_s = time.monotonic() - killed
         assert process.wait(20) == 0
     assert tree_hash(tmp_path / "ds") == undisturbed
+    figure("dead-worker", f"noticed after {noticed_s:.1f} s")
 
 
 LARGE = 3000, 4000
@@ -449,8 +460,12 @@ def test_full_disk_leaves_committed_shards_intact(fulls: list[Full]) -> None:
     assert [full for full in fulls if not full.intact] == []
 
 
-def test_run_resumes_to_the_same_bytes_once_space_is_free(fulls: list[Full], six_undisturbed: str) -> None:
+def test_run_resumes_to_the_same_bytes_once_space_is_free(
+    fulls: list[Full], six_undisturbed: str, figure: Figure
+) -> None:
     assert [full for full in fulls if full.rerun != six_undisturbed] == []
+    equal, sizes = sum(full.rerun == six_undisturbed for full in fulls), [full.kilobytes for full in fulls]
+    figure("disk-full", f"same bytes in {equal} of {len(fulls)} reruns, disks of {min(sizes)} to {max(sizes)} KiB")
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
@@ -693,7 +708,7 @@ def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_pat
 
 @pytest.mark.parametrize("number", [6, pytest.param(40, marks=pytest.mark.slow)])
 def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
-    number: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path
+    number: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
     """The moments begin 0.3 s after the start, when the command handles signals.
 
@@ -722,3 +737,4 @@ def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
         assert_whole(out)
     print(f"exit codes of {number} signals: {dict(codes)}")
     assert codes[130] + codes[143] >= number / 2
+    figure("resume", f"signals: same bytes in {kill + 1} of {number} runs")

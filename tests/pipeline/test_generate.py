@@ -18,6 +18,7 @@ import pytest
 from helpers.commands import Cli
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import PHOTOS, fill, pixels
+from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs
@@ -50,10 +51,11 @@ def sha256(path: Path) -> str:
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_number_of_workers_changes_no_byte(
-    n_jobs: int, make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path
+    n_jobs: int, make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
     make(photos, tmp_path / "ds", SHARDS_OF_5, n_jobs=n_jobs)
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+    figure("workers", f"same bytes in {len(rows(tmp_path / 'ds'))} of {len(rows(dataset))} pairs")
 
 
 class Backwards:
@@ -72,11 +74,18 @@ class Backwards:
 
 
 def test_order_of_directory_entries_changes_no_byte(
-    make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Make,
+    photos: Path,
+    dataset: Path,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    figure: Figure,
 ) -> None:
     monkeypatch.setattr(os, "scandir", Backwards)
     make(photos, tmp_path / "ds", SHARDS_OF_5)
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+    figure("workers", f"same bytes in {len(rows(tmp_path / 'ds'))} of {len(rows(dataset))} pairs")
 
 
 def test_order_of_file_creation_changes_no_byte(
@@ -92,7 +101,7 @@ def test_order_of_file_creation_changes_no_byte(
 
 
 def test_place_locale_clock_and_hash_seed_change_no_byte(
-    cli: Cli, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path
+    cli: Cli, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
     (tmp_path / "a/b").mkdir(parents=True)
     root = os.path.relpath(photos, tmp_path / "a/b")
@@ -102,15 +111,19 @@ def test_place_locale_clock_and_hash_seed_change_no_byte(
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+    figure("workers", f"same bytes in {len(rows(tmp_path / 'ds'))} of {len(rows(dataset))} pairs")
 
 
-def test_umask_changes_no_byte(make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path) -> None:
+def test_umask_changes_no_byte(
+    make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path, figure: Figure
+) -> None:
     before = os.umask(0o077)
     try:
         make(photos, tmp_path / "ds", SHARDS_OF_5)
     finally:
         os.umask(before)
     assert tree_hash(tmp_path / "ds") == tree_hash(dataset)
+    figure("workers", f"same bytes in {len(rows(tmp_path / 'ds'))} of {len(rows(dataset))} pairs")
 
 
 def test_seed_changes_every_noisy_frame(make: Make, photos: Path, dataset: Path, tmp_path: Path) -> None:
@@ -136,7 +149,7 @@ def by_source(out: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("shard", [1, 3])
-def test_adding_a_file_leaves_other_images_unchanged(shard: int, make: Make, tmp_path: Path) -> None:
+def test_adding_a_file_leaves_other_images_unchanged(shard: int, make: Make, tmp_path: Path, figure: Figure) -> None:
     source = fill(tmp_path / "p", 5)
     make(source, tmp_path / "before", f"output.pairs_per_shard={shard}", "camera=choice", "noise=brooks2019")
     Image.fromarray(pixels(99, 14, 14)).save(source / "000-first.png")
@@ -144,9 +157,10 @@ def test_adding_a_file_leaves_other_images_unchanged(shard: int, make: Make, tmp
     before, after = by_source(tmp_path / "before"), by_source(tmp_path / "after")
     assert after.keys() - before.keys() == {"000-first.png"}
     assert {name: after[name] for name in before} == before
+    figure("independence", f"{sum(after[name] == before[name] for name in before)} of {len(before)} images unchanged")
 
 
-def test_removing_a_file_leaves_other_images_unchanged(make: Make, tmp_path: Path) -> None:
+def test_removing_a_file_leaves_other_images_unchanged(make: Make, tmp_path: Path, figure: Figure) -> None:
     source = fill(tmp_path / "p", 5)
     make(source, tmp_path / "before", "noise=brooks2019")
     (source / "001.png").unlink()
@@ -154,6 +168,7 @@ def test_removing_a_file_leaves_other_images_unchanged(make: Make, tmp_path: Pat
     before, after = by_source(tmp_path / "before"), by_source(tmp_path / "after")
     assert before.keys() - after.keys() == {"001.png"}
     assert {name: before[name] for name in after} == after
+    figure("independence", f"{sum(after[name] == before[name] for name in after)} of {len(after)} images unchanged")
 
 
 def test_shard_size_leaves_images_unchanged(make: Make, dataset: Path, photos: Path, tmp_path: Path) -> None:

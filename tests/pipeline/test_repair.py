@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
+from helpers.promise_report import Figure
 
 from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import verify
@@ -66,8 +67,9 @@ def lost(folder: Path) -> bool:
     return json.loads((folder / "dataset.json").read_text())["run"] is None
 
 
-def assert_flips_repaired(intact: Path, copy: Path, run_main: RunMain, name: str, count: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def assert_flips_repaired(intact: Path, copy: Path, run_main: RunMain, name: str, count: int, seed: int) -> int:
+    """Return the number of repaired bits."""
+    rng, repaired = np.random.default_rng(seed), 0
     for bit in rng.integers(0, 8 * (intact / name).stat().st_size, count):
         flip(copy / name, int(bit))
         assert run_main("verify", copy, "--repair").code == 0, f"bit {bit} of {name}"
@@ -77,19 +79,23 @@ def assert_flips_repaired(intact: Path, copy: Path, run_main: RunMain, name: str
             del found[name], wanted[name]
             shutil.copy(intact / name, copy / name)
         assert found == wanted
+        repaired += 1
+    return repaired
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_flipped_bit_is_repaired(name: str, intact: Path, copy: Path, run_main: RunMain) -> None:
-    assert_flips_repaired(intact, copy, run_main, name, 4, seed=1)
+def test_flipped_bit_is_repaired(name: str, intact: Path, copy: Path, run_main: RunMain, figure: Figure) -> None:
+    repaired = assert_flips_repaired(intact, copy, run_main, name, 4, seed=1)
+    figure("repair", f"{repaired} of 4 flipped bits repaired")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_hundred_flipped_bits_in_every_file_are_repaired(
-    name: str, intact: Path, copy: Path, run_main: RunMain
+    name: str, intact: Path, copy: Path, run_main: RunMain, figure: Figure
 ) -> None:
-    assert_flips_repaired(intact, copy, run_main, name, 100, seed=2)
+    repaired = assert_flips_repaired(intact, copy, run_main, name, 100, seed=2)
+    figure("repair", f"{repaired} of 100 flipped bits repaired")
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name != "dataset.json"])

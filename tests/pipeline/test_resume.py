@@ -30,6 +30,7 @@ from helpers.processes import (
     wait_for,
     workers,
 )
+from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs
@@ -55,7 +56,7 @@ def undisturbed(forty: Path, make: Make, tree_hash: TreeHash) -> str:
 
 
 def test_run_killed_ten_times_ends_as_if_undisturbed(
-    forty: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path
+    forty: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
     """Each kill comes a few random milliseconds after a number of shards that grows from kill to kill."""
     moment = random.Random(385)
@@ -71,6 +72,7 @@ def test_run_killed_ten_times_ends_as_if_undisturbed(
     make(forty, out, ONE)
     assert tree_hash(out) == undisturbed
     assert_whole(out)
+    figure("resume", f"same bytes after {kill + 1} kills of one run")
 
 
 FILES = 10
@@ -80,7 +82,13 @@ FILES = 10
 @pytest.mark.parametrize("renamed", [False, True])
 @pytest.mark.parametrize("number", range(FILES))
 def test_run_killed_around_any_rename_can_be_resumed(
-    number: int, renamed: bool, make: Make, tree_hash: TreeHash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    number: int,
+    renamed: bool,
+    make: Make,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    figure: Figure,
 ) -> None:
     source, out = fill(tmp_path / "p", 5), tmp_path / "ds"
     seen: list[Path] = []
@@ -102,6 +110,7 @@ def test_run_killed_around_any_rename_can_be_resumed(
     make(source, tmp_path / "undisturbed", "output.pairs_per_shard=2")
     assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
     assert_whole(out)
+    figure("resume", "same bytes after a kill before or after each rename")
 
 
 def test_every_rename_of_a_run_is_tested(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.photographs import fill
+from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
@@ -70,13 +71,17 @@ def flips_found(intact: Path, folder: Path, count: int, seed: int) -> int:
     return found
 
 
-def test_every_flipped_bit_is_found(intact: Path, copy: Path) -> None:
-    assert flips_found(intact, copy, 150, seed=1) == 150
+def test_every_flipped_bit_is_found(intact: Path, copy: Path, figure: Figure) -> None:
+    found = flips_found(intact, copy, 150, seed=1)
+    assert found == 150
+    figure("verify", f"{found} of 150 flipped bits found")
 
 
 @pytest.mark.slow
-def test_a_thousand_flipped_bits_are_found(intact: Path, copy: Path) -> None:
-    assert flips_found(intact, copy, 1000, seed=2) == 1000
+def test_a_thousand_flipped_bits_are_found(intact: Path, copy: Path, figure: Figure) -> None:
+    found = flips_found(intact, copy, 1000, seed=2)
+    assert found == 1000
+    figure("verify", f"{found} of 1000 flipped bits found")
 
 
 def boundaries(shard: Path) -> list[int]:
@@ -99,14 +104,16 @@ def test_every_truncation_is_found(name: str, copy: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_thousand_truncations_are_found(copy: Path) -> None:
-    rng = random.Random(3)
+def test_a_thousand_truncations_are_found(copy: Path, figure: Figure) -> None:
+    rng, found = random.Random(3), 0
     for _ in range(1000):
         path = copy / rng.choice(FILES)
         content = path.read_bytes()
         path.write_bytes(content[: rng.randrange(len(content))])
         assert damage_texts(copy), path
+        found += 1
         path.write_bytes(content)
+    figure("verify", f"{found} of 1000 truncations found")
 
 
 def test_damage_is_named_by_shard_key_and_member(copy: Path) -> None:
@@ -190,10 +197,11 @@ def test_command_reports_an_intact_dataset(copy: Path, run_main: RunMain) -> Non
 # Replay ---------------------------------------------------------------------------------------------------------------
 
 
-def test_replay_regenerates_the_pair_of_every_row(intact: Path) -> None:
+def test_replay_regenerates_the_pair_of_every_row(intact: Path, figure: Figure) -> None:
     root = str(intact.parent / "p")
     replayed = list(replay(read_rows(intact / "manifest.csv"), root))
     assert [(one.key, one.complaint) for one in replayed] == [(f"{i:08d}", "") for i in range(3)]
+    figure("replay", f"{sum(not one.complaint for one in replayed)} of {len(replayed)} pairs regenerated")
 
 
 def test_rows_of_built_in_scenes_need_no_folder(tmp_path: Path, make: Make) -> None:

@@ -34,6 +34,7 @@ import pytest
 from helpers import everywhere
 from helpers.commands import environment
 from helpers.photographs import pixels
+from helpers.promise_report import Figure
 from packaging.requirements import Requirement
 from packaging.version import Version
 from PIL import Image
@@ -156,28 +157,34 @@ def test_more_workers_than_cores_change_no_byte(make: Make, plain: Made) -> None
         pytest.param("LANG", "tr_TR.UTF-8", marks=pytest.mark.slow),
     ],
 )
-def test_no_locale_changes_a_byte(name: str, value: str, make: Make, plain: Made) -> None:
+def test_no_locale_changes_a_byte(name: str, value: str, make: Make, plain: Made, figure: Figure) -> None:
     assert_same(make(**{"LC_ALL": "", name: value}), plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 @pytest.mark.parametrize(("flag", "level"), [("-O", 1), pytest.param("-OO", 2, marks=pytest.mark.slow)])
-def test_python_without_assertions_changes_no_byte(flag: str, level: int, make: Make, plain: Made) -> None:
+def test_python_without_assertions_changes_no_byte(
+    flag: str, level: int, make: Make, plain: Made, figure: Figure
+) -> None:
     made = make(sys.executable, flag)
 
     assert made.facts["optimize"] == level
     assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
-def test_the_content_of_fresh_memory_changes_no_byte(make: Make, plain: Made) -> None:
+def test_the_content_of_fresh_memory_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
     assert_same(make(MALLOC_PERTURB_="165"), plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_IO_MAX_IMAGE_PIXELS", "100")],
 )
-def test_no_opencv_setting_changes_a_byte(name: str, value: str, make: Make, plain: Made) -> None:
+def test_no_opencv_setting_changes_a_byte(name: str, value: str, make: Make, plain: Made, figure: Figure) -> None:
     assert_same(make(**{name: value}), plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 SHORT_OF_MEMORY = """
@@ -218,18 +225,19 @@ ENABLED = [
 
 
 @pytest.mark.parametrize("kept", [ENABLED[:i] for i in range(len(ENABLED))], ids=lambda kept: "+".join(kept) or "none")
-def test_numpys_instruction_sets_change_no_byte(kept: list[str], make: Make, plain: Made) -> None:
+def test_numpys_instruction_sets_change_no_byte(kept: list[str], make: Make, plain: Made, figure: Figure) -> None:
     made = make(NPY_DISABLE_CPU_FEATURES=" ".join(name for name in ENABLED if name not in kept))
 
     assert made.facts["numpy"] == kept
     assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 @pytest.mark.parametrize(
     "core",
     ["Prescott", *(pytest.param(core, marks=pytest.mark.slow) for core in ("Nehalem", "Haswell", "Zen", "SkylakeX"))],
 )
-def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made) -> None:
+def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made, figure: Figure) -> None:
     product = "import numpy; numpy.ones((50, 50)) @ numpy.ones((50, 50))"
     tried = subprocess.run([sys.executable, "-c", product], env=environment(OPENBLAS_CORETYPE=core), check=False)
     if tried.returncode == -signal.SIGILL:
@@ -240,9 +248,10 @@ def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made) -> 
     if made.facts["product"] == plain.facts["product"]:
         pytest.skip(f"a matrix product for {core} is the same as here")
     assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
-def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made) -> None:
+def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
     if not plain.facts["opencv"]:
         pytest.skip("this OpenCV has one kind of code only")
 
@@ -251,9 +260,10 @@ def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made) -> 
     assert made.facts["opencv"] == []
     assert not made.facts["ipp"]
     assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
-def test_a_c_library_without_fma_changes_no_byte(make: Make, plain: Made) -> None:
+def test_a_c_library_without_fma_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
     hidden = ",".join(f"-{name}" for name in ("AVX2", "FMA", "FMA4", "AVX2_Usable", "FMA_Usable"))
 
     made = make(GLIBC_TUNABLES=f"glibc.cpu.hwcaps={hidden}")
@@ -261,6 +271,7 @@ def test_a_c_library_without_fma_changes_no_byte(make: Make, plain: Made) -> Non
     if made.facts["libm"] == plain.facts["libm"]:
         pytest.skip("the C library computes sines, powers and logarithms as before")
     assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 WITHOUT_VECTOR_CODE = """
@@ -302,13 +313,16 @@ GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE
         pytest.param({"NUMBA_BOUNDSCHECK": "1"}, id="within bounds", marks=pytest.mark.slow),
     ],
 )
-def test_other_compiler_options_change_no_byte(env: dict[str, str], make: Make, plain: Made, tmp_path: Path) -> None:
+def test_other_compiler_options_change_no_byte(
+    env: dict[str, str], make: Make, plain: Made, tmp_path: Path, figure: Figure
+) -> None:
     made = make(NUMBA_CACHE_DIR=str(tmp_path), **env)
 
     assert made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
     assert made.facts["kernels"]["code"] != plain.facts["kernels"]["code"]
     assert env is not GENERIC or not made.facts["kernels"]["ymm"]
     assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
@@ -340,7 +354,7 @@ def test_the_machine_code_of_every_kernel_is_inspected(code: dict[str, Any]) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("target", ["Numba's own", *everywhere.TARGETS])
-def test_no_kernel_contains_a_fused_multiply_add(target: str, code: dict[str, Any]) -> None:
+def test_no_kernel_contains_a_fused_multiply_add(target: str, code: dict[str, Any], figure: Figure) -> None:
     kernels, free_to_fuse = code["instructions"][target]
     if kernels is None:
         pytest.skip("this LLVM was built without that target")
@@ -348,6 +362,7 @@ def test_no_kernel_contains_a_fused_multiply_add(target: str, code: dict[str, An
     assert free_to_fuse["fused"]
     assert kernels["fused"] == []
     assert kernels["guessed"] == []
+    figure("machines", f"{len(kernels['fused'])} fused multiply-adds in the kernels for {target}")
 
 
 @pytest.mark.slow
@@ -461,7 +476,7 @@ def oldest(requirement: Requirement) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("which", ["oldest", "newest"])
-def test_library_versions_change_no_byte(which: str, make: Make, plain: Made, tmp_path: Path) -> None:
+def test_library_versions_change_no_byte(which: str, make: Make, plain: Made, tmp_path: Path, figure: Figure) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     requirements = [Requirement(one) for one in project["dependencies"]]
     venv.create(tmp_path, with_pip=False, symlinks=True)
@@ -485,3 +500,4 @@ def test_library_versions_change_no_byte(which: str, make: Make, plain: Made, tm
     assert (plainest.facts["numpy"], plainest.facts["opencv"]) == ([], [])
     assert_same(made, plain)
     assert_same(plainest, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")

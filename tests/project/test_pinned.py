@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 
 import pytest
+from helpers.promise_report import Figure
 
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
@@ -41,7 +42,7 @@ def test_pinned_manifest_without_new_columns_is_that_of_0_1(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BUILDS)
-def test_pinned_build_gives_the_recorded_bytes(name: str, tmp_path: Path) -> None:
+def test_pinned_build_gives_the_recorded_bytes(name: str, tmp_path: Path, figure: Figure) -> None:
     config, kind = read_dataset_yaml(PINNED / f"{name}.yaml")
     assert kind == "synthetic"
     config.out, config.n_jobs = str(tmp_path / "ds"), 1
@@ -56,3 +57,4 @@ def test_pinned_build_gives_the_recorded_bytes(name: str, tmp_path: Path) -> Non
     assert sorted(path.name for path in (tmp_path / "ds/shards").iterdir()) == sorted(
         file.removeprefix("shards/") for file in expected if file.startswith("shards/")
     )
+    figure("pinned-builds", f"{name}: {len(expected)} of {len(expected)} files have the recorded SHA-256")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.photographs import fill
+from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -121,7 +122,7 @@ def test_reference_has_ratio_one_and_no_error(found: BenchmarkReport) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
-def test_measured_errors_are_within_the_stated_limits(found: BenchmarkReport, method: Any) -> None:
+def test_measured_errors_are_within_the_stated_limits(found: BenchmarkReport, method: Any, figure: Figure) -> None:
     row = rows_of(found, method.stage)[method.spelled]
     if row.error_max is None:
         pytest.skip("kernel cannot be called separately")
@@ -134,6 +135,7 @@ def test_measured_errors_are_within_the_stated_limits(found: BenchmarkReport, me
         changed_by_chance = 5 * math.sqrt(method.clean_changed_share / (3 * math.prod(LITTLE.sampled)))
         assert row.error_max <= method.clean_dn
         assert (row.changed_share or 0) <= method.clean_changed_share + changed_by_chance
+    figure("tiers", f"{method.stage}: error {row.error_max:.2g} {row.error_unit}")
 
 
 @pytest.mark.parametrize("stage", TIER_STAGES)

@@ -27,6 +27,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
+from helpers.promise_report import Figure
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
@@ -579,7 +580,9 @@ def colours_in(picture: np.ndarray, box: list[float]) -> int:
 
 
 @pytest.mark.parametrize("width", [1200, 360])
-def test_browser_shows_every_picture_without_overflow(width: int, scenes_page: str, tmp_path: Path) -> None:
+def test_browser_shows_every_picture_without_overflow(
+    width: int, scenes_page: str, tmp_path: Path, figure: Figure
+) -> None:
     measured, shot = browse(scenes_page, width, tmp_path)
     assert measured["wide"] == [width, width]
     assert shot.shape[:2] == (measured["high"], width)
@@ -592,6 +595,7 @@ def test_browser_shows_every_picture_without_overflow(width: int, scenes_page: s
     for box in measured["charts"]:
         assert box[2] >= min(200, width - 40) and box[3] >= 40
         assert colours_in(shot, box) >= 2
+    figure("report", f"{width} pixels: page {measured['wide'][0]} wide, {len(measured['pictures'])} pictures shown")
 
 
 @pytest.mark.slow

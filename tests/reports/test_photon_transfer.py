@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
+from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs
 from unprocess_gen.reports import photon_transfer
@@ -21,10 +22,11 @@ def scenes(tmp_path_factory: pytest.TempPathFactory, make: Make) -> Path:
     return out
 
 
-def test_every_pair_agrees_with_its_row(scenes: Path) -> None:
+def test_every_pair_agrees_with_its_row(scenes: Path, figure: Figure) -> None:
     found = list(photon_transfer.iterate_fits(scenes))
     assert len(found) == 3
     assert max(one.deviation for one in found) < 5
+    figure("photon-transfer", f"{len(found)} pairs within {max(one.deviation for one in found):.1f} standard errors")
 
 
 @pytest.mark.parametrize(
@@ -37,11 +39,14 @@ def test_every_pair_agrees_with_its_row(scenes: Path) -> None:
         ("noise=oppo_reno10x", "noise.iso=1600", "sensor=generic_10bit"),
     ],
 )
-def test_every_kind_of_noise_agrees_with_its_row(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
+def test_every_kind_of_noise_agrees_with_its_row(
+    overrides: tuple[str, ...], make: Make, tmp_path: Path, figure: Figure
+) -> None:
     make(None, tmp_path / "ds", "source.limit=2", *overrides)
     found = list(photon_transfer.iterate_fits(tmp_path / "ds"))
     assert len(found) == 2
     assert max(one.deviation for one in found) < 5
+    figure("photon-transfer", f"{len(found)} pairs within {max(one.deviation for one in found):.1f} standard errors")
 
 
 @pytest.mark.parametrize(("column", "factor"), [("a_dn", 1.05), ("a_dn", 0.95), ("b_dn2", 1.8), ("b_dn2", 0.2)])

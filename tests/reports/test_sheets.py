@@ -12,6 +12,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.photographs import PHOTOS, fill, pixels
+from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -71,7 +72,7 @@ def places(sheet: np.ndarray, picture: np.ndarray) -> list[tuple[int, int]]:
 # Panels ---------------------------------------------------------------------------------------------------
 
 
-def test_sheet_contains_every_panel_exactly(few: Path, gray_world: Path, tmp_path: Path) -> None:
+def test_sheet_contains_every_panel_exactly(few: Path, gray_world: Path, tmp_path: Path, figure: Figure) -> None:
     """Order: source and three views of the clean frame; below, difference and three views of the noisy frame."""
     clean, noisy, row = RawPairs(few)[0]
     plan = plan_from_row(row)
@@ -109,6 +110,7 @@ def test_sheet_contains_every_panel_exactly(few: Path, gray_world: Path, tmp_pat
     assert columns[:4] == columns[4:] == tuple(sorted(columns[:4]))
     assert len(set(rows[:4])) == len(set(rows[4:])) == 1
     assert rows[0] < rows[4]
+    figure("preview", f"{sum(len(places_) == 1 for places_ in found)} of {len(expected)} panels found, pixel by pixel")
 
 
 def test_detail_equals_the_developed_complete_frame(few: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import algorithm1
+from helpers.promise_report import Figure
 
 from unprocess_gen import RawPairs
 from unprocess_gen.config.schema import (
@@ -76,22 +77,28 @@ def assert_clean_frames_agree(root: Path, dataset: Path) -> int:
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_every_clean_dn_follows_from_row_and_source(photographs: Path, tmp_path: Path, name: str) -> None:
+def test_every_clean_dn_follows_from_row_and_source(
+    photographs: Path, tmp_path: Path, name: str, figure: Figure
+) -> None:
     given = {"gains": GainsConfig(*BROOKS), "noise": NOISE, **SETTINGS[name]}
     source = SourceConfig(str(photographs), ["*.jpg", "*.png"])
 
     generate(Config(source=source, out=str(tmp_path / "ds"), n_jobs=1, **given))
 
-    assert assert_clean_frames_agree(photographs, tmp_path / "ds") == 6
+    agreeing = assert_clean_frames_agree(photographs, tmp_path / "ds")
+    assert agreeing == 6
+    figure("clean-frame", f"all DN of {agreeing} of 6 frames equal")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif("PHOTOS" not in os.environ, reason="set PHOTOS to a folder of photographs")
-def test_every_clean_dn_of_real_photographs(tmp_path: Path) -> None:
+def test_every_clean_dn_of_real_photographs(tmp_path: Path, figure: Figure) -> None:
     root = Path(os.environ["PHOTOS"])
     source = SourceConfig(str(root), ["*.jpg"])
 
     summary = generate(Config(source=source, gains=GainsConfig(*BROOKS), noise=NOISE, out=str(tmp_path / "ds")))
 
     assert summary.failed == {}
-    assert assert_clean_frames_agree(root, tmp_path / "ds") == summary.pairs
+    agreeing = assert_clean_frames_agree(root, tmp_path / "ds")
+    assert agreeing == summary.pairs
+    figure("clean-frame", f"all DN of {agreeing} of {summary.pairs} photographs equal")

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.moments import REACH, SAMPLER_ERROR, Moments, bernstein, moments, shares
+from helpers.promise_report import Figure
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
@@ -151,9 +152,13 @@ def test_exact_moments_without_noise_have_no_variance() -> None:
 
 @pytest.mark.parametrize("clip", ["sensor", "black"])
 @pytest.mark.parametrize("noise", OPTIONS)
-def test_mean_and_variance_of_flats_follow_the_distribution(settings: Settings, noise: str, clip: str) -> None:
+def test_mean_and_variance_of_flats_follow_the_distribution(
+    settings: Settings, noise: str, clip: str, figure: Figure
+) -> None:
     plan = plan_of(settings, noise, f"sensor.clip={clip}")
-    assert misfits(plan, histograms(plan, 1)) == []
+    found = histograms(plan, 1)
+    assert misfits(plan, found) == []
+    figure("noise-moments", f"{len(CODES)} levels of {found[0].sum()} sites: mean and variance within their bounds")
 
 
 @pytest.mark.parametrize("image", [1, 2, 3, 4])
@@ -177,9 +182,13 @@ def test_mean_and_variance_of_flats_hold_for_extreme_noise(settings: Settings, a
 @pytest.mark.slow
 @pytest.mark.parametrize("clip", ["sensor", "black"])
 @pytest.mark.parametrize("noise", OPTIONS)
-def test_mean_and_variance_of_flats_hold_for_four_million_pixels(settings: Settings, noise: str, clip: str) -> None:
+def test_mean_and_variance_of_flats_hold_for_four_million_pixels(
+    settings: Settings, noise: str, clip: str, figure: Figure
+) -> None:
     plan = plan_of(settings, noise, f"sensor.clip={clip}")
-    assert misfits(plan, histograms(plan, 32)) == []
+    found = histograms(plan, 32)
+    assert misfits(plan, found) == []
+    figure("noise-moments", f"{len(CODES)} levels of {found[0].sum()} sites: mean and variance within their bounds")
 
 
 @pytest.mark.parametrize("noise", OPTIONS)

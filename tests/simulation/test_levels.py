@@ -14,6 +14,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.photographs import fill, pixels
+from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs
@@ -94,11 +95,12 @@ def test_levels_draw_their_own_profile_and_draws_share_it(many: Path) -> None:
     assert len({a for _, a, _ in levels}) == 3
 
 
-def test_noise_of_levels_and_draws_is_independent(many: Path) -> None:
+def test_noise_of_levels_and_draws_is_independent(many: Path, figure: Figure) -> None:
     """Tolerance: six standard errors of a correlation over 32,000 sites, each 0.0056."""
     found = np.corrcoef(list(residuals(many, "large.png").values()))
     assert found.shape == (6, 6)
     assert np.abs(found - np.eye(6)).max() < 6 / np.sqrt(32_000)
+    figure("levels", f"largest correlation of noise {np.abs(found - np.eye(6)).max():.1g} over 32,000 sites")
 
 
 def test_the_first_level_and_draw_equals_a_single_pair(
@@ -109,11 +111,12 @@ def test_the_first_level_and_draw_equals_a_single_pair(
     assert {row["source"]: row["noisy_xxh3"] for row in rows(tmp_path / "one")} == first
 
 
-def test_every_pair_is_regenerated_from_its_row(many: Path, photographs: Path) -> None:
+def test_every_pair_is_regenerated_from_its_row(many: Path, photographs: Path, figure: Figure) -> None:
     assert verify(many) == []
     replayed = list(replay(read_rows(many / "manifest.csv"), str(photographs)))
     assert len(replayed) == 24
     assert [one for one in replayed if one.complaint] == []
+    figure("levels", f"{sum(not one.complaint for one in replayed)} of {len(replayed)} pairs regenerated")
 
 
 def test_a_damaged_draw_is_named_and_repaired(

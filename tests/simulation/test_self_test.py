@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from helpers.commands import RunMain
+from helpers.promise_report import Figure
 
 from unprocess_gen.core import lookup_tables, tone_curves
 from unprocess_gen.core import random_streams as streams
@@ -154,22 +155,24 @@ def test_uncompiled_kernels_pass_the_self_test() -> None:
 
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_wrong_kernel_is_detected(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_kernel_is_detected(kernel: str, monkeypatch: pytest.MonkeyPatch, figure: Figure) -> None:
     holders = [module for module in KERNEL_MODULES if hasattr(module, kernel)]
     other = nudged(getattr(holders[0], kernel))
     for module in holders:
         monkeypatch.setattr(module, kernel, other)
 
     assert any("the golden" in one for one in selftest.failures("one_normal"))
+    figure("self-test", "an error in a kernel is detected")
 
 
-def test_a_fused_multiply_add_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fused_multiply_add_is_detected(monkeypatch: pytest.MonkeyPatch, figure: Figure) -> None:
     def fused_at_once(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
         out[:] = [float(Fraction(a) ** 2 + Fraction(b)) for a, b in zip(x, y, strict=True)]
 
     monkeypatch.setattr(selftest, "_product_and_sum", fused_at_once)
 
     assert "a kernel uses a fused multiply-add" in selftest.failures("one_normal")
+    figure("self-test", f"a fused multiply-add: {len(selftest.failures('one_normal'))} failure")
 
 
 def nudged(kernel: Callable[..., object]) -> Callable[..., object]:

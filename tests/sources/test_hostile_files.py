@@ -35,6 +35,7 @@ from helpers.commands import COMMAND, environment
 from helpers.corpus import DAMAGES, MATCHED
 from helpers.datasets import Settings
 from helpers.photographs import pixels
+from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen.config.schema import Config
@@ -140,8 +141,9 @@ def test_damaged_photographs_end_the_run_with_3_and_no_traceback(damaged: Run) -
     assert no_trouble(damaged), damaged.done.stderr
 
 
-def test_every_damaged_photograph_has_a_row(damaged: Run) -> None:
+def test_every_damaged_photograph_has_a_row(damaged: Run, figure: Figure) -> None:
     assert sorted(damaged.rows) == sorted(os.listdir(damaged.root))
+    figure("hostile-files", f"{len(damaged.rows)} of {len(os.listdir(damaged.root))} damaged files have a row")
 
 
 def test_damaged_photographs_are_pairs_or_have_a_reason(damaged: Run) -> None:
@@ -451,12 +453,15 @@ def weigh_bomb(make: Callable[[], bytes], path: Path, scales: Scales) -> Weight:
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_small_file_of_maximum_pixels_stays_within_bounds(name: str, tmp_path: Path, scales: Scales) -> None:
+def test_small_file_of_maximum_pixels_stays_within_bounds(
+    name: str, tmp_path: Path, scales: Scales, figure: Figure
+) -> None:
     make, outcome = BOMBS[name]
     weight = weigh_bomb(make, tmp_path / name, scales)
     assert weight.outcome == outcome
     assert weight.seconds < MAX_SECONDS
     assert weight.peak_bytes < MAX_BYTES
+    figure("hostile-files", f"largest pictures: {weight.seconds:.1f} s, {weight.peak_bytes / 1e9:.2f} GB")
 
 
 @pytest.mark.slow
@@ -505,8 +510,9 @@ def test_the_corpus_ends_the_run_with_3_and_no_traceback(corpus_run: Run) -> Non
 
 
 @pytest.mark.slow
-def test_every_file_of_the_corpus_has_a_row(corpus: Path, corpus_run: Run) -> None:
+def test_every_file_of_the_corpus_has_a_row(corpus: Path, corpus_run: Run, figure: Figure) -> None:
     assert sorted(corpus_run.rows) == matched_files(corpus)
+    figure("hostile-files", f"{len(corpus_run.rows)} of {len(matched_files(corpus))} files of the corpus have a row")
 
 
 @pytest.mark.slow
@@ -533,7 +539,7 @@ def test_cut_files_of_the_corpus_are_truncated_or_corrupt(corpus: Path, corpus_r
 
 
 @pytest.mark.slow
-def test_corpus_files_take_at_most_10_s_and_1500_mb(corpus: Path, scales: Scales) -> None:
+def test_corpus_files_take_at_most_10_s_and_1500_mb(corpus: Path, scales: Scales, figure: Figure) -> None:
     weights = {path: scales.weigh(corpus / path) for path in matched_files(corpus)}
     for measure in ("seconds", "peak_bytes"):
         print(
@@ -541,6 +547,10 @@ def test_corpus_files_take_at_most_10_s_and_1500_mb(corpus: Path, scales: Scales
         )
     over = {path: w for path, w in weights.items() if w.seconds > MAX_SECONDS or w.peak_bytes > MAX_BYTES}
     assert over == {}
+    seconds, gigabytes = (
+        max(one) for one in zip(*((w.seconds, w.peak_bytes / 1e9) for w in weights.values()), strict=True)
+    )
+    figure("hostile-files", f"{len(weights)} files of the corpus: at most {seconds:.1f} s and {gigabytes:.2f} GB each")
 
 
 # Small files of much work ---------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ import yaml
 from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill, pixels
+from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -111,11 +112,13 @@ def assert_cut_outs(patched: Path, whole: Path) -> int:
 )
 @pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
 def test_patch_equals_the_crop_of_its_full_pair(
-    patch: str, overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
+    patch: str, overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path, figure: Figure
 ) -> None:
     make(sources, tmp_path / "whole", *overrides)
     make(sources, tmp_path / "patched", *overrides, patch)
-    assert assert_cut_outs(tmp_path / "patched", tmp_path / "whole") >= 14
+    equal = assert_cut_outs(tmp_path / "patched", tmp_path / "whole")
+    assert equal >= 14
+    figure("patches", f"{equal} patches are crops of their frames")
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])

@@ -20,6 +20,7 @@ import mpmath
 import numpy as np
 import pytest
 from helpers.moments import REACH, SAMPLER_ERROR, bernstein
+from helpers.promise_report import Figure
 from helpers.published import CRVD
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -917,7 +918,7 @@ COUNTED = {"dark_e": 3.0, "hot_pixel_share": 0.3, "hot_pixel_e": 20.0, "dn_per_e
 
 
 @pytest.mark.parametrize("effect", ["shot", "dark_current", "hot_pixels"])
-def test_omitted_effect_in_electrons_changes_no_other_effect(effect: str) -> None:
+def test_omitted_effect_in_electrons_changes_no_other_effect(effect: str, figure: Figure) -> None:
     """Electrons and DN are integers, so that the contribution of an effect is exact."""
     others = [one for one in ("shot", "dark_current", "hot_pixels") if one != effect]
 
@@ -928,6 +929,7 @@ def test_omitted_effect_in_electrons_changes_no_other_effect(effect: str) -> Non
     alone = frame(effect) - frame()
     assert (alone != 0).any()
     assert (frame(*(one for one in EFFECTS if one in {effect, *others})) - frame(*others) == alone).all()
+    figure("effects", f"{effect}: other effects unchanged at {alone.size} of {alone.size} sites")
 
 
 ALL = {
@@ -968,7 +970,7 @@ def test_full_well_above_signal_changes_nothing() -> None:
     np.testing.assert_array_equal(with_it, without)
 
 
-def test_effects_of_frame_are_uncorrelated() -> None:
+def test_effects_of_frame_are_uncorrelated(figure: Figure) -> None:
     """Check the correlations between contributions of single effects."""
     added = []
     for effect in ("shot", "dark_current", "read"):
@@ -977,6 +979,8 @@ def test_effects_of_frame_are_uncorrelated() -> None:
         added.append(frame / frame.std())
     for one, other in itertools.combinations(added, 2):
         assert bounds_off(one * other, 0, 1.05, 50) <= 1
+    largest = max(abs(float(np.mean(a * b))) for a, b in itertools.combinations(added, 2))
+    figure("effects", f"largest correlation of two effects: {largest:.1g}")
 
 
 # Exposure -------------------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -70,7 +71,9 @@ def unclipped(light: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize("gains", GAINS)
 @pytest.mark.parametrize("camera", colour.CAMERAS)
-def test_unclipped_colours_return_to_their_codes(plan: Plan, camera: str, gains: str, step: int) -> None:
+def test_unclipped_colours_return_to_their_codes(
+    plan: Plan, camera: str, gains: str, step: int, figure: Figure
+) -> None:
     """As many colours as are not clipped is asserted too: between a fifth of the cube and all of it."""
     planned = plan_with(plan, camera, gains, "per_channel")
     returned = checked = 0
@@ -84,6 +87,7 @@ def test_unclipped_colours_return_to_their_codes(plan: Plan, camera: str, gains:
 
     assert returned == checked
     assert checked >= (255 // step + 1) ** 3 / 5
+    figure("colours", f"{checked - returned} of {checked} unclipped colours change")
 
 
 @pytest.mark.parametrize("highlight", ["gray_mean", "none"])
@@ -255,12 +259,15 @@ SIZES = [(2, 2), (2, 3), (3, 2), (5, 2), (3, 3), (7, 10)]
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("origin", ORIGINS)
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_flat_colours_survive_the_mosaic(pattern: str, origin: tuple[int, int], size: tuple[int, int]) -> None:
+def test_flat_colours_survive_the_mosaic(
+    pattern: str, origin: tuple[int, int], size: tuple[int, int], figure: Figure
+) -> None:
     flat = np.broadcast_to([0.3, 1.1, -0.2], (*size, 3))
 
     found = process.demosaic(mosaic(flat, pattern, origin), pattern, origin)
 
     np.testing.assert_allclose(found, flat, rtol=0, atol=32 * EPS)  # of 13 products, each at most 1.1
+    figure("developing", f"flat colours within {np.abs(found - flat).max():.1g} after the mosaic")
 
 
 def ramp(height: int, width: int) -> np.ndarray:
@@ -328,7 +335,7 @@ def test_a_mosaic_without_all_channels_is_refused(size: tuple[int, int]) -> None
 
 @pytest.mark.parametrize("highlight", HIGHLIGHTS)
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_flat_colours_return_from_a_raw_frame(plan: Plan, pattern: str, highlight: str) -> None:
+def test_flat_colours_return_from_a_raw_frame(plan: Plan, pattern: str, highlight: str, figure: Figure) -> None:
     """64 flat squares in one frame; the inner sites of each see nothing but their own."""
     side = 8
     levels = np.array(list(itertools.product((0, 100, 250, 255), repeat=3)), dtype=np.uint8).reshape(8, 8, 3)
@@ -342,6 +349,7 @@ def test_flat_colours_return_from_a_raw_frame(plan: Plan, pattern: str, highligh
     inner = np.outer(np.tile(inner, 8), np.tile(inner, 8)) & unclipped(unprocess.camera_light(source, planned))
     assert inner.sum() >= 16 * 30
     np.testing.assert_array_equal(found[inner], source[inner])
+    figure("developing", f"{(found == source)[inner].all(axis=-1).sum()} of {inner.sum()} sites return to their codes")
 
 
 def test_a_crop_is_developed_in_its_own_phase(plan: Plan) -> None:
