@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.browser import open_page
 from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
@@ -525,12 +526,6 @@ def test_size_and_memory_do_not_grow_with_the_number_of_rows(
 
 # In a browser ---------------------------------------------------------------------------------------------------------
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    "--host-resolver-rules=MAP * ~NOTFOUND",  # block network requests
-)
 MEASURE = """<script>addEventListener("load", () => {
   const box = (one) => { const {x, y, width, height} = one.getBoundingClientRect(); return [x, y, width, height]; };
   const all = (what) => [...document.querySelectorAll(what)];
@@ -549,17 +544,11 @@ FRAME = """<!doctype html><body style="margin: 0"><script>
 
 def browse(content: str, width: int, folder: Path) -> tuple[dict[str, Any], np.ndarray]:
     """Return the sizes of the elements of a page in Chromium, and a screenshot, uint8 ``[H, W, 3]``."""
-    if CHROMIUM is None:
-        pytest.skip("chromium is not installed")
 
     def called(page_name: str, height: int, *flags: str) -> str:
         frame = folder / f"frame_of_{page_name}"
         frame.write_text(FRAME % (page_name, width, height), encoding="utf-8")
-        window = f"--window-size={max(width, 500)},{height}"
-        command = [CHROMIUM or "", *FLAGS, f"--user-data-dir={folder / 'profile'}", window, *flags, frame.as_uri()]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=folder)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+        return open_page(frame, (max(width, 500), height), folder / "profile", *flags)
 
     (folder / "page.html").write_text(content, encoding="utf-8")
     (folder / "measured.html").write_text(content.replace("</body>", MEASURE + "</body>"), encoding="utf-8")

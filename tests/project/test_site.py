@@ -1,0 +1,151 @@
+"""The site of the documentation: its links and pictures resolve, it loads nothing from servers, and its pages fit."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import pytest
+from helpers.browser import open_page
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
+WIDTHS = (1200, 390)
+"""Widths of a window on a desktop and on a phone, pixels."""
+
+
+class Page(HTMLParser):
+    """Collect the anchors of a page and the addresses that it refers to, with the element and its ``rel``."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        self.anchors: set[str] = set()
+        self.addresses: list[tuple[str, str, str]] = []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {name: value or "" for name, value in attrs}
+        self.anchors |= {values[name] for name in ("id", "name") if name in values}
+        for name in ("href", "src", "data", "poster"):
+            if name in values:
+                self.addresses.append((tag, values.get("rel", ""), values[name]))
+
+    def local_targets(self) -> Iterator[tuple[Path, str]]:
+        """Yield path and fragment of each address without a server."""
+        for _, _, address in self.addresses:
+            parts = urlsplit(address)
+            if not parts.scheme and not parts.netloc:
+                path = (self.path.parent / unquote(parts.path)).resolve() if parts.path else self.path
+                yield path, unquote(parts.fragment)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the site, built as in CI."""
+    pytest.importorskip("myst_parser", reason="needs the extra docs")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", folder / "doctrees"]
+    done = subprocess.run(
+        [*command, ROOT / "docs", folder / "html"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "html"
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[Path, Page]:
+    paths = [path for path in sorted(site.resolve().rglob("*.html")) if "_static" not in path.parts]
+    found = {path: Page(path) for path in paths}
+    assert len(found) > len(list((ROOT / "docs").rglob("*.md")))
+    return found
+
+
+def test_links_anchors_and_pictures_resolve(pages: dict[Path, Page]) -> None:
+    broken = [
+        f"{page.path.name}: {target.name}#{fragment}"
+        for page in pages.values()
+        for target, fragment in page.local_targets()
+        if not target.exists() or (fragment and target in pages and fragment not in pages[target].anchors)
+    ]
+    assert broken == []
+
+
+def test_pages_load_nothing_from_servers(site: Path, pages: dict[Path, Page]) -> None:
+    loaded = [
+        f"{page.path.name}: {address}"
+        for page in pages.values()
+        for tag, rel, address in page.addresses
+        if (tag != "a" and rel not in ("canonical", "author"))
+        and (urlsplit(address).scheme or urlsplit(address).netloc)
+    ]
+    assert [address for address in loaded if not address.partition(": ")[2].startswith("data:")] == []
+    for style in site.rglob("*.css"):
+        assert not re.search(r"(url\(|@import)\s*['\"]?(https?:)?//", style.read_text(encoding="utf-8")), style.name
+
+
+MEASURE = """<script>addEventListener("load", () => parent.postMessage({
+  width: document.documentElement.scrollWidth,
+  missing: [...document.images].filter((one) => !one.complete || !one.naturalWidth).map((one) => one.src),
+}, "*"));</script>"""
+TOUR = """<!doctype html><body style="margin: 0"><script>
+const visits = %s, measured = {};
+let frame;
+function next() {
+  if (frame) frame.remove();
+  if (!visits.length) { document.body.dataset.measured = JSON.stringify(measured); return; }
+  frame = document.createElement("iframe");
+  frame.style = `border: 0; height: 1000px; width: ${visits[0][1]}px`;
+  frame.src = visits[0][0];
+  document.body.append(frame);
+}
+addEventListener("message", (message) => { measured[visits.shift().join(" ")] = message.data; next(); });
+next();
+</script></body>"""
+"""Page that opens other pages one after another in a frame; a window of headless Chromium has at least 500 pixels."""
+
+
+def test_pages_fit_their_window_and_show_their_pictures(site: Path, pages: dict[Path, Page], tmp_path: Path) -> None:
+    tour = tmp_path / "site"
+    shutil.copytree(site, tour)
+    (tour / "control.html").write_text('<body><p style="width: 2000px">wide</p><img src="no.png" alt=""></body>')
+    names = [path.relative_to(site.resolve()).as_posix() for path in pages] + ["control.html"]
+    for name in names:
+        text = (tour / name).read_text(encoding="utf-8")
+        (tour / name).write_text(text.replace("</body>", MEASURE + "</body>"), encoding="utf-8")
+    visits = [[name, width] for name in names for width in WIDTHS]
+    (tour / "tour.html").write_text(TOUR % json.dumps(visits), encoding="utf-8")
+    dom = open_page(
+        tour / "tour.html",
+        (1200, 1000),
+        tmp_path / "profile",
+        "--virtual-time-budget=600000",
+        "--dump-dom",
+        timeout=300,
+    )
+    (found,) = re.findall(r'data-measured="([^"]*)"', dom)
+    measured: dict[str, dict[str, Any]] = json.loads(html.unescape(found))
+    assert len(measured) == len(visits)
+    faults = defaultdict(list)
+    for visit, page in measured.items():
+        name, _, width = visit.partition(" ")
+        if page["width"] > int(width):
+            faults[name].append(f"is {page['width']} pixels wide in a window of {width}")
+        faults[name] += [f"does not show {picture}" for picture in page["missing"]]
+    assert len(faults.pop("control.html")) == 4, "too wide pages or missing pictures are not detected"
+    assert {name: some for name, some in faults.items() if some} == {}
