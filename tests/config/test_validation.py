@@ -18,10 +18,11 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from unprocess_gen.config import distributions
-from unprocess_gen.config.distributions import DISTRIBUTION_NUMBERS, parse_distribution
-from unprocess_gen.config.noise_validation import PROFILE_RANGES
+from unprocess_gen.config.distributions import parse_distribution
+from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
+from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import PHYSICAL_NUMBERS, Config, all_settings
 from unprocess_gen.config.serialization import (
     NOT_DATA,
     dataset_yaml,
@@ -30,12 +31,15 @@ from unprocess_gen.config.serialization import (
     read_dataset_yaml,
     source_kind,
 )
-from unprocess_gen.config.validation import HIGHLIGHTS, validate_config
+from unprocess_gen.config.settings import Setting
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import tone_curves
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Distribution, Facts
+from unprocess_gen.core.types import FLOAT32, MOSAIC, PACKED, UINT16, Distribution, Facts
+from unprocess_gen.planning import noise_profile
 from unprocess_gen.planning.plan import plan_image, plan_pairs
-from unprocess_gen.simulation.reference import unprocess
+from unprocess_gen.simulation.reference import cfa, unprocess
+from unprocess_gen.sources.image.decode import ICC_CHOICES
 
 Settings = Callable[..., Config]
 FILES = sorted(
@@ -49,7 +53,7 @@ NEEDS = {
 }
 NOISE_KEYS = {"name", "units", "black", "bits", "black_level_dn", "white_level_dn"}
 TWO_NUMBERS = {"a", "b", "negative_variance"}
-PHYSICAL = {"branches", "assumed", *(key for key, _, _ in PROFILE_RANGES)}
+PHYSICAL = {"branches", "assumed", *PHYSICAL_NUMBERS}
 CHOSEN = {"iso", "law", "levels", "draws"}
 """Keys that users set and no profile does."""
 SHA256 = "0" * 64
@@ -606,9 +610,23 @@ def test_integers_that_no_float_holds_are_refused(number: int) -> None:
 
 
 def test_choices_match_their_implementations() -> None:
-    assert tuple(unprocess.HIGHLIGHTS) == HIGHLIGHTS
-    assert set(unprocess.TONES) == set(tone_curves.TONES) == {"smoothstep", "none"}
-    assert set(DISTRIBUTION_NUMBERS) == set(distributions.DISTRIBUTIONS)
+    words = {f"{group}.{name}": one.limit.words for group, name, one in all_settings() if isinstance(one.limit, Choice)}
+    assert words["gains.highlight"] == tuple(unprocess.HIGHLIGHTS)
+    assert set(words["isp.tone"]) == set(unprocess.TONES) == set(tone_curves.TONES)
+    assert words["sensor.pattern"] == cfa.PATTERNS
+    assert words["source.icc"] == ICC_CHOICES
+    assert (words["output.dtype"], words["output.layout"]) == ((UINT16, FLOAT32), (MOSAIC, PACKED))
+
+
+def test_forms_match_their_implementations() -> None:
+    assert set(DISTRIBUTION_FORMS) == set(distributions.DISTRIBUTIONS)
+    assert set(ISO_FORMS) == {*noise_profile.FORMS, "by_log_iso"}
+
+
+@pytest.mark.parametrize(("group", "name", "setting"), list(all_settings()), ids=lambda value: str(value)[:20])
+def test_default_value_is_allowed(group: str, name: str, setting: Setting, settings: Settings) -> None:
+    config = settings()
+    setting.check(f"{group}.{name}", getattr(getattr(config, group) if group else config, name))
 
 
 @pytest.mark.parametrize("gain", [0, ["per_iso", 0.0], 1e-12])

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import STAGES, methods_of_stage
-from unprocess_gen.config.noise_validation import PROFILE_RANGES
+from unprocess_gen.config.schema import PHYSICAL_NUMBERS
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source
 from unprocess_gen.dataset.columns import COLUMNS, NAMES, Range
@@ -437,7 +437,7 @@ def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
     all_given = settings("noise=nikon_d850", "noise.full_well_e=1e5", "noise.assumed=[]")
     all_given.noise.branches[0].column_std_dn = 1.0
     assumed = settings("noise=nikon_d850")
-    assumed.noise.assumed = [key for key, _, _ in PROFILE_RANGES]
+    assumed.noise.assumed = list(PHYSICAL_NUMBERS)
     for config in (lacking, half, all_given, assumed):
         config.noise.iso = 3200
     found: dict[str, list[str]] = {effect: [] for effect in EFFECTS}

@@ -14,9 +14,8 @@ import update_reference
 
 from unprocess_gen.cli.help import global_help
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.noise_validation import PROFILE_RANGES
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import BranchConfig, Config
+from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, Config
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.planning.noise_profile import FORMS
 
@@ -67,7 +66,7 @@ KEYS = [
     for field in dataclasses.fields(getattr(Config(), group.name))
     if (group.name, field.name) != ("scene", "name")
 ]
-KEYS += [("noise", key) for key, _, _ in PROFILE_RANGES] + [
+KEYS += [("noise", key) for key in PHYSICAL_NUMBERS] + [
     ("noise", field.name) for field in dataclasses.fields(BranchConfig) if field.name != "iso"
 ]
 

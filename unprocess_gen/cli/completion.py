@@ -12,12 +12,13 @@ import itertools
 import re
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
 
 from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Argument, Call, Verb
+from unprocess_gen.config.limits import Boolean, Choice
 from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.schema import GROUPS, Config, all_settings
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.suggestions import did_you_mean
 
@@ -64,9 +65,6 @@ _gen_dataset() {
 (( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }
 compdef _gen_dataset gen-dataset
 """
-
-SWITCHED = ("auto", "on", "off")
-"""Values of each effect."""
 
 
 def print_completion(call: Call, verbs: Mapping[str, Verb]) -> int:
@@ -182,44 +180,32 @@ def _option_folders(words: list[str]) -> list[Path]:
 
 def _settings(current: str, folders: list[Path]) -> list[str]:
     """Return keys as far as they are typed: ``camera=``, ``camera.``, and the keys of ``camera.`` once it is typed."""
-    from unprocess_gen.config.schema import Config
-
     added = {path.name for folder in folders for path in folder.glob("*/")}
-    keys: list[str] = []
-    for field in fields(Config):
-        keys.append(f"{field.name}.") if is_dataclass(_default(field)) else keys.append(f"{field.name}=")
-        if is_dataclass(_default(field)):
-            if len(group_options(field.name, *folders)) > 1:
-                keys.append(f"{field.name}=")
-            if current.startswith(f"{field.name}."):
-                keys += [f"{field.name}.{key.name}=" for key in fields(_default(field))]
+    keys = [f"{name}=" for name in settings_of(Config)]
+    for group, kind in GROUPS.items():
+        keys.append(f"{group}.")
+        if len(group_options(group, *folders)) > 1:
+            keys.append(f"{group}=")
+        if current.startswith(f"{group}."):
+            keys += [f"{group}.{name}=" for name in settings_of(kind)]
     typed = current.endswith(".") or "." in current
-    plus = sorted(added - {field.name for field in fields(Config)})
+    plus = sorted(added - set(GROUPS))
     return [key for key in keys if not (typed and key.endswith("."))] + [f"+{group}=" for group in plus]
-
-
-def _default(field: Any) -> Any:
-    return field.default_factory() if callable(field.default_factory) else field.default
 
 
 def _values(key: str, current: str, folders: list[Path]) -> tuple[str, list[str]]:
     """Return the values of a key: options of a group, strings, booleans, folders; and of the last item of a list."""
-    from unprocess_gen.config.schema import Config
-    from unprocess_gen.config.validation import CHOICES
-
     if key == "out":
         return FOLDERS, []
     if key == "source.root":
         return FILES, []
     group, _, name = key.lstrip("+").partition(".")
     values: Iterable[str] = () if name else group_options(group, *folders)
-    default = getattr(getattr(Config(), group, None), name, None) if name else getattr(Config(), group, None)
-    if isinstance(default, bool):
+    limit = next((setting.limit for *path, setting in all_settings() if ".".join(filter(None, path)) == key), None)
+    if isinstance(limit, Boolean):
         values = ("true", "false")
-    elif group == "effects" and name and name != "tolerance":
-        values = SWITCHED
-    elif key in CHOICES:
-        values = CHOICES[key]
+    elif isinstance(limit, Choice):
+        values = limit.words
     before, comma, _ = current.rpartition(",")  # of a sweep: camera=sony_a7r,nex
     listed = before.partition("=")[2].split(",")
     start = f"{before}," if comma else f"{key}="

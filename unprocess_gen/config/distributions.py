@@ -11,6 +11,8 @@ from collections.abc import Callable
 from decimal import Decimal, localcontext
 from typing import Any
 
+from unprocess_gen.config.forms import DISTRIBUTION_FORMS, spelled
+from unprocess_gen.config.limits import Drawn
 from unprocess_gen.config.values import is_number, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
@@ -117,16 +119,16 @@ def _check_line(slope: float, intercept: float, std: float) -> str | None:
     return None
 
 
-DISTRIBUTION_NUMBERS: dict[str, tuple[tuple[str, ...], Callable[..., str | None]]] = {
-    "constant": (("value",), lambda value: None),
-    "uniform": (("lowest", "highest"), _check_increasing),
-    "log_uniform": (("lowest", "highest"), _check_log_range),
-    "truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _check_truncated),
-    "inverse_truncated_normal": (("mean", "standard deviation", "lowest", "highest"), _check_truncated),
-    "log_linear_in_a": (("slope", "intercept", "standard deviation"), _check_line),
-    "choice": (("value", "…"), lambda *values: None if values else "expected at least one value"),
+_PROBLEMS: dict[str, Callable[..., str | None]] = {
+    "constant": lambda value: None,
+    "uniform": _check_increasing,
+    "log_uniform": _check_log_range,
+    "truncated_normal": _check_truncated,
+    "inverse_truncated_normal": _check_truncated,
+    "log_linear_in_a": _check_line,
+    "choice": lambda *values: None if values else "expected at least one value",
 }
-"""The names of each distribution's numbers, and a function that returns what is wrong with them, or None."""
+"""A function for each distribution that returns what is wrong with its numbers, or None."""
 
 
 def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distribution:
@@ -151,19 +153,50 @@ def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distri
     ConfigError
         If the value is neither, its kind is not allowed, or its numbers do not fit the kind.
     """
-    forms = "; ".join(f"[{kind}, {', '.join(DISTRIBUTION_NUMBERS[kind][0])}]" for kind in allowed)
+    forms = "; ".join(spelled(kind, DISTRIBUTION_FORMS[kind]) for kind in allowed)
     if is_number(value):
         return Distribution("constant", (float(value),))
     if not isinstance(value, list) or not value or value[0] not in allowed:
         raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a distribution: {forms}")
     kind, numbers = str(value[0]), value[1:]
-    names, rule = DISTRIBUTION_NUMBERS[kind]
-    if (len(numbers) != len(names) and kind != "choice") or not all(is_number(number) for number in numbers):
-        raise ConfigError(f"{key}={value_text(value)}: expected finite numbers: [{kind}, {', '.join(names)}]")
-    problem = rule(*numbers)
+    form = DISTRIBUTION_FORMS[kind]
+    if (len(numbers) != len(form.numbers) and kind != "choice") or not all(is_number(number) for number in numbers):
+        raise ConfigError(f"{key}={value_text(value)}: expected finite numbers: {spelled(kind, form)}")
+    problem = _PROBLEMS[kind](*numbers)
     if problem:
         raise ConfigError(f"{key}={value_text(value)}: {problem}")
     return Distribution(kind, tuple(float(number) for number in numbers))
+
+
+def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
+    """Parse a number or a distribution, and check the range of its draws.
+
+    Parameters
+    ----------
+    key : str
+        Key of the value, for messages.
+    value : Any
+        The configuration value.
+    limit : Drawn
+        Allowed kinds and range.
+
+    Returns
+    -------
+    Distribution
+        Kind ``constant`` for a number.
+
+    Raises
+    ------
+    ConfigError
+        If the value is neither, its kind is not allowed, its numbers do not fit the kind, or a draw could be out of
+        range. The range of ``log_linear_in_a`` depends on a and is not checked.
+    """
+    distribution = parse_distribution(key, value, limit.kinds)
+    if distribution.kind != "log_linear_in_a" and not (
+        limit.low <= lowest(distribution) and highest(distribution) <= limit.high
+    ):
+        raise ConfigError(f"{key}={value_text(value)}: expected {limit.range}")
+    return distribution
 
 
 def lowest(distribution: Distribution) -> float:

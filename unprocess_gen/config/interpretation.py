@@ -6,7 +6,21 @@ import dataclasses
 from typing import Any
 
 from unprocess_gen.config.accuracy import Budget
-from unprocess_gen.config.distributions import highest, lowest, parse_distribution
+from unprocess_gen.config.distributions import lowest, parse_drawn
+from unprocess_gen.config.limits import (
+    DEQUANTIZE,
+    GAIN,
+    INVERSE_GAIN,
+    LEVELS,
+    MAX_LEVELS,
+    MAX_PATCH,
+    MAX_RANDOM_PATCHES,
+    MIN_PATCH,
+    PATCH,
+    SWITCH,
+    VARIANCE_OFFSET,
+    VARIANCE_SLOPE,
+)
 from unprocess_gen.config.schema import (
     AccuracyConfig,
     BranchConfig,
@@ -22,19 +36,6 @@ from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
 
 # ---------------------------------------------------------------------------------------------------- distributions
 
-GAIN_DISTRIBUTIONS = ("uniform", "truncated_normal")
-INVERSE_GAIN_DISTRIBUTIONS = (*GAIN_DISTRIBUTIONS, "inverse_truncated_normal")
-A_DISTRIBUTIONS = ("uniform", "log_uniform")
-B_DISTRIBUTIONS = (*A_DISTRIBUTIONS, "log_linear_in_a")
-SCENE_DISTRIBUTIONS = ("uniform", "log_uniform", "choice")
-"""Allowed distributions of ISO and of the values of a scene."""
-
-MIN_GAIN, MAX_GAIN = 1e-3, 1e3
-"""Range of all gains. Chosen: far beyond cameras, and no product or quotient of gains overflows."""
-
-MAX_VARIANCE = 1e15
-"""Largest a and b of a profile. Chosen: far beyond sensors, and the conversion to DN does not overflow."""
-
 
 def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, Distribution]:
     """Parse the distributions of the gains.
@@ -47,23 +48,18 @@ def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, 
     Returns
     -------
     tuple of Distribution
-        Of the red, blue and inverse brightening gain; all draws are from `MIN_GAIN` to `MAX_GAIN`.
+        Of the red, blue and inverse brightening gain; all draws are within `limits.GAIN`.
 
     Raises
     ------
     ConfigError
         If a value is no number or distribution, or a draw could be out of range.
     """
-    distributions = (
-        parse_distribution("gains.red", gains.red, GAIN_DISTRIBUTIONS),
-        parse_distribution("gains.blue", gains.blue, GAIN_DISTRIBUTIONS),
-        parse_distribution("gains.inverse_rgb", gains.inverse_rgb, INVERSE_GAIN_DISTRIBUTIONS),
+    return (
+        parse_drawn("gains.red", gains.red, GAIN),
+        parse_drawn("gains.blue", gains.blue, GAIN),
+        parse_drawn("gains.inverse_rgb", gains.inverse_rgb, INVERSE_GAIN),
     )
-    for name, distribution in zip(("red", "blue", "inverse_rgb"), distributions, strict=True):
-        if not (lowest(distribution) >= MIN_GAIN and highest(distribution) <= MAX_GAIN):
-            value = value_text(getattr(gains, name))
-            raise ConfigError(f"gains.{name}={value}: expected a gain above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}")
-    return distributions
 
 
 def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]:
@@ -82,27 +78,16 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
     Raises
     ------
     ConfigError
-        If a value is no number or distribution, or a draw could be out of range: a negative a, or more than
-        `MAX_VARIANCE`.
+        If a value is no number or distribution, or a draw could be out of range.
     """
-    a, b = (
-        parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS),
-        parse_distribution("noise.b", noise.b, B_DISTRIBUTIONS),
-    )
-    if lowest(a) < 0:
-        raise ConfigError(f"noise.a={value_text(noise.a)}: expected a slope of the variance of 0 or more")
-    for name, distribution in (("a", a), ("b", b)):
-        if max(abs(number) for number in distribution.numbers) > MAX_VARIANCE:
-            raise ConfigError(f"noise.{name}={value_text(getattr(noise, name))}: expected at most {MAX_VARIANCE:g}")
+    a = parse_drawn("noise.a", noise.a, VARIANCE_SLOPE)
+    b = parse_drawn("noise.b", noise.b, VARIANCE_OFFSET)
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
         raise ConfigError(f"noise.a={value_text(noise.a)}: expected more than 0, because noise.b depends on ln a")
     return a, b
 
 
 # ----------------------------------------------------------------------------------------------------- noise levels
-
-MAX_LEVELS = 100
-"""Most noise levels, and most draws at each level: keys have two digits for them."""
 
 
 def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
@@ -127,9 +112,7 @@ def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
     if is_integer(levels) and 1 <= levels <= MAX_LEVELS:
         return (noise,) * levels
     if not isinstance(levels, list) or not 1 <= len(levels) <= MAX_LEVELS:
-        raise ConfigError(
-            f"noise.levels={value_text(levels)}: expected how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}"
-        )
+        raise ConfigError(f"noise.levels={value_text(levels)}: expected {LEVELS}")
     return tuple(_level(noise, level) for level in levels)
 
 
@@ -156,8 +139,14 @@ EFFECT_NUMBERS = {
 }
 """Keys of a profile that must have a number for an effect to be simulated."""
 
-BRANCH_NUMBERS = {"row": "row_std_dn", "column": "column_std_dn", "black_error": "black_error_dn"}
-"""Key of each branch of a profile that must have a number for an effect to be simulated."""
+BRANCH_NUMBERS = {
+    "shot": ("dn_per_e",),
+    "read": ("read_law", "read_shape", "read_std_dn"),
+    "row": ("row_std_dn",),
+    "column": ("column_std_dn",),
+    "black_error": ("black_error_dn",),
+}
+"""Keys of each branch of a profile that must have a value for an effect to be simulated."""
 
 
 def is_physical(noise: NoiseConfig) -> bool:
@@ -225,18 +214,13 @@ def missing_number(noise: NoiseConfig, effect: str) -> str | None:
     str or None
         Key of the first missing number; None if the profile has all of them.
     """
-    if effect in BRANCH_NUMBERS and any(getattr(branch, BRANCH_NUMBERS[effect]) is None for branch in noise.branches):
-        return BRANCH_NUMBERS[effect]
+    for key in BRANCH_NUMBERS.get(effect, ()):
+        if any(getattr(branch, key) is None for branch in noise.branches):
+            return key
     return next((key for key in EFFECT_NUMBERS.get(effect, ()) if getattr(noise, key) is None), None)
 
 
 # ------------------------------------------------------------------------------------------------------------ source
-
-MIN_PATCH, MAX_PATCH = 2, 2**15
-"""Range of the sides and strides of patches, pixels."""
-
-MAX_RANDOM_PATCHES = 10**4
-"""Most patches at random places of one image: keys have four digits for them."""
 
 
 def patch_rule(source: SourceConfig) -> PatchRule | None:
@@ -266,11 +250,7 @@ def patch_rule(source: SourceConfig) -> PatchRule | None:
             return PatchRule("grid", side, stride=stride)
         case ["random", side, count] if _is_patch_length(side) and _is_patch_count(count):
             return PatchRule("random", side, count=count)
-    raise ConfigError(
-        f"source.patch={value_text(source.patch)}: expected null, a side, [grid, side], [grid, side, stride] or "
-        f"[random, side, count]; side and stride are even, {MIN_PATCH} to {MAX_PATCH} pixels, "
-        f"count is 1 to {MAX_RANDOM_PATCHES}"
-    )
+    raise ConfigError(f"source.patch={value_text(source.patch)}: expected {PATCH}")
 
 
 def _is_patch_length(value: Any) -> bool:
@@ -288,11 +268,6 @@ def canonical_patch(source: SourceConfig) -> list[Any] | None:
 
 
 # ---------------------------------------------------------------------------------------------- switches and choices
-
-SWITCHES = ("auto", "on", "off")
-
-YAML_SWITCHES = {"True": "on", "False": "off"}
-"""Text of the booleans that YAML reads from on and off without quotes."""
 
 NO_CLIP = "none"
 """Value of ``sensor.clip`` with which noisy frames are not clipped."""
@@ -313,8 +288,7 @@ def effect_switch(effects: EffectsConfig, effect: str) -> str:
     str
         ``auto``, ``on`` or ``off``: the effect's own switch if it is set, otherwise that of ``all``.
     """
-    switch = getattr(effects, effect) or effects.all
-    return YAML_SWITCHES.get(switch, switch)
+    return str(SWITCH.word(getattr(effects, effect) or effects.all))
 
 
 def dequantize_method(source: SourceConfig) -> str:
@@ -330,7 +304,7 @@ def dequantize_method(source: SourceConfig) -> str:
     str
         ``off``, or ``dither``: codes get a random offset of up to half a code.
     """
-    return YAML_SWITCHES.get(source.dequantize, source.dequantize)
+    return str(DEQUANTIZE.word(source.dequantize))
 
 
 def is_normalised(config: Config) -> bool:

@@ -7,37 +7,27 @@ from collections.abc import Iterable
 from decimal import Decimal
 from typing import Any
 
-from unprocess_gen.config.distributions import highest, lowest, parse_distribution
-from unprocess_gen.config.interpretation import (
-    A_DISTRIBUTIONS,
-    SCENE_DISTRIBUTIONS,
-    branch_of,
-    is_physical,
-    noise_distributions,
+from unprocess_gen.config.distributions import highest, lowest, parse_drawn
+from unprocess_gen.config.forms import ISO_FORMS
+from unprocess_gen.config.interpretation import branch_of, is_physical, noise_distributions
+from unprocess_gen.config.limits import (
+    BLACK_ERROR,
+    BLACK_LEVEL,
+    EXPOSURE_S,
+    ISO,
+    ISO_RANGE,
+    MAX_BRANCH_NUMBER,
+    MAX_ISO,
+    READ_SHAPE,
+    TEMPERATURE_C,
+    VARIANCE_SLOPE,
+    WHITE_LEVEL,
+    IsoForm,
 )
-from unprocess_gen.config.schema import BranchConfig, NoiseConfig, SceneConfig
-from unprocess_gen.config.values import in_range, is_number, one_of, value_text
+from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, NoiseConfig, SceneConfig
+from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.values import is_number, one_of, value_text
 from unprocess_gen.core.errors import ConfigError
-
-PROFILE_RANGES = (
-    ("prnu_std", 0.0, 0.5),
-    ("dark_e_per_s", 0.0, 1e6),
-    ("dark_reference_c", -273.0, 200.0),
-    ("dark_doubling_c", 0.1, 100.0),
-    ("hot_pixel_share", 0.0, 1.0),
-    ("hot_pixel_e_per_s", 0.0, 1e6),
-    ("dead_pixel_share", 0.0, 1.0),
-    ("full_well_e", 1.0, 1e9),
-)
-"""Range of the numbers of a physical profile that do not depend on ISO (chosen, far beyond sensors)."""
-
-FORM_LENGTHS = {"per_iso": (1, 2), "root": (1, 3), "line": (3, 3), "scale_line": (3, 3)}
-"""Fewest and most numbers of each form in `planning.noise_profile.FORMS`."""
-
-MAX_BRANCH_NUMBER = 1e9
-"""Largest number in a branch of a physical profile, and largest standard deviation in DN that a line gives."""
-
-MAX_ISO = 1e7
 
 MAX_ELECTRONS = 1e9
 """Largest mean of an exact Poisson count (`simulation.reference.poisson`); no pixel holds as many electrons."""
@@ -90,22 +80,21 @@ def _check_calibration(noise: NoiseConfig) -> None:
             f"got {', '.join(value_text(level) for level in levels)}"
         )
     assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
-    in_range("noise.bits", noise.bits, 1, 32)
-    in_range("noise.black_level_dn", noise.black_level_dn, 0, 2**noise.bits - 2)
-    in_range("noise.white_level_dn", noise.white_level_dn, noise.black_level_dn + 1, 2**noise.bits - 1)
+    BLACK_LEVEL.check_in("noise.black_level_dn", noise.black_level_dn, noise)
+    WHITE_LEVEL.check_in("noise.white_level_dn", noise.white_level_dn, noise)
 
 
 def _black_variance(noise: NoiseConfig) -> float:
     """Return the least that an included black level adds to the variance at black, DN² of the profile."""
     if noise.black != "included" or noise.black_level_dn is None:
         return 0.0
-    return lowest(parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS)) * noise.black_level_dn
+    return lowest(parse_drawn("noise.a", noise.a, VARIANCE_SLOPE)) * noise.black_level_dn
 
 
 def _check_countable(noise: NoiseConfig) -> None:
     """Raise ConfigError if white is more than `MAX_ELECTRONS`; a = 0 means no shot noise, so nothing is counted."""
     span = 1 if noise.units == "normalized" else (noise.white_level_dn or 0) - (noise.black_level_dn or 0)
-    a = parse_distribution("noise.a", noise.a, A_DISTRIBUTIONS)
+    a = parse_drawn("noise.a", noise.a, VARIANCE_SLOPE)
     if a.numbers != (0.0,) and lowest(a) * MAX_ELECTRONS < span:
         raise ConfigError(
             f"noise.a={value_text(noise.a)}: noise.law=poisson counts up to {MAX_ELECTRONS:g} electrons, so a must be "
@@ -135,33 +124,25 @@ def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
     _check_calibration(noise)
     for number, branch in enumerate(noise.branches):
         _check_branch(f"noise.branches[{number}]", noise, branch)
-    for key, low, high in PROFILE_RANGES:
-        value = getattr(noise, key)
-        if value is not None and not (math.isfinite(value) and low <= value <= high):
-            raise ConfigError(f"noise.{key}={value}: expected {low:g} to {high:g}")
     for name in noise.assumed:
-        one_of("noise.assumed", name, tuple(key for key, _, _ in PROFILE_RANGES))
+        one_of("noise.assumed", name, PHYSICAL_NUMBERS)
     _check_iso(noise, scene)
     _check_electrons(noise, scene)
 
 
 def _check_branch(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
     if len(branch.iso) != 2 or not 0 < branch.iso[0] <= branch.iso[1] <= MAX_ISO:
-        raise ConfigError(f"{key}.iso={value_text(branch.iso)}: expected the lowest and the highest ISO, [100, 6400]")
-    one_of(f"{key}.read_law", branch.read_law, ("gaussian", "tukey"))
-    _check_form(f"{key}.dn_per_e", branch.dn_per_e, ("per_iso",))
-    gains = _gains_at_ends(branch)
-    _check_gain(f"{key}.dn_per_e", noise, branch, gains[0])
-    _check_form(f"{key}.read_std_dn", branch.read_std_dn, ("root", "line", "scale_line"), gains)
-    for name in ("row_std_dn", "column_std_dn"):
-        if getattr(branch, name) is not None:
-            _check_form(f"{key}.{name}", getattr(branch, name), ("root", "line"), gains)
-    shape = parse_distribution(f"{key}.read_shape", branch.read_shape, ("choice",))
-    if not (lowest(shape) > -0.5 and highest(shape) < 10):
-        raise ConfigError(
-            f"{key}.read_shape={value_text(branch.read_shape)}: expected more than -0.5, where the Tukey-lambda "
-            "distribution has a variance, and less than 10"
-        )
+        raise ConfigError(f"{key}.iso={value_text(branch.iso)}: expected {ISO_RANGE}")
+    gains: tuple[float, ...] = ()
+    for name, setting in settings_of(BranchConfig).items():
+        value = getattr(branch, name)
+        if isinstance(setting.limit, IsoForm) and not (value is None and setting.null):
+            _check_form(f"{key}.{name}", value, setting.limit, gains)
+        if name == "dn_per_e":
+            gains = _gains_at_ends(branch)
+            _check_gain(f"{key}.{name}", noise, branch, gains[0])
+        setting.check(f"{key}.{name}", value)
+    parse_drawn(f"{key}.read_shape", branch.read_shape, READ_SHAPE)
     _check_black_error(f"{key}.black_error_dn", branch.black_error_dn)
 
 
@@ -184,17 +165,15 @@ def _check_gain(key: str, noise: NoiseConfig, branch: BranchConfig, lowest_gain:
         )
 
 
-def _check_form(key: str, value: Any, allowed: tuple[str, ...], gains: tuple[float, ...] = ()) -> None:
+def _check_form(key: str, value: Any, limit: IsoForm, gains: tuple[float, ...]) -> None:
     """Raise ConfigError unless a value is a number or an allowed form; ``gains`` are those at which lines are used."""
     if is_number(value) and 0 <= value <= MAX_BRANCH_NUMBER:
         return
     form, numbers = (value[0], value[1:]) if isinstance(value, list) and value else (None, [])
-    if form not in allowed:
-        raise ConfigError(
-            f"{key}={value_text(value)}: expected a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: "
-            f"{', '.join(allowed)}"
-        )
-    fewest, most = FORM_LENGTHS[form]
+    if form not in limit.forms:
+        raise ConfigError(f"{key}={value_text(value)}: expected {limit}")
+    most = len(ISO_FORMS[form].numbers)
+    fewest = most - ISO_FORMS[form].optional
     if not (
         fewest <= len(numbers) <= most
         and all(is_number(number) and abs(number) <= MAX_BRANCH_NUMBER for number in numbers)
@@ -222,9 +201,7 @@ def _check_black_error(key: str, value: Any) -> None:
     by_iso = isinstance(value, list) and bool(value) and value[0] == "by_log_iso"
     rows = value[1:] if by_iso else [value]
     if not rows or not all(isinstance(row, list) and len(row) == 4 and all(map(_is_black_error, row)) for row in rows):
-        raise ConfigError(
-            f"{key}={value_text(value)[:60]}: expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"
-        )
+        raise ConfigError(f"{key}={value_text(value)[:60]}: expected {BLACK_ERROR}")
 
 
 def _is_black_error(value: Any) -> bool:
@@ -234,7 +211,7 @@ def _is_black_error(value: Any) -> bool:
 def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
     """Raise ConfigError if an ISO could be drawn for which the profile was not calibrated."""
     key, value = ("scene.iso", scene.iso) if noise.iso is None else ("noise.iso", noise.iso)
-    drawn = parse_distribution(key, value, SCENE_DISTRIBUTIONS)
+    drawn = parse_drawn(key, value, ISO)
     ends = drawn.numbers
     branches = [(branch.iso[0], branch.iso[1]) for branch in noise.branches]
     if any(branch_of(noise, iso) is None for iso in ends):
@@ -263,8 +240,8 @@ def _merged(branches: Iterable[tuple[float, float]]) -> list[tuple[float, float]
 
 def _check_electrons(noise: NoiseConfig, scene: SceneConfig) -> None:
     """Raise ConfigError if the dark current could exceed `MAX_ELECTRONS`."""
-    seconds = highest(parse_distribution("scene.exposure_s", scene.exposure_s, SCENE_DISTRIBUTIONS))
-    celsius = highest(parse_distribution("scene.temperature_c", scene.temperature_c, SCENE_DISTRIBUTIONS))
+    seconds = highest(parse_drawn("scene.exposure_s", scene.exposure_s, EXPOSURE_S))
+    celsius = highest(parse_drawn("scene.temperature_c", scene.temperature_c, TEMPERATURE_C))
     for key in ("dark_e_per_s", "hot_pixel_e_per_s"):
         rate = Decimal((getattr(noise, key) or 0.0) * seconds)
         doublings = (Decimal(celsius) - Decimal(noise.dark_reference_c)) / Decimal(noise.dark_doubling_c)

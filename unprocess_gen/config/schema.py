@@ -1,7 +1,8 @@
 """Typed dataclasses of the configuration: one for each folder of ``conf/``, and `Config` for all of them.
 
-OmegaConf checks keys and types against these dataclasses; `validation` checks ranges and combinations. The dataclasses
-are not frozen, because Hydra cannot override frozen ones. No code changes a configuration once it has been validated.
+Each key is declared once, with its meaning, unit and allowed values (`settings.key`). OmegaConf checks keys and types
+against these dataclasses; `validation` checks values by the same declarations. The dataclasses are not frozen, because
+Hydra cannot override frozen ones. No code changes a configuration once it has been validated.
 
 A parameter that is drawn for every image is a number or a distribution, written as a list: ``[uniform, 1.9, 2.4]``. An
 override replaces a list completely. A mapping would be merged with the default's mapping, into a mixture of both.
@@ -9,344 +10,488 @@ override replaces a list completely. A mapping would be merged with the default'
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
 from typing import Any, Optional
 
-from unprocess_gen.core.types import MOSAIC, UINT16
+from unprocess_gen.config import limits
+from unprocess_gen.config.limits import (
+    Boolean,
+    Choice,
+    Described,
+    Integers,
+    IsoForm,
+    Name,
+    NumberOrWord,
+    Numbers,
+    Text,
+)
+from unprocess_gen.config.settings import Setting, documented, key, settings_of
 
 
+@documented
 @dataclass
 class SourceConfig:
-    """Select and prepare the source images.
+    """Select and prepare the source images."""
 
-    Attributes
-    ----------
-    root : str or None
-        Folder or single picture; None selects the built-in synthetic scenes.
-    include : list of str
-        Glob patterns of images. Without a slash they match the base name; case does not matter.
-    recursive : bool
-        Whether to descend into folders.
-    limit : int or None
-        Number of sources to use, in the order of their names; None uses all.
-    max_pixels : int
-        Images with more pixels fail with reason ``too_large``.
-    max_failed : int
-        Number of failed sources above which a run exits with code 3.
-    icc : str
-        ``ignore`` colour profiles, or ``refuse`` images whose profile is not sRGB.
-    clips : bool
-        Whether folders, and files that match ``video``, are clips.
-    video : list of str
-        Glob patterns of video files; used with ``clips`` only.
-    downscale : int
-        Side of the block of pixels whose mean becomes one pixel.
-    dequantize : str
-        ``off`` or ``dither``; see `interpretation.dequantize_method`.
-    patch : Any
-        Patches to cut; see `interpretation.patch_rule`.
-    """
+    root: Optional[str] = key(
+        None,
+        "folder of photographs, or one photograph",
+        Described("a folder, a file, or null"),
+        null="the built-in synthetic scenes",
+        decides_data=False,
+    )
+    include: list[str] = key(
+        [],
+        "glob patterns of images; one with a slash matches the path below root, others the file name, in any case",
+        Described("a list of at least one pattern such as '*.jpg'"),
+    )
+    recursive: bool = key(True, "descend into folders", Boolean())
+    limit: Optional[int] = key(
+        None, "use only the first sources, in the order of their names", Integers(1, 10**9), null="all sources"
+    )
+    max_pixels: int = key(
+        2**26, "images with more pixels fail with reason too_large", Integers(1, 2**40), unit="pixels"
+    )
+    max_failed: int = key(
+        0,
+        "number of failed sources up to which a run exits with code 0; with more it exits with code 3",
+        Integers(0, 10**9),
+        decides_data=False,
+    )
+    icc: str = key(
+        "ignore",
+        "colour profiles of photographs: ignore treats pixels as sRGB, refuse fails images with another profile "
+        "(extra icc)",
+        Choice(("ignore", "refuse")),
+    )
+    clips: bool = key(
+        False,
+        "treat each folder, and each file that matches video, as a clip: its frames share camera, gains, noise level "
+        "and fixed patterns",
+        Boolean(),
+    )
+    video: list[str] = key(
+        [], "glob patterns of video files, used if clips is true (extra video)", Described("a list of patterns")
+    )
+    downscale: int = key(
+        1,
+        "side of the squares whose mean becomes one pixel of 16 bits; 2 removes JPEG artefacts, as Brooks et al. did",
+        Integers(1, 64),
+        unit="pixels",
+    )
+    dequantize: str = key(
+        "off",
+        "dither moves 8-bit codes by up to half a code at random, so that 256 codes do not become 256 raw levels; 0, "
+        "255 and highlights keep their codes",
+        limits.DEQUANTIZE,
+    )
+    patch: Any = key(
+        None, "cut images into square patches, after downscaling", limits.PATCH, unit="pixels", null="complete images"
+    )
 
-    root: Optional[str] = None
-    include: list[str] = field(default_factory=list)
-    recursive: bool = True
-    limit: Optional[int] = None
-    max_pixels: int = 2**26
-    max_failed: int = 0
-    icc: str = "ignore"
-    clips: bool = False
-    video: list[str] = field(default_factory=list)
-    downscale: int = 1
-    dequantize: str = "off"
-    patch: Any = None
 
-
+@documented
 @dataclass
 class CameraConfig:
-    """Choose the colour matrix of the camera.
+    """Choose the colour matrix of the camera."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the camera, recorded in each row.
-    law : str
-        One of `validation.CAMERA_LAWS`: how the matrix is chosen for an image.
-    xyz2cam : list of float or None
-        Nine numbers, row by row, from XYZ (D65) to the camera; for ``law=custom`` only.
-    """
+    name: str = key("convex", "name of the camera, recorded in each row", Name())
+    law: str = key(
+        "convex",
+        "how the matrix of an image is chosen: fixed is the camera called name, convex a mix of four cameras, choice "
+        "one of the four, identity linear sRGB, custom xyz2cam",
+        limits.CAMERA_LAWS,
+    )
+    xyz2cam: Optional[list[float]] = key(
+        None,
+        "matrix from XYZ (D65) to the camera, row by row, for law=custom",
+        Described("nine numbers of an invertible matrix"),
+        null="a law other than custom",
+    )
 
-    name: str = "convex"
-    law: str = "convex"
-    xyz2cam: Optional[list[float]] = None
 
-
+@documented
 @dataclass
 class GainsConfig:
-    """Define white balance, brightening and the treatment of highlights.
+    """Define white balance, brightening and the treatment of highlights."""
 
-    Attributes
-    ----------
-    red, blue : Any
-        Forward white-balance gains: numbers or distributions.
-    inverse_rgb : Any
-        Inverse of the brightening gain: a number or a distribution. The image is multiplied by it.
-    highlight : str
-        ``per_channel`` (the article), ``gray_mean`` (the code of Brooks et al.) or ``none``.
-    threshold : float
-        Linear signal above which highlights are preserved, at least 0 and below 1.
-    """
-
-    red: Any = None
-    blue: Any = None
-    inverse_rgb: Any = None
-    highlight: str = "per_channel"
-    threshold: float = 0.9
+    red: Any = key(None, "forward white-balance gain of red", limits.GAIN)
+    blue: Any = key(None, "forward white-balance gain of blue", limits.GAIN)
+    inverse_rgb: Any = key(None, "inverse of the brightening gain; the image is multiplied by it", limits.INVERSE_GAIN)
+    highlight: str = key(
+        "per_channel",
+        "how highlights are preserved: per_channel as in the article, gray_mean as in the code of Brooks et al., none",
+        Choice(("per_channel", "gray_mean", "none")),
+    )
+    threshold: float = key(0.9, "linear signal above which highlights are preserved", Numbers(0, 1, open_high=True))
 
 
+@documented
 @dataclass
 class IspConfig:
-    """Define the curves that the camera applied after the colour matrix.
+    """Define the curves that the camera applied after the colour matrix."""
 
-    Attributes
-    ----------
-    tone : str
-        ``smoothstep`` or ``none``.
-    gamma : Any
-        Exponent from 0.1 to 10, or ``srgb`` for the piecewise curve of IEC 61966-2-1.
-    """
-
-    tone: str = "smoothstep"
-    gamma: Any = 2.2
+    tone: str = key("smoothstep", "tone curve that is inverted", Choice(("smoothstep", "none")))
+    gamma: Any = key(
+        2.2,
+        "exponent that is inverted, or srgb for the piecewise curve of IEC 61966-2-1",
+        NumberOrWord("srgb", Numbers(0.1, 10), "a number from {numbers}, or {word}"),
+    )
 
 
+@documented
 @dataclass
 class SensorConfig:
-    """Define the digital output of the sensor.
+    """Define the digital output of the sensor."""
 
-    Attributes
-    ----------
-    bits : int
-        Bits per sample, 1 to 16.
-    black_level_dn, white_level_dn : int
-        Levels without light and at saturation, DN.
-    pattern : str
-        CFA pattern: RGGB, BGGR, GRBG or GBRG.
-    clip : str
-        Lowest value of noisy frames: ``sensor`` (0 DN), ``black`` (the black level) or ``none`` (no clipping).
-    saturated : str
-        Noisy value at sites where the clean frame is saturated: ``noisy`` or ``pinned`` (white level).
-    dark_offset : str
-        Mean of the dark current: ``removed`` or ``kept``.
-    units : Any
-        ``image``: a new camera body for every image; an integer: number of bodies to draw from.
-    """
+    bits: int = key(12, "bits per sample", Integers(1, 16))
+    black_level_dn: int = key(240, "black level, the value without light", limits.BLACK_LEVEL, unit="DN")
+    white_level_dn: int = key(4095, "white level, the value at saturation", limits.WHITE_LEVEL, unit="DN")
+    pattern: str = key(
+        "RGGB", "CFA pattern of the top-left 2x2 sites, row by row", Choice(("RGGB", "BGGR", "GRBG", "GBRG"))
+    )
+    clip: str = key(
+        "sensor",
+        "clipping of noisy frames: sensor at 0 and 2^bits - 1, black at the black level instead of 0, none only with "
+        "float32",
+        Choice(("sensor", "black", "none")),
+    )
+    saturated: str = key(
+        "noisy",
+        "noisy value where the clean frame is saturated: noisy adds noise to the clipped value, as in the article, "
+        "pinned is the white level",
+        Choice(("noisy", "pinned")),
+    )
+    dark_offset: str = key(
+        "removed",
+        "mean of the dark current: removed as a camera does with optical-black pixels, or kept",
+        Choice(("removed", "kept")),
+    )
+    units: Any = key(
+        "image",
+        "camera bodies, which have their own fixed patterns: image is a new body for each image, a number is how many "
+        "to draw from",
+        NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"),
+    )
 
-    bits: int = 12
-    black_level_dn: int = 240
-    white_level_dn: int = 4095
-    pattern: str = "RGGB"
-    clip: str = "sensor"
-    saturated: str = "noisy"
-    dark_offset: str = "removed"
-    units: Any = "image"
 
-
+@documented
 @dataclass
 class BranchConfig:
     """Hold the numbers of a physical noise profile that depend on ISO, for one range of ISO.
 
-    A number may be written as a form, ``[form, number, …]``; see `planning.noise_profile.FORMS`.
-
-    Attributes
-    ----------
-    iso : list of float
-        Lowest and highest ISO of the range.
-    dn_per_e : Any
-        System gain K, DN per electron.
-    read_law : str
-        Distribution of the read noise: ``gaussian`` or ``tukey`` (Tukey-λ).
-    read_shape : Any
-        Shape λ of the Tukey-λ distribution, or a choice of shapes.
-    read_std_dn, row_std_dn, column_std_dn : Any
-        Standard deviations of read, row and column noise, DN of the profile.
-    black_error_dn : Any
-        Error of the black level: one number, four (the sites of the CFA pattern), or a table; DN of the profile.
+    A number may be written as a form of `forms.ISO_FORMS`.
     """
 
-    iso: list[float] = field(default_factory=list)
-    dn_per_e: Any = None
-    read_law: str = "gaussian"
-    read_shape: Any = 0.0
-    read_std_dn: Any = None
-    row_std_dn: Any = None
-    column_std_dn: Any = None
-    black_error_dn: Any = None
+    iso: list[float] = key([], "lowest and highest ISO of the branch", limits.ISO_RANGE)
+    dn_per_e: Any = key(None, "system gain K", IsoForm(("per_iso",)), unit="DN per electron")
+    read_law: str = key(
+        "gaussian",
+        "distribution of the read noise: gaussian, or tukey for Tukey's lambda",
+        Choice(("gaussian", "tukey")),
+    )
+    read_shape: Any = key(0.0, "shape of Tukey's lambda distribution", limits.READ_SHAPE)
+    read_std_dn: Any = key(
+        None,
+        "standard deviation of the read noise",
+        IsoForm(("root", "line", "scale_line")),
+        unit="DN of the profile",
+    )
+    row_std_dn: Any = key(
+        None,
+        "standard deviation of row offsets",
+        IsoForm(("root", "line")),
+        unit="DN of the profile",
+        null="not known, so the effect row cannot be simulated",
+    )
+    column_std_dn: Any = key(
+        None,
+        "standard deviation of column offsets",
+        IsoForm(("root", "line")),
+        unit="DN of the profile",
+        null="not known, so the effect column cannot be simulated",
+    )
+    black_error_dn: Any = key(
+        None,
+        "error of the black level",
+        limits.BLACK_ERROR,
+        unit="DN of the profile",
+        null="not known, so the effect black_error cannot be simulated",
+    )
 
 
+CHOSEN, PROFILE = "Chosen for a run", "Every profile"
+TWO_PARAMETERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
+"""Sections of the keys of `NoiseConfig`."""
+
+UNKNOWN = "not known"
+
+
+@documented
 @dataclass
 class NoiseConfig:
-    """Define the noise: two numbers (variance a·x + b), or a physical profile with ``branches`` by ISO.
+    """Define the noise: two numbers (variance a·x + b), or a physical profile with ``branches`` by ISO."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the profile, recorded in each row.
-    units : str or None
-        ``dn`` or ``normalized`` (0 at black, 1 at white).
-    black : str or None
-        Whether x has the black level ``subtracted`` or ``included``.
-    bits, black_level_dn, white_level_dn : int or None
-        Levels at which a profile in DN was calibrated.
-    a, b : Any
-        Slope and offset of the variance: numbers or distributions.
-    negative_variance : str
-        ``refuse`` profiles whose variance is negative at black, or ``clip`` it at 0.
-    law : str
-        Distribution of the noise of a profile with two numbers: ``gaussian`` or ``poisson``.
-    iso : Any
-        ISO at which to use a physical profile: a number or a distribution; None takes the ISO of the scene.
-    levels : Any
-        Noise levels for each clean frame: how many to draw, a list of ISOs, or a list of ``{a, b}``.
-    draws : int
-        Noisy frames at each level.
-    branches : list of BranchConfig
-        Numbers of a physical profile that depend on ISO; empty for a profile with two numbers.
-    prnu_std : float or None
-        Standard deviation of the photo response non-uniformity; the mean is 1.
-    dark_e_per_s : float or None
-        Mean dark current, electrons per second, at ``dark_reference_c``.
-    dark_reference_c, dark_doubling_c : float
-        Temperature of ``dark_e_per_s``, and the rise that doubles it, degrees Celsius.
-    hot_pixel_share : float or None
-        Fraction of hot pixels, 0 to 1.
-    hot_pixel_e_per_s : float or None
-        Mean of the exponentially distributed current of hot pixels, electrons per second, at ``dark_reference_c``.
-    dead_pixel_share : float or None
-        Fraction of dead pixels, 0 to 1.
-    full_well_e : float or None
-        Saturation capacity, electrons.
-    assumed : list of str
-        Keys whose numbers no source gives. Their effects are simulated only if switched on by name.
-    """
+    name: str = key("none", "name of the profile, recorded in each row", Name(), section=PROFILE)
+    units: Optional[str] = key(
+        None,
+        "units of a and b: dn, or normalized (0 at black, 1 at white)",
+        Choice(("dn", "normalized")),
+        section=PROFILE,
+    )
+    black: Optional[str] = key(
+        None,
+        "whether the signal x of the variance a * x + b has the black level subtracted or included",
+        Choice(("subtracted", "included")),
+        section=PROFILE,
+    )
+    bits: Optional[int] = key(
+        None,
+        "bits of the sensor that a profile in DN was calibrated with",
+        Integers(1, 32),
+        null="with units=normalized",
+        section=PROFILE,
+    )
+    black_level_dn: Optional[int] = key(
+        None,
+        "black level of the calibration",
+        limits.BLACK_LEVEL,
+        unit="DN of the profile",
+        null="with units=normalized",
+        section=PROFILE,
+    )
+    white_level_dn: Optional[int] = key(
+        None,
+        "white level of the calibration",
+        limits.WHITE_LEVEL,
+        unit="DN of the profile",
+        null="with units=normalized",
+        section=PROFILE,
+    )
+    a: Any = key(
+        None,
+        "slope of the variance a * x + b",
+        limits.VARIANCE_SLOPE,
+        unit="DN, or 1 with units=normalized",
+        null="a physical profile",
+        section=TWO_PARAMETERS,
+    )
+    b: Any = key(
+        None,
+        "offset of the variance a * x + b",
+        limits.VARIANCE_OFFSET,
+        unit="DN², or 1 with units=normalized",
+        null="a physical profile",
+        section=TWO_PARAMETERS,
+    )
+    negative_variance: str = key(
+        "refuse",
+        "profiles whose variance at black is negative: refuse them, or clip the variance at 0",
+        Choice(("refuse", "clip")),
+        section=TWO_PARAMETERS,
+    )
+    law: str = key(
+        "gaussian",
+        "distribution of the noise of a two-parameter profile: gaussian is one normal distribution, poisson a Poisson "
+        "count times a plus a normal distribution of variance b",
+        Choice(("gaussian", "poisson")),
+        section=CHOSEN,
+    )
+    iso: Any = key(
+        None,
+        "ISO at which a physical profile is used, in place of scene.iso",
+        limits.ISO,
+        null="the ISO of the scene",
+        section=CHOSEN,
+    )
+    levels: Any = key(
+        None, "noise levels of each clean frame", limits.LEVELS, null="one level, as the profile has it", section=CHOSEN
+    )
+    draws: int = key(1, "noisy frames at each level", Integers(1, limits.MAX_LEVELS), section=CHOSEN)
+    branches: list[BranchConfig] = key(
+        [],
+        "numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters",
+        Described("a list of mappings with the keys of a branch"),
+        section=PHYSICAL,
+    )
+    prnu_std: Optional[float] = key(
+        None,
+        "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1",
+        Numbers(0, 0.5),
+        null=UNKNOWN,
+        section=PHYSICAL,
+    )
+    dark_e_per_s: Optional[float] = key(
+        None,
+        "mean dark current at dark_reference_c",
+        Numbers(0, 1e6),
+        unit="electrons per second",
+        null=UNKNOWN,
+        section=PHYSICAL,
+    )
+    dark_reference_c: float = key(
+        25.0,
+        "temperature at which the dark currents were measured",
+        Numbers(-273, 200),
+        unit="degrees Celsius",
+        section=PHYSICAL,
+    )
+    dark_doubling_c: float = key(
+        7.0,
+        "rise of the temperature that doubles the dark currents",
+        Numbers(0.1, 100),
+        unit="degrees Celsius",
+        section=PHYSICAL,
+    )
+    hot_pixel_share: Optional[float] = key(
+        None, "fraction of hot pixels", Numbers(0, 1), null=UNKNOWN, section=PHYSICAL
+    )
+    hot_pixel_e_per_s: Optional[float] = key(
+        None,
+        "mean of the exponentially distributed current of hot pixels at dark_reference_c",
+        Numbers(0, 1e6),
+        unit="electrons per second",
+        null=UNKNOWN,
+        section=PHYSICAL,
+    )
+    dead_pixel_share: Optional[float] = key(
+        None, "fraction of dead pixels, which read 0", Numbers(0, 1), null=UNKNOWN, section=PHYSICAL
+    )
+    full_well_e: Optional[float] = key(
+        None, "saturation capacity", Numbers(1, 1e9), unit="electrons", null=UNKNOWN, section=PHYSICAL
+    )
+    assumed: list[str] = key(
+        [],
+        "keys of this section whose numbers no source gives; their effects are simulated only if switched on by name",
+        Described("a list of keys of this section"),
+        section=PHYSICAL,
+    )
 
-    name: str = "none"
-    units: Optional[str] = None
-    black: Optional[str] = None
-    bits: Optional[int] = None
-    black_level_dn: Optional[int] = None
-    white_level_dn: Optional[int] = None
-    a: Any = None
-    b: Any = None
-    negative_variance: str = "refuse"
-    law: str = "gaussian"
-    iso: Any = None
-    levels: Any = None
-    draws: int = 1
-    branches: list[BranchConfig] = field(default_factory=list)
-    prnu_std: Optional[float] = None
-    dark_e_per_s: Optional[float] = None
-    dark_reference_c: float = 25.0
-    dark_doubling_c: float = 7.0
-    hot_pixel_share: Optional[float] = None
-    hot_pixel_e_per_s: Optional[float] = None
-    dead_pixel_share: Optional[float] = None
-    full_well_e: Optional[float] = None
-    assumed: list[str] = field(default_factory=list)
+
+PHYSICAL_NUMBERS = tuple(
+    name
+    for name, setting in settings_of(NoiseConfig).items()
+    if setting.section == PHYSICAL and isinstance(setting.limit, Numbers)
+)
+"""Keys of the numbers of a physical profile that do not depend on ISO."""
 
 
+@documented
 @dataclass
 class SceneConfig:
-    """Describe the exposure of a scene; each value is a number or a distribution.
+    """Describe the exposure of a scene; each value is a number or a distribution."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the scene, recorded in each row.
-    iso : Any
-        ISO of a physical noise profile.
-    exposure_s : Any
-        Exposure time, seconds.
-    temperature_c : Any
-        Temperature of the sensor, degrees Celsius.
-    exposure_ratio : Any
-        Divisor of the light in the photograph; 100 leaves a hundredth.
-    """
-
-    name: str = "daylight"
-    iso: Any = 100
-    exposure_s: Any = 0.001
-    temperature_c: Any = 25
-    exposure_ratio: Any = 1
+    name: str = key("daylight", "name of the scene, recorded in each row", Name())
+    iso: Any = key(100, "ISO of a physical noise profile", limits.ISO)
+    exposure_s: Any = key(0.001, "exposure time", limits.EXPOSURE_S, unit="seconds")
+    temperature_c: Any = key(25, "temperature of the sensor", limits.TEMPERATURE_C, unit="degrees Celsius")
+    exposure_ratio: Any = key(
+        1,
+        "divisor of the light in the photograph, so that 100 leaves a hundredth; nothing multiplies the frames by it "
+        "afterwards",
+        limits.EXPOSURE_RATIO,
+    )
 
 
+AS_ALL = "the value of all"
+
+
+@documented
 @dataclass
 class EffectsConfig:
-    """Choose the sensor effects to simulate: ``auto``, ``on`` or ``off``.
+    """Choose the sensor effects to simulate."""
 
-    The switch of a named effect takes precedence over ``all``; None uses ``all``. ``tolerance`` limits what ``auto``
-    omits, as a ratio to the masking noise (see `planning.effect_selection`).
-    """
+    all: str = key(
+        "auto",
+        "auto omits effects that together stay within tolerance, on simulates all effects, off none; the switch of a "
+        "named effect takes precedence",
+        limits.SWITCH,
+    )
+    tolerance: float = key(
+        0.1,
+        "largest ratio of the omitted effects to the masking noise, in each statistic",
+        Numbers(0, 10, open_low=True),
+    )
+    heteroscedastic: Optional[str] = key(
+        None, "noise of a two-parameter profile, its only effect", limits.SWITCH, null=AS_ALL
+    )
+    prnu: Optional[str] = key(None, "unequal response of pixels; fixed pattern", limits.SWITCH, null=AS_ALL)
+    shot: Optional[str] = key(None, "Poisson counts of electrons", limits.SWITCH, null=AS_ALL)
+    dark_current: Optional[str] = key(None, "Poisson counts of thermal electrons", limits.SWITCH, null=AS_ALL)
+    hot_pixels: Optional[str] = key(
+        None, "few pixels with a far larger dark current; fixed pattern", limits.SWITCH, null=AS_ALL
+    )
+    full_well: Optional[str] = key(
+        None, "saturation capacity, at which the clean and the noisy frame are clipped", limits.SWITCH, null=AS_ALL
+    )
+    read: Optional[str] = key(None, "noise of the amplifier and the converter", limits.SWITCH, null=AS_ALL)
+    row: Optional[str] = key(None, "an offset of each row, new in every frame", limits.SWITCH, null=AS_ALL)
+    column: Optional[str] = key(None, "an offset of each column; fixed pattern", limits.SWITCH, null=AS_ALL)
+    black_error: Optional[str] = key(
+        None, "difference between black and the black level, by CFA site; fixed pattern", limits.SWITCH, null=AS_ALL
+    )
+    dead_pixels: Optional[str] = key(None, "few pixels that read 0; fixed pattern", limits.SWITCH, null=AS_ALL)
+    quantise: Optional[str] = key(
+        None, "rounding and clipping; on for uint16, off for float32", limits.SWITCH, null=AS_ALL
+    )
 
-    all: str = "auto"
-    tolerance: float = 0.1
-    heteroscedastic: Optional[str] = None
-    prnu: Optional[str] = None
-    shot: Optional[str] = None
-    dark_current: Optional[str] = None
-    hot_pixels: Optional[str] = None
-    full_well: Optional[str] = None
-    read: Optional[str] = None
-    row: Optional[str] = None
-    column: Optional[str] = None
-    black_error: Optional[str] = None
-    dead_pixels: Optional[str] = None
-    quantise: Optional[str] = None
 
-
+@documented
 @dataclass
 class CleanConfig:
-    """Choose what clean frames contain.
+    """Choose what clean frames contain."""
 
-    ``includes_fixed_pattern``: whether they contain the fixed-pattern noise of the camera body.
-    """
+    includes_fixed_pattern: bool = key(
+        False,
+        "whether clean frames contain the fixed-pattern noise of the camera body, like an average of many frames; they "
+        "are then clipped like noisy frames",
+        Boolean(),
+    )
 
-    includes_fixed_pattern: bool = False
 
-
+@documented
 @dataclass
 class AccuracyConfig:
-    """Limit the errors accepted for speed; the attributes are those of `accuracy.Budget`."""
+    """Limit the errors accepted for speed; see `accuracy.Budget`."""
 
-    name: str = "exact"
-    readable: bool = False
-    clean_dn: float = 0.0
-    clean_changed_share: float = 0.0
-    normal_error: float = 1e-6
-    law_distance: float = 0.0
+    name: str = key("exact", "name of the tier, recorded in each row", Name())
+    readable: bool = key(False, "allow only the NumPy reference", Boolean())
+    clean_dn: float = key(0.0, "largest error of a clean value", Numbers(0), unit="DN")
+    clean_changed_share: float = key(0.0, "largest fraction of clean values that differ, at 14 bits", Numbers(0))
+    normal_error: float = key(
+        1e-6, "largest error of a normal deviate against the true quantile", Numbers(0), unit="standard deviations"
+    )
+    law_distance: float = key(
+        0.0,
+        "largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead",
+        Numbers(0),
+    )
 
 
+@documented
 @dataclass
 class OutputConfig:
-    """Define the format of the dataset.
+    """Define the format of the dataset."""
 
-    Attributes
-    ----------
-    dtype : str
-        ``uint16`` (DN) or ``float32`` (0 at black, 1 at white, not rounded).
-    layout : str
-        ``mosaic``, [H, W], or ``packed``, [4, H/2, W/2].
-    pairs_per_shard : int
-        Sources per shard.
-    """
+    dtype: str = key(
+        "uint16",
+        "type of the arrays: uint16 in DN, or float32 with 0 at black and 1 at white, not rounded",
+        Choice(("uint16", "float32")),
+    )
+    layout: str = key(
+        "mosaic",
+        "layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue rows, "
+        "B",
+        Choice(("mosaic", "packed")),
+    )
+    pairs_per_shard: int = key(8, "sources per shard, the unit of work and of a retry", Integers(1, 10**6))
 
-    dtype: str = UINT16
-    layout: str = MOSAIC
-    pairs_per_shard: int = 8
 
-
+@documented
 @dataclass
 class Config:
-    """Hold the complete configuration of a run; the keys of `serialization.NOT_DATA` do not decide the data."""
+    """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level."""
 
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
@@ -359,8 +504,52 @@ class Config:
     clean: CleanConfig = field(default_factory=CleanConfig)
     accuracy: AccuracyConfig = field(default_factory=AccuracyConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
-    seed: int = 0
-    out: str = "ds"
-    n_jobs: int = -1
-    self_test: str = "stop"
-    check_disk: bool = True
+    seed: int = key(0, "seed of all random streams", Integers(0, 2**63 - 1))
+    out: str = key(
+        "ds",
+        "folder of the dataset; in a sweep, the folder that contains the datasets",
+        Text("the name of a folder"),
+        decides_data=False,
+    )
+    n_jobs: int = key(
+        -1,
+        "number of worker processes",
+        Integers(1, 1024, other=-1, remark=" or -1 for one per core"),
+        decides_data=False,
+    )
+    self_test: str = key(
+        "stop",
+        "what happens if this machine computes other values than the reference: stop ends the run, go_on continues and "
+        "records the differences in dataset.json",
+        Choice(("stop", "go_on")),
+        decides_data=False,
+    )
+    check_disk: bool = key(
+        True,
+        "refuse to start if the free disk space is smaller than the estimated size of the dataset",
+        Boolean(),
+        decides_data=False,
+    )
+
+
+GROUPS: dict[str, type[Any]] = {
+    group.name: group.default_factory  # type: ignore[misc]
+    for group in fields(Config)
+    if isinstance(group.default_factory, type)
+}
+"""Dataclass of each config group, in the order of the config."""
+
+
+def all_settings() -> Iterator[tuple[str, str, Setting]]:
+    """Yield every setting of a config with its group, ``""`` for the top level; branches are left out.
+
+    Yields
+    ------
+    group, name : str
+        Where the setting is.
+    setting : Setting
+        Its description.
+    """
+    for group, kind in [*GROUPS.items(), ("", Config)]:
+        for name, setting in settings_of(kind).items():
+            yield group, name, setting

@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
 from unprocess_gen.config.interpretation import canonical_patch
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
+from unprocess_gen.config.schema import Config, all_settings
+from unprocess_gen.config.settings import Setting
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
 from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_text
@@ -21,16 +24,24 @@ from unprocess_gen.core.errors import ConfigError
 Option = TypeVar("Option")
 
 
-NOT_DATA = {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
+def _keys(chosen: Callable[[Setting], bool]) -> dict[str, tuple[str, ...]]:
+    """Return the keys of each group whose settings a condition chooses; groups without such keys are left out."""
+    keys: dict[str, tuple[str, ...]] = {}
+    for group, name, setting in all_settings():
+        if chosen(setting):
+            keys[group] = (*keys.get(group, ()), name)
+    return keys
+
+
+NOT_DATA = _keys(lambda setting: not setting.decides_data)
 """Keys that do not decide the bytes of a dataset, by group; ``config.yaml`` omits them."""
 
-
-DISTRIBUTION_KEYS = {
-    "gains": ("red", "blue", "inverse_rgb"),
-    "noise": ("a", "b", "iso"),
-    "isp": ("gamma",),
-    "scene": ("iso", "exposure_s", "temperature_c", "exposure_ratio"),
-}
+NUMBER_KEYS = _keys(
+    lambda setting: (
+        isinstance(setting.limit, Drawn)
+        or (isinstance(setting.limit, NumberOrWord) and isinstance(setting.limit.numbers, Numbers))
+    )
+)
 """Keys whose numbers are written as floats, because users may write 1 or 1.0."""
 
 
@@ -72,7 +83,7 @@ def dataset_yaml(config: Config) -> str:
         key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
     }
     settings["source"]["patch"] = canonical_patch(config.source)
-    for group, keys in DISTRIBUTION_KEYS.items():
+    for group, keys in NUMBER_KEYS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
 

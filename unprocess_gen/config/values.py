@@ -3,19 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import Any
 
 from unprocess_gen.core.errors import ConfigError
-
-NAME = re.compile(r"[\w.+-]{1,100}", re.ASCII)
-"""Allowed names of cameras, noise profiles, scenes and accuracy tiers. Every row of a manifest contains them."""
-
-
-def check_name(key: str, name: str) -> None:
-    """Raise ConfigError unless a name consists of 1 to 100 characters that `NAME` allows."""
-    if not NAME.fullmatch(name):
-        raise ConfigError(f"{key}={name[:40]!r}: expected up to 100 letters, digits, and . _ + -")
 
 
 def one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:

@@ -12,8 +12,9 @@ from collections.abc import Callable, Sequence
 from decimal import Decimal, localcontext
 from typing import Any
 
-from unprocess_gen.config.distributions import draw_parameter, parse_distribution
-from unprocess_gen.config.interpretation import SCENE_DISTRIBUTIONS, branch_of
+from unprocess_gen.config.distributions import draw_parameter, parse_drawn
+from unprocess_gen.config.interpretation import branch_of
+from unprocess_gen.config.limits import EXPOSURE_S, ISO, READ_SHAPE, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config, NoiseConfig
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile, tukey_std
 from unprocess_gen.core.random_streams import body_key
@@ -41,18 +42,18 @@ def plan_physics(config: Config, uniforms: dict[str, float], stream_key: int) ->
     """
     noise, scene, sensor = config.noise, config.scene, config.sensor
     iso, seconds, celsius = (
-        draw_parameter(parse_distribution(key, value, SCENE_DISTRIBUTIONS), uniforms[key])
-        for key, value in (
-            ("iso", scene.iso if noise.iso is None else noise.iso),
-            ("exposure_s", scene.exposure_s),
-            ("temperature_c", scene.temperature_c),
+        draw_parameter(parse_drawn(key, value, limit), uniforms[key])
+        for key, value, limit in (
+            ("iso", scene.iso if noise.iso is None else noise.iso, ISO),
+            ("exposure_s", scene.exposure_s, EXPOSURE_S),
+            ("temperature_c", scene.temperature_c, TEMPERATURE_C),
         )
     )
     branch = branch_of(noise, iso)
     assert branch is not None and noise.white_level_dn is not None and noise.black_level_dn is not None
     scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
     gain = number(branch.dn_per_e, iso=iso)
-    shape = draw_parameter(parse_distribution("read_shape", branch.read_shape, ("choice",)), uniforms["read_shape"])
+    shape = draw_parameter(parse_drawn("read_shape", branch.read_shape, READ_SHAPE), uniforms["read_shape"])
     warmth = _doublings(celsius, noise)
     unit = f"{stream_key:016x}" if sensor.units == "image" else str(int(uniforms["sensor_unit"] * sensor.units))
     errors = _black_error(branch, iso)

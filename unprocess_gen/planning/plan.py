@@ -10,9 +10,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from unprocess_gen.config.accuracy import choose_methods, is_steep
-from unprocess_gen.config.distributions import draw_parameter, parse_distribution
+from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.interpretation import (
-    SCENE_DISTRIBUTIONS,
     accuracy_budget,
     dequantize_method,
     effect_switch,
@@ -23,6 +22,7 @@ from unprocess_gen.config.interpretation import (
     noise_levels,
     uses_physics,
 )
+from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Facts, Plan
@@ -192,7 +192,7 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
     """Return the plan without the numbers and effects of a physical profile."""
     camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
     red, blue, inverse_rgb = gain_distributions(config.gains)
-    exposure_ratio = parse_distribution("scene.exposure_ratio", config.scene.exposure_ratio, SCENE_DISTRIBUTIONS)
+    exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
     a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
     span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
     effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)

@@ -1,0 +1,83 @@
+"""Name the lists that users write instead of a number: distributions, and functions of ISO in noise profiles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """Describe a list ``[name, number, …]``.
+
+    Attributes
+    ----------
+    numbers : tuple of str
+        What the numbers are, in order.
+    meaning : str
+        One phrase for the documentation.
+    optional : int
+        How many numbers at the end may be left out.
+    """
+
+    numbers: tuple[str, ...]
+    meaning: str
+    optional: int = 0
+
+
+DISTRIBUTION_FORMS: Mapping[str, Form] = {
+    "constant": Form(("value",), "a number, written without brackets"),
+    "uniform": Form(("lowest", "highest"), "each value in the range with equal probability"),
+    "log_uniform": Form(("lowest", "highest"), "a value whose logarithm is uniform"),
+    "truncated_normal": Form(
+        ("mean", "standard deviation", "lowest", "highest"), "a normal distribution limited to a range"
+    ),
+    "inverse_truncated_normal": Form(
+        ("mean", "standard deviation", "lowest", "highest"), "1 divided by a draw from `truncated_normal`"
+    ),
+    "log_linear_in_a": Form(
+        ("slope", "intercept", "standard deviation"),
+        "b of a noise profile: ln b = slope · ln a + intercept + standard deviation · n, where n is a standard normal "
+        "deviate",
+    ),
+    "choice": Form(("value", "…"), "one of the values with equal probability"),
+}
+"""Distributions that a parameter can be drawn from, by kind."""
+
+ISO_FORMS: Mapping[str, Form] = {
+    "per_iso": Form(("slope", "intercept"), "slope · ISO + intercept (0 if it is left out)", optional=1),
+    "root": Form(("c0", "c1", "c2"), "the square root of the variance c0 + c1 · ISO + c2 · ISO²", optional=2),
+    "line": Form(
+        ("slope", "intercept", "scatter"),
+        "the standard deviation σ with ln σ = slope · ln K + intercept + scatter · n, where K is `dn_per_e` and n a "
+        "standard normal deviate, drawn for each image",
+    ),
+    "scale_line": Form(
+        ("slope", "intercept", "scatter"),
+        "the same line for the scale of Tukey's lambda distribution; the scale is multiplied by the standard deviation "
+        "at scale 1",
+    ),
+    "by_log_iso": Form(
+        ("[four]", "…"),
+        "black-level errors of the four sites, for equal parts of the branch's range of ln ISO, lowest ISO first",
+    ),
+}
+"""Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""
+
+
+def spelled(name: str, form: Form) -> str:
+    """Return a form as users write it, such as ``[uniform, lowest, highest]``.
+
+    Parameters
+    ----------
+    name : str
+        Key of the form in its table.
+    form : Form
+        The form.
+
+    Returns
+    -------
+    str
+        The list, with the names of its numbers.
+    """
+    return f"[{', '.join((name, *form.numbers))}]"

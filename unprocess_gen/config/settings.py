@@ -1,0 +1,141 @@
+"""Describe settings: `key` declares a field of the schema, `settings_of` returns what it declared.
+
+The description of a setting is in one place, the field's metadata. Checks and messages (`validation`), ``--help`` and
+shell completion (`cli`), docstrings and ``docs/reference/settings.md`` read it. OmegaConf ignores the metadata.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from unprocess_gen.config.limits import Limit
+from unprocess_gen.core.errors import ConfigError
+
+METADATA = "setting"
+"""Key of a field's metadata that holds its `Setting`."""
+
+Group = TypeVar("Group", bound=type)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Describe one key of a config group.
+
+    Attributes
+    ----------
+    meaning : str
+        One sentence for users, without a period at its end.
+    limit : Limit
+        The allowed values.
+    unit : str
+        Unit of a number; empty for words and pure numbers.
+    null : str
+        What null means; empty if null is not allowed.
+    decides_data : bool
+        Whether the bytes of a dataset depend on the value. ``config.yaml`` omits other keys.
+    section : str
+        Title of the part of the group that the key belongs to; empty in groups without parts.
+    """
+
+    meaning: str
+    limit: Limit
+    unit: str = ""
+    null: str = ""
+    decides_data: bool = True
+    section: str = ""
+
+    @property
+    def allowed(self) -> str:
+        """Return the allowed values in words, as after "expected" in a message."""
+        text = str(self.limit)
+        return f"{text} or null" if self.null and "null" not in text else text
+
+    def check(self, key: str, value: Any) -> None:
+        """Check a value by itself; limits that depend on other settings are checked by `validation`.
+
+        Parameters
+        ----------
+        key : str
+            Full name of the setting.
+        value : Any
+            Its value.
+
+        Raises
+        ------
+        ConfigError
+            If the value is not allowed.
+        """
+        if not (value is None and self.null) and not self.limit.allows(value):
+            raise ConfigError(f"{key}={self.limit.shown(value)}: expected {self.allowed}")
+
+
+def key(
+    default: Any,
+    meaning: str,
+    limit: Limit,
+    *,
+    unit: str = "",
+    null: str = "",
+    decides_data: bool = True,
+    section: str = "",
+) -> Any:
+    """Return a field of the schema with its description; the parameters are those of `Setting`.
+
+    Parameters
+    ----------
+    default : Any
+        Default value; a list is copied for each instance.
+    meaning : str
+        One sentence for users.
+    limit : Limit
+        The allowed values.
+    unit, null : str
+        Unit of a number, and what null means.
+    decides_data : bool
+        Whether the bytes of a dataset depend on the value.
+    section : str
+        Title of the part of the group that the key belongs to.
+
+    Returns
+    -------
+    dataclasses.Field
+        For the body of a dataclass.
+    """
+    metadata = {METADATA: Setting(meaning, limit, unit, null, decides_data, section)}
+    if isinstance(default, list):
+        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def settings_of(group: Any) -> Mapping[str, Setting]:
+    """Return the settings of a group by key.
+
+    Parameters
+    ----------
+    group : dataclass
+        A class of `schema`, or an instance.
+
+    Returns
+    -------
+    dict of str to Setting
+        In the order of the fields; groups inside the group are left out.
+    """
+    return {field.name: field.metadata[METADATA] for field in dataclasses.fields(group) if METADATA in field.metadata}
+
+
+def documented(group: Group) -> Group:
+    """Append the descriptions of a group's keys to its docstring, in the form of numpydoc."""
+    if group.__doc__:
+        types = {field.name: str(field.type) for field in dataclasses.fields(group)}
+        lines = [group.__doc__.rstrip(), "", "Attributes", "----------"]
+        for name, setting in settings_of(group).items():
+            details = [setting.meaning, f"unit: {setting.unit}"] if setting.unit else [setting.meaning]
+            details += [f"allowed: {setting.allowed}"]
+            details += [f"null: {setting.null}"] if setting.null else []
+            lines += [f"{name} : {types[name]}", textwrap.indent("; ".join(details) + ".", "    ")]
+        group.__doc__ = "\n".join(lines) + "\n"
+    return group
