@@ -411,7 +411,6 @@ def test_config_yaml_round_trip_keeps_the_text(file: Path, settings: Settings, t
     assert dataset_yaml(again) == text
 
 
-@hypothesis_settings(deadline=None)
 @given(
     numbers=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=3, max_size=3),
     seed=st.integers(0, 2**63 - 1),
@@ -534,7 +533,7 @@ def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 
 @pytest.mark.parametrize("overrides", [(), ("noise=sony_a7s2", "scene=low_light")], ids=str)
-@hypothesis_settings(deadline=None, max_examples=150)
+@hypothesis_settings(max_examples=150)
 @given(data=st.data())
 def test_edited_config_yaml_is_refused_in_one_line_or_can_be_planned(
     overrides: tuple[str, ...], data: st.DataObject, settings: Settings, tmp_path_factory: pytest.TempPathFactory
