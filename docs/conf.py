@@ -34,6 +34,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = project
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_sidebars = {"*": []}  # only pages in folders have neighbours to list
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
