@@ -42,10 +42,24 @@ def test_readme_is_short() -> None:
     assert len(README.splitlines()) <= 200
 
 
+def linked_files(page: Path) -> list[Path]:
+    targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+    return [(page.parent / target).resolve() for target in targets]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_of_a_page_lead_to_files(page: Path) -> None:
-    targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
-    assert [target for target in targets if not (page.parent / target).exists()] == []
+    assert [str(path) for path in linked_files(page) if not path.exists()] == []
+
+
+def test_every_page_is_reached_by_links_without_the_site() -> None:
+    reached: set[Path] = set()
+    found = {ROOT / "docs" / "index.md"}
+    while found:
+        reached |= found
+        found = {path for page in found for path in linked_files(page) if path.suffix == ".md"} - reached
+    missing = [str(page.relative_to(ROOT)) for page in PAGES[1:] if page not in reached]
+    assert missing == [], "link these pages from docs/index.md or from the index page of their folder"
 
 
 @pytest.mark.parametrize("group", [field.name for field in dataclasses.fields(Config)])
