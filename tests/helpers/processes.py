@@ -20,11 +20,35 @@ WAIT_S = 60
 ONE = "output.pairs_per_shard=1"
 
 
+SLOW_DISK = """
+import os, time
+
+fsync = os.fsync
+
+
+def slow(handle):
+    time.sleep(0.01)
+    fsync(handle)
+
+
+os.fsync = slow
+"""
+"""Module for `imported_first`: a shard takes 0.04 s or more to commit, so that a run does not end before its kill."""
+
+
+def imported_first(folder: Path, code: str) -> dict[str, str]:
+    """Return an environment in which every Python process runs ``code`` first, from a new folder in ``folder``."""
+    site = folder / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(code)
+    return {"PYTHONPATH": os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])}
+
+
 @contextmanager
-def running(*arguments: object, cwd: Path) -> Iterator[subprocess.Popen[str]]:
+def running(*arguments: object, cwd: Path, **env: str) -> Iterator[subprocess.Popen[str]]:
     """Start ``gen-dataset`` in a new session; processes of it that are left afterwards are killed."""
     process = subprocess.Popen(
-        [str(COMMAND), *map(str, arguments)], cwd=cwd, env=environment(), text=True, start_new_session=True,
+        [str(COMMAND), *map(str, arguments)], cwd=cwd, env=environment(**env), text=True, start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     try:
@@ -53,11 +77,17 @@ def workers(leader: int) -> list[int]:
     return [pid for pid in session(leader) if b"popen_loky_posix" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
+def handles_signals(pid: int) -> bool:
+    """Return whether a process has a handler for SIGTERM."""
+    caught = Path(f"/proc/{pid}/status").read_text().partition("SigCgt:")[2].split()[0]
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
+
+
 def wait_for(what: Callable[[], Any], seconds: float = WAIT_S) -> Any:
     until = time.monotonic() + seconds
     while not (found := what()):
         assert time.monotonic() < until, "waited in vain"
-        time.sleep(0.002)
+        time.sleep(0.005)
     return found
 
 

@@ -27,7 +27,19 @@ import pytest
 from helpers.commands import Cli, RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill, pixels
-from helpers.processes import ONE, Killed, assert_whole, committed, running, session, wait_for, workers
+from helpers.processes import (
+    ONE,
+    SLOW_DISK,
+    Killed,
+    assert_whole,
+    committed,
+    handles_signals,
+    imported_first,
+    running,
+    session,
+    wait_for,
+    workers,
+)
 from helpers.promise_report import Figure
 from PIL import Image
 
@@ -176,8 +188,8 @@ def test_orphaned_workers_do_not_disturb_the_next_run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Workers are stopped (SIGSTOP) amid a shard, outlive their coordinator, and continue in the next run."""
-    out = tmp_path / "ds"
-    with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path) as process:
+    out, env = tmp_path / "ds", imported_first(tmp_path, SLOW_DISK)
+    with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path, **env) as process:
         wait_for(lambda: committed(out) >= 2)
         orphans = workers(process.pid)
         for orphan in orphans:
@@ -244,7 +256,7 @@ def acting(data=b"", **options):
 
 hashlib.sha256 = acting
 """
-"""Module that every process of a run imports first: when it hashes one photograph, it acts."""
+"""Module for `imported_first`: when a process hashes one photograph, it acts."""
 
 
 def acting_at(folder: Path, photograph: Path, action: str) -> dict[str, str]:
@@ -252,28 +264,16 @@ def acting_at(folder: Path, photograph: Path, action: str) -> dict[str, str]:
 
     ``wait``: the first one waits as long as the file ``note`` exists. ``limit``: every one gets a limit of memory.
     """
-    (folder / "site").mkdir()
-    (folder / "site/sitecustomize.py").write_text(AT_ONE)
-    return {
-        "PYTHONPATH": os.pathsep.join([str(folder / "site"), *filter(None, [os.environ.get("PYTHONPATH")])]),
-        "MARKED": str(photograph),
-        "NOTE": str(folder / "note"),
-        "ACTION": action,
-    }
+    env = imported_first(folder, AT_ONE)
+    return env | {"MARKED": str(photograph), "NOTE": str(folder / "note"), "ACTION": action}
 
 
 def test_killed_worker_is_noticed_within_five_seconds(
-    photographs: Path,
-    undisturbed: str,
-    tree_hash: TreeHash,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    figure: Figure,
+    photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
     """The killed worker was at the last photograph, so no other work would reveal its death."""
-    for name, value in acting_at(tmp_path, photographs / f"{COUNT - 1:03d}.png", "wait").items():
-        monkeypatch.setenv(name, value)
-    with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path) as process:
+    env = acting_at(tmp_path, photographs / f"{COUNT - 1:03d}.png", "wait")
+    with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path, **env) as process:
         wait_for(lambda: committed(tmp_path / "ds") == COUNT - 1 and (tmp_path / "note").exists())
         idle = set(workers(process.pid)) - {asleep := int((tmp_path / "note").read_text())}
         assert len(idle) == 1
@@ -281,8 +281,11 @@ def test_killed_worker_is_noticed_within_five_seconds(
         killed = time.monotonic()
         wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # loky ends all workers
         noticed_s = time.monotonic() - killed
-        assert process.wait(20) == 0
+        said, err = process.communicate(timeout=20)
+    assert (process.returncode, own_lines(err)) == (0, []), err
+    assert f"{COUNT} pairs in {COUNT} shards" in said
     assert tree_hash(tmp_path / "ds") == undisturbed
+    assert_whole(tmp_path / "ds")
     figure("dead-worker", f"noticed after {noticed_s:.1f} s")
 
 
@@ -308,7 +311,8 @@ def with_large_undisturbed(with_large: Path, make: Make, tree_hash: TreeHash) ->
 
 
 @pytest.mark.parametrize(
-    ("n_jobs", "megabytes"), [(1, 20), (1, 100), (2, 20), pytest.param(2, 100, marks=pytest.mark.slow)]
+    ("n_jobs", "megabytes"),
+    [(1, 100), (2, 20), pytest.param(1, 20, marks=pytest.mark.slow), pytest.param(2, 100, marks=pytest.mark.slow)],
 )
 def test_out_of_memory_is_reported_and_rerun_completes_dataset(
     n_jobs: int,
@@ -468,7 +472,7 @@ def test_run_resumes_to_the_same_bytes_once_space_is_free(
     figure("disk-full", f"same bytes in {equal} of {len(fulls)} reruns, disks of {min(sizes)} to {max(sizes)} KiB")
 
 
-@pytest.mark.parametrize("n_jobs", [1, 2])
+@pytest.mark.parametrize("n_jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_full_disk_ends_with_5_within_five_seconds(
     n_jobs: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, empty_disk: Disk
 ) -> None:
@@ -532,23 +536,20 @@ def test_out_deleted_after_any_shard_ends_the_run_with_5(
     assert not (tmp_path / "ds").exists()
 
 
-@pytest.mark.parametrize("what", ["ds", "p"])
+@pytest.mark.parametrize("what", ["ds", pytest.param("p", marks=pytest.mark.slow)])
 def test_folder_deleted_under_two_workers_ends_the_run_with_5(
-    what: str, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    what: str, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
     """One worker is at the third photograph; the other has a few left."""
     shutil.copytree(photographs, tmp_path / "p")
-    for name, value in acting_at(tmp_path, photographs / "002.png", "wait").items():
-        monkeypatch.setenv(name, value)
-    with running("source.root=p", ONE, "n_jobs=2", cwd=tmp_path) as process:
+    env = acting_at(tmp_path, photographs / "002.png", "wait")
+    with running("source.root=p", ONE, "n_jobs=2", cwd=tmp_path, **env) as process:
         wait_for((tmp_path / "note").exists)
         (tmp_path / what).rename(tmp_path / "away")
         (tmp_path / "note").unlink()
         said, err = process.communicate(timeout=10)
         wait_for_the_end(process.pid)
     assert (process.returncode, said, len(own_lines(err))) == (5, "", 1), err
-    monkeypatch.undo()
     (tmp_path / "away").rename(tmp_path / what)
     make(tmp_path / "p", tmp_path / "ds", ONE)
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -660,20 +661,17 @@ def signalled():
 
 threading._shutdown = signalled
 """
-"""Module that a run imports first: it sends a signal while Python waits for its threads at exit."""
+"""Module for `imported_first`: it sends a signal while Python waits for its threads at exit."""
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sent", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_signal_at_exit_prints_nothing(
-    sent: signal.Signals, photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    sent: signal.Signals, photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
     """Pressing Ctrl-C twice has the same effect."""
-    (tmp_path / "sitecustomize.py").write_text(AT_THE_END)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setenv("SIGNAL", str(int(sent)))
-    with running(f"source.root={photographs}", ONE, "n_jobs=1", cwd=tmp_path) as process:
-        _, err = process.communicate(timeout=20)
+    env = imported_first(tmp_path, AT_THE_END) | {"SIGNAL": str(int(sent))}
+    with running(f"source.root={photographs}", ONE, "n_jobs=1", cwd=tmp_path, **env) as process:
+        _, err = process.communicate(timeout=60)
     assert process.returncode in (0, 128 + sent, -sent)
     assert own_lines(err) == []
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -701,27 +699,28 @@ sys.exit(cli.main())
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", IN_A_CALLBACK, str(int(sent))]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=10, restore_signals=True)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, restore_signals=True)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (128 + sent, "", 1)
     assert "finished shards are kept; rerun to resume" in done.stderr
 
 
-@pytest.mark.parametrize("number", [6, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [3, pytest.param(40, marks=pytest.mark.slow)])
 def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
     number: int, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
-    """The moments begin 0.3 s after the start, when the command handles signals.
+    """The moments begin when the command handles signals.
 
     A run may also complete if it was nearly done, or if SIGINT arrives in the hundredths of a second for which it is
     ignored while workers start.
     """
-    draw, codes = random.Random(number), Counter[int]()
+    draw, codes, env = random.Random(number), Counter[int](), imported_first(tmp_path, SLOW_DISK)
     for kill in range(number):
         out = tmp_path / str(kill) / "ds"
         out.parent.mkdir()
         sent, n_jobs, group = draw.choice([signal.SIGINT, signal.SIGTERM]), draw.choice([1, 2]), draw.random() < 0.5
-        with running(f"source.root={photographs}", ONE, f"n_jobs={n_jobs}", cwd=out.parent) as process:
-            time.sleep(draw.uniform(0.3, 1.6 * n_jobs))
+        with running(f"source.root={photographs}", ONE, f"n_jobs={n_jobs}", cwd=out.parent, **env) as process:
+            wait_for(lambda pid=process.pid: handles_signals(pid))
+            time.sleep(draw.uniform(0, 1.3 * n_jobs))
             with suppress(ProcessLookupError):
                 (os.killpg if group else os.kill)(process.pid, sent)
             _, err = process.communicate(timeout=5)

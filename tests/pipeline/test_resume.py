@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,10 +21,12 @@ from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.processes import (
     ONE,
+    SLOW_DISK,
     WAIT_S,
     Killed,
     assert_whole,
     committed,
+    imported_first,
     kill_group,
     running,
     session,
@@ -40,6 +43,8 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline.workspace import read_dataset
 
+TWO = "output.pairs_per_shard=2"
+
 
 @pytest.fixture(scope="module")
 def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -55,20 +60,27 @@ def undisturbed(forty: Path, make: Make, tree_hash: TreeHash) -> str:
 # Killed ---------------------------------------------------------------------------------------------------------------
 
 
-def test_run_killed_ten_times_ends_as_if_undisturbed(
-    forty: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path, figure: Figure
+@pytest.mark.parametrize("kills", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_run_killed_repeatedly_ends_as_if_undisturbed(
+    kills: int,
+    forty: Path,
+    undisturbed: str,
+    make: Make,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    figure: Figure,
 ) -> None:
     """Each kill comes a few random milliseconds after a number of shards that grows from kill to kill."""
     moment = random.Random(385)
-    out = tmp_path / "ds"
-    for kill in range(10):
-        with running(f"source.root={forty}", ONE, f"n_jobs={1 + (kill % 3 == 0)}", cwd=tmp_path) as process:
-            wait_for(lambda at=4 * kill: (out.exists() and committed(out) >= at) or process.poll() is not None)
+    out, env = tmp_path / "ds", imported_first(tmp_path, SLOW_DISK)
+    for kill in range(kills):
+        with running(f"source.root={forty}", ONE, f"n_jobs={1 + (kill % 3 == 0)}", cwd=tmp_path, **env) as process:
+            wait_for(lambda at=3 * kill: (out.exists() and committed(out) >= at) or process.poll() is not None)
             time.sleep(moment.uniform(0, 0.05))
             assert process.poll() is None, process.communicate()
             kill_group(process)
         assert not (out / "dataset.json").exists()
-        assert committed(out) >= 4 * kill
+        assert committed(out) >= 3 * kill
     make(forty, out, ONE)
     assert tree_hash(out) == undisturbed
     assert_whole(out)
@@ -79,37 +91,43 @@ FILES = 10
 """Renames of a run with three shards: sources.json, config.yaml, rows and file of each, manifest and dataset.json."""
 
 
-@pytest.mark.parametrize("renamed", [False, True])
+@pytest.fixture(scope="module")
+def six(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make photographs p, and their dataset ds in three shards."""
+    folder = tmp_path_factory.mktemp("six")
+    make(fill(folder / "p", 6), folder / "ds", TWO)
+    return folder
+
+
 @pytest.mark.parametrize("number", range(FILES))
 def test_run_killed_around_any_rename_can_be_resumed(
     number: int,
-    renamed: bool,
+    six: Path,
     make: Make,
     tree_hash: TreeHash,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     figure: Figure,
 ) -> None:
-    source, out = fill(tmp_path / "p", 5), tmp_path / "ds"
-    seen: list[Path] = []
-    replace = os.replace
+    for renamed in (False, True):
+        source, out = six / "p", tmp_path / f"ds-{renamed}"
+        seen: list[Path] = []
+        replace = os.replace
 
-    def stops(old: Any, new: Any) -> None:
-        stop = len(seen) == number and tmp_path in Path(new).parents
-        seen.append(Path(new))
-        if not stop or renamed:
-            replace(old, new)
-        if stop:
-            raise Killed
+        def stops(old: Any, new: Any, renamed: bool = renamed, seen: list[Path] = seen, replace: Any = replace) -> None:
+            stop = len(seen) == number and tmp_path in Path(new).parents
+            seen.append(Path(new))
+            if not stop or renamed:
+                replace(old, new)
+            if stop:
+                raise Killed
 
-    monkeypatch.setattr(os, "replace", stops)
-    with pytest.raises(Killed):
-        make(source, out, "output.pairs_per_shard=2")
-    monkeypatch.undo()
-    make(source, out, "output.pairs_per_shard=2")
-    make(source, tmp_path / "undisturbed", "output.pairs_per_shard=2")
-    assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
-    assert_whole(out)
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(os, "replace", stops)
+            make(source, out, TWO)
+        make(source, out, TWO)
+        assert tree_hash(out) == tree_hash(six / "ds"), renamed
+        assert_whole(out)
     figure("resume", "same bytes after a kill before or after each rename")
 
 
@@ -117,7 +135,7 @@ def test_every_rename_of_a_run_is_tested(make: Make, tmp_path: Path, monkeypatch
     seen: list[str] = []
     replace = os.replace
     monkeypatch.setattr(os, "replace", lambda old, new: (seen.append(Path(new).name), replace(old, new)))
-    make(fill(tmp_path / "p", 5), tmp_path / "ds", "output.pairs_per_shard=2")
+    make(fill(tmp_path / "p", 5), tmp_path / "ds", TWO)
     assert seen == [
         "sources.json", "config.yaml", "00000.json", "shard-00000.tar", "00001.json", "shard-00001.tar", "00002.json",
         "shard-00002.tar", "manifest.csv", "dataset.json",
@@ -149,10 +167,10 @@ def test_files_are_synced_before_their_rename(make: Make, tmp_path: Path, monkey
 # Begun ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def begun(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def begun_template(six: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make photographs p, and a dataset ds of which two shards of three are committed."""
-    source = fill(tmp_path / "p", 6)
+    folder = Path(shutil.copytree(six / "p", tmp_path_factory.mktemp("begun") / "p")).parent
     replace = os.replace
 
     def stops(old: Any, new: Any) -> None:
@@ -160,11 +178,17 @@ def begun(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             raise Killed
         replace(old, new)
 
-    with monkeypatch.context() as patch, pytest.raises(Killed):
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         patch.setattr(os, "replace", stops)
-        make(source, tmp_path / "ds", "output.pairs_per_shard=2")
-    assert committed(tmp_path / "ds") == 2
-    return tmp_path
+        make(folder / "p", folder / "ds", TWO)
+    assert committed(folder / "ds") == 2
+    return folder
+
+
+@pytest.fixture
+def begun(begun_template: Path, tmp_path: Path) -> Path:
+    """Copy photographs p, and a dataset ds of which two shards of three are committed."""
+    return Path(shutil.copytree(begun_template, tmp_path, dirs_exist_ok=True))
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -177,7 +201,7 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 def test_resumed_run_makes_only_missing_shards(begun: Path, make: Make) -> None:
     before = snapshot(begun / "ds/shards")
-    summary = make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    summary = make(begun / "p", begun / "ds", TWO)
     assert (summary.made, summary.rows) == (2, 6)
     after = snapshot(begun / "ds/shards")
     assert {name: after[name] for name in before} == before
@@ -189,38 +213,36 @@ def test_unfinished_shards_are_deleted_at_the_start(begun: Path, make: Make, mon
     there: list[bool] = []
     count_jobs = runner.effective_jobs
     monkeypatch.setattr(runner, "effective_jobs", lambda *given: (there.append(left.exists()), count_jobs(*given))[1])
-    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    make(begun / "p", begun / "ds", TWO)
     assert there == [False]
 
 
 def test_unfinished_files_are_deleted_at_the_end(begun: Path, make: Make) -> None:
     (begun / "ds/.work/tmp/shard-00002.tar.1.1").write_bytes(b"half")
     (begun / "ds/.work/manifest.csv.part").write_text("half")
-    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    make(begun / "p", begun / "ds", TWO)
     assert_whole(begun / "ds")
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: os.truncate(path, 600)], ids=["deleted", "cut off"])
 def test_incomplete_committed_shard_is_regenerated(
-    damage: Callable[[Path], Any], begun: Path, make: Make, tree_hash: TreeHash
+    damage: Callable[[Path], Any], six: Path, begun: Path, make: Make, tree_hash: TreeHash
 ) -> None:
     damage(begun / "ds/shards/shard-00000.tar")
-    summary = make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
-    make(begun / "p", begun / "undisturbed", "output.pairs_per_shard=2")
-    assert summary.made == 4
-    assert tree_hash(begun / "ds") == tree_hash(begun / "undisturbed")
+    assert make(begun / "p", begun / "ds", TWO).made == 4
+    assert tree_hash(begun / "ds") == tree_hash(six / "ds")
 
 
 def test_progress_of_a_resumed_run_counts_finished_images(begun: Path, make: Make, capfd: Any) -> None:
     with logging_to():
-        make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+        make(begun / "p", begun / "ds", TWO)
     assert "gen-dataset: 6/6 images" in capfd.readouterr().err
 
 
 @pytest.fixture
-def finished(begun: Path, make: Make) -> Path:
-    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
-    return begun
+def finished(six: Path, tmp_path: Path) -> Path:
+    """Copy photographs p and their dataset ds."""
+    return Path(shutil.copytree(six, tmp_path, dirs_exist_ok=True))
 
 
 def add(source: Path) -> None:
@@ -260,13 +282,13 @@ def test_changed_settings_or_sources_are_refused_and_change_nothing(
     before = snapshot(folder / "ds")
     change(folder / "p")
     with pytest.raises(ConfigError, match=f"^out=.*/ds: .*{sentence}.*; choose another out, or remove it$"):
-        make(folder / "p", folder / "ds", "output.pairs_per_shard=2", override)
+        make(folder / "p", folder / "ds", TWO, override)
     assert snapshot(folder / "ds") == before
 
 
 def test_scene_run_is_not_resumed_from_a_folder(begun: Path, make: Make) -> None:
     with pytest.raises(ConfigError, match=r"source.kind=synthetic \(there: folder\)"):
-        make(None, begun / "ds", "output.pairs_per_shard=2")
+        make(None, begun / "ds", TWO)
 
 
 # Finished -------------------------------------------------------------------------------------------------------------
@@ -274,7 +296,7 @@ def test_scene_run_is_not_resumed_from_a_folder(begun: Path, make: Make) -> None
 
 def test_rerun_of_a_finished_dataset_reports_nothing_to_do(finished: Path, run_main: RunMain) -> None:
     before = snapshot(finished)
-    done = run_main("source.root=p", "output.pairs_per_shard=2")
+    done = run_main("source.root=p", TWO)
     assert (done.code, done.err) == (0, "")
     assert done.out.startswith("ds is complete: 6 pairs in 3 shards")
     assert done.out.endswith("; nothing to do\n")
@@ -288,7 +310,7 @@ def test_finished_dataset_of_scenes_is_complete(make: Make, tmp_path: Path) -> N
 
 def test_missing_shard_of_a_finished_dataset_is_damage(finished: Path, run_main: RunMain) -> None:
     (finished / "ds/shards/shard-00001.tar").unlink()
-    done = run_main("source.root=p", "output.pairs_per_shard=2")
+    done = run_main("source.root=p", TWO)
     assert (done.code, done.err.count("\n")) == (4, 1)
     assert "shard-00001.tar: is missing, expected " in done.err
 
@@ -296,19 +318,19 @@ def test_missing_shard_of_a_finished_dataset_is_damage(finished: Path, run_main:
 def test_shard_of_another_size_is_damage(finished: Path, make: Make) -> None:
     os.truncate(finished / "ds/shards/shard-00001.tar", 700)
     with pytest.raises(DamageError, match=r"shard-00001.tar: has 700 bytes, expected \d+ bytes"):
-        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+        make(finished / "p", finished / "ds", TWO)
 
 
 def test_finished_dataset_without_manifest_is_damage(finished: Path, make: Make) -> None:
     (finished / "ds/manifest.csv").unlink()
     with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
-        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+        make(finished / "p", finished / "ds", TWO)
 
 
 def test_finished_dataset_without_config_is_damage(finished: Path, make: Make) -> None:
     (finished / "ds/config.yaml").unlink()
     with pytest.raises((DamageError, ConfigError)):
-        make(finished / "p", finished / "ds", "output.pairs_per_shard=2", "seed=1")
+        make(finished / "p", finished / "ds", TWO, "seed=1")
 
 
 @pytest.mark.parametrize(
@@ -324,20 +346,20 @@ def test_unreadable_dataset_file_is_reported_in_one_line(
 ) -> None:
     folder: Path = request.getfixturevalue(state)
     (folder / "ds" / name).write_text("{[")
-    done = run_main("source.root=p", "output.pairs_per_shard=2", "n_jobs=1")
+    done = run_main("source.root=p", TWO, "n_jobs=1")
     assert done.code in (2, 4)
     assert done.err.count("\n") == 1
 
 
 def test_committed_shard_with_unreadable_rows_is_regenerated(begun: Path, make: Make) -> None:
     (begun / "ds/.work/rows/00000.json").write_text("{[")
-    make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+    make(begun / "p", begun / "ds", TWO)
     assert_whole(begun / "ds")
 
 
 def test_work_folder_left_by_a_kill_is_deleted(finished: Path, make: Make) -> None:
     (finished / "ds/.work/rows").mkdir(parents=True)
-    make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+    make(finished / "p", finished / "ds", TWO)
     assert_whole(finished / "ds")
 
 
@@ -371,7 +393,7 @@ def test_folder_with_foreign_files_is_refused_and_unchanged(name: str, make: Mak
 def test_foreign_shard_is_refused(begun: Path, make: Make) -> None:
     (begun / "ds/shards/shard-00009.tar").write_text("stale")
     with pytest.raises(ConfigError, match=r"unexpected file .*shard-00009.tar; expected only committed shards"):
-        make(begun / "p", begun / "ds", "output.pairs_per_shard=2")
+        make(begun / "p", begun / "ds", TWO)
 
 
 def test_folder_locked_by_another_run_is_refused_with_11(run_main: RunMain, tmp_path: Path) -> None:
@@ -388,12 +410,12 @@ def test_folder_locked_by_another_run_is_refused_with_11(run_main: RunMain, tmp_
 
 def test_locked_finished_dataset_is_refused(finished: Path, make: Make) -> None:
     with held(finished / "ds"), pytest.raises(LockedError):
-        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+        make(finished / "p", finished / "ds", TWO)
 
 
 def test_run_locks_its_folder_exclusively(finished: Path, make: Make) -> None:
     with held(finished / "ds", fcntl.LOCK_SH), pytest.raises(LockedError):
-        make(finished / "p", finished / "ds", "output.pairs_per_shard=2")
+        make(finished / "p", finished / "ds", TWO)
 
 
 def test_finished_run_releases_its_folder(finished: Path) -> None:
@@ -439,11 +461,13 @@ class Stopped(NamedTuple):
 
 
 SIGNALS = [(number, group) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) for group in (False, True)]
+QUICK = {(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, True)}
+"""What a terminal sends for Ctrl-C, `kill` sends to one process, and a terminal that closes sends."""
 
 
 @pytest.fixture(
     scope="module",
-    params=SIGNALS,
+    params=[pytest.param(sent, marks=() if sent in QUICK else pytest.mark.slow) for sent in SIGNALS],
     ids=[f"{number.name}{' to the group' if group else ''}" for number, group in SIGNALS],
 )
 def stopped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
@@ -478,7 +502,9 @@ def test_signal_prints_only_lines_of_gen_dataset(stopped: Stopped) -> None:
     assert others == []
 
 
+@pytest.mark.slow
 def test_workers_end_when_their_coordinator_is_killed(tmp_path: Path) -> None:
+    """`test_orphaned_workers_do_not_disturb_the_next_run` is the quick form."""
     with running(*LONG, cwd=tmp_path) as process:
         wait_for(lambda: committed(tmp_path / "ds"))
         assert len(workers(process.pid)) == 2
@@ -502,7 +528,7 @@ def deadly(data=b"", **options):
 
 hashlib.sha256 = deadly
 """
-"""Module that every process of a run imports first: hashing one photograph kills the worker a number of times."""
+"""Module for `imported_first`: hashing one photograph kills the worker a number of times."""
 
 TWELVE = ("source.root=p", "output.pairs_per_shard=4", "n_jobs=2")
 
@@ -510,11 +536,9 @@ TWELVE = ("source.root=p", "output.pairs_per_shard=4", "n_jobs=2")
 def run_with_deaths(cli: Cli, folder: Path, deaths: int) -> subprocess.CompletedProcess[str]:
     """Make a dataset of twelve photographs; the tenth, in the third shard, kills its worker."""
     fill(folder / "p", 12)
-    (folder / "site").mkdir()
-    (folder / "site/sitecustomize.py").write_text(DEADLY)
     (folder / "deaths").write_text(str(deaths))
-    path = os.pathsep.join([str(folder / "site"), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return cli(*TWELVE, PYTHONPATH=path, DEATHS=str(folder / "deaths"), KILLER=str(folder / "p/009.png"))
+    env = imported_first(folder, DEADLY)
+    return cli(*TWELVE, **env, DEATHS=str(folder / "deaths"), KILLER=str(folder / "p/009.png"))
 
 
 @pytest.fixture(scope="module")
@@ -524,9 +548,11 @@ def twelve_undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest
     return tree_hash(folder / "ds")
 
 
+@pytest.mark.slow
 def test_worker_that_dies_once_changes_no_byte(
     twelve_undisturbed: str, cli: Cli, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
+    """`test_killed_worker_is_noticed_within_five_seconds` is the quick form."""
     done = run_with_deaths(cli, tmp_path, deaths=1)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "deaths").read_text() == "0"
@@ -577,8 +603,8 @@ def test_failed_write_ends_with_5_and_a_rerun_finishes(make: Make, tree_hash: Tr
     assert committed(tmp_path / "ds") == 3
     assert list((tmp_path / "ds/.work/tmp").iterdir()) == []
     make(source, tmp_path / "ds", ONE)
-    make(source, tmp_path / "twelve_undisturbed", ONE)
-    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "twelve_undisturbed")
+    make(source, tmp_path / "undisturbed", ONE)
+    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")
 
 
 def test_deleted_out_is_a_system_error(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
