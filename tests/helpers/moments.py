@@ -48,8 +48,9 @@ def shares(mean: float, std: float, low: int, high: int) -> tuple[NDArray[np.int
     first = min(max(math.floor(mean - 9 * std), low), high)
     last = min(max(math.ceil(mean + 9 * std), low), high)
     levels = np.arange(first, last + 1)
-    z = (levels[:-1] + 0.5 - mean) / std  # the edges between neighbours, each seen from its own tail
-    above, below = upper_tail(z), upper_tail(-z)
+    z = (levels[:-1] + 0.5 - mean) / std  # the edges between neighbours
+    tail = upper_tail(np.abs(z))
+    above, below = np.where(z < 0, 1 - tail, tail), np.where(z < 0, tail, 1 - tail)
     from_above = np.concatenate([[1.0], above]) - np.concatenate([above, [0.0]])
     from_below = np.concatenate([below, [1.0]]) - np.concatenate([[0.0], below])
     return levels, np.where(levels > mean, from_above, from_below)

@@ -1,22 +1,21 @@
 """Datasets are identical on other processors, with other libraries, compilers and environments.
 
-Each test makes one small dataset in a new process under a setting that changes the code path of a library, and compares
-every byte with a plain run. The process reports whether the setting took effect (`everywhere`); a setting that a
-library no longer knows proves nothing.
+Each test makes one small dataset in a new process under settings that change the code path of a library, and compares
+every byte with a plain run. The process reports whether the settings took effect (`everywhere`); a setting that a
+library no longer knows proves nothing. A quick test applies all settings of libraries at once. Slow tests apply them
+one by one, to name the setting that changes a byte; they also compile the kernels with other options.
 
 A change in the last place of a double changes one DN in 10^12 sites, so that bytes alone could miss it. Doubles before
 rounding are therefore compared too, and the machine code of the kernels is inspected for x86-64 with AVX-512, Arm and
-RISC-V. `test_runner` covers order and time of creation, time zone, umask, working directory, hash seed, LC_ALL=C, one
-and two workers. For emulated 64-bit Arm and an old x86-64, see `everywhere`.
+RISC-V. `tests/pipeline` covers order and time of creation, time zone, umask, working directory, hash seed, LC_ALL=C,
+one and two workers. For emulated 64-bit Arm and an old x86-64, see `everywhere`.
 """
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import io
 import json
-import math
 import platform
 import re
 import signal
@@ -88,7 +87,6 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Make:
     """Return a function that makes the dataset in a new process: Python and its flags, n_jobs, environment."""
-    shared_cache = tmp_path_factory.mktemp("kernels")
 
     def made(*python: str | Path, n_jobs: int = 1, **env: str) -> Made:
         folder = tmp_path_factory.mktemp("made")
@@ -104,7 +102,7 @@ def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: 
         done = subprocess.run(
             [str(part) for part in command],
             cwd=folder,
-            env=environment(**{"NUMBA_CACHE_DIR": str(shared_cache), **env}),
+            env=environment(**env),
             capture_output=True,
             text=True,
             timeout=300,
@@ -119,11 +117,19 @@ def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: 
 
 @pytest.fixture(scope="module")
 def plain(make: Make) -> Made:
-    """The plain dataset, made by freshly compiled kernels, which the other tests load from the cache."""
+    """Return the plain dataset, made without any setting."""
     made = make()
-    assert made.facts["kernels"]["compiled"]
     statuses = re.findall(",(ok|failed),(?:corrupt)?,", (made.out / "manifest.csv").read_text(encoding="utf-8"))
     assert sorted(statuses) == ["failed"] * 2 + ["ok"] * 9
+    return made
+
+
+@pytest.fixture(scope="module")
+def compiled(make: Make, plain: Made, tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """Return the plain dataset made by freshly compiled kernels, which alone report their machine code."""
+    made = make(NUMBA_CACHE_DIR=str(tmp_path_factory.mktemp("kernels")))
+    assert made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
+    assert_same(made, plain)
     return made
 
 
@@ -139,9 +145,53 @@ def assert_same(made: Made, plain: Made) -> None:
     assert made.facts["doubles"] == plain.facts["doubles"]
 
 
+# All settings at once -------------------------------------------------------------------------------------------------
+
+ENABLED = [
+    name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
+]
+"""Instruction sets that NumPy uses on this machine, lowest first."""
+
+WITHOUT_FMA = "glibc.cpu.hwcaps=" + ",".join(
+    f"-{name}" for name in ("AVX2", "FMA", "FMA4", "AVX2_Usable", "FMA_Usable")
+)
+
+SURROUNDINGS = {
+    "LC_ALL": "tr_TR.UTF-8",
+    "MALLOC_PERTURB_": "165",
+    "OPENCV_LOG_LEVEL": "SILENT",
+    "OPENCV_IO_MAX_IMAGE_PIXELS": "100",
+}
+
+
+def without_vector_code(plain: Made) -> dict[str, str]:
+    """Return the settings that disable all optional vector code of OpenCV."""
+    return {"OPENCV_CPU_DISABLE": ",".join(plain.facts["opencv"]), "OPENCV_IPP": "disabled"}
+
+
+def test_all_settings_together_change_no_byte(make: Make, plain: Made, figure: Figure) -> None:
+    """Libraries use their oldest code, and Python's assertions are off."""
+    libraries = {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
+
+    made = make(sys.executable, "-O", **SURROUNDINGS, **libraries, **without_vector_code(plain))
+
+    assert made.facts["optimize"] == 1
+    assert (made.facts["numpy"], made.facts["opencv"], made.facts["ipp"]) == ([], [], False)
+    assert_same(made, plain)
+    figure("machines", f"same bytes in {len(files(plain))} files")
+
+
+def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
+    made = make(NUMBA_DISABLE_JIT="1")
+
+    assert not made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
+    assert_same(made, plain)
+
+
 # Surroundings ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_more_workers_than_cores_change_no_byte(make: Make, plain: Made) -> None:
     made = make(n_jobs=8)
 
@@ -149,20 +199,15 @@ def test_more_workers_than_cores_change_no_byte(make: Make, plain: Made) -> None
     assert made.tree == plain.tree
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("LC_ALL", "C.UTF-8"),
-        ("LC_ALL", "tr_TR.UTF-8"),
-        pytest.param("LANG", "tr_TR.UTF-8", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "value"), [("LC_ALL", "C.UTF-8"), ("LC_ALL", "tr_TR.UTF-8"), ("LANG", "tr_TR.UTF-8")])
 def test_no_locale_changes_a_byte(name: str, value: str, make: Make, plain: Made, figure: Figure) -> None:
     assert_same(make(**{"LC_ALL": "", name: value}), plain)
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
-@pytest.mark.parametrize(("flag", "level"), [("-O", 1), pytest.param("-OO", 2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("flag", "level"), [("-O", 1), ("-OO", 2)])
 def test_python_without_assertions_changes_no_byte(
     flag: str, level: int, make: Make, plain: Made, figure: Figure
 ) -> None:
@@ -173,15 +218,14 @@ def test_python_without_assertions_changes_no_byte(
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
+@pytest.mark.slow
 def test_the_content_of_fresh_memory_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
     assert_same(make(MALLOC_PERTURB_="165"), plain)
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_IO_MAX_IMAGE_PIXELS", "100")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "value"), [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_IO_MAX_IMAGE_PIXELS", "100")])
 def test_no_opencv_setting_changes_a_byte(name: str, value: str, make: Make, plain: Made, figure: Figure) -> None:
     assert_same(make(**{name: value}), plain)
     figure("machines", f"same bytes in {len(files(plain))} files")
@@ -218,12 +262,8 @@ def test_a_photograph_is_not_corrupt_when_memory_is_short(photographs: Path, tmp
 
 # Processors, as libraries see them ------------------------------------------------------------------------------------
 
-ENABLED = [
-    name for name in np._core._multiarray_umath.__cpu_dispatch__ if np._core._multiarray_umath.__cpu_features__[name]
-]
-"""What NumPy chooses between on this machine, under the names of this NumPy, lowest first."""
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", [ENABLED[:i] for i in range(len(ENABLED))], ids=lambda kept: "+".join(kept) or "none")
 def test_numpys_instruction_sets_change_no_byte(kept: list[str], make: Make, plain: Made, figure: Figure) -> None:
     made = make(NPY_DISABLE_CPU_FEATURES=" ".join(name for name in ENABLED if name not in kept))
@@ -233,10 +273,8 @@ def test_numpys_instruction_sets_change_no_byte(kept: list[str], make: Make, pla
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
-@pytest.mark.parametrize(
-    "core",
-    ["Prescott", *(pytest.param(core, marks=pytest.mark.slow) for core in ("Nehalem", "Haswell", "Zen", "SkylakeX"))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("core", ["Prescott", "Nehalem", "Haswell", "Zen", "SkylakeX"])
 def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made, figure: Figure) -> None:
     product = "import numpy; numpy.ones((50, 50)) @ numpy.ones((50, 50))"
     tried = subprocess.run([sys.executable, "-c", product], env=environment(OPENBLAS_CORETYPE=core), check=False)
@@ -251,11 +289,12 @@ def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made, fig
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
+@pytest.mark.slow
 def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
     if not plain.facts["opencv"]:
         pytest.skip("this OpenCV has one kind of code only")
 
-    made = make(OPENCV_CPU_DISABLE=",".join(plain.facts["opencv"]), OPENCV_IPP="disabled")
+    made = make(**without_vector_code(plain))
 
     assert made.facts["opencv"] == []
     assert not made.facts["ipp"]
@@ -263,10 +302,9 @@ def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made, fig
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
+@pytest.mark.slow
 def test_a_c_library_without_fma_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
-    hidden = ",".join(f"-{name}" for name in ("AVX2", "FMA", "FMA4", "AVX2_Usable", "FMA_Usable"))
-
-    made = make(GLIBC_TUNABLES=f"glibc.cpu.hwcaps={hidden}")
+    made = make(GLIBC_TUNABLES=WITHOUT_FMA)
 
     if made.facts["libm"] == plain.facts["libm"]:
         pytest.skip("the C library computes sines, powers and logarithms as before")
@@ -300,36 +338,32 @@ def test_jpegs_have_the_same_pixels_without_vector_code(photographs: Path) -> No
 
 # Compilers ------------------------------------------------------------------------------------------------------------
 
+
 GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_INTEL_SVML": "1"}
+"""Compile for any processor of this architecture."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "env",
     [
         pytest.param(GENERIC, id="for any processor"),
-        pytest.param({"NUMBA_OPT": "0"}, id="not optimised", marks=pytest.mark.slow),
-        pytest.param({"NUMBA_OPT": "1"}, id="hardly optimised", marks=pytest.mark.slow),
-        pytest.param({"NUMBA_LOOP_VECTORIZE": "0"}, id="not vectorised", marks=pytest.mark.slow),
-        pytest.param({"NUMBA_BOUNDSCHECK": "1"}, id="within bounds", marks=pytest.mark.slow),
+        pytest.param({"NUMBA_OPT": "0"}, id="not optimised"),
+        pytest.param({"NUMBA_OPT": "1"}, id="hardly optimised"),
+        pytest.param({"NUMBA_LOOP_VECTORIZE": "0"}, id="not vectorised"),
+        pytest.param({"NUMBA_BOUNDSCHECK": "1"}, id="within bounds"),
     ],
 )
 def test_other_compiler_options_change_no_byte(
-    env: dict[str, str], make: Make, plain: Made, tmp_path: Path, figure: Figure
+    env: dict[str, str], make: Make, compiled: Made, tmp_path: Path, figure: Figure
 ) -> None:
     made = make(NUMBA_CACHE_DIR=str(tmp_path), **env)
 
     assert made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
-    assert made.facts["kernels"]["code"] != plain.facts["kernels"]["code"]
+    assert made.facts["kernels"]["code"] != compiled.facts["kernels"]["code"]
     assert env is not GENERIC or not made.facts["kernels"]["ymm"]
-    assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
-    made = make(NUMBA_DISABLE_JIT="1")
-
-    assert not made.facts["kernels"]["compiled"] and not made.facts["kernels"]["loaded"]
-    assert_same(made, plain)
+    assert_same(made, compiled)
+    figure("machines", f"same bytes in {len(files(compiled))} files")
 
 
 @pytest.fixture(scope="module")
@@ -381,79 +415,6 @@ def test_kernels_call_only_exact_functions(code: dict[str, Any]) -> None:
     loads = {name for name in called if re.match(r"masked\.(load|gather)\.v\d+f(32|64)\.", name)}
     read = {"PyFloat_AsDouble", "PyNumber_Float"}  # arguments
     assert called - loads - read <= {"sqrt", "floor", "fabs"}
-
-
-# Functions that modules may call --------------------------------------------------------------------------------------
-
-EXACT_FUNCTIONS = {
-    *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc"),
-    *("minimum", "maximum", "copysign", "isfinite", "isnan", "fabs", "frexp", "ldexp", "gcd", "nextafter", "prod"),
-}
-"""Functions of NumPy and `math` whose results IEEE 754 or integer arithmetic determines."""
-
-UNORDERED_SUMS = {
-    *("dot", "vdot", "inner", "matmul", "tensordot", "einsum", "linalg", "fft", "convolve", "correlate", "interp"),
-    *("sum", "mean", "average", "var", "std", "polyval", "polyfit"),
-}
-ALLOWED_IN_OPENCV = {"imdecode", "error", "getNumThreads", "setNumThreads", "utils"}
-
-OUTSIDE_OUTPUT = {
-    *("core/exact_distributions.py", "core/lookup_tables.py", "core/tone_curves.py"),
-    *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
-    "config/noise_validation.py",  # a logarithm decides only whether a config is refused
-    *("dataset/dng.py", "reports"),
-}
-"""Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables
-with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""
-
-PACKAGE = ROOT / "unprocess_gen"
-MODULES = [
-    path
-    for path in sorted(PACKAGE.rglob("*.py"))
-    if not any(path.is_relative_to(PACKAGE / outside) for outside in OUTSIDE_OUTPUT)
-]
-
-
-def inexact_operations(source: str) -> list[str]:
-    """Return the expressions of a module that machines may round differently."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        match node:
-            case ast.BinOp(op=ast.MatMult()) | ast.Call(func=ast.Name(id="pow")):
-                found.append(node)
-            case ast.BinOp(op=ast.Pow(), left=ast.Constant()) | ast.BinOp(op=ast.Pow(), right=ast.Constant(value=2)):
-                pass
-            case ast.BinOp(op=ast.Pow()):
-                found.append(node)
-            case ast.Attribute(value=ast.Name(id="np"), attr=name) if name not in EXACT_FUNCTIONS:
-                found += [node] * (isinstance(getattr(np, name, None), np.ufunc) or name in UNORDERED_SUMS)
-            case ast.Attribute(value=ast.Name(id="math"), attr=name) if name not in EXACT_FUNCTIONS:
-                found += [node] * callable(getattr(math, name))
-            case ast.Attribute(value=ast.Name(id="cv2"), attr=name) if not name.startswith("IMREAD_"):
-                found += [node] * (name not in ALLOWED_IN_OPENCV)
-    return [ast.unparse(node) for node in found]
-
-
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_modules_call_no_function_that_machines_round_differently(path: Path) -> None:
-    assert inexact_operations(path.read_text(encoding="utf-8")) == []
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "a @ b",
-        "np.exp(a)",
-        "np.einsum('ij,j', a, b)",
-        "math.log(2)",
-        "a ** 2.2",
-        "a ** b",
-        "pow(a, b)",
-        "cv2.resize(a)",
-    ],
-)
-def test_functions_that_round_differently_are_found(line: str) -> None:
-    assert inexact_operations(line)
 
 
 # Versions -------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,80 @@
+"""Modules that decide bytes of a dataset call only operations that every machine rounds alike."""
+
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "unprocess_gen"
+
+EXACT_FUNCTIONS = {
+    *("abs", "add", "subtract", "multiply", "divide", "sqrt", "square", "rint", "floor", "ceil", "trunc"),
+    *("minimum", "maximum", "copysign", "isfinite", "isnan", "fabs", "frexp", "ldexp", "gcd", "nextafter", "prod"),
+}
+"""Functions of NumPy and `math` whose results IEEE 754 or integer arithmetic determines."""
+
+UNORDERED_SUMS = {
+    *("dot", "vdot", "inner", "matmul", "tensordot", "einsum", "linalg", "fft", "convolve", "correlate", "interp"),
+    *("sum", "mean", "average", "var", "std", "polyval", "polyfit"),
+}
+ALLOWED_IN_OPENCV = {"imdecode", "error", "getNumThreads", "setNumThreads", "utils"}
+
+OUTSIDE_OUTPUT = {
+    *("core/exact_distributions.py", "core/lookup_tables.py", "core/tone_curves.py"),
+    *("simulation/reference/isp.py", "simulation/reference/unprocess.py"),
+    "config/noise_validation.py",  # a logarithm decides only whether a config is refused
+    *("dataset/dng.py", "reports"),
+}
+"""Paths below the package of modules that no byte of a dataset depends on, or that cannot differ: `decimal`, tables
+with a checked SHA-256, the formulas of the reference, its inverse, measurements, drawings and exports."""
+
+
+def inexact_operations(source: str) -> list[str]:
+    """Return the expressions of a module that machines may round differently."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.BinOp(op=ast.MatMult()) | ast.Call(func=ast.Name(id="pow")):
+                found.append(node)
+            case ast.BinOp(op=ast.Pow(), left=ast.Constant()) | ast.BinOp(op=ast.Pow(), right=ast.Constant(value=2)):
+                pass
+            case ast.BinOp(op=ast.Pow()):
+                found.append(node)
+            case ast.Attribute(value=ast.Name(id="np"), attr=name) if name not in EXACT_FUNCTIONS:
+                found += [node] * (isinstance(getattr(np, name, None), np.ufunc) or name in UNORDERED_SUMS)
+            case ast.Attribute(value=ast.Name(id="math"), attr=name) if name not in EXACT_FUNCTIONS:
+                found += [node] * callable(getattr(math, name))
+            case ast.Attribute(value=ast.Name(id="cv2"), attr=name) if not name.startswith("IMREAD_"):
+                found += [node] * (name not in ALLOWED_IN_OPENCV)
+    return [ast.unparse(node) for node in found]
+
+
+def test_modules_call_no_function_that_machines_round_differently() -> None:
+    found = {
+        str(path.relative_to(PACKAGE)): inexact_operations(path.read_text(encoding="utf-8"))
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if not any(path.is_relative_to(PACKAGE / outside) for outside in OUTSIDE_OUTPUT)
+    }
+    assert len(found) > 50
+    assert {name: operations for name, operations in found.items() if operations} == {}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "a @ b",
+        "np.exp(a)",
+        "np.einsum('ij,j', a, b)",
+        "math.log(2)",
+        "a ** 2.2",
+        "a ** b",
+        "pow(a, b)",
+        "cv2.resize(a)",
+    ],
+)
+def test_functions_that_round_differently_are_found(line: str) -> None:
+    assert inexact_operations(line)
