@@ -1,6 +1,12 @@
-"""Approximate normal deviates are within their error, and exact ones equal the reference bit for bit."""
+"""Approximate normal deviates are within their error, and exact ones equal the reference bit for bit.
+
+Quick tests try all words next to the ends of the table's lines and 10^5 random ones; slow tests try up to 2^31.
+"""
 
 from __future__ import annotations
+
+import functools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -49,37 +55,51 @@ def exact(words: np.ndarray, law: QuantileTables) -> np.ndarray:
     return out
 
 
-def telling_words() -> np.ndarray:
-    """Return the words next to the ends of every line, words that float32 rounds up there, and random words."""
+@functools.cache
+def telling_words(random_bits: int) -> np.ndarray:
+    """Return the words next to the ends of every line, words that float32 rounds up there, and random words.
+
+    There are ``2**random_bits`` random words of uniform index and half as many of uniform logarithm, of either sign.
+    """
     ends = (
         (2.0 ** np.arange(-1, 31)[:, None] * (1 + np.arange(LINES_PER_OCTAVE) / LINES_PER_OCTAVE))
         .ravel()
         .astype(np.int64)
     )
     spread = np.concatenate([ends[:, None] + np.arange(-3, 4), ends[:, None] - 2 ** np.arange(8)], axis=1).ravel()
-    random = np.random.default_rng(1).integers(0, SIGN, 2**21)
-    tails = (2 ** (31 * np.random.default_rng(2).random(2**20))).astype(np.int64)
+    random = np.random.default_rng(1).integers(0, SIGN, 2**random_bits)
+    tails = (2 ** (31 * np.random.default_rng(2).random(2 ** (random_bits - 1)))).astype(np.int64)
     last = SIGN - 1 - np.arange(300)
     index = np.unique(np.clip(np.concatenate([spread, random, tails, last]), 0, SIGN - 1))
     return np.concatenate([index, index + SIGN]).astype(np.uint32)
 
 
-LAWS = {"normal": normal_table(), **{f"tukey {shape}": tukey_table(shape) for shape in (0.0, 0.1571, 1.0, -0.2429)}}
+LAWS: dict[str, Callable[[], np.ndarray]] = {
+    "normal": normal_table,
+    **{f"tukey {shape}": functools.partial(tukey_table, shape) for shape in (0.0, 0.1571, 1.0, -0.2429)},
+}
+RANDOM_BITS = [pytest.param(16, id="few words"), pytest.param(21, id="many words", marks=pytest.mark.slow)]
 
 
+@functools.cache
+def reference(law: str, random_bits: int) -> np.ndarray:
+    return effects.by_inverse_cdf(telling_words(random_bits), LAWS[law]())
+
+
+@pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("law", LAWS)
-def test_approximate_values_are_within_their_error_bound(law: str) -> None:
-    table, words = LAWS[law], telling_words()
-    form = build_quantile_tables(table)
-    off = np.abs(quick(words, form) - effects.by_inverse_cdf(words, table))
+def test_approximate_values_are_within_their_error_bound(law: str, random_bits: int) -> None:
+    form = build_quantile_tables(LAWS[law]())
+    off = np.abs(quick(telling_words(random_bits), form) - reference(law, random_bits))
     assert off.max() <= form.error
     assert off.max() > form.error / 20  # nor is the claim far too wide
 
 
+@pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("law", LAWS)
-def test_the_exact_value_of_a_word_equals_the_reference(law: str) -> None:
-    words = telling_words()
-    assert (exact(words, build_quantile_tables(LAWS[law])) == effects.by_inverse_cdf(words, LAWS[law])).all()
+def test_the_exact_value_of_a_word_equals_the_reference(law: str, random_bits: int) -> None:
+    found = exact(telling_words(random_bits), build_quantile_tables(LAWS[law]()))
+    assert (found == reference(law, random_bits)).all()
 
 
 def test_approximate_normals_are_within_1e_5() -> None:
@@ -103,23 +123,25 @@ POLYNOMIALS = {
 
 
 def by_polynomial(words: np.ndarray, which: str) -> np.ndarray:
-    whole = np.resize(words, -(-words.size // 8) * 8)
-    depths, out = np.empty((2, whole.size), dtype=np.float32)
-    POLYNOMIALS[which][0](whole, depths, out)
+    padded = np.resize(words, -(-words.size // 8) * 8)
+    depths, out = np.empty((2, padded.size), dtype=np.float32)
+    POLYNOMIALS[which][0](padded, depths, out)
     return out[: words.size].astype(np.float64)
 
 
+@pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("which", POLYNOMIALS)
-def test_polynomial_normals_are_within_their_error(which: str, figure: Figure) -> None:
-    words, error = telling_words(), POLYNOMIALS[which][1]
-    off = np.abs(by_polynomial(words, which) - effects.normals(words))
+def test_polynomial_normals_are_within_their_error(which: str, random_bits: int, figure: Figure) -> None:
+    error = POLYNOMIALS[which][1]
+    off = np.abs(by_polynomial(telling_words(random_bits), which) - reference("normal", random_bits))
     assert 0.9 * error < off.max() <= error
-    figure("normal", f"{which} polynomial: at most {off.max():.2g} standard deviations off, {words.size} words")
+    figure("normal", f"{which} polynomial: at most {off.max():.2g} standard deviations off, {off.size} words")
 
 
+@pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("which", POLYNOMIALS)
-def test_polynomial_normals_have_the_sign_of_their_word(which: str) -> None:
-    words = telling_words()
+def test_polynomial_normals_have_the_sign_of_their_word(which: str, random_bits: int) -> None:
+    words = telling_words(random_bits)
     half = words.size // 2
     made = by_polynomial(words, which)
     assert (made[:half] == -made[half:]).all()
