@@ -11,7 +11,8 @@ import sys
 import threading
 from types import FrameType
 
-ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""SIGINT, SIGTERM and, except on Windows, SIGHUP."""
 
 
 class TerminationSignal(BaseException):
@@ -70,9 +71,17 @@ class Signals:
         elif self.received is not None:
             if self._timer is not None:
                 self._timer.cancel()
-            self._timer = threading.Timer(self.REPEAT_S, os.kill, (os.getpid(), self.received))
+            self._timer = threading.Timer(self.REPEAT_S, _send, (self.received,))
             self._timer.daemon = True
             self._timer.start()
+
+
+def _send(number: int) -> None:
+    """Send a signal to this process."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)  # os.kill ends the process there
+    else:
+        os.kill(os.getpid(), number)  # interrupts the main thread's system call, unlike raise_signal
 
 
 SIGNALS = Signals()

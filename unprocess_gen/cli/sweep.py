@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import hashlib
 import os
 import uuid
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.locks import FolderLock
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -164,14 +164,14 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the kernel's lock of a folder; a file system without locks is used without one."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    """Hold the lock of a folder; a file system without locks is used without one."""
+    lock = FolderLock(folder)
+    with suppress(OSError):
+        lock.acquire(wait=True)
     try:
-        with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
         yield
     finally:
-        os.close(handle)
+        lock.release()
 
 
 def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:

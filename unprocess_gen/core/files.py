@@ -1,4 +1,4 @@
-"""Hash, sync and rename files; turn operating-system errors into one sentence."""
+"""Hash, sync and rename files; check relative paths; turn operating-system errors into one sentence."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import shutil
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -128,13 +129,33 @@ def commit_file(temporary: Path, path: Path) -> None:
     """
     sync(temporary)
     os.replace(temporary, path)
-    sync(path.parent)
+    if sys.platform != "win32":  # Windows opens no folders
+        sync(path.parent)
 
 
 def sync(path: Path) -> None:
     """Make a file's contents, or a folder's renames, survive a loss of power."""
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(
+        path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
+    )  # Windows syncs only what it may write
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def leads_outside(path: str) -> bool:
+    """Return whether a relative path leads out of the folder that it is relative to.
+
+    Parameters
+    ----------
+    path : str
+        A path with ``/`` between its segments. On Windows, backslashes separate segments too.
+
+    Returns
+    -------
+    bool
+        True for an absolute path, a path with a drive, and a path with a ``..`` segment.
+    """
+    path = path.replace(os.sep, "/")
+    return path.startswith("/") or ".." in path.split("/") or os.path.splitdrive(path)[0] != ""

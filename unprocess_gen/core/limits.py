@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-import resource
+import sys
 
 from unprocess_gen.core.errors import MachineError
+
+if sys.platform != "win32":
+    import resource
 
 LEAST_ADDRESS_SPACE = 3 * 2**28
 """Bytes of ``ulimit -v`` below which libraries crash instead of raising MemoryError.
@@ -22,9 +25,10 @@ def prepare_libraries() -> None:
         If ``ulimit -v`` is below `LEAST_ADDRESS_SPACE`.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
-        raise MachineError(
-            f"ulimit -v {limit // 1024}: not enough address space; expected at least "
-            f"{LEAST_ADDRESS_SPACE // 1024} (KiB); raise the limit"
-        )
+    if sys.platform != "win32":
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_SPACE:
+            raise MachineError(
+                f"ulimit -v {limit // 1024}: not enough address space; expected at least "
+                f"{LEAST_ADDRESS_SPACE // 1024} (KiB); raise the limit"
+            )

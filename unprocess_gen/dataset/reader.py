@@ -250,6 +250,6 @@ def read_sweep_table(table: Path) -> list[tuple[str, str]]:
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise DamageError(f"{table}: not the table of a sweep ({error})") from error
     for folder, _ in jobs:
-        if folder in ("", ".", "..") or "/" in folder or "\0" in folder:
+        if folder in ("", "..") or Path(folder).name != folder or "\0" in folder:
             raise DamageError(f"{table}: folder={folder[:60]!r}: expected the name of a folder next to the table")
     return jobs

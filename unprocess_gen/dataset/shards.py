@@ -400,18 +400,18 @@ def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dic
     dict of str to ndarray
         Intact frames of each sample, by member.
     """
-    content = np.memmap(path, np.uint8, "r") if path.is_file() and path.stat().st_size else np.empty(0, np.uint8)
-    at = 0
-    for sample in samples:
-        size, head = sample.array.size, len(sample.array.header)
-        frames = {}
-        for member, digest in sample.frames:
-            frame = content[at + RECORD + head :][:size]
-            at += RECORD + head + size + _padding(head + size)
-            if len(frame) == size and xxhash.xxh3_128_hexdigest(frame.data) == digest:
-                frames[member] = frame.view(sample.array.description).reshape(sample.array.shape)
-        at += RECORD + len(sample.json) + _padding(len(sample.json))
-        yield frames
+    with path.open("rb") if path.is_file() else io.BytesIO() as stream:
+        at = 0
+        for sample in samples:
+            size, head = sample.array.size, len(sample.array.header)
+            frames = {}
+            for member, digest in sample.frames:
+                content = _read_at(stream, Member(at + RECORD + head, size))
+                at += RECORD + head + size + _padding(head + size)
+                if len(content) == size and xxhash.xxh3_128_hexdigest(content) == digest:
+                    frames[member] = np.frombuffer(content, sample.array.description).reshape(sample.array.shape)
+            at += RECORD + len(sample.json) + _padding(len(sample.json))
+            yield frames
 
 
 def json_inside(path: Path) -> list[bytes]:

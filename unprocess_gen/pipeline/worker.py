@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -151,7 +152,8 @@ def _prepare_process(coordinator_pid: int) -> None:
     keep_memory()
     if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        threading.Thread(target=_exit_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
+        if sys.platform != "win32":  # there, os.getppid does not change when the parent process ends
+            threading.Thread(target=_exit_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()
 
 
 @contextmanager

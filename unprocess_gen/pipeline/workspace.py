@@ -11,15 +11,13 @@
 
 Only the coordinator renames files to their final names: it syncs them first, and commits a shard's rows before the
 shard. So a committed shard has its rows whenever a run is killed, and everything else is regenerated to the same bytes.
-The lock is the kernel's (flock on the folder): it needs no file and ends with the process. Syncing and renaming take
-45 ms per shard.
+The lock (`core.locks`) ends with the process. Syncing and renaming take 45 ms per shard.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import itertools
 import json
@@ -36,6 +34,7 @@ from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
 from unprocess_gen.core.files import RESUME, commit_file, machine_error
+from unprocess_gen.core.locks import FolderLock, NoLocksError
 from unprocess_gen.core.output_paths import enclosing_dataset
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.columns import NAMES
@@ -61,7 +60,7 @@ class Workspace:
         self.tmp = self.work / "tmp"
         self.rows = self.work / "rows"
         self.shards = out / "shards"
-        self._lock: int | None = None
+        self._lock = FolderLock(out)
 
     def __enter__(self) -> Workspace:
         return self
@@ -71,9 +70,7 @@ class Workspace:
 
     def close(self) -> None:
         """Release the lock."""
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+        self._lock.release()
 
     def open(self) -> None:
         """Create the folder if needed, and lock it.
@@ -92,19 +89,17 @@ class Workspace:
     def hold(self) -> None:
         """Lock an existing folder; raise LockedError or ConfigError as `open` does."""
         try:
-            self._lock = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        except OSError as error:
-            raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock.acquire(wait=False)
         except BlockingIOError:
             raise LockedError(
                 f"out={self.out}: another run is writing to it; wait for that run, or choose another out"
             ) from None
-        except OSError as error:
+        except NoLocksError as error:
             raise ConfigError(
                 f"out={self.out}: this file system cannot lock it ({error.strerror}); choose another out"
             ) from error
+        except OSError as error:
+            raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
 
     def _refuse_datasets_around(self) -> None:
         """Refuse a folder inside a dataset, finished or begun, which would become a foreign file of that dataset."""

@@ -25,6 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, TypeVar
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.files import leads_outside
 from unprocess_gen.core.types import NO_CLIP, Row, Source
 
 _Result = TypeVar("_Result")
@@ -50,7 +51,9 @@ Stamp = tuple[int, int, int, int]
 """Device, inode, size in bytes and modification time in nanoseconds of a file."""
 
 # A pipe that replaced a listed file must not block the open for ever.
-_OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOCTTY", 0)
+_OPEN_FLAGS = os.O_RDONLY
+for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # the last only on Windows, the others only elsewhere
+    _OPEN_FLAGS |= getattr(os, _flag, 0)
 
 _BROKEN_LINK = (errno.ENOENT, errno.ELOOP, errno.ENOTDIR)
 
@@ -242,7 +245,7 @@ def source_file(root: str, path: str) -> str:
         With reason ``unreadable`` if ``path`` is absolute or contains ``..``; listings contain no such path, only
         manifests that were edited.
     """
-    if path.startswith("/") or ".." in path.split("/"):
+    if leads_outside(path):
         raise SourceError("unreadable", f"{encode_name(path)} leads outside source.root")
     if Path(root).name == path and not Path(root).is_dir():
         return root
@@ -456,7 +459,10 @@ def _scan(root: str, folder: str, matches: Callable[[str], bool]) -> list[_Entry
 
 def _entry(entry: os.DirEntry[str], path: str, matched: bool) -> _Entry:
     try:
-        return _Entry(path, matched, entry.stat())
+        status = entry.stat()
+        if stat.S_ISDIR(status.st_mode) and not status.st_ino:
+            status = Path(entry.path).stat()  # on Windows, DirEntry.stat gives no numbers that identify a folder
+        return _Entry(path, matched, status)
     except OSError as error:
         return _Entry(path, matched, None, error)
 
