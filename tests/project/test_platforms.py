@@ -92,6 +92,16 @@ def test_imitated_system_gives_the_bytes_of_linux(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["linux", "other", "other-sweep"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("system", ["darwin", "win32"])
+def test_types_are_correct_on_other_systems(system: str) -> None:
+    """Mypy skips branches for other systems, and knows which modules, functions and constants a system lacks."""
+    command = [sys.executable, "-m", "mypy", "--platform", system]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+
+    assert done.returncode == 0, done.stdout
+
+
 @pytest.mark.parametrize("path", ["/a", "../a", "a/../../b", "C:/a", "C:a", "..\\a", "\\a", "//server/share/a"])
 def test_paths_that_lead_outside_on_windows_are_found(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "os", SimpleNamespace(path=ntpath, sep="\\"))
