@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import hypothesis
@@ -23,6 +25,8 @@ from PIL import Image
 from unprocess_gen.cli import main as entry_point
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.sources import loader
+from unprocess_gen.sources.scenes import synthetic
 
 pytest_plugins = ["helpers.promise_report"]
 
@@ -47,6 +51,19 @@ def _no_sync() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda handle: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _scenes_drawn_once() -> Iterator[None]:
+    """Let the loader draw each built-in scene once: a scene takes up to 0.5 s, and half of the datasets use one.
+
+    Tests of the scenes call `synthetic.scene` itself.
+    """
+    drawn = functools.cache(synthetic.scene)
+    module = SimpleNamespace(**vars(synthetic) | {"scene": lambda name: drawn(name).copy()})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loader, "synthetic", module)
         yield
 
 

@@ -54,18 +54,63 @@ def shell(line: str, folder: Path, *arguments: str, **more: Any) -> subprocess.C
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False, **more)
 
 
+def messages(text: str) -> list[str]:
+    """Return the lines of stderr without those of progress."""
+    return [line for line in text.splitlines() if " images, " not in line and ": compiling kernels" not in line]
+
+
+FULL = "gen-dataset: stdout: cannot be written (No space left on device); redirect it elsewhere and rerun"
+
+
 @pytest.mark.parametrize("arguments", COMMANDS.values(), ids=COMMANDS)
-def test_full_stdout_gives_one_line_and_exit_code_5(arguments: list[str], folder: Path) -> None:
-    done = shell('exec "$@" > /dev/full', folder, *arguments)
-    assert done.returncode == 5
-    lines = [line for line in done.stderr.splitlines() if " images, " not in line]
-    assert lines == [
-        "gen-dataset: stdout: cannot be written (No space left on device); redirect it elsewhere and rerun"
-    ]
+def test_full_stdout_gives_one_line_and_exit_code_5(
+    arguments: list[str], folder: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    full = os.fdopen(os.open("/dev/full", os.O_WRONLY), "w")
+    monkeypatch.setattr(sys, "stdout", full)
+    done = run_main(*arguments)
+    full.close()  # `main` has redirected it, so that this flush succeeds
+    assert (done.code, messages(done.err)) == (5, [FULL])
 
 
-@pytest.mark.parametrize("stream", [">&-", "2>&-", "2>/dev/full", "<&- >&- 2>&-"])
-@pytest.mark.parametrize("name", ["help", "generate", "plan", "verify"])
+@pytest.mark.parametrize("name", ["plan", "verify"])
+def test_closed_pipe_gives_exit_code_141_without_a_message(
+    name: str, folder: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    pipe = os.fdopen(write_end, "w")
+    monkeypatch.setattr(sys, "stdout", pipe)
+    done = run_main(*COMMANDS[name])
+    pipe.close()
+    assert (done.code, messages(done.err)) == (141, [])
+
+
+SLOW_TO_START = [name for name in COMMANDS if name not in ("help", "plan")]
+
+
+@pytest.mark.parametrize(
+    "name", ["help", "plan", *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW_TO_START)]
+)
+def test_full_stdout_of_a_process_gives_exit_code_5(name: str, folder: Path) -> None:
+    done = shell('exec "$@" > /dev/full', folder, *COMMANDS[name])
+    assert (done.returncode, messages(done.stderr)) == (5, [FULL])
+
+
+STREAMS = [">&-", "2>&-", "2>/dev/full", "<&- >&- 2>&-"]
+QUICK = [("generate", "<&- >&- 2>&-"), *(("help", stream) for stream in STREAMS)]
+
+
+@pytest.mark.parametrize(
+    ("name", "stream"),
+    [
+        pytest.param(name, stream, marks=() if (name, stream) in QUICK else pytest.mark.slow)
+        for name in ("help", "generate", "plan", "verify")
+        for stream in STREAMS
+    ],
+)
 def test_closed_streams_and_full_stderr_do_not_end_a_command(name: str, stream: str, folder: Path) -> None:
     done = shell(f'exec "$@" {stream}', folder, *COMMANDS[name])
     assert done.returncode == 0
@@ -77,7 +122,7 @@ def test_mistake_keeps_its_exit_code_without_stderr(folder: Path) -> None:
     assert shell('exec "$@" 2>&-', folder, "verify", "no such folder").returncode == 4
 
 
-@pytest.mark.parametrize("name", ["help", "plan", "verify"])
+@pytest.mark.parametrize("name", ["help", *(pytest.param(one, marks=pytest.mark.slow) for one in ("plan", "verify"))])
 def test_broken_pipe_gives_exit_code_141_without_a_message(name: str, folder: Path) -> None:
     done = shell('{ "$@"; echo $? >&3; } 3>&2 | true', folder, *COMMANDS[name])
     assert done.stderr in ("141\n", "0\n")  # 0: the pipe still had a reader
@@ -89,8 +134,18 @@ def test_broken_pipe_gives_exit_code_141_without_a_message(name: str, folder: Pa
     assert (broken.returncode, broken.stderr) == (141, "")
 
 
-@pytest.mark.parametrize("code", [5, 141])
-@pytest.mark.parametrize("plugin", [[], ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]], ids=["own", "joblib"])
+LAUNCHER = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+
+
+@pytest.mark.parametrize(
+    ("plugin", "code"),
+    [
+        pytest.param([], 5, id="own-5"),
+        pytest.param([], 141, id="own-141", marks=pytest.mark.slow),
+        pytest.param(LAUNCHER, 5, id="joblib-5", marks=pytest.mark.slow),
+        pytest.param(LAUNCHER, 141, id="joblib-141", marks=pytest.mark.slow),
+    ],
+)
 def test_unwritable_stdout_ends_a_sweep_and_keeps_the_row(code: int, plugin: list[str], tmp_path: Path) -> None:
     if plugin:
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -202,11 +257,6 @@ def wait_for(path: Path, seconds: float = 60) -> None:
         time.sleep(0.02)
 
 
-def messages(text: str) -> list[str]:
-    """Return the lines of stderr without those of progress."""
-    return [line for line in text.splitlines() if " images, " not in line]
-
-
 @pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
 def test_signal_during_a_run_gives_one_line(number: signal.Signals, tmp_path: Path) -> None:
     process = start(tmp_path, "source.limit=2000", "output.pairs_per_shard=1", "n_jobs=1")
@@ -217,6 +267,7 @@ def test_signal_during_a_run_gives_one_line(number: signal.Signals, tmp_path: Pa
     assert messages(err) == [f"gen-dataset: {ENDS[number]}; finished shards are kept; rerun to resume"]
 
 
+@pytest.mark.slow  # `test_signals_end_composing_within_two_seconds` sends them at one moment of the composition
 @pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
 @pytest.mark.parametrize("delay_s", [0.4, 0.6, 0.9])
 def test_signal_while_settings_are_composed_ends_within_two_seconds(
