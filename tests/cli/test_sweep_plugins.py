@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from helpers.commands import Cli
+from helpers.commands import Cli, RunMain
 from helpers.datasets import TreeHash
 from helpers.photographs import fill
 
@@ -16,6 +16,9 @@ needs_joblib_launcher = pytest.mark.skipif(
     find_spec("hydra_plugins") is None or find_spec("hydra_plugins.hydra_joblib_launcher") is None,
     reason="needs the package hydra-joblib-launcher",
 )
+
+IN_PROCESS = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=1")
+"""joblib runs a single job at a time in the process of the sweep; two at a time would start workers."""
 
 SWEEPER = '''
 from hydra.core.config_store import ConfigStore
@@ -55,12 +58,15 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 @needs_joblib_launcher
-def test_joblib_launcher_generates_the_datasets_of_a_sweep(cli: Cli, tree_hash: TreeHash, tmp_path: Path) -> None:
+@pytest.mark.parametrize("n_jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_joblib_launcher_generates_the_datasets_of_a_sweep(
+    n_jobs: int, cli: Cli, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
+) -> None:
     fill(tmp_path / "p", 2)
     sweep = ("-m", "camera=sony_a7r,nexus_6p", "source.root=p", "n_jobs=1")
-    done = cli(*sweep, "out=launched", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    done = cli(*sweep, "out=launched", "hydra/launcher=joblib", f"hydra.launcher.n_jobs={n_jobs}")
     assert done.returncode == 0, done.stderr
-    assert cli(*sweep, "out=own").returncode == 0
+    assert run_main(*sweep, "out=own").code == 0
 
     folders = ["camera=sony_a7r", "camera=nexus_6p"]
     assert sorted(os.listdir(tmp_path / "launched")) == sorted([".hydra", *folders, "sweep.csv"])
@@ -71,26 +77,26 @@ def test_joblib_launcher_generates_the_datasets_of_a_sweep(cli: Cli, tree_hash: 
 
 
 @needs_joblib_launcher
-def test_failing_job_of_a_launcher_decides_the_exit_code(cli: Cli, tmp_path: Path) -> None:
+def test_failing_job_of_a_launcher_decides_the_exit_code(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
-    done = cli("-m", "gains.red=0,2", "source.root=p", "n_jobs=1", "out=sweep", "hydra/launcher=joblib")
-    assert done.returncode == 2
-    assert done.stderr.count("gains.red=0: expected a gain above 0") == 1
+    done = run_main("-m", "gains.red=0,2", "source.root=p", "n_jobs=1", "out=sweep", *IN_PROCESS)
+    assert done.code == 2
+    assert done.err.count("gains.red=0: expected a gain above 0") == 1
     assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
         ("gains.red=0", "2"), ("gains.red=2", "0"),
     ]  # fmt: skip
 
 
 @needs_joblib_launcher
-def test_launcher_runs_a_sweep_in_a_file(cli: Cli, tmp_path: Path) -> None:
+def test_launcher_runs_a_sweep_in_a_file(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
     (tmp_path / "mine/sweep").mkdir(parents=True)
     (tmp_path / "mine/sweep/seeds.yaml").write_text(
         "# @package _global_\ndefaults: [{override /hydra/launcher: joblib}]\n"
-        "hydra: {mode: MULTIRUN, sweeper: {params: {seed: '1,2'}}}\n"
+        "hydra: {mode: MULTIRUN, launcher: {n_jobs: 1}, sweeper: {params: {seed: '1,2'}}}\n"
     )
-    done = cli("+sweep=seeds", "--config-dir", "mine", "source.root=p", "n_jobs=1", "out=sweep")
-    assert done.returncode == 0, done.stderr
+    done = run_main("+sweep=seeds", "--config-dir", "mine", "source.root=p", "n_jobs=1", "out=sweep")
+    assert done.code == 0, done.err
     assert [(row["folder"], row["seed"], row["exit"]) for row in table(tmp_path / "sweep")] == [
         ("seed=1", "1", "0"), ("seed=2", "2", "0"),
     ]  # fmt: skip
@@ -111,15 +117,15 @@ def test_sweeper_plugin_chooses_the_jobs(cli: Cli, tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_unknown_launcher_is_refused_in_one_line(cli: Cli, tmp_path: Path) -> None:
-    done = cli("-m", "seed=1,2", "hydra/launcher=nope", "out=sweep")
-    assert done.returncode == 2
-    assert "hydra/launcher=nope: no such option; expected one of basic" in done.stderr
+def test_unknown_launcher_is_refused_in_one_line(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("-m", "seed=1,2", "hydra/launcher=nope", "out=sweep")
+    assert done.code == 2
+    assert "hydra/launcher=nope: no such option; expected one of basic" in done.err
     assert not (tmp_path / "sweep").exists()
 
 
-def test_plan_of_a_sweep_ignores_the_launcher(cli: Cli, tmp_path: Path) -> None:
+def test_plan_of_a_sweep_ignores_the_launcher(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "p", 1)
-    done = cli("plan", "-m", "seed=1,2", "source.root=p", "n_jobs=1", "hydra/launcher=basic")
-    assert (done.returncode, done.stdout.count("sources   1")) == (0, 2)
+    done = run_main("plan", "-m", "seed=1,2", "source.root=p", "n_jobs=1", "hydra/launcher=basic")
+    assert (done.code, done.out.count("sources   1")) == (0, 2)
     assert os.listdir(tmp_path) == ["p"]
