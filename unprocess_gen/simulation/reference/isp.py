@@ -249,7 +249,7 @@ def apply_gains_per_channel(y: Float, k: Float, threshold: float) -> Float:
 def _solve_highlight(y: Float, k: Float, threshold: float) -> Float:
     """Solve for the highlights by Newton's method from above; the function is convex, so no step passes the root.
 
-    Cardano's formula loses half the digits where the mask begins.
+    Cardano's formula loses digits as the gain approaches 1 (``docs/hard_cases.md``).
     """
     i = np.maximum(y, 1)
     width = 1 - threshold
