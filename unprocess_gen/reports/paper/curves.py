@@ -70,8 +70,8 @@ def draw_tone(source: FigureSource) -> PaperFigure:
         (
             f"On {source.name}. The tone curve makes bright values brighter and dark values darker. Its inverse maps "
             f"codes {examples}; the photograph loses contrast and its values move towards the middle.",
-            "Against the article: it writes ½ − sin(asin(1 − 2x) / 3), a difference that loses a digit near black. Here "
-            "the same function is computed as sin t · (√3 cos t + sin t), t = asin(√x) / 3, without cancellation. On "
+            "Against the article: it writes ½ − sin(asin(1 − 2x) / 3), which loses a digit near black. Here the same "
+            "function is computed as sin t · (√3 cos t + sin t), t = asin(√x) / 3, without cancellation. On "
             f"the 256 codes the two differ by at most {np.abs(as_written - inverse).max():.1g}, which is invisible.",
         ),
     )
