@@ -1,4 +1,4 @@
-"""Write the parts of the documentation that follow from the code: columns, packages, table of promises.
+"""Write the parts of the documentation that follow from the code: reference, packages, table of promises.
 
 ``python docs/update_reference.py`` rewrites the text between the markers ``<!-- NAME: from the code -->`` and
 ``<!-- end of NAME -->`` of each page, and the files of `GENERATED_FILES`; a test compares them with the code.
@@ -14,11 +14,10 @@ from pathlib import Path
 
 import grimp
 
-from unprocess_gen.dataset.columns import COLUMNS
-
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "tests")]
 from helpers.promises import evidence_table  # noqa: E402
+from reference_pages import PAGES  # noqa: E402
 
 PACKAGE = "unprocess_gen"
 LAYERS = (
@@ -31,17 +30,6 @@ LAYERS = (
     ("core",),
 )
 """Packages from the command line down to core; the order that import-linter holds."""
-
-
-def columns() -> str:
-    """Return the table of manifest columns; the nine matrix elements share a row."""
-    rows = ["| column | meaning |", "|---|---|"]
-    for column in COLUMNS:
-        if column.name == "rgb2cam_00":
-            rows.append(f"| `rgb2cam_00` … `rgb2cam_22` | {column.meaning} |")
-        elif not column.name.startswith("rgb2cam_"):
-            rows.append(f"| `{column.name}` | {column.meaning} |")
-    return "\n".join(rows)
 
 
 PACKAGES = tuple(package for layer in LAYERS for package in layer)
@@ -123,13 +111,12 @@ def purpose(package: str) -> str:
 
 
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
-    "columns": ("docs/dataset.md", columns),
     "packages": ("docs/design/architecture.md", package_table),
     "promises": ("docs/evidence.md", evidence_table),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
 
-GENERATED_FILES: dict[str, Callable[[], str]] = {"docs/design/packages.svg": package_drawing}
+GENERATED_FILES: dict[str, Callable[[], str]] = {"docs/design/packages.svg": package_drawing, **PAGES}
 """Generated files, and the functions that return their text."""
 
 

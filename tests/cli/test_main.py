@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +22,13 @@ from PIL import Image
 
 from unprocess_gen import RawPairs, __version__
 from unprocess_gen.cli.arguments import STANDARD, Verb
-from unprocess_gen.cli.help import GROUP_KEYS, global_help
+from unprocess_gen.cli.exit_codes import EXIT_CODES
+from unprocess_gen.cli.help import global_help
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, option_summary
+from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.settings import settings_of
+from unprocess_gen.core.errors import SourceError, UnprocessGenError
 
 REFUSED = [
     (["camera=nope"], r"camera=nope: no such option; expected one of choice, convex, custom, identity, nexus_6p, "),
@@ -220,12 +223,44 @@ def test_help_names_every_verb_group_and_option() -> None:
 
 
 def test_help_names_every_group_and_top_level_setting() -> None:
-    assert list(GROUP_KEYS) == [field.name for field in fields(Config) if is_dataclass(getattr(Config(), field.name))]
-    for field in fields(Config):
-        assert re.search(rf"\b{field.name}\b", HELP)
-    for group, keys in GROUP_KEYS.items():
-        known = {field.name for field in fields(getattr(Config(), group))}
-        assert {key for key in re.findall(r"\w+(?=[,:]|$)", keys) if "_" in key} <= known
+    listed = [re.match(r"  (\w+)(?: |=)", line) for line in HELP.splitlines()]
+    names = [match[1] for match in listed if match]
+    assert [name for name in names if hasattr(Config(), name)] == [*GROUPS, *settings_of(Config)]
+
+
+def test_help_names_every_key_of_a_group() -> None:
+    for group, kind in GROUPS.items():
+        listed = re.search(rf"^  {group} +(.*(?:\n {{13}}.*)*)$", HELP, re.MULTILINE)
+        assert listed is not None
+        assert set(settings_of(kind)) <= set(re.findall(r"\w+", listed[1]))
+
+
+@pytest.mark.parametrize("group", [*GROUPS, *ADDED_GROUPS])
+def test_help_of_a_group_explains_its_options_and_keys(group: str, run_main: RunMain) -> None:
+    done = run_main("--help", group)
+    assert (done.code, done.err) == (0, "")
+    text = " ".join(done.out.split())
+    for file in (conf_dir() / group).glob("*.yaml"):
+        assert option_summary(group, file.stem) in text or file.stem == "default"
+    for name, setting in settings_of(GROUPS[group]).items() if group in GROUPS else ():
+        assert f"{name}=" in text and setting.meaning in text and str(setting.limit) in text
+    assert max(map(len, done.out.splitlines())) <= 100
+
+
+def test_help_of_a_word_is_that_of_the_verb_or_group(run_main: RunMain) -> None:
+    assert run_main("--help", "verify") == run_main("verify", "--help")
+    both = run_main("-h", "accuracy").out
+    assert both.startswith(run_main("accuracy", "--help").out) and "Keys of accuracy" in both
+    assert run_main("--help", "nothing").out == HELP
+
+
+def test_help_and_errors_name_the_same_exit_codes() -> None:
+    codes = {code for one in EXIT_CODES for code in one.codes}
+    errors = (UnprocessGenError, *UnprocessGenError.__subclasses__())
+    assert {error.exit_code for error in errors if error is not SourceError} <= codes
+    assert {128 + number for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)} <= codes
+    for one in EXIT_CODES:
+        assert f"{', '.join(map(str, one.codes))} {one.summary}" in HELP
 
 
 def test_help_fits_a_hundred_columns() -> None:

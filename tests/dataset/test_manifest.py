@@ -21,7 +21,7 @@ from unprocess_gen.config.accuracy import STAGES, methods_of_stage
 from unprocess_gen.config.schema import PHYSICAL_NUMBERS
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source
-from unprocess_gen.dataset.columns import COLUMNS, NAMES, Range
+from unprocess_gen.dataset.columns import COLUMNS, NAMES, NO_VIDEO, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
     JSON_BYTES,
@@ -205,6 +205,25 @@ def test_column_names_are_unique() -> None:
 
 def test_every_column_has_a_meaning() -> None:
     assert all(column.meaning for column in COLUMNS)
+
+
+def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
+    video = dataclasses.replace(SOURCE, name="a.mp4", clip="a.mp4")
+    unread = dataclasses.replace(SOURCE, size_bytes=None, reason="unreadable")
+    bare = dataclasses.replace(PLAN, effects=(), skipped=())
+    conditions = {column.empty_if for column in COLUMNS} - {""}
+    failed = {condition for condition in conditions if "the source failed" in condition}
+    passed = {"the source did not fail"}
+    holding = {
+        "pair": (row_of(PHYSICAL), passed),
+        "without effects": (row_of(bare), passed | {one for one in failed if one.startswith("no effect")}),
+        "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed),
+        "failed frame": (failed_row(video, SHA256, 0, 7, "corrupt", "why"), failed - {NO_VIDEO}),
+        "unread": (failed_row(unread, None, 0, 7, "unreadable", "why"), conditions - passed),
+    }
+    for name, (row, held) in holding.items():
+        for column in COLUMNS:
+            assert (row[column.name] == column.empty) == (column.empty_if in held), f"{name}: {column.name}"
 
 
 def test_every_value_of_a_row_has_the_type_of_its_column() -> None:

@@ -11,20 +11,34 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import update_reference
+from helpers.datasets import Settings
 
-from unprocess_gen.cli.help import global_help
+from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
+from unprocess_gen.cli.exit_codes import EXIT_CODES
+from unprocess_gen.cli.help import global_help, hydra_flag, spelled, synopsis
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, Config
+from unprocess_gen.config.defaults import default_values
+from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
+from unprocess_gen.config.limits import Choice
+from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, group_options, option_summary
+from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, all_settings
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.planning.noise_profile import FORMS
+from unprocess_gen.dataset.columns import COLUMNS
 
 HELP = global_help(VERBS, conf_dir())
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 README = PAGES[0].read_text(encoding="utf-8")
 TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-OPTIONS = sorted((path.parent.name, path.stem) for path in (ROOT / "conf").glob("*/*.yaml"))
+
+
+def generated(name: str) -> str:
+    """Return a page of ``docs/reference``."""
+    return (ROOT / "docs" / "reference" / f"{name}.md").read_text(encoding="utf-8")
+
+
+SETTINGS = generated("settings")
 
 
 @pytest.mark.parametrize("name", update_reference.GENERATED)
@@ -62,48 +76,130 @@ def test_every_page_is_reached_by_links_without_the_site() -> None:
     assert missing == [], "link these pages from docs/index.md or from the index page of their folder"
 
 
-@pytest.mark.parametrize("group", [field.name for field in dataclasses.fields(Config)])
-def test_every_group_and_top_level_key_is_in_the_docs_and_the_help(group: str) -> None:
-    assert f"`{group}`" in TEXT
-    assert re.search(rf"\b{group}\b", HELP)
+# Explanations in the code, which --help and the reference show -------------------------------------------------------
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_is_in_the_docs(group: str, option: str) -> None:
-    assert option == "default" or f"`{option}`" in TEXT
+def section(title: str) -> str:
+    """Return a group's section of the settings page, with its parts."""
+    return SETTINGS.split(f"\n## `{title}`\n" if title else "\n## Top level\n")[1].split("\n## ")[0]
 
 
-KEYS = [
-    (group.name, field.name)
-    for group in dataclasses.fields(Config)
-    if group.name in ("source", "gains", "isp", "sensor", "scene", "effects", "clean")
-    for field in dataclasses.fields(getattr(Config(), group.name))
-    if (group.name, field.name) != ("scene", "name")
-]
-KEYS += [("noise", key) for key in PHYSICAL_NUMBERS] + [
-    ("noise", field.name) for field in dataclasses.fields(BranchConfig) if field.name != "iso"
-]
+UNITS = {"_dn": "DN", "_dn2": "DN²", "_e": "electrons", "_e_per_s": "electrons per second", "_s": "seconds"}
+UNITS |= {"_c": "degrees Celsius", "_per_e": "DN per electron"}
+"""First words of the unit that a name's suffix promises."""
 
 
-@pytest.mark.parametrize(("group", "key"), KEYS)
-def test_every_key_of_a_group_is_in_the_docs(group: str, key: str) -> None:
-    assert f"`{key}`" in TEXT
+def promised_unit(name: str) -> str:
+    """Return what the unit of a key or column must begin with."""
+    name = re.sub(r"_\d\d$", "", name)
+    return next((UNITS[suffix] for suffix in sorted(UNITS, key=len, reverse=True) if name.endswith(suffix)), "")
 
 
-@pytest.mark.parametrize("form", [*FORMS, "by_log_iso"])
-def test_every_form_of_a_physical_profile_is_in_the_docs(form: str) -> None:
-    assert f"[{form}, " in TEXT
+def test_every_setting_is_explained() -> None:
+    branches = [("noise", name, setting) for name, setting in settings_of(BranchConfig).items()]
+    for group, name, setting in [*all_settings(), *branches]:
+        key = f"{group}.{name}"
+        assert setting.meaning and not setting.meaning.endswith("."), key
+        assert str(setting.limit), key
+        assert setting.unit.startswith(promised_unit(name)), key
+        assert f"| `{name}` |" in section(group), key
 
 
-@pytest.mark.parametrize("reason", REASONS)
-def test_every_reason_is_in_the_docs(reason: str) -> None:
-    assert f"`{reason}`" in TEXT
+def test_settings_declare_all_keys_of_the_schema() -> None:
+    for kind in (*GROUPS.values(), BranchConfig, Config):
+        plain = {field.name for field in dataclasses.fields(kind)} - set(settings_of(kind))
+        assert plain == (set(GROUPS) if kind is Config else set())
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_is_in_the_docs_and_the_help(verb: str) -> None:
-    assert f"gen-dataset {verb}" in TEXT
-    assert f"gen-dataset {verb}" in HELP
+def test_null_is_explained_if_and_only_if_it_is_allowed() -> None:
+    for group, name, setting in all_settings():
+        values = [default_values(group)[name]]
+        assert all(setting.null or value is not None for value in values), f"{group}.{name}"
+
+
+def test_default_values_are_those_of_a_composed_config(settings: Settings) -> None:
+    config = settings()
+    for group in ("", *GROUPS):
+        composed = getattr(config, group) if group else config
+        values = {name: getattr(composed, name) for name in settings_of(composed)}
+        written = {
+            name: type(values[name])(value) if values[name] is not None else value
+            for name, value in default_values(group).items()
+        }
+        assert written == values, group
+
+
+def test_every_option_is_explained() -> None:
+    for group in (*GROUPS, *ADDED_GROUPS):
+        for option in group_options(group):
+            summary = option_summary(group, option)
+            assert re.fullmatch(r"[A-Z].*\.", summary), f"{group}={option}: {summary!r}"
+            row = rf"^\| `{option}`( \(default\))? \| {re.escape(summary)} \|$"
+            assert option == "default" or re.search(row, section(group), re.MULTILINE), f"{group}={option}"
+
+
+def test_every_form_is_explained() -> None:
+    for name, form in {**DISTRIBUTION_FORMS, **ISO_FORMS}.items():
+        assert form.meaning and form.numbers, name
+        assert name == "constant" or f"| `[{name}, " in SETTINGS, name
+
+
+def test_every_column_is_explained() -> None:
+    page = generated("columns")
+    for column in COLUMNS:
+        assert column.meaning and not column.meaning.endswith("."), column.name
+        assert column.unit.startswith(promised_unit(column.name)), column.name
+        assert re.search(rf"^\| `{column.name}`(\\\*)? \| {column.type_name} \|", page, re.MULTILINE), column.name
+
+
+def test_every_reason_is_explained() -> None:
+    for reason, meaning in REASONS.items():
+        assert meaning and f"| `{reason}` | {meaning} |" in generated("columns"), reason
+
+
+def test_every_verb_and_flag_is_explained() -> None:
+    page = generated("command_line")
+    for verb in VERBS.values():
+        assert verb.summary and f"    {synopsis(verb)}\n" in page, verb.name
+        assert f"gen-dataset {verb.name}" in HELP
+        text = page.split(f"\n## {verb.name}\n")[1].split("\n## ")[0]
+        for argument in verb.arguments:
+            assert argument.help and f"| `{spelled(argument)}` | {argument.help}" in text, spelled(argument)
+        assert verb.place is None or f"| `{verb.place.metavar}` | {verb.place.expected} |" in text
+    for argument in STANDARD:
+        assert argument.help and f"| `{spelled(argument)}` | {argument.help} |" in page
+    for spellings, (_, text) in HYDRA_FLAGS.items():
+        assert text and f"| `{hydra_flag(spellings)}` | {text} |" in page
+
+
+def test_every_exit_code_is_explained() -> None:
+    for one in EXIT_CODES:
+        assert one.meaning and one.summary
+        assert f"| {', '.join(map(str, one.codes))} | {one.meaning} |" in generated("command_line")
+
+
+def test_columns_allow_every_value_that_settings_allow() -> None:
+    columns = {column.name: column.allowed for column in COLUMNS}
+    pairs = {
+        "isp.tone": "tone",
+        "gains.highlight": "highlight",
+        "sensor.pattern": "pattern",
+        "sensor.clip": "sensor_clip",
+    }
+    pairs |= {"sensor.saturated": "saturated_as", "sensor.dark_offset": "dark_offset", "noise.law": "noise_law"}
+    pairs |= {"source.dequantize": "dequantize", "output.dtype": "dtype", "output.layout": "layout"}
+    limits = {f"{group}.{name}": setting.limit for group, name, setting in all_settings()}
+    for setting, column in pairs.items():
+        limit = limits[setting]
+        assert isinstance(limit, Choice) and all(word in columns[column] for word in limit.words), setting
+
+
+# Pages ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*settings_of(Config), *GROUPS])
+def test_help_names_every_group_and_top_level_key(name: str) -> None:
+    assert re.search(rf"\b{name}\b", HELP)
 
 
 @pytest.mark.parametrize("path", sorted(set(re.findall(r"`(?:python )?((?:tests|\.readme)/[\w./]+\.py)", TEXT))))

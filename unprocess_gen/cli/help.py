@@ -5,9 +5,14 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Argument, Verb
-from unprocess_gen.config.option_files import group_options
+from unprocess_gen.cli.exit_codes import EXIT_CODES
+from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
+from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.config.values import value_text
 
 WIDTH = 100
 INDENT = 11
@@ -27,45 +32,20 @@ Verbs:
 
 SETTINGS = """
 Settings are key=value, in any order. group=option chooses an option, group.key=value changes one
-value. Groups, their options (and keys):
+value. gen-dataset --help GROUP explains the options and keys of a group. Groups, options and keys:
 """
 
-GROUP_KEYS: Mapping[str, str] = {
-    "source": "root, include, recursive, limit, max_pixels, max_failed, icc, clips, video, downscale, dequantize, "
-    "patch",
-    "camera": "",
-    "gains": "",
-    "isp": "",
-    "sensor": "",
-    "noise": "levels, draws: several frames of one clean frame; iso: overrides the ISO of the scene",
-    "scene": "",
-    "effects": "all (auto, on, off), tolerance, and each effect by name",
-    "clean": "includes_fixed_pattern",
-    "accuracy": "clean_dn, clean_changed_share, normal_error, law_distance, readable",
-    "output": "dtype (uint16, float32), layout (mosaic, packed), pairs_per_shard",
-}
-"""Groups of settings in the order of the config, and the keys that the help mentions."""
-
-ADDED_GROUPS = {"experiment": "settings of published work", "sweep": "prepared sweeps"}
-"""Groups that do not belong to the settings; their options are added with a plus: ``+experiment=ipol_demo``."""
-
-ENDING = """\
-and at the top: seed (0), out (ds), n_jobs (-1: all cores), self_test (stop; go_on),
-check_disk (true).
-
+ENDING = """
 Flags:
   --cfg job           print the settings and stop
   --config-dir DIR    add a folder of your own options
   -m, --multirun      sweep over comma-separated values
   -q, --quiet         show only warnings and errors; -v, --verbose: details; --log-file FILE
-  --version, --help, --hydra-help
+  --version, --help [VERB or GROUP], --hydra-help
   --                  everything after it is a file or folder, even with a leading hyphen
 
 Tab completion: eval "$(gen-dataset completion bash)", or zsh.
 
-Exit codes: 0 done · 1 a bug · 2 usage or settings · 3 more failed sources than max_failed
-            4 damage found · 5 system error (disk full, source changed)
-            11 output locked by another run · 129, 130, 143 ended by SIGHUP, SIGINT, SIGTERM
 """
 
 
@@ -85,26 +65,102 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
         At most 100 columns wide.
     """
     lines = [f"  gen-dataset {verb.name:<11} {verb.summary}" for verb in verbs.values()]
-    groups = [_paragraph(*group) for group in group_lines(conf)]
-    return INTRODUCTION + "\n".join(lines) + "\n" + SETTINGS + "\n".join(groups) + "\n" + ENDING
+    groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(conf)]
+    keys = [
+        _hanging(f"  {f'{name}={default_text(getattr(Config, name))}':<{INDENT + 6}}", _description(setting))
+        for name, setting in settings_of(Config).items()
+    ]
+    blocks = [INTRODUCTION + "\n".join(lines), SETTINGS + "\n".join(groups), "\nKeys at the top level:", *keys]
+    return "\n".join(blocks) + "\n" + ENDING + exit_code_lines()
 
 
 def group_lines(conf: Path) -> list[tuple[str, str]]:
-    """Return each group of settings with its options and keys, in the order of the config."""
+    """Return each group with its options and, in parentheses, its keys, in the order of the config."""
     lines = []
-    for group, keys in GROUP_KEYS.items():
+    for group, kind in GROUPS.items():
         options = [name for name in group_options(group, conf) if name != "default"]
-        lines.append((group, " ".join([*options, *([f"({keys})"] if keys else [])])))
-    for group, contents in ADDED_GROUPS.items():
+        lines.append((group, " ".join([*options, f"({', '.join(settings_of(kind))})"])))
+    for group, added in ADDED_GROUPS.items():
         options = group_options(group, conf)
         if options:
-            lines.append((group, f"{' '.join(options)} ({contents}; added with a plus: +{group}={options[0]})"))
+            lines.append((group, f"{' '.join(options)} ({added.contents}; added with a plus: +{group}={options[0]})"))
     return lines
 
 
-def _paragraph(group: str, text: str) -> str:
-    lines = textwrap.wrap(text, WIDTH - INDENT - 2, break_long_words=False, break_on_hyphens=False)
-    return textwrap.indent("\n".join(lines), " " * (INDENT + 2)).replace(" " * (INDENT + 2), f"  {group:<{INDENT}}", 1)
+def exit_code_lines() -> str:
+    """Return the exit codes with a few words for each."""
+    words = [f"{', '.join(map(str, code.codes))} {code.summary}" for code in EXIT_CODES]
+    lines = ["Exit codes:"]
+    for word in words:
+        if len(lines[-1]) + len(word) + 3 > WIDTH:
+            lines.append(" " * len(lines[0].split(":")[0]) + " ")
+        separator = " " if lines[-1].strip() in ("", "Exit codes:") else " · "
+        lines[-1] += f"{separator}{word}"
+    return "\n".join(lines) + "\n"
+
+
+def group_help(group: str, conf: Path) -> str:
+    """Return the help of one group of settings: its options and its keys.
+
+    Parameters
+    ----------
+    group : str
+        A key of `schema.GROUPS` or `option_files.ADDED_GROUPS`.
+    conf : Path
+        Folder of the options.
+
+    Returns
+    -------
+    str
+        At most 100 columns wide.
+    """
+    parts = []
+    options = [option for option in group_options(group, conf) if option != "default"]
+    if options:
+        plus = "+" if group in ADDED_GROUPS else ""
+        lines = [_two_columns(option, option_summary(group, option, conf)) for option in options]
+        parts.append("\n".join([f"Options of {group} ({plus}{group}=OPTION):", *lines]))
+    if group in GROUPS:
+        from unprocess_gen.config.defaults import default_options, default_values
+
+        values, option = default_values(group), default_options().get(group, "default")
+        chosen = f" with {group}={option}" if option != "default" else ""
+        title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
+        lines = [
+            _two_columns(f"{name}={default_text(values[name])}"[: WIDTH - 2], _description(setting))
+            for name, setting in settings_of(GROUPS[group]).items()
+        ]
+        parts.append("\n".join([title, *lines]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _description(setting: Setting) -> str:
+    """Return meaning, unit, allowed values and the meaning of null in one line."""
+    unit = f", in {setting.unit}" if setting.unit else ""
+    null = f"; null: {setting.null}" if setting.null else ""
+    return f"{setting.meaning}{unit}. Allowed: {setting.limit}{null}"
+
+
+def default_text(value: Any) -> str:
+    """Return a value as users write it.
+
+    Parameters
+    ----------
+    value : Any
+        A value of a config.
+
+    Returns
+    -------
+    str
+        Its YAML text on one line.
+    """
+    return str(value).lower() if isinstance(value, bool) else value_text(value)
+
+
+def _hanging(start: str, text: str) -> str:
+    """Return text that begins with ``start`` and continues below the text."""
+    lines = textwrap.wrap(text, WIDTH - len(start), break_long_words=False, break_on_hyphens=False)
+    return start + f"\n{' ' * len(start)}".join(lines)
 
 
 def verb_help(verb: Verb) -> str:
@@ -120,47 +176,65 @@ def verb_help(verb: Verb) -> str:
     str
         Usage, arguments and flags.
     """
-    words = [verb.place.metavar] if verb.place else []
-    words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
-    words += [_spelled(argument) for argument in verb.arguments if argument.required]
-    words += ["[key=value ...]"] if verb.composes or any(one.settings for one in verb.arguments) else []
     sections = {
         "Arguments": [(verb.place.metavar, verb.place.expected)] if verb.place else [],
         "Flags and settings": [
-            (_spelled(argument), argument.help + (" (required)" if argument.required else ""))
+            (spelled(argument), argument.help + (" (required)" if argument.required else ""))
             for argument in (*verb.arguments, *STANDARD)
         ]
         + [("-h, --help", "show this help")],
         "Hydra's flags": [
-            (", ".join(spellings) + (f" {_choices(values)}" if values else ""), text)
-            for spellings, (values, text) in HYDRA_FLAGS.items()
-            if verb.composes
+            (hydra_flag(spellings), text) for spellings, (_, text) in HYDRA_FLAGS.items() if verb.composes
         ],
     }
-    parts = [" ".join(["usage: gen-dataset", verb.name, *words, "[flags]"]), textwrap.fill(_sentence(verb), WIDTH)]
+    parts = [f"usage: {synopsis(verb)}", textwrap.fill(_sentence(verb), WIDTH)]
     for title, lines in sections.items():
         if lines:
             parts.append("\n".join([f"{title}:", *(_two_columns(*line) for line in lines)]))
     if verb.composes:
-        parts.append("Settings are listed by gen-dataset --help.")
+        parts.append("Settings are listed by gen-dataset --help, and explained by gen-dataset --help GROUP.")
     return "\n\n".join(parts) + "\n"
+
+
+def synopsis(verb: Verb) -> str:
+    """Return the command line of a verb with its required arguments.
+
+    Parameters
+    ----------
+    verb : Verb
+        The verb.
+
+    Returns
+    -------
+    str
+        One line, such as ``gen-dataset verify DIR [flags]``.
+    """
+    words = [verb.place.metavar] if verb.place else []
+    words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
+    words += [spelled(argument) for argument in verb.arguments if argument.required]
+    words += ["[key=value ...]"] if verb.composes else []
+    return " ".join(["gen-dataset", verb.name, *words, "[flags]"])
+
+
+def spelled(argument: Argument) -> str:
+    """Return the spellings of an argument with the name of its value, such as ``--source ROOT, source.root=ROOT``."""
+    flags = [", ".join(argument.flags) + (f" {argument.metavar}" if argument.metavar else "")] if argument.flags else []
+    return ", ".join([*flags, *(f"{key}={argument.metavar}" for key in argument.settings)])
+
+
+def hydra_flag(spellings: tuple[str, ...]) -> str:
+    """Return the spellings of a flag of Hydra with its values."""
+    values, _ = HYDRA_FLAGS[spellings]
+    shown = "VALUE" if values == ANY_VALUE else "{" + ",".join(values) + "}"
+    return ", ".join(spellings) + (f" {shown}" if values else "")
 
 
 def _sentence(verb: Verb) -> str:
     return f"{verb.summary[0].upper()}{verb.summary[1:]}."
 
 
-def _choices(values: tuple[str, ...]) -> str:
-    return "VALUE" if values == ANY_VALUE else "{" + ",".join(values) + "}"
-
-
-def _spelled(argument: Argument) -> str:
-    flags = [", ".join(argument.flags) + (f" {argument.metavar}" if argument.metavar else "")] if argument.flags else []
-    return ", ".join([*flags, *(f"{key}={argument.metavar}" for key in argument.settings)])
-
-
 def _two_columns(left: str, right: str) -> str:
-    text = textwrap.wrap(right, WIDTH - COLUMN)
+    text = textwrap.wrap(right, WIDTH - COLUMN, break_on_hyphens=False) or [""]
     if len(left) + 4 > COLUMN:
         return "\n".join([f"  {left}", *(" " * COLUMN + line for line in text)])
     return "\n".join([f"  {left}".ljust(COLUMN) + text[0], *(" " * COLUMN + line for line in text[1:])])

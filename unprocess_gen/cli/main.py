@@ -7,6 +7,7 @@ Design: ``docs/design/command_line.md``.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import re
@@ -17,20 +18,19 @@ from collections.abc import Callable, Sequence
 
 from unprocess_gen import __version__
 from unprocess_gen.cli.arguments import SWITCHES, Verb, parse, path_hint
-from unprocess_gen.cli.help import global_help, verb_help
+from unprocess_gen.cli.exit_codes import BROKEN_PIPE
+from unprocess_gen.cli.help import global_help, group_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
 from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
+from unprocess_gen.config.schema import GROUPS
 from unprocess_gen.core.errors import ConfigError, UnprocessGenError
 from unprocess_gen.core.limits import prepare_libraries
 from unprocess_gen.core.suggestions import did_you_mean
 
 OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
 """OpenCV refuses pictures above these limits if the environment sets them; here `source.max_pixels` decides."""
-
-BROKEN_PIPE = 141
-"""Exit code if stdout is a pipe whose reader ended, as for a process that SIGPIPE ends."""
 
 KEPT = "finished shards are kept; rerun to resume"
 
@@ -72,7 +72,7 @@ def run(arguments: Sequence[str]) -> int:
     verb, rest = find_verb(arguments)
     flags = rest[: rest.index("--")] if "--" in rest else rest
     if {"-h", "--help"} & set(flags):
-        print(global_help(VERBS, conf_dir()) if len(rest) == len(arguments) else verb_help(verb), end="")
+        print(_help(verb_help(verb) if len(rest) < len(arguments) else "", flags), end="")
         return 0
     if "--version" in flags:
         print(f"unprocess_gen {__version__}")
@@ -85,6 +85,16 @@ def run(arguments: Sequence[str]) -> int:
         code = _exit_code(lambda: verb.run(call), arguments)
         RESULTS.info("exit code %d", code)
         return code
+
+
+def _help(verb: str, flags: Sequence[str]) -> str:
+    """Return the help of the verb; without one, of the verb or group after ``--help``; else that of the program."""
+    if verb:
+        return verb
+    name = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "")
+    parts = [verb_help(VERBS[name])] if name in VERBS else []
+    parts += [group_help(name, conf_dir())] if name in GROUPS or name in ADDED_GROUPS else []
+    return "\n".join(parts) or global_help(VERBS, conf_dir())
 
 
 def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import SOURCE, Argument, Call, Place, Verb
 from unprocess_gen.cli.completion import SHELLS, print_completion
+from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.messages import print_result, print_results, report, report_error
 from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
@@ -68,7 +69,7 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, lis
     if summary.unmatched:
         lines.append(unmatched_sentence(summary.unmatched))
     too_many = sum(summary.failed.values()) > config.source.max_failed
-    return 3 if too_many else 0, summary, lines
+    return TOO_MANY_FAILED if too_many else DONE, summary, lines
 
 
 def _summary_line(summary: Summary, max_failed: int) -> str:

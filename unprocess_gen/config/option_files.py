@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
 
@@ -13,8 +14,22 @@ MAX_KEY_CHARACTERS = 100
 MAX_BRACKETS = 1000
 """Most opening brackets of one override; Hydra's parser recurses once for each level of nesting."""
 
-ADDED_GROUPS = {"experiment": "a recipe", "sweep": "a sweep"}
-"""Groups without settings of their own, and what their options are: added with ``+``, in no defaults list."""
+
+class AddedGroup(NamedTuple):
+    """Name an option of a group without settings of its own, and describe what its options contain."""
+
+    noun: str
+    contents: str
+
+
+ADDED_GROUPS = {
+    "experiment": AddedGroup("a recipe", "settings of published work"),
+    "sweep": AddedGroup("a sweep", "prepared sweeps"),
+}
+"""Groups without settings of their own: their options are added with ``+`` and are in no defaults list."""
+
+PACKAGE_DIRECTIVE = "# @package"
+"""Begin of the first line of an option file whose keys are at the top level."""
 
 
 def conf_dir() -> Path:
@@ -57,6 +72,27 @@ def group_options(group: str, *folders: Path) -> list[str]:
     return sorted({path.stem for folder in folders or (conf_dir(),) for path in (folder / group).glob("*.yaml")})
 
 
+def option_summary(group: str, option: str, folder: Path | None = None) -> str:
+    """Return the description of an option: the first line of the comment at the head of its file.
+
+    Parameters
+    ----------
+    group, option : str
+        Name of the option: ``camera``, ``sony_a7r``.
+    folder : Path, optional
+        Folder that contains the group; `conf_dir` if omitted.
+
+    Returns
+    -------
+    str
+        One line; empty if the file does not begin with a comment.
+    """
+    path = (folder or conf_dir()) / group / f"{option}.yaml"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = [line for line in lines if not line.startswith(PACKAGE_DIRECTIVE)][:1]
+    return head[0].lstrip("# ") if head and head[0].startswith("#") else ""
+
+
 def check_override(override: str) -> None:
     """Refuse an override that Hydra would take for something else, or answer with several lines.
 
@@ -82,7 +118,7 @@ def check_override(override: str) -> None:
     if len(key) > MAX_KEY_CHARACTERS:
         raise ConfigError(f"{key[:60]}…: no such key; see gen-dataset --help")
     if key in ADDED_GROUPS and not override.startswith("+"):
-        raise ConfigError(f"{override}: {ADDED_GROUPS[key]} is added to the settings; write +{override}")
+        raise ConfigError(f"{override}: {ADDED_GROUPS[key].noun} is added to the settings; write +{override}")
     options = group_options(key) if key.isalpha() else []
     word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
     if options and not word:

@@ -453,7 +453,10 @@ class CleanConfig:
 @documented
 @dataclass
 class AccuracyConfig:
-    """Limit the errors accepted for speed; see `accuracy.Budget`."""
+    """Limit the errors accepted for speed.
+
+    The keys are those of `accuracy.Budget`.
+    """
 
     name: str = key("exact", "name of the tier, recorded in each row", Name())
     readable: bool = key(False, "allow only the NumPy reference", Boolean())

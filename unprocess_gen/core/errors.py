@@ -14,21 +14,21 @@ a traceback (exit code 1). Each exception here takes strings only, so that it ca
 
 from __future__ import annotations
 
-REASONS = (
-    "empty",
-    "unreadable",
-    "not_a_file",
-    "unsupported",
-    "truncated",
-    "corrupt",
-    "too_large",
-    "cmyk",
-    "alpha",
-    "animated",
-    "icc",
-    "worker_died",
-)
-"""Reasons for which a source fails: the values of the manifest column ``reason``."""
+REASONS = {
+    "empty": "the file has no bytes, or the video no frame",
+    "unreadable": "the file cannot be opened or read, or leads outside `source.root`",
+    "not_a_file": "the name is not that of a regular file",
+    "unsupported": "the format, the codec or the colours of the file are not supported, or it is too small for a patch",
+    "truncated": "the end of the file is missing",
+    "corrupt": "the content of the file contradicts itself or cannot be decoded",
+    "too_large": "the image has more pixels than `source.max_pixels`, or is larger than the decoder reads",
+    "cmyk": "the pixels are printing inks",
+    "alpha": "pixels are transparent, or could be",
+    "animated": "the file contains several pictures",
+    "icc": "with `source.icc=refuse`: the colours are not those of sRGB",
+    "worker_died": "a worker process died twice at this shard, usually out of memory; the next run retries the shard",
+}
+"""Reasons for which a source fails, the values of the manifest column ``reason``, with their explanations."""
 
 
 class UnprocessGenError(Exception):

@@ -110,6 +110,14 @@ def number_or_text(cell: str) -> str | int | float:
     return cell
 
 
+TYPE_NAMES: Mapping[Any, str] = {int: "integer", float: "number", str: "text", number_or_text: "number or text"}
+
+FAILED = "the source failed"
+"""Condition under which the cells of most columns are empty."""
+
+NO_VIDEO = "the source failed, unless it is a frame of a video"
+
+
 def _same(value: Any) -> Any:
     return value
 
@@ -154,7 +162,7 @@ class Column:
     type : callable
         Converts a cell's text to its value: `int`, `float`, `str` or `number_or_text`.
     meaning : str
-        Description for users.
+        One phrase for users.
     allowed : Range, Words, Text or RelativePath
         Values other than the empty cell.
     of : type, optional
@@ -167,6 +175,10 @@ class Column:
         First version of unprocess_gen that writes the column. Older manifests do not have it; it then reads as empty.
     in_json : bool
         Whether ``KEY.json`` has the column.
+    unit : str
+        Unit of a number; empty for text and pure numbers.
+    empty_if : str
+        Condition under which the cell is empty; ``""`` if it never is.
     """
 
     name: str
@@ -178,6 +190,13 @@ class Column:
     spelling: Spelling | None = None
     since: str = FIRST
     in_json: bool = True
+    unit: str = ""
+    empty_if: str = FAILED
+
+    @property
+    def type_name(self) -> str:
+        """Name of the type for users."""
+        return TYPE_NAMES[self.type]
 
     @property
     def empty(self) -> Value:
@@ -225,18 +244,28 @@ def _short(value: object) -> str:
 
 COLUMNS = (
     Column(
-        "key", str, "source index as eight digits; then patch, level and draw if there are several", KEY_TEXT
+        "key", str, "source index as eight digits, then number of patch, level and draw if there are several", KEY_TEXT,
+        empty_if="",
     ),
-    Column("source", str, "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name"),
-    Column("source_sha256", str, "SHA-256 of the source's bytes", HEX_256),
-    Column("source_bytes", int, "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes"),
-    Column("status", str, "ok or failed", Words(("ok", "failed"))),
-    Column("reason", str, "reason of the failure", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt")),
-    Column("width", int, "width of the frame, pixels; packed planes have half of it", SIDE, Patch),
-    Column("height", int, "height of the frame, pixels; packed planes have half of it", SIDE, Patch),
+    Column(
+        "source", str, "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name",
+        empty_if="",
+    ),
+    Column("source_sha256", str, "SHA-256 of the source's bytes", HEX_256, empty_if="the source cannot be read"),
+    Column(
+        "source_bytes", int, "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes",
+        unit="bytes", empty_if="there is no readable file",
+    ),
+    Column("status", str, "ok, or failed if the source could not be used", Words(("ok", "failed")), empty_if=""),
+    Column(
+        "reason", str, "reason of the failure", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt"),
+        empty_if="the source did not fail",
+    ),
+    Column("width", int, "width of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
+    Column("height", int, "height of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
     Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8", Range(1, 8)),
-    Column("shard", int, "number of the shard", Range(0, 10**9)),
-    Column("seed", int, "seed of the run", COUNT, Plan),
+    Column("shard", int, "number of the shard", Range(0, 10**9), empty_if=""),
+    Column("seed", int, "seed of the run", COUNT, Plan, empty_if=""),
     Column("stream_key", str, "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
     Column("camera", str, "convex, or the name of the camera", ANY_TEXT, Plan),
     *(
@@ -247,7 +276,10 @@ COLUMNS = (
         for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
     ),
     *(
-        Column(f"rgb2cam_{i}{j}", float, "linear sRGB to camera, row and column", MATRIX_ENTRY, Plan, "rgb2cam")
+        Column(
+            f"rgb2cam_{i}{j}", float, f"matrix from linear sRGB to the camera, row {i}, column {j}",
+            MATRIX_ENTRY, Plan, "rgb2cam",
+        )
         for i in range(3)
         for j in range(3)
     ),
@@ -264,40 +296,47 @@ COLUMNS = (
         Words(("per_channel", "gray_mean", "none")), Plan,
     ),
     Column(
-        "highlight_threshold", float, "intensity above which highlights are kept",
+        "highlight_threshold", float, "linear signal above which highlights are preserved, 1 is white",
         Range(0, math.nextafter(1, 0)), Plan,
     ),
-    Column("pattern", str, "Bayer pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), Plan),
-    Column("bits", int, "bits of the sensor", Range(1, 16), Plan),
-    Column("black_level_dn", int, "black level, DN", Range(0, 65534), Plan),
-    Column("white_level_dn", int, "white level (saturation), DN", Range(1, 65535), Plan),
+    Column("pattern", str, "CFA pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), Plan),
+    Column("bits", int, "bits per sample of the sensor", Range(1, 16), Plan),
+    Column("black_level_dn", int, "black level", Range(0, 65534), Plan, unit="DN"),
+    Column("white_level_dn", int, "white level (saturation)", Range(1, 65535), Plan, unit="DN"),
     Column(
         "sensor_clip", str, "clipping of the noisy frame: sensor, black or none",
         Words(("sensor", "black", "none")), Plan,
     ),
     Column("noise", str, "name of the noise profile", ANY_TEXT, Plan),
     Column(
-        "a_dn", float, "slope of the noise variance, DN: variance = a_dn (x - black) + b_dn2", Range(-1e30, 1e30), Plan
+        "a_dn", float, "slope of the noise variance, which is a_dn (x - black) + b_dn2",
+        Range(-1e30, 1e30), Plan, unit="DN",
     ),
-    Column("b_dn2", float, "noise variance at black, DN²", FINITE, Plan),
-    Column("effects", str, "simulated effects, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST),
-    Column("skipped", str, "skipped effects, each with its reason, separated by ;", ANY_TEXT, Plan, spelling=LIST),
-    Column("accuracy", str, "requested accuracy", ANY_TEXT, Plan),
+    Column("b_dn2", float, "noise variance at black", FINITE, Plan, unit="DN²"),
+    Column(
+        "effects", str, "simulated effects, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST,
+        empty_if="no effect was simulated, or the source failed",
+    ),
+    Column(
+        "skipped", str, "skipped effects, each with its reason, separated by ;", ANY_TEXT, Plan, spelling=LIST,
+        empty_if="no effect was skipped, or the source failed",
+    ),
+    Column("accuracy", str, "name of the accuracy tier", ANY_TEXT, Plan),
     Column("methods", str, "method of each stage, separated by ;", ANY_TEXT, Plan, spelling=LIST),
     Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes", HEX_128),
     Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
-    Column("clean_clipped_low", int, "clean sites below black before clipping", COUNT, Counts),
-    Column("clean_clipped_high", int, "clean sites above white before clipping", COUNT, Counts),
-    Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping", COUNT, Counts),
-    Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping", COUNT, Counts),
-    Column("saturated", int, "clean sites at the white level", COUNT, Counts),
-    Column("zero_variance", int, "sites at which the noise has no variance", COUNT, Counts),
+    Column("clean_clipped_low", int, "clean sites below black before clipping", COUNT, Counts, unit="sites"),
+    Column("clean_clipped_high", int, "clean sites above white before clipping", COUNT, Counts, unit="sites"),
+    Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping", COUNT, Counts, unit="sites"),
+    Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping", COUNT, Counts, unit="sites"),
+    Column("saturated", int, "clean sites at the white level", COUNT, Counts, unit="sites"),
+    Column("zero_variance", int, "sites at which the noise has no variance", COUNT, Counts, unit="sites"),
     Column(
         "law_distance", float, "largest accepted CDF distance of shot plus read noise",
         NOT_NEGATIVE, Plan,
     ),
     Column("scene", str, "name of the scene", ANY_TEXT, Plan),
-    Column("exposure_ratio", float, "factor by which the scene was darkened", Range(1e-4, 1e7), Plan),
+    Column("exposure_ratio", float, "divisor of the light in the photograph", Range(1e-4, 1e7), Plan),
     Column(
         "saturated_as", str, "noisy sites whose clean site is saturated: noisy, or pinned to white",
         Words(("noisy", "pinned")), Plan, "saturated",
@@ -306,33 +345,30 @@ COLUMNS = (
         "noise_law", str, "distribution of a two-parameter profile: gaussian or poisson",
         Words(("gaussian", "poisson")), Plan,
     ),
-    Column(
-        "iso", float, "ISO of a physical profile; this and all columns to its right are 0 or none for other profiles",
-        Range(0, 1e9), Physics,
-    ),
-    Column("exposure_s", float, "exposure time, seconds", Range(0, 1e7), Physics),
-    Column("temperature_c", float, "temperature of the sensor, degrees Celsius", Range(-300, 1000), Physics),
-    Column("dn_per_e", float, "system gain K, DN per electron", Range(0, 1e20), Physics),
-    Column("prnu_std", float, "PRNU: relative standard deviation of pixel responses", SHARE, Physics),
-    Column("dark_e", float, "mean dark current of the exposure, electrons", ELECTRONS, Physics),
+    Column("iso", float, "ISO of a physical profile", Range(0, 1e9), Physics),
+    Column("exposure_s", float, "exposure time", Range(0, 1e7), Physics, unit="seconds"),
+    Column("temperature_c", float, "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius"),
+    Column("dn_per_e", float, "system gain K", Range(0, 1e20), Physics, unit="DN per electron"),
+    Column("prnu_std", float, "relative standard deviation of pixel responses (PRNU)", SHARE, Physics),
+    Column("dark_e", float, "mean dark current of the exposure", ELECTRONS, Physics, unit="electrons"),
     Column(
         "dark_offset", str, "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics
     ),
     Column("hot_pixel_share", float, "fraction of hot pixels", SHARE, Physics),
-    Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure, electrons", ELECTRONS, Physics),
-    Column("full_well_e", float, "full-well capacity, electrons; 0: unknown", ELECTRONS, Physics),
+    Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure", ELECTRONS, Physics, unit="electrons"),
+    Column("full_well_e", float, "saturation capacity; 0 if it is not known", ELECTRONS, Physics, unit="electrons"),
     Column(
         "read_law", str, "distribution of the read noise: gaussian or tukey",
         Words(("gaussian", "tukey", "none")), Physics,
     ),
-    Column("read_shape", float, "shape of the Tukey lambda distribution", Range(-0.5, 10), Physics),
-    Column("read_std_dn", float, "standard deviation of the read noise, DN", NOT_NEGATIVE, Physics),
-    Column("row_std_dn", float, "standard deviation of row offsets, DN", NOT_NEGATIVE, Physics),
-    Column("column_std_dn", float, "standard deviation of column offsets, DN", NOT_NEGATIVE, Physics),
+    Column("read_shape", float, "shape of Tukey's lambda distribution", Range(-0.5, 10), Physics),
+    Column("read_std_dn", float, "standard deviation of the read noise", NOT_NEGATIVE, Physics, unit="DN"),
+    Column("row_std_dn", float, "standard deviation of row offsets", NOT_NEGATIVE, Physics, unit="DN"),
+    Column("column_std_dn", float, "standard deviation of column offsets", NOT_NEGATIVE, Physics, unit="DN"),
     *(
         Column(
-            f"black_error_dn_{i}{j}", float, "black-level error at row, column of the 2x2 CFA, DN",
-            FINITE, Physics, "black_error_dn",
+            f"black_error_dn_{i}{j}", float, f"black-level error of the 2x2 CFA pattern, row {i}, column {j}",
+            FINITE, Physics, "black_error_dn", unit="DN",
         )
         for i in range(2)
         for j in range(2)
@@ -344,22 +380,29 @@ COLUMNS = (
         "fixed_pattern_in_clean", int, "1 if the clean frame has the fixed patterns too", SHARE, Physics,
         spelling=SWITCH,
     ),
-    Column("level", int, "number of the noise level", Range(0, 99), Plan),
-    Column("draw", int, "number of the draw at this level", Range(0, 99), Plan),
-    Column("frame", int, "number of the frame in its clip", COORDINATE, Plan),
-    Column("clip", str, "name of the clip; none for single photographs", ANY_TEXT, Source),
-    Column("downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan),
+    Column("level", int, "number of the noise level, from 0", Range(0, 99), Plan),
+    Column("draw", int, "number of the draw at this level, from 0", Range(0, 99), Plan),
+    Column("frame", int, "number of the frame in its clip, from 0", COORDINATE, Plan, empty_if=NO_VIDEO),
+    Column("clip", str, "name of the clip; none for single photographs", ANY_TEXT, Source, empty_if=NO_VIDEO),
+    Column(
+        "downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan, unit="pixels"
+    ),
     Column("dequantize", str, "dequantization of 8-bit codes: off or dither", Words(("off", "dither")), Plan),
     Column("patch", int, "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
-    Column("patch_y", int, "first row of the arrays in the full frame; even", COORDINATE, Patch, "y"),
-    Column("patch_x", int, "first column of the arrays in the full frame; even", COORDINATE, Patch, "x"),
+    Column(
+        "patch_y", int, "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels"
+    ),
+    Column(
+        "patch_x", int, "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels"
+    ),
     Column(
         "dtype", str, "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)",
         Words((UINT16, FLOAT32)), Plan,
     ),
     Column("layout", str, "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), Plan),
     Column(
-        "detail", str, "explanation of a failed source, one line", ANY_TEXT, since="0.2", in_json=False
+        "detail", str, "explanation of the failure, one line", ANY_TEXT, since="0.2", in_json=False,
+        empty_if="the source did not fail",
     ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""

@@ -46,7 +46,7 @@ PAIRS_FITTED = 8
 SHARDS_LISTED = 20
 JPEG_QUALITY = 88
 
-MEANINGS = {column.name: column.meaning for column in COLUMNS}
+MEANINGS = {column.name: ", ".join(filter(None, (column.meaning, column.unit))) for column in COLUMNS}
 
 
 def write_dataset_report(folder: Path, to: Path | None = None, source: Path | None = None) -> Path:

@@ -1,0 +1,255 @@
+"""Generate the pages of ``docs/reference`` from the tables in the code: settings, manifest columns, command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
+from unprocess_gen.cli.exit_codes import EXIT_CODES
+from unprocess_gen.cli.help import default_text, hydra_flag, spelled, synopsis
+from unprocess_gen.cli.verbs import VERBS
+from unprocess_gen.config.defaults import default_options, default_values
+from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
+from unprocess_gen.config.forms import spelled as spelled_form
+from unprocess_gen.config.interpretation import BRANCH_NUMBERS, EFFECT_NUMBERS
+from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
+from unprocess_gen.config.schema import GROUPS, BranchConfig, all_settings
+from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.core.errors import REASONS
+from unprocess_gen.core.types import Physics
+from unprocess_gen.dataset.columns import COLUMNS, FIRST
+
+GENERATED_NOTE = "<!-- from the code: python docs/update_reference.py -->"
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a Markdown table; cells are escaped."""
+    head = list(head)
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def page(*blocks: str) -> str:
+    """Return a page of blocks, with a note that it is generated."""
+    return "\n\n".join([GENERATED_NOTE, *blocks]) + "\n"
+
+
+def code(text: str) -> str:
+    """Return text as inline code; an empty text stays empty."""
+    return f"`{text}`" if text else ""
+
+
+# ----------------------------------------------------------------------------------------------------------- settings
+
+SETTINGS_INTRODUCTION = """\
+# Settings
+
+Settings are `key=value` arguments of `gen-dataset`, in any order. `group=option` selects an option, a file of `conf/`.
+`group.key=value` changes one value; `-m` with commas sweeps over values. `gen-dataset --cfg job` prints all settings of
+a run, and `gen-dataset --help GROUP` the options and keys of a group."""
+
+DISTRIBUTIONS_INTRODUCTION = """\
+## Distributions
+
+A setting that is drawn for each image is a number, which is the same for all images, or a distribution, written as a
+list: `gains.red=[uniform,1.9,2.4]`. The column "allowed" names the distributions that a setting accepts."""
+
+FORMS_INTRODUCTION = """\
+### Numbers that depend on ISO
+
+A number of a branch is constant, or one of these forms:"""
+
+BRANCH_INTRODUCTION = """\
+### Keys of a branch
+
+Each item of `noise.branches` holds the numbers of a physical profile for one range of ISO. Ranges may touch. An ISO
+that no branch contains is refused."""
+
+EFFECTS_INTRODUCTION = """\
+### Numbers that an effect needs
+
+An effect is simulated only if the noise profile gives its numbers."""
+
+
+def settings_page() -> str:
+    """Return the page of all settings: options, keys, distributions and the numbers of noise profiles."""
+    defaults = default_options()
+    blocks = [SETTINGS_INTRODUCTION, "## Top level", _keys("", {n: s for g, n, s in all_settings() if not g})]
+    for group, kind in GROUPS.items():
+        blocks += [f"## `{group}`", _first_line(kind)]
+        options = [option for option in group_options(group) if option != "default"]
+        if options:
+            blocks.append(_options(group, options, defaults[group]))
+        settings = settings_of(kind)
+        if options and len(options) > 1:
+            blocks.append(f"Keys, with their values in `{group}={defaults[group]}`:")
+        for section in dict.fromkeys(setting.section for setting in settings.values()):
+            if section:
+                blocks.append(f"### {section}")
+            blocks.append(_keys(group, {name: one for name, one in settings.items() if one.section == section}))
+        if group == "noise":
+            blocks += [
+                BRANCH_INTRODUCTION,
+                _keys(None, settings_of(BranchConfig)),
+                FORMS_INTRODUCTION,
+                _forms(ISO_FORMS),
+            ]
+        if group == "effects":
+            blocks += [EFFECTS_INTRODUCTION, _effect_numbers()]
+    for group, added in ADDED_GROUPS.items():
+        text = f"Options for {added.contents}. They are added with a plus: `+{group}=OPTION`."
+        blocks += [f"## `{group}`", text, _options(group, group_options(group), "")]
+    blocks += [DISTRIBUTIONS_INTRODUCTION, _forms(DISTRIBUTION_FORMS), _not_data()]
+    return page(*blocks)
+
+
+def _first_line(kind: type) -> str:
+    return (kind.__doc__ or "").splitlines()[0].replace("``", "`")
+
+
+def _options(group: str, options: Iterable[str], default: str) -> str:
+    return table(
+        ["option", "meaning"],
+        [[f"`{name}`{' (default)' if name == default else ''}", option_summary(group, name)] for name in options],
+    )
+
+
+def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
+    """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
+    values = {} if group is None else default_values(group)
+    head = ["key", "default", "unit", "allowed", "meaning"]
+    rows = [
+        [
+            code(name),
+            code(default_text(values[name])) if name in values else "",
+            setting.unit,
+            str(setting.limit),
+            setting.meaning + (f"; null: {setting.null}" if setting.null else ""),
+        ]
+        for name, setting in settings.items()
+    ]
+    kept = [place for place in range(len(head)) if any(row[place] for row in rows)]
+    return table([head[place] for place in kept], [[row[place] for place in kept] for row in rows])
+
+
+def _forms(forms: Mapping[str, object]) -> str:
+    rows = []
+    for name, form in {**DISTRIBUTION_FORMS, **ISO_FORMS}.items():
+        if name in forms:
+            written = "a number" if name == "constant" else spelled_form(name, form)
+            rows.append([code(written), form.meaning])
+    return table(["form", "meaning"], rows)
+
+
+def _effect_numbers() -> str:
+    keys = {**BRANCH_NUMBERS, **EFFECT_NUMBERS, "heteroscedastic": ("a", "b")}
+    effects = [name for name in settings_of(GROUPS["effects"]) if name in keys]
+    return table(["effect", "keys of `noise`"], [[code(name), ", ".join(map(code, keys[name]))] for name in effects])
+
+
+def _not_data() -> str:
+    names = [f"`{group}.{name}`".replace("`.", "`") for group, name, one in all_settings() if not one.decides_data]
+    return (
+        "## Settings that do not decide the data\n\n"
+        "The bytes of a dataset do not depend on these keys. `config.yaml` omits them, and a rerun may change them:\n"
+        f"{', '.join(names[:-1])} and {names[-1]}."
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------ columns
+
+COLUMNS_INTRODUCTION = """\
+# Manifest columns
+
+`manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order; later
+versions append columns. `KEY.json` in the shards holds the same values, typed.
+
+An empty cell means that the value does not exist. Numbers are written so that they read back exactly. The columns of
+physical profiles, marked with an asterisk, are 0 or `none` in rows of other profiles."""
+
+REASONS_INTRODUCTION = """\
+## Reasons for failures
+
+A source that cannot be used has a row with `status` failed. `reason` is one of these words; `detail` explains it in one
+line."""
+
+
+def columns_page() -> str:
+    """Return the page of manifest columns and reasons for failures."""
+    rows = [
+        [
+            code(column.name) + ("\\*" if column.of is Physics else ""),
+            column.type_name,
+            column.unit,
+            column.empty_if,
+            column.meaning,
+            "" if column.since == FIRST else column.since,
+        ]
+        for column in COLUMNS
+    ]
+    reasons = [[code(reason), meaning] for reason, meaning in REASONS.items()]
+    return page(
+        COLUMNS_INTRODUCTION,
+        table(["column", "type", "unit", "empty if", "meaning", "since"], rows),
+        f'A column without an entry under "since" is in datasets of version {FIRST} too.',
+        REASONS_INTRODUCTION,
+        table(["reason", "meaning"], reasons),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------- command line
+
+COMMAND_LINE_INTRODUCTION = """\
+# Command line
+
+    gen-dataset [key=value ...] [flags]    generate a dataset; the same command resumes it
+    gen-dataset VERB ...                   one of the verbs below
+
+The first word is a verb if it consists of small letters only. [Settings](settings.md) and flags may be mixed in any
+order. `gen-dataset VERB --help` prints the arguments of a verb, `gen-dataset --help GROUP` the options and keys of a
+group of settings. An argument that names an existing folder is a folder, whatever characters its name contains.
+Everything after `--` is a file or folder, even with a leading hyphen."""
+
+HYDRA_INTRODUCTION = """\
+## Flags of Hydra
+
+Verbs with `[key=value ...]` also take these flags of
+[Hydra](https://hydra.cc/docs/1.3/intro/):"""
+
+
+def command_line_page() -> str:
+    """Return the page of verbs, flags and exit codes."""
+    verbs = [[f"[`{verb.name}`](#{verb.name})", verb.summary] for verb in VERBS.values()]
+    blocks = [COMMAND_LINE_INTRODUCTION, table(["verb", "effect"], verbs)]
+    for verb in VERBS.values():
+        blocks += [f"## {verb.name}", f"    {synopsis(verb)}", _summary(verb)]
+        arguments = [[code(verb.place.metavar), verb.place.expected]] if verb.place else []
+        arguments += [_argument(argument) for argument in verb.arguments]
+        if arguments:
+            blocks.append(table(["argument", "meaning"], arguments))
+    flags = [_argument(argument) for argument in STANDARD]
+    flags += [["`-h, --help`", "print the help of the verb"], ["`--version`", "print the version"]]
+    hydra = [[code(hydra_flag(spellings)), text] for spellings, (_, text) in HYDRA_FLAGS.items()]
+    codes = [[", ".join(map(str, one.codes)), one.meaning] for one in EXIT_CODES]
+    blocks += ["## Flags of every verb", table(["flag", "meaning"], flags)]
+    blocks += [HYDRA_INTRODUCTION, table(["flag", "meaning"], hydra)]
+    blocks += ["## Exit codes", table(["code", "meaning"], codes)]
+    blocks.append("The exit code of a sweep, and of `verify` for a sweep, is that of its worst part.")
+    return page(*blocks)
+
+
+def _summary(verb: Verb) -> str:
+    summary = verb.summary.replace('eval "$(gen-dataset completion bash)"', '`eval "$(gen-dataset completion bash)"`')
+    return f"{summary[0].upper()}{summary[1:]}."
+
+
+def _argument(argument: Argument) -> list[str]:
+    return [code(spelled(argument)), argument.help + (" (required)" if argument.required else "")]
+
+
+PAGES = {
+    "docs/reference/settings.md": settings_page,
+    "docs/reference/columns.md": columns_page,
+    "docs/reference/command_line.md": command_line_page,
+}
+"""The pages, and the functions that return their text."""
