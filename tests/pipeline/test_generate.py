@@ -18,6 +18,7 @@ import pytest
 from helpers.commands import Cli
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import PHOTOS, fill, pixels
+from helpers.processes import wait_for
 from helpers.promise_report import Figure
 from PIL import Image
 
@@ -29,6 +30,7 @@ from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.executors import local
 
 SHARDS_OF_5 = "output.pairs_per_shard=5"
@@ -473,11 +475,36 @@ def test_progress_is_plain_lines_without_a_terminal(make: Make, photos: Path, tm
     assert re.fullmatch(r"gen-dataset: 13/13 images, [\d.]+ images/s, 0 failed, 0 s left\n", err)
 
 
+COMPILING = "gen-dataset: 0/1 images, compiling kernels, once per machine and version"
+
+
+@pytest.mark.slow
 def test_only_the_first_run_reports_compiling(cli: Cli, tmp_path: Path) -> None:
-    line = "gen-dataset: 0/1 images, compiling kernels, once per machine and version"
     said = [cli("source.limit=1", f"out=ds{n}", NUMBA_CACHE_DIR=str(tmp_path / "kept")).stderr for n in range(2)]
 
-    assert [line in one for one in said] == [True, False]
+    assert [COMPILING in one for one in said] == [True, False]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_run_reports_compiling_unless_kernels_are_compiled(
+    compiled: bool, make: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Compiling is simulated: the self-test, which compiles, ends once its report was printed."""
+    shown: list[str] = []
+
+    def is_shown() -> bool:
+        shown.append(capsys.readouterr().err)
+        return COMPILING in "".join(shown)
+
+    def compile_kernels(*_: object) -> None:
+        if not compiled:
+            wait_for(is_shown)
+
+    monkeypatch.setattr(worker.self_test, "are_compiled", lambda kernels: compiled)
+    monkeypatch.setattr(worker.self_test, "check", compile_kernels)
+    with logging_to():
+        make(fill(tmp_path / "p", 1), tmp_path / "ds", "self_test=stop")
+    assert (COMPILING in "".join([*shown, capsys.readouterr().err])) is not compiled
 
 
 def test_summary_adds_up_the_counts_of_the_manifest(dataset: Path) -> None:

@@ -16,7 +16,6 @@ import yaml
 from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill, pixels
-from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -110,15 +109,13 @@ def assert_cut_outs(patched: Path, whole: Path) -> int:
     ],
     ids=["levels", "poisson", "physical", "every effect", "averaged", "dark"],
 )
-@pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])
 def test_patch_equals_the_crop_of_its_full_pair(
-    patch: str, overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path, figure: Figure
+    overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
 ) -> None:
     make(sources, tmp_path / "whole", *overrides)
-    make(sources, tmp_path / "patched", *overrides, patch)
-    equal = assert_cut_outs(tmp_path / "patched", tmp_path / "whole")
-    assert equal >= 14
-    figure("patches", f"{equal} patches are crops of their frames")
+    for number, patch in enumerate((GRID, STRIDE, RANDOM)):
+        make(sources, tmp_path / f"patched{number}", *overrides, patch)
+        assert assert_cut_outs(tmp_path / f"patched{number}", tmp_path / "whole") >= 14, patch
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
@@ -264,15 +261,15 @@ def test_spellings_of_a_patch_setting_give_one_config_yaml(
     assert dataset_yaml(read_dataset_yaml(tmp_path / "config.yaml")[0]) == texts.pop()
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        *("0", "1", "127", "-2", "32770", "2.0", "true", "''", "wide", "[]", "{a:1}", "[128]", "[grid]"),
-        *("[grid,127]", "[grid,8,3]", "[grid,8,0]", "[grid,8,8,8]", "[grid,8.0]", "[grid,null]", "[[grid,8]]"),
-        *("[random,8]", "[random,7,1]", "[random,8,0]", "[random,8,10001]", "[random,8,1.5]", "[random,8,true]"),
-        "[spiral,8,8]",
-    ],
+IMPOSSIBLE = (
+    *("0", "1", "127", "-2", "32770", "2.0", "true", "''", "wide", "[]", "{a:1}", "[128]", "[grid]"),
+    *("[grid,127]", "[grid,8,3]", "[grid,8,0]", "[grid,8,8,8]", "[grid,8.0]", "[grid,null]", "[[grid,8]]"),
+    *("[random,8]", "[random,7,1]", "[random,8,0]", "[random,8,10001]", "[random,8,1.5]", "[random,8,true]"),
+    "[spiral,8,8]",
 )
+
+
+@pytest.mark.parametrize("value", IMPOSSIBLE)
 def test_impossible_patch_settings_are_refused(value: str, settings: Settings) -> None:
     with pytest.raises(ConfigError, match=r"^source\.patch=.*: expected null, a side, \[grid, side\], ") as caught:
         validate_config(settings(f"source.patch={value}"))
@@ -358,7 +355,8 @@ def test_rows_of_patches_have_no_empty_number(cut_up: Path) -> None:
         assert row["status"] == "failed" or None not in row.values()
 
 
-def test_the_bytes_do_not_depend_on_the_number_of_workers(
+@pytest.mark.slow
+def test_number_of_workers_changes_no_byte_of_patches(
     sources: Path, cut_up: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
     make(sources, tmp_path / "ds", *LEVELS, RANDOM, "output.pairs_per_shard=2", n_jobs=2)
@@ -517,16 +515,18 @@ def test_dataset_of_patches_is_regenerated_from_its_config(cut_up: Path, sources
     assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {cut_up}, bit for bit")
 
 
-@pytest.mark.parametrize("side", [16, 64])
-def test_fitted_noise_of_small_patches_matches_their_rows(side: int, make: Make, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("side", "count"), [(16, 150), (64, 150), *(pytest.param(side, 400, marks=pytest.mark.slow) for side in (16, 64))]
+)
+def test_fitted_noise_of_small_patches_matches_their_rows(side: int, count: int, make: Make, tmp_path: Path) -> None:
     """Few sites give large errors of the fit. The largest of 800 standard normal values is below 5."""
-    make(None, tmp_path / "ds", "source.limit=2", f"source.patch=[random,{side},400]")
+    make(None, tmp_path / "ds", "source.limit=2", f"source.patch=[random,{side},{count}]")
     found = list(transfer.iterate_fits(tmp_path / "ds"))
-    assert len(found) > 300
+    assert len(found) > count * 3 / 4
     assert max(one.deviation for one in found) < 5
 
 
-# Foretold -------------------------------------------------------------------------------------------------------------
+# Plans ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("patch", [GRID, STRIDE, RANDOM])

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import itertools
 import random
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.commands import COMMAND, RunMain, environment
-from helpers.datasets import Make, Settings
+from helpers.commands import RunMain
+from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import pixels
+from helpers.processes import SLOW_DISK, committed, imported_first, kill_group, running, wait_for
 from helpers.promise_report import Figure
 from PIL import Image
 
@@ -124,6 +124,18 @@ ENCODED = {
     "dnxhd": ("dnxhd", "mov", {"profile": "dnxhr_sq"}),
 }
 PIX_FMT = {"mjpeg": "yuvj420p", "prores": "yuv422p10le", "dnxhd": "yuv422p"}
+
+
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return a function that returns a film of 30 frames, encoded once for all tests, which leave it as it is."""
+    folder = tmp_path_factory.mktemp("encoded")
+
+    @functools.cache
+    def path_of(kind: str) -> Path:
+        return encode(folder, kind)
+
+    return path_of
 
 
 def encode(folder: Path, kind: str, count: int = 30) -> Path:
@@ -330,8 +342,8 @@ def test_a_frame_is_the_same_however_it_was_reached(kind: str, tmp_path: Path, f
 
 
 @pytest.mark.parametrize("kind", [kind for kind in ENCODED if kind not in ("prores", "dnxhd")])
-def test_frames_are_those_a_player_shows_in_its_order(kind: str, tmp_path: Path) -> None:
-    path = encode(tmp_path, kind)
+def test_frames_are_those_a_player_shows_in_its_order(kind: str, encoded: Callable[[str], Path]) -> None:
+    path = encoded(kind)
     video, shown = opened(path), plain(path)
     assert len(shown) == len(video)
     for number, luma in enumerate(shown):
@@ -341,13 +353,13 @@ def test_frames_are_those_a_player_shows_in_its_order(kind: str, tmp_path: Path)
         assert np.abs(found - wanted)[inside].max() < 1
 
 
-def test_decoder_starts_at_each_closed_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decoder_starts_at_each_closed_group(encoded: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
     starts: list[int] = []
     packets = Video._packets
     monkeypatch.setattr(Video, "_packets", lambda self, start: starts.append(start) or packets(self, start))
     for kind, groups in (("h264", 5), ("h264_open", 1), ("hevc", 5), ("mjpeg", 1), ("ffv1", 6), ("vp9", 3)):
         starts.clear()
-        video = opened(encode(tmp_path, kind))
+        video = opened(encoded(kind))
         for number in range(30):
             rgb(video, number)
         assert (kind, len(starts)) == (kind, groups)
@@ -552,9 +564,9 @@ def test_damage_affects_its_frame_and_dependent_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in ENCODED if kind != "av1"])
-def test_damage_shows_alike_however_it_was_reached(kind: str, tmp_path: Path) -> None:
+def test_damage_shows_alike_however_it_was_reached(kind: str, encoded: Callable[[str], Path], tmp_path: Path) -> None:
     """Frames before the damage are intact; later ones are the same each time, whether the decoder finds it or not."""
-    path = encode(tmp_path, kind)
+    path = Path(shutil.copy(encoded(kind), tmp_path))
     video = opened(path)
     whole = [outcome(video, number) for number in range(30)]
     with av.open(str(path)) as container:
@@ -653,7 +665,7 @@ def test_noise_of_frames_is_independent(filmed: Path) -> None:
 
 
 def test_the_same_bytes_for_any_number_of_workers(
-    films: Path, filmed: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
+    films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
     make(films, tmp_path / "ds", *CLIPS, n_jobs=2)
     assert tree_hash(tmp_path / "ds") == tree_hash(filmed)
@@ -671,18 +683,17 @@ def key(row: dict[str, str]) -> tuple[str, ...]:
     return row["source"], row["frame"], row["clean_xxh3"], row["noisy_xxh3"]
 
 
-def test_the_same_bytes_after_a_kill(
-    films: Path, filmed: Path, tree_hash: Callable[[Path], str], tmp_path: Path
+@pytest.mark.parametrize("n_jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_killed_run_of_videos_resumes_to_the_same_bytes(
+    n_jobs: int, films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
-    command = [COMMAND, *CLIPS, f"source.root={films}", f"out={tmp_path}/ds", "n_jobs=2"]
-    run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    until = time.monotonic() + 60
-    while not list((tmp_path / "ds" / "shards").glob("*")) and time.monotonic() < until and run.poll() is None:
-        time.sleep(0.005)
-    run.send_signal(signal.SIGKILL)
-    run.wait()
-    subprocess.run(command, env=environment(), check=True, capture_output=True)
-    assert tree_hash(tmp_path / "ds") == tree_hash(filmed)
+    out, env = tmp_path / "ds", imported_first(tmp_path, SLOW_DISK)
+    with running(*CLIPS, f"source.root={films}", f"out={out}", f"n_jobs={n_jobs}", cwd=tmp_path, **env) as run:
+        wait_for(lambda: committed(out) or run.poll() is not None)
+        kill_group(run)
+    assert not (out / "dataset.json").exists()
+    assert make(films, out, *CLIPS).made > 0
+    assert tree_hash(out) == tree_hash(filmed)
 
 
 def test_another_video_moves_nothing(films: Path, filmed: Path, make: Make, tmp_path: Path) -> None:
