@@ -273,7 +273,9 @@ def test_libraw_develops_a_scene_to_the_photographs_light(
     assert_colours_are_right(tmp_path, scenes, 1)
 
 
-def assert_colours_are_right(place: Path, photographs: list[np.ndarray], allowed_db: float) -> None:
+def assert_colours_are_right(place: Path, photographs: list[np.ndarray], allowed_db: float) -> float:
+    """Return the least PSNR of a channel, dB."""
+    least_db = np.inf
     for number, srgb in enumerate(photographs):
         _, _, row, plan = pair(place / "ds", number)
         dng.export(place / "ds", row["key"], ["clean"], place / "to")
@@ -285,6 +287,8 @@ def assert_colours_are_right(place: Path, photographs: list[np.ndarray], allowed
         assert share > 0.3
         assert (np.abs(error) < largest).all()
         assert (psnr_db > rounding_db - allowed_db).all()
+        least_db = min(least_db, float(psnr_db.min()))
+    return least_db
 
 
 REAL = pytest.mark.skipif("PHOTOS" not in os.environ, reason="set PHOTOS to a folder of photographs")
@@ -300,14 +304,16 @@ def centre(path: Path, side: int) -> np.ndarray:
 @REAL
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_libraw_develops_photographs_to_their_light(sensor: str, make: Make, tmp_path: Path) -> None:
+def test_libraw_develops_photographs_to_their_light(sensor: str, make: Make, tmp_path: Path, figure: Figure) -> None:
     (tmp_path / "photos").mkdir()
     paths = sorted(Path(os.environ["PHOTOS"]).glob("*.jpg"))
     photographs = [centre(path, 512) for path in paths]
     for path, srgb in zip(paths, photographs, strict=True):
         doubled(srgb, tmp_path / "photos" / f"{path.stem}.png")
     make(tmp_path / "photos", tmp_path / "ds", f"sensor={sensor}")
-    assert_colours_are_right(tmp_path, photographs, 3)  # smooth ones have few codes, whose errors are not spread evenly
+    # smooth photographs have few codes, whose errors are not spread evenly
+    least_db = assert_colours_are_right(tmp_path, photographs, 3)
+    figure("dng", f"{sensor}, {len(photographs)} photographs: PSNR at least {least_db:.1f} dB")
 
 
 # ------------------------------------------------------------------------------------------------------------- noise

@@ -53,8 +53,8 @@ PROMISES = (
         "machines",
         "The bytes do not depend on the processor, the library versions, or the code that libraries select for a "
         "processor; 64-bit Arm was emulated.",
-        ("tests/project/test_everywhere.py",),
-        ("pytest -m slow tests/project/test_everywhere.py", "Arm: see the head of tests/helpers/everywhere.py"),
+        ("tests/project/test_everywhere.py", "tests/helpers/everywhere.py"),
+        ("pytest -m slow tests/project/test_everywhere.py",),
     ),
     Promise(
         "resume",
@@ -211,7 +211,7 @@ PROMISES = (
         "Broken, oversized and unusual pictures of other projects cause no crash and no hang: at most 10 s and 1.5 GB "
         "each.",
         ("tests/sources/test_hostile_files.py",),
-        ("pytest -m slow tests/sources/test_hostile_files.py (downloads the pictures)",),
+        ("pytest -m slow tests/sources/test_hostile_files.py",),
     ),
     Promise(
         "hostile-names",
@@ -283,7 +283,7 @@ def _with_ranges(words: tuple[str, ...], texts: Counter[str]) -> str:
         low, high = (choose(numbers, key=lambda text: float(text.replace(",", ""))) for choose in (min, max))
         shown += (low if low == high else f"{low} to {high}") + word
     cases = texts.total()
-    return shown if cases == 1 else f"{shown} (in each of {cases} cases)"
+    return shown if cases == 1 else f"{shown} ({cases} cases)"
 
 
 def evidence_table() -> str:

@@ -143,9 +143,12 @@ def test_the_distribution_holds_at_the_ends_of_every_cell(cell: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_distribution_holds_at_thousands_of_rates() -> None:
+def test_the_distribution_holds_at_thousands_of_rates(figure: Figure) -> None:
+    errors = []
     for rate in random_rates(6000, seed=2):
-        assert np.abs(error_in_words(min(float(rate), 1e7), most=150)).max() <= LEAST_ERROR + COMPUTED_ERROR, rate
+        errors.append(np.abs(error_in_words(min(float(rate), 1e7), most=150)).max())
+        assert errors[-1] <= LEAST_ERROR + COMPUTED_ERROR, rate
+    figure("poisson", f"{len(errors)} random rates: at most {max(errors):.2f} of 2^32 words off")
 
 
 @pytest.mark.parametrize("rate", [1e-12, 1e-6, 0.01, 0.3, 1.0, 3.7, 12.5, 20.0])
