@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -54,12 +54,6 @@ class Copy:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.package = folder / "unprocess_gen"
-        shutil.copytree(PACKAGE / "core", self.package / "core", ignore=shutil.ignore_patterns("__pycache__"))
-        self.write("__init__.py", "")
-        self.write("simulation/__init__.py", "")
-        self.write("simulation/library.py", LIBRARY)
-        self.write("simulation/caller.py", CALLER)
-        self.write("cli/main.py", "x = 1")
 
     def write(self, name: str, text: str) -> None:
         (self.package / name).parent.mkdir(parents=True, exist_ok=True)
@@ -77,15 +71,34 @@ class Copy:
         ).stdout.strip()
 
 
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Copy:
+    """Return a package whose kernels were compiled by another process."""
+    made = Copy(tmp_path_factory.mktemp("compiled"))
+    shutil.copytree(PACKAGE / "core", made.package / "core", ignore=shutil.ignore_patterns("__pycache__"))
+    made.write("__init__.py", "")
+    made.write("simulation/__init__.py", "")
+    made.write("simulation/library.py", LIBRARY)
+    made.write("simulation/caller.py", CALLER)
+    made.write("cli/main.py", "x = 1")
+    assert made.call() == "False 2.0 0"
+    return made
+
+
 @pytest.fixture
-def copy(tmp_path: Path) -> Copy:
-    copy = Copy(tmp_path)
-    assert copy.call() == "False 2.0 0"
-    return copy
+def copy(compiled: Copy, tmp_path: Path) -> Iterator[Copy]:
+    """Return the package, and restore its files and machine code after the test.
+
+    Numba stores machine code by the path of a kernel's file, so a copy at another path would load none.
+    """
+    shutil.copytree(compiled.package, tmp_path / "intact")
+    yield compiled
+    shutil.rmtree(compiled.package)
+    shutil.copytree(tmp_path / "intact", compiled.package)
 
 
-def test_another_process_loads_the_machine_code(copy: Copy) -> None:
-    assert copy.call() == "True 2.0 1"
+def test_another_process_loads_the_machine_code(compiled: Copy) -> None:
+    assert compiled.call() == "True 2.0 1"
 
 
 def test_editing_other_packages_keeps_machine_code(copy: Copy) -> None:
@@ -104,25 +117,23 @@ def test_other_modification_times_keep_machine_code(copy: Copy) -> None:
 
 
 def test_editing_a_called_kernel_recompiles_its_callers(copy: Copy) -> None:
+    """Machine code of the earlier sources is removed."""
     copy.write("simulation/library.py", LIBRARY.replace("/ 2", "/ 4"))
 
     assert copy.call() == "False 0.5 0"
     assert copy.call() == "True 0.5 1"
-
-
-@pytest.mark.parametrize("name", ["core/random_streams.py", "core/jit.py", "simulation/new.py"])
-def test_changing_any_kernel_package_recompiles(copy: Copy, name: str) -> None:
-    path = copy.package / name
-    copy.write(name, (path.read_text() if path.exists() else "") + "\n# changed\n")
-
-    assert copy.call() == "False 2.0 0"
-
-
-def test_machine_code_of_earlier_sources_is_removed(copy: Copy) -> None:
-    copy.write("simulation/library.py", LIBRARY.replace("/ 2", "/ 4"))
-    copy.call()
-
     assert len(list((copy.package / "__pycache__").glob(f"{jit.PREFIX}*"))) == 1
+
+
+def test_changing_any_kernel_package_changes_the_folder(copy: Copy) -> None:
+    folders = [jit.source_digest(copy.package)]
+    for name in ("core/random_streams.py", "core/jit.py", "simulation/new.py"):
+        path = copy.package / name
+        copy.write(name, (path.read_text() if path.exists() else "") + "\n# changed\n")
+        folders.append(jit.source_digest(copy.package))
+
+    assert len(set(folders)) == 4
+    assert copy.call() == "False 2.0 0"
 
 
 def test_a_read_only_package_caches_below_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
