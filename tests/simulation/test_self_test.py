@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from helpers.commands import RunMain
+from helpers.photographs import fill
 from helpers.promise_report import Figure
 
 from unprocess_gen.core import lookup_tables, tone_curves
@@ -29,6 +30,12 @@ def _fresh() -> Iterator[None]:
     selftest.failures.cache_clear()
     yield
     selftest.failures.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the override that selects two small photographs as the source."""
+    return f"source.root={fill(tmp_path_factory.mktemp('self_test') / 'photographs', 2)}"
 
 
 @pytest.mark.parametrize("kernels", selftest.GOLDEN_PAIRS)
@@ -71,23 +78,25 @@ def test_a_golden_pair_tests_the_kernels_that_simulate_it(name: str) -> None:
     ],
 )
 def test_only_the_kernels_of_the_plans_are_tested(
-    kernels: str, settings: list[str], run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+    kernels: str, settings: list[str], two: str, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     proved: list[str] = []
     monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
 
-    assert run_main("n_jobs=1", "source.limit=2", *settings).code == 0
+    assert run_main("n_jobs=1", two, *settings).code == 0
     assert set(proved) == {kernels}
 
 
-def test_kernels_are_tested_when_a_plan_first_needs_them(run_main: RunMain, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_are_tested_when_a_plan_first_needs_them(
+    two: str, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The plans of all noise levels of an image count."""
     proved: list[str] = []
     monkeypatch.setattr(selftest, "failures", lambda kernels: proved.append(kernels) or ())
     kinds = iter(["plain", "physical", "plain", "one_normal"])
     monkeypatch.setattr(selftest, "kernels", lambda plan: next(kinds))
 
-    assert run_main("n_jobs=1", "source.limit=2", "noise.draws=2").code == 0
+    assert run_main("n_jobs=1", two, "noise.draws=2").code == 0
     assert list(dict.fromkeys(proved)) == ["plain", "physical", "one_normal"]
 
 
@@ -193,12 +202,12 @@ def nudged(kernel: Callable[..., object]) -> Callable[..., object]:
 GOLDEN = {**selftest.GOLDEN, "per_channel": ("0" * 32, "0" * 32)}
 
 
-def test_a_failed_self_test_stops_the_run_before_the_first_pair(
-    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_failed_self_test_stops_before_the_first_pair(
+    two: str, run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
 
-    done = run_main("n_jobs=1", "source.limit=2")
+    done = run_main("n_jobs=1", two)
 
     assert done.code == 5
     assert done.err.startswith(
@@ -211,11 +220,11 @@ def test_a_failed_self_test_stops_the_run_before_the_first_pair(
 
 
 def test_go_on_continues_and_records_the_failure(
-    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    two: str, run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
 
-    done = run_main("n_jobs=1", "source.limit=3", "output.pairs_per_shard=2", "self_test=go_on")
+    done = run_main("n_jobs=1", two, "output.pairs_per_shard=1", "self_test=go_on")
 
     facts = json.loads((tmp_path / "ds" / "dataset.json").read_text())
     assert done.code == 0
@@ -225,19 +234,18 @@ def test_go_on_continues_and_records_the_failure(
 
 
 def test_only_shards_of_the_failing_process_are_recorded(
-    run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    two: str, run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    whole = ("n_jobs=1", "source.limit=4", "output.pairs_per_shard=2", "self_test=go_on")
-    assert run_main(*whole, "out=other").code == 0
+    arguments = ("n_jobs=1", two, "output.pairs_per_shard=1", "self_test=go_on")
     with monkeypatch.context() as patched:
         patched.setattr("unprocess_gen.pipeline.workspace.Workspace.finish", interrupted)
-        assert run_main(*whole).code == 130
+        assert run_main(*arguments).code == 130
     (tmp_path / "ds" / ".work" / "rows" / "00001.json").unlink()
     (tmp_path / "ds" / "shards" / "shard-00001.tar").unlink()
     monkeypatch.setattr(selftest, "GOLDEN", GOLDEN)
     selftest.failures.cache_clear()
 
-    assert run_main(*whole).code == 0
+    assert run_main(*arguments).code == 0
 
     shards = json.loads((tmp_path / "ds" / "dataset.json").read_text())["shards"]
     assert [("self_test" in entry) for entry in shards] == [False, True]
