@@ -77,7 +77,7 @@ def test_a_single_pixel_is_the_first_site(pattern: str, channel: int) -> None:
 
 
 @given(st.sampled_from(PATTERNS), st.data())
-def test_the_mosaic_of_a_crop_is_the_crop_of_the_mosaic(pattern: str, data: st.DataObject) -> None:
+def test_the_mosaic_of_a_crop_is_the_cropped_mosaic(pattern: str, data: st.DataObject) -> None:
     colours = coloured(11, 12)
     top, left = data.draw(st.integers(0, 10)), data.draw(st.integers(0, 11))
     bottom, right = data.draw(st.integers(top + 1, 11)), data.draw(st.integers(left + 1, 12))
