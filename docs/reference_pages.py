@@ -117,14 +117,14 @@ def _options(group: str, options: Iterable[str], default: str) -> str:
 def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
     """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
     values = {} if group is None else default_values(group)
-    head = ["key", "default", "unit", "allowed", "meaning"]
+    head = ["key", "meaning", "default", "unit", "allowed"]
     rows = [
         [
             code(name),
+            setting.meaning + (f"; null: {setting.null}" if setting.null else ""),
             code(default_text(values[name])) if name in values else "",
             setting.unit,
             str(setting.limit),
-            setting.meaning + (f"; null: {setting.null}" if setting.null else ""),
         ]
         for name, setting in settings.items()
     ]
@@ -179,10 +179,10 @@ def columns_page() -> str:
     rows = [
         [
             code(column.name) + ("\\*" if column.of is Physics else ""),
+            column.meaning,
             column.type_name,
             column.unit,
             column.empty_if,
-            column.meaning,
             "" if column.since == FIRST else column.since,
         ]
         for column in COLUMNS
@@ -190,7 +190,7 @@ def columns_page() -> str:
     reasons = [[code(reason), meaning] for reason, meaning in REASONS.items()]
     return page(
         COLUMNS_INTRODUCTION,
-        table(["column", "type", "unit", "empty if", "meaning", "since"], rows),
+        table(["column", "meaning", "type", "unit", "empty if", "since"], rows),
         f'A column without an entry under "since" is in datasets of version {FIRST} too.',
         REASONS_INTRODUCTION,
         table(["reason", "meaning"], reasons),
