@@ -326,7 +326,7 @@ def test_libraw_develops_photographs_to_their_light(sensor: str, make: Make, tmp
         ("noise=nikon_d850", "noise.iso=6400", "effects.all=off", "effects.shot=on", "effects.read=on"),
     ],
 )
-def test_the_noise_profile_is_the_noise_of_the_frames(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
+def test_noise_profile_is_the_noise_of_the_frames(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
     """Mean of (noisy - clean)² is that of S·x + O, and 1/6 DN² of rounding, to five standard errors of a normal's."""
     make(None, tmp_path / "ds", "source.limit=1", *overrides)
     _, _, row, plan = pair(tmp_path / "ds")
@@ -342,7 +342,7 @@ def test_the_noise_profile_is_the_noise_of_the_frames(overrides: tuple[str, ...]
     assert abs(excess) < 5 * np.sqrt(2 * (law**2).mean() / used.sum())
 
 
-def test_the_noise_profile_is_the_rows_law_in_units_of_the_range(ds: Path) -> None:
+def test_noise_profile_is_the_rows_variance_in_range_units(ds: Path) -> None:
     row = pair(ds)[2] | {"a_dn": 7.5, "b_dn2": 30.0, "black_level_dn": 240, "white_level_dn": 4095}
     assert tags_of(row)["NoiseProfile"] == (7.5 / 3855, 30.0 / 3855**2) * 3
 
@@ -513,7 +513,7 @@ def test_a_frame_that_no_file_can_hold_is_refused(width: int, height: int, ds: P
 
 
 @pytest.mark.parametrize("frame", [np.zeros((22, 22), np.float32), np.zeros((22, 22, 4), np.uint16)])
-def test_what_is_no_uint16_mosaic_is_refused(frame: np.ndarray, ds: Path) -> None:
+def test_other_arrays_than_uint16_mosaics_are_refused(frame: np.ndarray, ds: Path) -> None:
     with pytest.raises(ConfigError, match=r"its clean frame is \w+ \[22.*; a DNG is made of uint16 mosaics \[H, W\]"):
         dng.encode(frame, pair(ds)[2], "clean")
 

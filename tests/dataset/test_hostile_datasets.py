@@ -110,7 +110,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize(("name", "value"), HOSTILE)
-def test_value_outside_its_range_is_damage_of_row_column_and_value(name: str, value: str, copy: Path) -> None:
+def test_value_outside_its_range_names_row_column_and_value(name: str, value: str, copy: Path) -> None:
     manifest = edit(copy, **{name: value})
     with pytest.raises(DamageError) as error:
         for row in read_rows(manifest):
@@ -290,7 +290,7 @@ def test_version_0_1_has_the_first_columns() -> None:
     assert "detail" not in HEADERS[0]
 
 
-def test_dataset_of_0_1_reads_verifies_and_replays(copy: Path, original: Path) -> None:
+def test_dataset_of_0_1_is_read_verified_and_replayed(copy: Path, original: Path) -> None:
     old = as_version_0_1(copy)
     assert read_header(old / "manifest.csv") == HEADERS[0]
     assert verify(old) == []

@@ -195,7 +195,7 @@ names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_
 # Columns --------------------------------------------------------------------------------------------------------------
 
 
-def test_columns_of_the_contract_are_there_in_its_order() -> None:
+def test_columns_have_the_order_of_the_contract() -> None:
     assert [name for name in NAMES if name in CONTRACT] == CONTRACT
 
 
@@ -226,7 +226,7 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
             assert (row[column.name] == column.empty) == (column.empty_if in held), f"{name}: {column.name}"
 
 
-def test_every_value_of_a_row_has_the_type_of_its_column() -> None:
+def test_every_value_of_a_row_has_its_columns_type() -> None:
     for plan in (PLAN, PHYSICAL):
         row = row_of(plan)
         assert list(row) == list(NAMES)
@@ -269,32 +269,30 @@ def test_keys_have_eight_digits_or_more(index: int, key: str) -> None:
 
 
 @given(plans)
-def test_a_row_holds_its_plan(plan: Plan) -> None:
+def test_row_has_its_plan(plan: Plan) -> None:
     assert plan_from_row(row_of(plan)) == plan
 
 
 @given(plan=plans, name=names)
-def test_row_read_from_csv_holds_the_same_plan_bit_for_bit(
-    plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_row_read_from_csv_has_the_same_plan(plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     (row,) = through_csv([row_of(plan, dataclasses.replace(SOURCE, name=name))], tmp_path_factory.mktemp("csv"))
     assert repr(plan_from_row(row)) == repr(plan)
     assert row["source"] == name
 
 
 @given(plans)
-def test_a_row_read_back_from_json_holds_the_same_plan(plan: Plan) -> None:
+def test_row_read_from_json_has_the_same_plan(plan: Plan) -> None:
     assert repr(plan_from_row(json.loads(row_json([row_of(plan)])))) == repr(plan)
 
 
 @given(plan=plans)
-def test_a_row_read_back_from_csv_is_the_row(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_row_read_from_csv_is_the_row(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> None:
     (row,) = through_csv([row_of(plan)], tmp_path_factory.mktemp("csv"))
     assert repr(row) == repr(dict(row_of(plan)))
 
 
 @pytest.mark.parametrize("reason", REASONS)
-def test_a_failed_row_read_back_from_csv_is_the_row(reason: str, tmp_path: Path) -> None:
+def test_failed_row_read_from_csv_is_the_row(reason: str, tmp_path: Path) -> None:
     row = failed_row(SOURCE, SHA256, 2, 5, reason)
     assert through_csv([row], tmp_path) == [dict(row)]
 
@@ -315,7 +313,7 @@ def test_drawn_physical_plans_survive_csv(settings: Callable[..., Any], noise: s
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}])
-def test_a_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
+def test_row_without_a_needed_value_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
         plan_from_row({**row_of(), name: None})
 
@@ -327,7 +325,7 @@ NUMBERED = ("level", "draw", "frame", "downscale", "dequantize")
 @pytest.mark.parametrize(
     "name", [*("scene", "exposure_ratio", "saturated_as", "noise_law"), *PHYSICAL_NAMES, *NUMBERED]
 )
-def test_a_physical_row_without_a_value_its_plan_needs_is_damage(name: str) -> None:
+def test_physical_row_without_a_needed_value_is_damage(name: str) -> None:
     with pytest.raises(DamageError, match=f"row 00000003: not a plan \\(.*{name}"):
         plan_from_row({**row_of(PHYSICAL), name: None})
 

@@ -149,7 +149,7 @@ def digest(pairs: RawPairs, number: int) -> str:
     return array_xxh3(pairs[number].noisy)
 
 
-def test_it_can_be_pickled_before_and_after_use(dataset: Path) -> None:
+def test_reader_can_be_pickled_before_and_after_use(dataset: Path) -> None:
     pairs = RawPairs(dataset)
     for _ in range(2):
         copy = pickle.loads(pickle.dumps(pairs))
@@ -157,14 +157,14 @@ def test_it_can_be_pickled_before_and_after_use(dataset: Path) -> None:
         assert digest(pairs, 0) == digests(dataset)[0]
 
 
-def test_several_processes_read_it(dataset: Path) -> None:
+def test_several_processes_read_one_dataset(dataset: Path) -> None:
     pairs = RawPairs(dataset)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         found = list(pool.map(digest, [pairs] * 13, range(13)))
     assert found == digests(dataset)
 
 
-def test_several_threads_read_it(dataset: Path) -> None:
+def test_several_threads_read_one_dataset(dataset: Path) -> None:
     pairs = RawPairs(dataset)
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda i: digest(pairs, i % 13), range(52)))

@@ -95,12 +95,12 @@ def test_failed_row_named_alone_is_no_pair(manifest: Path) -> None:
         ("00000003-p0001", "--keys 00000003-p0001: .* has no such key"),
     ],
 )
-def test_what_names_no_row_is_refused(keys: str, problem: str, manifest: Path) -> None:
+def test_selection_without_rows_is_refused(keys: str, problem: str, manifest: Path) -> None:
     with pytest.raises(ConfigError, match=problem):
         list(select_rows(manifest, None, keys))
 
 
-def test_a_huge_range_costs_nothing() -> None:
+def test_huge_range_of_keys_costs_nothing() -> None:
     assert parse_keys("0-999999999999").ranges == {"0-999999999999": range(10**12)}
 
 

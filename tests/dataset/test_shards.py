@@ -105,7 +105,7 @@ def test_pythons_tarfile_reads_members_that_numpy_loads(shard: Path) -> None:
             assert (loaded.dtype, loaded.tolist()) == (np.dtype("<u2"), expected.tolist())
 
 
-def test_headers_hold_no_time_owner_or_other_mode(shard: Path) -> None:
+def test_headers_contain_no_time_owner_or_other_mode(shard: Path) -> None:
     with tarfile.open(shard, "r:") as archive:
         for info in archive:
             assert (info.mtime, info.uid, info.gid, info.uname, info.gname, info.mode) == (0, 0, 0, "", "", 0o644)

@@ -78,9 +78,7 @@ def little_space(monkeypatch: pytest.MonkeyPatch) -> int:
     return 20_000
 
 
-def test_run_that_does_not_fit_the_disk_ends_with_5_before_its_first_image(
-    little_space: int, tmp_path: Path, run_main: RunMain
-) -> None:
+def test_run_larger_than_the_disk_is_refused_with_5(little_space: int, tmp_path: Path, run_main: RunMain) -> None:
     fill(tmp_path / "p", 3)
     done = run_main("source.root=p", ONE, "n_jobs=1")
     assert (done.code, done.out, done.err.count("\n")) == (5, "", 1)

@@ -241,7 +241,7 @@ def test_false_size_is_refused_from_the_header_within_50_ms(claim: str) -> None:
 
 @pytest.mark.usefixtures("no_decoder")
 @pytest.mark.parametrize("claim", CLAIMS)
-def test_refusing_a_claim_takes_no_memory_to_speak_of(claim: str) -> None:
+def test_refusing_a_false_size_takes_little_memory(claim: str) -> None:
     tracemalloc.start()
     with contextlib.suppress(SourceError):
         decode(CLAIMS[claim][0], max_pixels=MAX_PIXELS, icc="ignore")
@@ -289,7 +289,7 @@ def test_entries_other_than_files_exit_3_without_traceback(odd: Run) -> None:
     assert no_trouble(odd), odd.done.stderr
 
 
-def test_what_is_no_file_has_a_row_with_its_reason(odd: Run) -> None:
+def test_entry_other_than_a_file_has_a_row_with_reason(odd: Run) -> None:
     wanted = {"good.png": ""} | {name: reason for name, (_, reason) in ENTRIES.items()}
     assert {path: row["reason"] for path, row in odd.rows.items()} == wanted
 

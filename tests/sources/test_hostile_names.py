@@ -326,7 +326,7 @@ FOLDER_NAMES = (
 
 
 @pytest.mark.parametrize("name", FOLDER_NAMES, ids=ascii)
-def test_folders_of_any_name_are_used_or_refused_in_one_line(name: str, run_main: RunMain, tmp_path: Path) -> None:
+def test_folder_of_any_name_is_used_or_refused(name: str, run_main: RunMain, tmp_path: Path) -> None:
     root, out = tmp_path / name, tmp_path / f"{name[:254]}2"
     root.mkdir()
     (root / "a.png").write_bytes(photograph(0))

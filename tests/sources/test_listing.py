@@ -64,7 +64,7 @@ def test_a_limit_keeps_the_first_in_order(tmp_path: Path) -> None:
     assert paths(listed(tmp_path, limit=2)) == ["a.jpg", "b.jpg"]
 
 
-def test_globs_are_blind_to_case(tmp_path: Path) -> None:
+def test_globs_ignore_case(tmp_path: Path) -> None:
     fill(tmp_path, "a.JPG", "b.Jpg")
     assert paths(listed(tmp_path, "*.jPg")) == ["a.JPG", "b.Jpg"]
 
@@ -154,7 +154,7 @@ def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
     assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in warning
 
 
-def test_sub_folders_are_left_alone_when_not_recursive(tmp_path: Path) -> None:
+def test_sub_folders_are_ignored_without_recursive(tmp_path: Path) -> None:
     fill(tmp_path, "a.jpg", "sub/b.jpg")
     assert paths(listed(tmp_path, recursive=False)) == ["a.jpg"]
 
@@ -205,7 +205,7 @@ ODD_ENTRIES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", ODD_ENTRIES)
-def test_what_is_no_file_is_listed_with_its_reason(tmp_path: Path, kind: str) -> None:
+def test_entry_other_than_a_file_is_listed_with_reason(tmp_path: Path, kind: str) -> None:
     make, reason = ODD_ENTRIES[kind]
     make(tmp_path / "z.jpg")
     assert only(tmp_path) == Source(0, "z.jpg", "z.jpg", None, reason)
@@ -257,7 +257,7 @@ def test_a_folder_without_permission_stops_the_run(tmp_path: Path) -> None:
         (tmp_path / "locked").chmod(stat.S_IRWXU)
 
 
-def test_a_dangling_link_that_no_glob_matches_is_nobodys_business(tmp_path: Path) -> None:
+def test_dangling_link_that_no_glob_matches_is_ignored(tmp_path: Path) -> None:
     fill(tmp_path, "a.jpg")
     (tmp_path / "lock").symlink_to("host:123")
     assert paths(listed(tmp_path)) == ["a.jpg"]
@@ -304,7 +304,7 @@ HARD_NAMES = {
 
 
 @pytest.mark.parametrize("raw", HARD_NAMES, ids=HARD_NAMES.values())
-def test_a_hard_name_is_listed_spelled_and_read(tmp_path: Path, raw: bytes) -> None:
+def test_hard_name_is_listed_encoded_and_read(tmp_path: Path, raw: bytes) -> None:
     (tmp_path / os.fsdecode(raw)).write_bytes(b"pixels")
     source = only(tmp_path)
     assert source.name == HARD_NAMES[raw]
@@ -319,7 +319,7 @@ def test_decode_name_undoes_encode_name_for_any_bytes(raw: bytes) -> None:
 
 
 @given(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])))
-def test_a_spelled_name_is_one_harmless_line_of_utf8(text: str) -> None:
+def test_encoded_name_is_one_harmless_line_of_utf8(text: str) -> None:
     name = encode_name(text)
     name.encode("utf-8")
     assert len(name.splitlines()) <= 1
@@ -418,7 +418,7 @@ def test_only_files_that_share_a_size_are_opened(tmp_path: Path, monkeypatch: py
     assert [Path(path).name for path in opened] == ["a.jpg", "b.jpg"]
 
 
-def test_twins_that_cannot_be_read_keep_number_zero(tmp_path: Path) -> None:
+def test_unreadable_identical_files_keep_number_zero(tmp_path: Path) -> None:
     fill(tmp_path, "a.jpg", "b.jpg", "c.jpg")
     found = listed(tmp_path).sources
     (tmp_path / "b.jpg").unlink()
@@ -426,7 +426,7 @@ def test_twins_that_cannot_be_read_keep_number_zero(tmp_path: Path) -> None:
     assert [source.occurrence for source in number_twins(str(tmp_path), found)] == [0, 0, 0]
 
 
-def test_what_is_no_file_is_passed_through(tmp_path: Path) -> None:
+def test_entries_other_than_files_are_passed_through(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.jpg")
     os.mkfifo(tmp_path / "b.jpg")
     found = listed(tmp_path).sources

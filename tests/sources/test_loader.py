@@ -51,7 +51,9 @@ def test_a_photograph_too_small_to_be_downscaled_is_unsupported(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("override", ["source.downscale=2", "source.dequantize=dither"])
-def test_such_pairs_are_regenerated_from_their_rows(override: str, photos: Path, make: Make, tmp_path: Path) -> None:
+def test_downscaled_and_dithered_pairs_are_regenerated_from_rows(
+    override: str, photos: Path, make: Make, tmp_path: Path
+) -> None:
     make(photos, tmp_path / "ds", override)
     replayed = list(replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(photos)))
     assert len(replayed) >= 12
@@ -91,7 +93,7 @@ def test_dither_of_a_crop_is_the_crop_of_the_dither(dithered: object) -> None:
     np.testing.assert_array_equal(dequantise(srgb[7:, 65:], dithered, CURVE, (7, 65)), whole[7:, 65:])  # type: ignore[arg-type]
 
 
-def test_the_fast_form_of_a_dithered_pair_is_the_references(dithered: object) -> None:
+def test_kernels_dither_like_the_reference(dithered: object) -> None:
     srgb = pixels(4, 33, 70)
     fast, reference = make_pair(srgb, dithered), reference_pair(srgb, dithered)  # type: ignore[arg-type]
     np.testing.assert_array_equal(fast.clean, reference.clean)

@@ -508,7 +508,7 @@ CARRIERS = ["JPEG", "PNG", "WEBP", "TIFF"]
 
 
 @pytest.mark.parametrize("kind", CARRIERS)
-def test_an_srgb_profile_is_taken(kind: str) -> None:
+def test_srgb_profile_is_accepted(kind: str) -> None:
     assert pixels_of(pillow(smooth(), kind, icc_profile=SRGB), icc="refuse").shape == (40, 61, 3)
 
 
@@ -519,12 +519,12 @@ def test_any_other_profile_is_refused_when_asked(kind: str, profile: bytes) -> N
 
 
 @pytest.mark.parametrize("kind", ["PNG", "TIFF"])
-def test_ignoring_profiles_leaves_the_pixels_alone(kind: str) -> None:
+def test_ignored_profiles_leave_pixels_unchanged(kind: str) -> None:
     data = pillow(smooth(), kind, icc_profile=swapped_primaries())
     np.testing.assert_array_equal(pixels_of(data, icc="ignore"), smooth())
 
 
-def test_a_profile_in_many_segments_is_put_together() -> None:
+def test_profile_in_many_segments_is_joined() -> None:
     profile = SRGB + bytes(150_000)
     assert probe(pillow(smooth(), "JPEG", icc_profile=profile)).icc == profile
 
@@ -589,7 +589,7 @@ def test_random_cuts_of_a_larger_file_are_refused(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "jpeg, thumbnail", "png", "webp", "bmp", "tiff"])
 @pytest.mark.parametrize("tail", [b"\0", b"\xff", pillow(smooth(), "JPEG"), b"\0\0\0\x18ftypmp42" + bytes(99)])
-def test_bytes_after_the_end_are_fine(kind: str, tail: bytes) -> None:
+def test_bytes_after_the_end_are_accepted(kind: str, tail: bytes) -> None:
     np.testing.assert_array_equal(pixels_of(CUTTABLE[kind] + tail), pixels_of(CUTTABLE[kind]))
 
 
@@ -623,7 +623,7 @@ def test_damage_is_corrupt(kind: str) -> None:
     assert reason_of(CORRUPT[kind]) == "corrupt"
 
 
-def test_a_chain_of_tiff_pages_that_bites_its_tail_ends() -> None:
+def test_circular_chain_of_tiff_pages_ends() -> None:
     data = bytearray(tiff(smooth()))
     (first,) = struct.unpack_from("<I", data, 4)
     (entries,) = struct.unpack_from("<H", data, first)
@@ -663,12 +663,12 @@ def test_a_header_is_what_pillow_reads(kind: str) -> None:
         assert header.format == (image.format or "").lower()
 
 
-def test_a_header_says_all_of_it() -> None:
+def test_header_has_size_colour_depth_and_alpha() -> None:
     data = cv2.imencode(".png", with_alpha(0, np.uint16))[1].tobytes()
     assert probe(data) == Header("png", 7, 5, "rgb", 16, has_alpha=True)
 
 
-def test_probing_a_cut_file_says_what_is_missing() -> None:
+def test_probing_a_cut_file_reports_what_is_missing() -> None:
     assert probe(CUTTABLE["jpeg"][:-1]).missing == "its end-of-image marker"
 
 

@@ -216,7 +216,7 @@ def test_motion_jpeg_has_full_range(pix_fmt: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("pix_fmt", LOSSLESS)
-def test_rgb_comes_back_as_it_was_encoded(pix_fmt: str, tmp_path: Path) -> None:
+def test_lossless_rgb_is_decoded_exactly(pix_fmt: str, tmp_path: Path) -> None:
     wanted = scene(3, 33, 17)
     codec, extension = LOSSLESS[pix_fmt]
     video = opened(film(tmp_path / f"a.{extension}", codec, pix_fmt, wanted))
@@ -248,7 +248,7 @@ def test_a_gray_ramp_of_limited_range_maps_exactly(bits: int, pix_fmt: str, tmp_
 
 
 @pytest.mark.parametrize(("tag", "black", "white"), [(0, 0, 255), (1, 16, 235), (2, 0, 255)])
-def test_gray_video_is_of_full_range_unless_it_says_otherwise(tag: int, black: int, white: int, tmp_path: Path) -> None:
+def test_gray_video_has_full_range_unless_tagged(tag: int, black: int, white: int, tmp_path: Path) -> None:
     codes = np.arange(256, dtype=np.uint8).reshape(16, 16)
     path = film(tmp_path / "a.mkv", "ffv1", "gray", [raw_frame("gray", [codes])], color_range=tag)
     found = rgb(opened(path), 0).reshape(-1, 3)
@@ -328,7 +328,7 @@ def plain(path: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ENCODED)
-def test_a_frame_is_the_same_however_it_was_reached(kind: str, tmp_path: Path, figure: Figure) -> None:
+def test_frame_is_the_same_in_any_order_of_reading(kind: str, tmp_path: Path, figure: Figure) -> None:
     path = encode(tmp_path, kind)
     video = opened(path)
     in_turn = [rgb(video, number) for number in range(len(video))]
@@ -342,7 +342,7 @@ def test_a_frame_is_the_same_however_it_was_reached(kind: str, tmp_path: Path, f
 
 
 @pytest.mark.parametrize("kind", [kind for kind in ENCODED if kind not in ("prores", "dnxhd")])
-def test_frames_are_those_a_player_shows_in_its_order(kind: str, encoded: Callable[[str], Path]) -> None:
+def test_frames_and_their_order_are_those_of_a_player(kind: str, encoded: Callable[[str], Path]) -> None:
     path = encoded(kind)
     video, shown = opened(path), plain(path)
     assert len(shown) == len(video)
@@ -520,7 +520,7 @@ def test_a_video_with_too_many_pixels_is_one_failed_row(tmp_path: Path) -> None:
         load_source(config, source)
 
 
-def test_other_primaries_are_refused_where_profiles_are(tmp_path: Path) -> None:
+def test_other_primaries_are_refused_under_icc_refuse(tmp_path: Path) -> None:
     film(tmp_path / "a.mkv", "ffv1", "yuv420p", scene(3), color_primaries=9)
     assert len(list_photographs(settings_of(tmp_path)).sources) == 3
     config = settings_of(tmp_path, icc="refuse")
@@ -564,7 +564,7 @@ def test_damage_affects_its_frame_and_dependent_ones(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in ENCODED if kind != "av1"])
-def test_damage_shows_alike_however_it_was_reached(kind: str, encoded: Callable[[str], Path], tmp_path: Path) -> None:
+def test_damage_is_the_same_in_any_order_of_reading(kind: str, encoded: Callable[[str], Path], tmp_path: Path) -> None:
     """Frames before the damage are intact; later ones are the same each time, whether the decoder finds it or not."""
     path = Path(shutil.copy(encoded(kind), tmp_path))
     video = opened(path)
@@ -664,7 +664,7 @@ def test_noise_of_frames_is_independent(filmed: Path) -> None:
     assert np.abs(found - np.eye(20)).max() < 6 / np.sqrt(3072)
 
 
-def test_the_same_bytes_for_any_number_of_workers(
+def test_number_of_workers_changes_no_byte_of_videos(
     films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
     make(films, tmp_path / "ds", *CLIPS, n_jobs=2)
@@ -672,7 +672,7 @@ def test_the_same_bytes_for_any_number_of_workers(
 
 
 @pytest.mark.parametrize("per_shard", [1, 5])
-def test_the_same_pairs_wherever_shards_begin(
+def test_shard_size_leaves_frames_unchanged(
     per_shard: int, films: Path, filmed: Path, make: Make, tmp_path: Path
 ) -> None:
     make(films, tmp_path / "ds", *CLIPS, f"output.pairs_per_shard={per_shard}")
@@ -696,7 +696,7 @@ def test_killed_run_of_videos_resumes_to_the_same_bytes(
     assert tree_hash(out) == tree_hash(filmed)
 
 
-def test_another_video_moves_nothing(films: Path, filmed: Path, make: Make, tmp_path: Path) -> None:
+def test_removing_a_video_leaves_others_unchanged(films: Path, filmed: Path, make: Make, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(films, tmp_path / "films"))
     (copy / "h264.mp4").unlink()
     make(copy, tmp_path / "ds", *CLIPS)
@@ -732,7 +732,7 @@ def test_lost_shard_and_manifest_are_regenerated_from_videos(
     assert (copy / "manifest.csv").read_bytes() == (filmed / "manifest.csv").read_bytes()
 
 
-def test_a_finished_dataset_of_videos_is_left_alone(films: Path, filmed: Path, make: Make) -> None:
+def test_finished_dataset_of_videos_is_complete(films: Path, filmed: Path, make: Make) -> None:
     assert make(films, filmed, *CLIPS).made == 0
 
 
@@ -748,7 +748,7 @@ def test_another_video_of_the_same_name_and_size_is_noticed(
         make(copy, out, *CLIPS)
 
 
-def test_a_video_that_changes_under_the_run_stops_it(films: Path, tmp_path: Path) -> None:
+def test_video_that_changes_during_a_run_stops_it(films: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copy(films / "h264.mp4", tmp_path / "a.mp4"))
     config = settings_of(tmp_path)
     first, second, *_ = list_photographs(config).sources
@@ -789,7 +789,7 @@ def test_without_clips_videos_are_left_out_and_counted(films: Path) -> None:
     assert listing.not_matched == 3
 
 
-def test_a_photograph_with_a_videos_name_is_one_without_clips(make: Make, tmp_path: Path) -> None:
+def test_photograph_named_like_a_video_is_read_without_clips(make: Make, tmp_path: Path) -> None:
     """Its row records this: a replay does not look at the name."""
     (tmp_path / "in").mkdir()
     jpeg(tmp_path / "in" / "a.mp4")
@@ -797,7 +797,7 @@ def test_a_photograph_with_a_videos_name_is_one_without_clips(make: Make, tmp_pa
     assert [one.complaint for one in replay(read_rows(tmp_path / "ds" / "manifest.csv"), str(tmp_path / "in"))] == [""]
 
 
-def test_without_pyav_a_video_is_refused_with_the_way_out(
+def test_without_pyav_a_video_is_refused_with_advice(
     films: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(photographs, "is_installed", lambda: False)
@@ -821,5 +821,5 @@ def test_a_plan_counts_frames(films: Path, run_main: RunMain) -> None:
     assert "sources   38 " in run_main("plan", f"source.root={films}", "source.clips=true").out
 
 
-def test_every_codec_taken_is_one_that_ffmpeg_knows() -> None:
+def test_ffmpeg_knows_every_accepted_codec() -> None:
     assert [name for name in CODECS if av.Codec(name, "r").canonical_name != name] == []
