@@ -149,7 +149,8 @@ def test_every_column_is_explained() -> None:
     for column in COLUMNS:
         assert column.meaning and not column.meaning.endswith("."), column.name
         assert column.unit.startswith(promised_unit(column.name)), column.name
-        assert re.search(rf"^\| `{column.name}`(\\\*)? \| {column.type_name} \|", page, re.MULTILINE), column.name
+        row = rf"^\| `{column.name}`(\\\*)? \| {re.escape(column.meaning)} \| {column.type_name} \|"
+        assert re.search(row, page, re.MULTILINE), column.name
 
 
 def test_every_reason_is_explained() -> None:
