@@ -223,6 +223,12 @@ PROMISES = (
         "The pinned builds of `manifests/` are reproduced.",
         ("tests/project/test_pinned.py",),
     ),
+    Promise(
+        "site",
+        "Every link and picture of the documentation's site resolves; it loads nothing from servers; its pages fit a "
+        "window and a phone.",
+        ("tests/project/test_site.py",),
+    ),
 )
 """Every promise, in the order of the page."""
 

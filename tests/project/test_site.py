@@ -18,6 +18,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from helpers.browser import open_page
+from helpers.promise_report import Figure
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
@@ -76,14 +77,15 @@ def pages(site: Path) -> dict[Path, Page]:
     return found
 
 
-def test_links_anchors_and_pictures_resolve(pages: dict[Path, Page]) -> None:
+def test_links_anchors_and_pictures_resolve(pages: dict[Path, Page], figure: Figure) -> None:
+    links = [(page, *target) for page in pages.values() for target in page.local_targets()]
     broken = [
         f"{page.path.name}: {target.name}#{fragment}"
-        for page in pages.values()
-        for target, fragment in page.local_targets()
+        for page, target, fragment in links
         if not target.exists() or (fragment and target in pages and fragment not in pages[target].anchors)
     ]
     assert broken == []
+    figure("site", f"{len(links) - len(broken)} of {len(links)} links of {len(pages)} pages resolve")
 
 
 def test_pages_load_nothing_from_servers(site: Path, pages: dict[Path, Page]) -> None:
@@ -120,7 +122,9 @@ next();
 """Page that opens other pages one after another in a frame; a window of headless Chromium has at least 500 pixels."""
 
 
-def test_pages_fit_their_window_and_show_their_pictures(site: Path, pages: dict[Path, Page], tmp_path: Path) -> None:
+def test_pages_fit_their_window_and_show_their_pictures(
+    site: Path, pages: dict[Path, Page], tmp_path: Path, figure: Figure
+) -> None:
     tour = tmp_path / "site"
     shutil.copytree(site, tour)
     (tour / "control.html").write_text('<body><p style="width: 2000px">wide</p><img src="no.png" alt=""></body>')
@@ -149,3 +153,4 @@ def test_pages_fit_their_window_and_show_their_pictures(site: Path, pages: dict[
         faults[name] += [f"does not show {picture}" for picture in page["missing"]]
     assert len(faults.pop("control.html")) == 4, "too wide pages or missing pictures are not detected"
     assert {name: some for name, some in faults.items() if some} == {}
+    figure("site", f"{len(measured) - len(WIDTHS)} views of pages at {' and '.join(map(str, WIDTHS))} pixels fit")
