@@ -1,0 +1,226 @@
+"""Train a small raw denoiser on pairs of unprocess_gen, and compare it with filters: the example of docs/tutorial.md.
+
+``python train_denoiser.py`` uses the built-in scenes; ``--photos FOLDER`` uses the photographs of a folder. It needs
+PyTorch, and writes the dataset ``denoiser_data`` and the picture ``denoiser.png`` below ``--out``. The last fifth of
+the photographs is not trained on; all figures come from it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+import unprocess_gen as ug
+
+NOISE = "imx385_iso12800"
+CROP = 64
+"""Side of a training crop, in sites of the mosaic; even."""
+BATCH = 16
+WIDTH = 32
+"""Channels of the hidden layers."""
+
+
+def pack(mosaic: np.ndarray, pattern: str) -> np.ndarray:
+    """Return the planes R, G of the red rows, G of the blue rows, B of a mosaic: [4, H // 2, W // 2]."""
+    red, blue = divmod(pattern.index("R"), 2), divmod(pattern.index("B"), 2)
+    sites = red, (red[0], 1 - red[1]), (blue[0], 1 - blue[1]), blue
+    even = mosaic[: mosaic.shape[0] // 2 * 2, : mosaic.shape[1] // 2 * 2]
+    return np.stack([even[y::2, x::2] for y, x in sites])
+
+
+def unpack(planes: np.ndarray, pattern: str) -> np.ndarray:
+    """Return the mosaic [2 H, 2 W] of four planes [4, H, W]; the inverse of `pack`."""
+    red, blue = divmod(pattern.index("R"), 2), divmod(pattern.index("B"), 2)
+    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), planes.dtype)
+    for plane, (y, x) in zip(planes, (red, (red[0], 1 - red[1]), (blue[0], 1 - blue[1]), blue), strict=True):
+        mosaic[y::2, x::2] = plane
+    return mosaic
+
+
+def to_light(dn: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
+    """Return DN as float32: 0 at the black level, 1 at the white level; noise below black stays negative."""
+    black, white = np.float32(row["black_level_dn"]), np.float32(row["white_level_dn"])
+    return (dn.astype(np.float32) - black) / (white - black)
+
+
+def noise_std(light: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
+    """Return the standard deviation of the noise at each site, on the scale of ``light``, from the noisy frame."""
+    span = row["white_level_dn"] - row["black_level_dn"]
+    variance = row["a_dn"] / span * np.maximum(light, 0) + row["b_dn2"] / span**2
+    return np.sqrt(variance, dtype=np.float32)
+
+
+class RandomCrops(Dataset):
+    """Serve one random crop of each pair: noisy planes, clean planes and noise map, float32 [4, side / 2, side / 2].
+
+    Rows and columns of the crops are even, so that every crop begins with the same filter of the CFA pattern.
+    """
+
+    def __init__(self, pairs: ug.RawPairs, side: int) -> None:
+        self.pairs = pairs
+        self.side = side
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, ...]:
+        clean, noisy, row = self.pairs[index]
+        height, width = clean.shape
+        y = 2 * int(torch.randint((height - self.side) // 2 + 1, ()))
+        x = 2 * int(torch.randint((width - self.side) // 2 + 1, ()))
+        crop = np.s_[y : y + self.side, x : x + self.side]
+        planes = [to_light(pack(frame[crop], row["pattern"]), row) for frame in (noisy, clean)]
+        return *map(torch.from_numpy, planes), torch.from_numpy(noise_std(planes[0], row))
+
+
+class Denoiser(nn.Module):
+    """Estimate the noise of four planes, in units of its standard deviation, and subtract it: a small DnCNN."""
+
+    def __init__(self, width: int = WIDTH, hidden_layers: int = 4) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [nn.Conv2d(8, width, 3, padding=1), nn.ReLU()]
+        for _ in range(hidden_layers):
+            layers += [nn.Conv2d(width, width, 3, padding=1), nn.ReLU()]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(width, 4, 3, padding=1))
+
+    def forward(self, noisy: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+        """Return the denoised planes."""
+        return noisy - std * self.layers(torch.cat([noisy, std], dim=1))
+
+
+def train(model: Denoiser, pairs: ug.RawPairs, steps: int, workers: int) -> None:
+    """Minimise the mean error in units of the noise, over random crops of ``pairs``."""
+    optimiser = torch.optim.Adam(model.parameters(), lr=2e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    crops = RandomCrops(pairs, CROP)
+    drawn = torch.utils.data.RandomSampler(crops, replacement=True, num_samples=steps * BATCH)
+    loader = DataLoader(crops, batch_size=BATCH, sampler=drawn, num_workers=workers)
+    start, losses = time.process_time(), []
+    for step, (noisy, clean, std) in enumerate(loader, start=1):
+        loss = ((model(noisy, std) - clean).abs() / std).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses.append(loss.item())
+        if step % 200 == 0 or step == steps:
+            seconds = time.process_time() - start
+            print(f"step {step:5}: mean error {np.mean(losses[-200:]):.3f} of the noise; {seconds:4.0f} s", flush=True)
+
+
+Filter = Callable[[np.ndarray, Mapping[str, Any]], np.ndarray]
+"""A denoiser of one frame: noisy mosaic and row to a mosaic in DN, float32."""
+
+
+def by_planes(filtered: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Filter:
+    """Return a filter of mosaics from one of planes (light and noise map to light)."""
+
+    def denoised(noisy: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
+        light = to_light(pack(noisy, row["pattern"]), row)
+        mosaic = unpack(filtered(light, noise_std(light, row)), row["pattern"])
+        return mosaic * np.float32(row["white_level_dn"] - row["black_level_dn"]) + np.float32(row["black_level_dn"])
+
+    return denoised
+
+
+def gaussian(std_sites: float) -> Filter:
+    """Return a Gaussian filter of each plane."""
+    return by_planes(lambda light, _: np.stack([cv2.GaussianBlur(plane, (0, 0), std_sites) for plane in light]))
+
+
+def bilateral(std_sites: float, std_range: float) -> Filter:
+    """Return a bilateral filter of each plane; ``std_range`` is in units of the mean noise."""
+    return by_planes(
+        lambda light, std: np.stack(
+            [cv2.bilateralFilter(plane, -1, std_range * float(std.mean()), std_sites) for plane in light]
+        )
+    )
+
+
+def network(model: Denoiser) -> Filter:
+    """Return the trained model as a filter."""
+
+    def filtered(light: np.ndarray, std: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            return model(torch.from_numpy(light)[None], torch.from_numpy(std)[None])[0].numpy()
+
+    return by_planes(filtered)
+
+
+def psnr(denoised: Filter, pairs: ug.RawPairs) -> float:
+    """Return the mean PSNR of denoised frames in raw DN, dB; the peak is the white level above black."""
+    values = []
+    for clean, noisy, row in pairs:
+        frame = np.clip(denoised(noisy, row), row["black_level_dn"], row["white_level_dn"])
+        error = frame - clean[: frame.shape[0], : frame.shape[1]].astype(np.float32)
+        values.append(20 * np.log10((row["white_level_dn"] - row["black_level_dn"]) / np.sqrt(np.mean(error**2))))
+    return float(np.mean(values))
+
+
+def best(candidates: dict[str, Filter], pairs: ug.RawPairs) -> tuple[str, Filter]:
+    """Return name and filter of the highest PSNR on ``pairs``."""
+    name = max(candidates, key=lambda one: psnr(candidates[one], pairs))
+    return name, candidates[name]
+
+
+def draw(path: Path, denoised: Filter, pairs: ug.RawPairs) -> None:
+    """Save crops of the noisy, the denoised and the clean frame of two pairs, developed to sRGB."""
+    rows = []
+    for clean, noisy, row in pairs:
+        frame = np.rint(np.clip(denoised(noisy, row), row["black_level_dn"], row["white_level_dn"])).astype(np.uint16)
+        height, width = frame.shape
+        top, left = (height // 2 - 80) // 2 * 2, (width // 2 - 100) // 2 * 2
+        crop = np.s_[top : top + 160, left : left + 200]
+        rows.append(np.hstack([ug.develop(one[crop], row) for one in (noisy, frame, clean)]))
+    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+
+
+def main() -> None:
+    """Generate the dataset, train, measure and draw."""
+    parser = argparse.ArgumentParser(description="Train a small raw denoiser.")
+    parser.add_argument("--photos", help="folder of photographs; by default 50 built-in scenes")
+    parser.add_argument("--scenes", type=int, default=50, help="number of built-in scenes")
+    parser.add_argument("--steps", type=int, default=2000, help="training steps")
+    parser.add_argument("--workers", type=int, default=0, help="processes that load crops")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
+    options = parser.parse_args()
+    torch.manual_seed(0)
+
+    data = options.out / "denoiser_data"
+    source = f"source.root={options.photos}" if options.photos else f"source.limit={options.scenes}"
+    ug.generate(ug.load_config([source, f"noise={NOISE}", f"out={data}"]))
+    pairs = ug.RawPairs(data)
+    held_out = max(len(pairs) // 5, 1)
+    known, new = pairs[:-held_out], pairs[-held_out:]
+    model = Denoiser()
+    size = sum(parameter.numel() for parameter in model.parameters())
+    print(f"{len(known)} pairs to train on, {len(new)} held out; {size:,} parameters")
+
+    train(model, known, options.steps, options.workers)
+
+    few = known[:: max(len(known) // 8, 1)]
+    gaussians = {f"Gaussian, {std} sites": gaussian(std) for std in (0.4, 0.6, 0.8, 1.0, 1.3, 1.7)}
+    bilaterals = {
+        f"bilateral, {std} sites, {width} sigma": bilateral(std, width)
+        for std in (1.0, 1.5, 2.5)
+        for width in (2, 3, 5)
+    }
+    print("PSNR of held-out frames, raw DN:")
+    results = {"noisy frame": lambda noisy, _: noisy.astype(np.float32)}
+    results |= dict([best(gaussians, few), best(bilaterals, few)]) | {"network": network(model)}
+    for name, one in results.items():
+        print(f"  {name:32} {psnr(one, new):5.2f} dB")
+    draw(options.out / "denoiser.png", network(model), new[: 2 * (len(new) // 2) : max(len(new) // 2, 1)])
+
+
+if __name__ == "__main__":
+    main()

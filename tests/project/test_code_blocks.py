@@ -1,0 +1,203 @@
+"""Code blocks of README and documentation run as they are printed.
+
+Every ``python`` and ``bash`` block of a page runs, in order, in a new folder that contains `photos` and `clips`. Python
+blocks of a page share their names. A ``yaml`` block whose first line is a comment with a path, such as
+``# mine/camera/phone.yaml: …``, is written to that path. Indented blocks that begin with a command count as ``bash``.
+HTML comments directly before a block change this:
+
+* ``<!-- not run: reason -->``: the block does not run.
+* ``<!-- needs: module -->``: the block runs if the module can be imported.
+* ``<!-- exit code: 4 -->``: the last command of the block ends with this code instead of 0.
+* ``<!-- output -->`` before a ``text`` block: it is exactly what the block before it prints on stdout.
+
+``python tests/project/test_code_blocks.py`` lists the blocks that do not run, with their reasons.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from helpers.commands import COMMAND, RunMain
+from helpers.photographs import pixels
+from PIL import Image
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+QUICK = ("README.md", "docs/quickstart.md", "docs/concepts.md")
+"""Pages whose blocks run in the quick tests; the others run with ``-m slow``."""
+
+COMMENT = re.compile(r"<!-- (not run|needs|exit code|output)(?:: (.+?))? -->")
+FENCE = re.compile(r"```(\S*)$")
+COMMANDS = ("gen-dataset", "python", ".venv/bin", "pip ", "pytest")
+YAML_PATH = re.compile(r"# ([\w./-]+\.yaml)\b")
+OPERATORS = ("|", "&", ";", ">", "<", "$(", "=$")
+
+
+@dataclass(frozen=True)
+class Block:
+    """One code block of a page: language, text, number of its first line, and the comments before it."""
+
+    language: str
+    text: str
+    line: int
+    comments: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def runs(self) -> bool:
+        """Return whether the block can run here."""
+        needed = self.comments.get("needs")
+        return "not run" not in self.comments and (needed is None or importlib.util.find_spec(needed) is not None)
+
+
+def read_blocks(text: str) -> Iterator[Block]:
+    """Yield the fenced and the indented code blocks of a page."""
+    lines = text.splitlines()
+    comments: dict[str, str] = {}
+    number = 0
+    while number < len(lines):
+        line = lines[number]
+        if fence := FENCE.match(line):
+            end = lines.index("```", number + 1)
+            yield Block(fence[1], "\n".join(lines[number + 1 : end]), number + 2, comments)
+            comments, number = {}, end
+        elif line.startswith("    ") and not lines[number - 1].strip():
+            end = number
+            while end + 1 < len(lines) and (lines[end + 1].startswith("    ") or not lines[end + 1].strip()):
+                end += 1
+            code = "\n".join(one[4:] for one in lines[number : end + 1]).rstrip()
+            yield Block("bash" if code.startswith(COMMANDS) else "", code, number + 1, comments)
+            comments, number = {}, end
+        elif comment := COMMENT.match(line):
+            comments = comments | {comment[1]: comment[2] or ""}
+        elif line.strip():
+            comments = {}
+        number += 1
+
+
+def blocks_of(page: Path) -> list[Block]:
+    return list(read_blocks(page.read_text(encoding="utf-8")))
+
+
+def commands_of(block: Block) -> list[str]:
+    """Return the commands of a block, without comments and with continued lines joined."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    return [line for line in lines if shlex.split(line, comments=True)]
+
+
+class Page:
+    """Run the blocks of one page in the current folder."""
+
+    def __init__(self, path: Path, run_main: RunMain) -> None:
+        self.path = path
+        self.run_main = run_main
+        self.names: dict[str, object] = {"__name__": "__main__"}
+
+    def run(self, block: Block) -> str:
+        """Run one block and return what it prints on stdout."""
+        place = f"{self.path.relative_to(ROOT)}:{block.line}"
+        if block.language == "python":
+            printed = io.StringIO()
+            code = compile("\n" * (block.line - 1) + block.text, str(self.path), "exec")
+            with contextlib.redirect_stdout(printed):
+                exec(code, self.names)
+            return printed.getvalue()
+        if block.language == "yaml" and (named := YAML_PATH.match(block.text)):
+            file = Path(named[1])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(block.text + "\n", encoding="utf-8")
+        if block.language != "bash":
+            return ""
+        printed_by, expected = "", [0] * len(commands_of(block))
+        expected[-1] = int(block.comments.get("exit code", 0))
+        for command, code in zip(commands_of(block), expected, strict=True):
+            exit_code, out, err = self.call(command)
+            assert exit_code == code, f"{place}: {command}: exit code {exit_code}\n{out}{err}"
+            printed_by += out
+        return printed_by
+
+    def call(self, command: str) -> tuple[int, str, str]:
+        """Run a command: `gen-dataset` in this process if the shell has nothing else to do."""
+        words = shlex.split(command, comments=True)
+        if words[0] == "gen-dataset" and not any(sign in command.partition("#")[0] for sign in OPERATORS):
+            return self.run_main(*words[1:])
+        environment = os.environ | {"PATH": f"{COMMAND.parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False, timeout=600
+        )
+        return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture
+def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of a page: ten pictures in `photos`, two clips of three frames in `clips`; one core is used."""
+    (tmp_path / "photos").mkdir()
+    for number in range(10):
+        Image.fromarray(pixels(number, 528, 560)).save(tmp_path / "photos" / f"picture_{number}.jpg", quality=95)
+    for clip in ("kitchen", "street"):
+        (tmp_path / "clips" / clip).mkdir(parents=True)
+        for number in range(3):
+            Image.fromarray(pixels(number, 96, 128)).save(tmp_path / "clips" / clip / f"{number:04}.png")
+    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(page, id=name, marks=() if name in QUICK else pytest.mark.slow)
+        for page in PAGES
+        if any(block.runs and block.language in ("python", "bash") for block in blocks_of(page))
+        for name in [str(page.relative_to(ROOT))]
+    ],
+)
+def test_blocks_run(path: Path, page_folder: Path, run_main: RunMain) -> None:
+    page, printed = Page(path, run_main), ""
+    for block in blocks_of(path):
+        if "output" in block.comments:
+            assert block.text.strip() == printed.strip(), f"{path.relative_to(ROOT)}:{block.line}: another output\n{printed}"
+        elif block.runs:
+            printed = page.run(block)
+
+
+def test_blocks_that_do_not_run_have_a_reason() -> None:
+    unknown = [
+        f"{page.relative_to(ROOT)}:{block.line}"
+        for page in PAGES
+        for block in blocks_of(page)
+        if block.comments.get("not run", "reason") == "" or block.language in ("sh", "shell", "console", "py")
+    ]
+    assert unknown == []
+
+
+def test_recipe_of_the_guide_is_that_of_the_example() -> None:
+    example = (ROOT / "docs" / "examples" / "train_denoiser.py").read_text(encoding="utf-8")
+    guide = "\n".join(block.text for block in blocks_of(ROOT / "docs" / "guides" / "loading.md"))
+    recipe = re.findall(r"^(?:def (?:pack|to_light|noise_std)|class RandomCrops)\b.*?(?=\n\n\n|\Z)", guide, re.M | re.S)
+    assert len(recipe) == 4
+    assert [part for part in recipe if part.strip() not in example] == []
+
+
+def test_blocks_are_found_with_their_comments() -> None:
+    text = "<!-- not run: a, b -->\n```bash\nls\n```\n\nword\n\n    gen-dataset x  # y\n\n<!-- output -->\n```text\n1\n```\n"
+    first, second, third = read_blocks(text)
+    assert (first.language, first.comments, first.runs) == ("bash", {"not run": "a, b"}, False)
+    assert (second.language, commands_of(second), second.runs) == ("bash", ["gen-dataset x  # y"], True)
+    assert (third.language, third.comments) == ("text", {"output": ""})
+
+
+if __name__ == "__main__":
+    for one in PAGES:
+        for part in blocks_of(one):
+            if reason := part.comments.get("not run"):
+                sys.stdout.write(f"{one.relative_to(ROOT)}:{part.line}: {reason}\n")
