@@ -1,7 +1,7 @@
 """Train a small raw denoiser on pairs of unprocess_gen, and compare it with filters: the example of docs/tutorial.md.
 
 ``python train_denoiser.py`` uses the built-in scenes; ``--photos FOLDER`` uses the photographs of a folder. It needs
-PyTorch, and writes the dataset ``denoiser_data`` and the picture ``denoiser.png`` below ``--out``. The last fifth of
+PyTorch, and writes the dataset ``denoiser_data`` and the picture ``denoiser.jpg`` below ``--out``. The last fifth of
 the photographs is not trained on; all figures come from it.
 """
 
@@ -181,7 +181,7 @@ def draw(path: Path, denoised: Filter, pairs: ug.RawPairs) -> None:
         top, left = (height // 2 - 80) // 2 * 2, (width // 2 - 100) // 2 * 2
         crop = np.s_[top : top + 160, left : left + 200]
         rows.append(np.hstack([ug.develop(one[crop], row) for one in (noisy, frame, clean)]))
-    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
+    cv2.imwrite(str(path), cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
 
 
 def main() -> None:
@@ -219,7 +219,7 @@ def main() -> None:
     results |= dict([best(gaussians, few), best(bilaterals, few)]) | {"network": network(model)}
     for name, one in results.items():
         print(f"  {name:32} {psnr(one, new):5.2f} dB")
-    draw(options.out / "denoiser.png", network(model), new[: 2 * (len(new) // 2) : max(len(new) // 2, 1)])
+    draw(options.out / "denoiser.jpg", network(model), new[: 2 * (len(new) // 2) : max(len(new) // 2, 1)])
 
 
 if __name__ == "__main__":
