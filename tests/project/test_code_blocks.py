@@ -1,7 +1,7 @@
 """Code blocks of README and documentation run as they are printed.
 
 Every ``python`` and ``bash`` block of a page runs, in order, in a new folder that contains `photos` and `clips`. Python
-blocks of a page share their names. A ``yaml`` block whose first line is a comment with a path, such as
+blocks of a page share their names. A ``yaml`` block that begins with a comment with a path, such as
 ``# mine/camera/phone.yaml: …``, is written to that path. Indented blocks that begin with a command count as ``bash``.
 HTML comments directly before a block change this:
 
@@ -38,9 +38,10 @@ QUICK = ("README.md", "docs/quickstart.md", "docs/concepts.md")
 """Pages whose blocks run in the quick tests; the others run with ``-m slow``."""
 
 COMMENT = re.compile(r"<!-- (not run|needs|exit code|output)(?:: (.+?))? -->")
-FENCE = re.compile(r"```(\S*)$")
+FENCE = re.compile(r"```(\S*)")
 COMMANDS = ("gen-dataset", "python", ".venv/bin", "pip ", "pytest")
-YAML_PATH = re.compile(r"# ([\w./-]+\.yaml)\b")
+YAML_PATH = re.compile(r"(?:# @package _global_\n)?# ([\w./-]+\.yaml)\b")
+SYNOPSIS = re.compile(r"\.\.\.|…|\[flags\]")
 OPERATORS = ("|", "&", ";", ">", "<", "$(", "=$")
 
 
@@ -76,7 +77,8 @@ def read_blocks(text: str) -> Iterator[Block]:
             while end + 1 < len(lines) and (lines[end + 1].startswith("    ") or not lines[end + 1].strip()):
                 end += 1
             code = "\n".join(one[4:] for one in lines[number : end + 1]).rstrip()
-            yield Block("bash" if code.startswith(COMMANDS) else "", code, number + 1, comments)
+            runs = code.startswith(COMMANDS) and not SYNOPSIS.search(code)
+            yield Block("bash" if runs else "", code, number + 1, comments)
             comments, number = {}, end
         elif comment := COMMENT.match(line):
             comments = comments | {comment[1]: comment[2] or ""}
@@ -152,6 +154,7 @@ def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
     "path",
     [
@@ -165,7 +168,9 @@ def test_blocks_run(path: Path, page_folder: Path, run_main: RunMain) -> None:
     page, printed = Page(path, run_main), ""
     for block in blocks_of(path):
         if "output" in block.comments:
-            assert block.text.strip() == printed.strip(), f"{path.relative_to(ROOT)}:{block.line}: another output\n{printed}"
+            assert block.text.strip() == printed.strip(), (
+                f"{path.relative_to(ROOT)}:{block.line}: another output\n{printed}"
+            )
         elif block.runs:
             printed = page.run(block)
 
@@ -182,14 +187,15 @@ def test_blocks_that_do_not_run_have_a_reason() -> None:
 
 def test_recipe_of_the_guide_is_that_of_the_example() -> None:
     example = (ROOT / "docs" / "examples" / "train_denoiser.py").read_text(encoding="utf-8")
-    guide = "\n".join(block.text for block in blocks_of(ROOT / "docs" / "guides" / "loading.md"))
+    guide = "\n\n\n".join(block.text for block in blocks_of(ROOT / "docs" / "guides" / "loading.md"))
     recipe = re.findall(r"^(?:def (?:pack|to_light|noise_std)|class RandomCrops)\b.*?(?=\n\n\n|\Z)", guide, re.M | re.S)
     assert len(recipe) == 4
     assert [part for part in recipe if part.strip() not in example] == []
 
 
 def test_blocks_are_found_with_their_comments() -> None:
-    text = "<!-- not run: a, b -->\n```bash\nls\n```\n\nword\n\n    gen-dataset x  # y\n\n<!-- output -->\n```text\n1\n```\n"
+    first = "<!-- not run: a, b -->\n```bash\nls\n```\n\nword\n\n"
+    text = f"{first}    gen-dataset x  # y\n\n<!-- output -->\n```text\n1\n```\n"
     first, second, third = read_blocks(text)
     assert (first.language, first.comments, first.runs) == ("bash", {"not run": "a, b"}, False)
     assert (second.language, commands_of(second), second.runs) == ("bash", ["gen-dataset x  # y"], True)
