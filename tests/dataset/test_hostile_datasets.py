@@ -156,10 +156,10 @@ def test_names_with_dots_and_percent_signs_stay_allowed() -> None:
 
 def test_line_of_megabytes_is_damage(copy: Path) -> None:
     manifest = edit(copy, noise="x" * 3 * 10**6)
-    started = time.monotonic()
+    started = time.process_time()
     with pytest.raises(DamageError, match=f"a line has more than {MAX_LINE_BYTES} bytes"):
         list(read_rows(manifest))
-    assert time.monotonic() - started < 2
+    assert time.process_time() - started < 2
 
 
 def test_manifest_that_is_a_folder_is_damage(tmp_path: Path) -> None:

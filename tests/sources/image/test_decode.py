@@ -470,9 +470,9 @@ HUGE = {
 
 @pytest.mark.parametrize("kind", HUGE)
 def test_a_header_that_claims_3600_megapixels_is_refused_at_once(kind: str) -> None:
-    start = time.perf_counter()
+    start = time.process_time()
     reason = reason_of(HUGE[kind] + bytes(10))
-    assert time.perf_counter() - start < 0.05
+    assert time.process_time() - start < 0.05
     # A BMP is not compressed: one that claims so much is short of it.
     assert reason == ("truncated" if kind == "bmp" else "too_large")
 
