@@ -92,7 +92,7 @@ PROMISES = (
         "video",
         "Colours of videos are within half a code of the formula. A frame depends neither on the order of reading nor "
         "on SIMD.",
-        ("tests/sources/video/test_decode.py",),
+        ("tests/sources/video/test_colours.py", "tests/sources/video/test_decode.py"),
     ),
     Promise(
         "patches",
