@@ -175,6 +175,20 @@ def test_blocks_run(path: Path, page_folder: Path, run_main: RunMain) -> None:
             printed = page.run(block)
 
 
+@pytest.mark.slow
+def test_denoiser_example_trains_and_draws(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, ROOT / "docs" / "examples" / "train_denoiser.py", "--scenes", "5", "--steps", "2"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "4 pairs to train on, 1 held out" in done.stdout
+    noisy, gaussian, bilateral, network = (float(line.split()[-2]) for line in done.stdout.splitlines()[-4:])
+    assert 20 < noisy < min(gaussian, bilateral)
+    assert 10 < network < 60
+    assert (tmp_path / "denoiser.jpg").stat().st_size > 1000
+
+
 def test_blocks_that_do_not_run_have_a_reason() -> None:
     unknown = [
         f"{page.relative_to(ROOT)}:{block.line}"
