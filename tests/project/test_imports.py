@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,7 @@ ONLY_IN = {
 """The modules that may import a library."""
 
 
+@functools.cache
 def imported(path: Path) -> set[str]:
     """Return the top-level names that a module imports, inside functions too."""
     names: set[str] = set()

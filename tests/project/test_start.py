@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.datasets import Make
 from helpers.promise_report import Figure
 
 RUN = """
@@ -27,10 +28,9 @@ def imported(*arguments: str) -> set[str]:
     return set(done.stdout.splitlines()[-1].split())
 
 
-def test_run_imports_no_unused_module(photos: Path, tmp_path: Path, figure: Figure) -> None:
-    settings = (f"source.root={photos}", "n_jobs=1")
-    imported(f"out={tmp_path / 'before'}", *settings)  # compiles kernels that are not cached
-    unused = imported(f"out={tmp_path / 'ds'}", *settings) & UNUSED
+def test_run_imports_no_unused_module(photos: Path, make: Make, tmp_path: Path, figure: Figure) -> None:
+    make(photos, tmp_path / "before")  # compiles kernels that are not cached
+    unused = imported(f"out={tmp_path / 'ds'}", f"source.root={photos}", "n_jobs=1") & UNUSED
     assert not unused
     figure("start", f"{len(unused)} of {len(UNUSED)} libraries imported without need")
 

@@ -79,12 +79,12 @@ def test_counts_of_figure_6_agree_with_the_reference(
     )
     after = {name: reference_pair(srgb, subject.plans[name]).counts.saturated for name in paper_sources.GAINS}
 
-    said = {line[0]: tuple(int(cell.split()[0].replace(",", "")) for cell in line[2:4]) for line in figure6.table[1:]}
-    assert said == {name: (before, count) for name, count in after.items()}
+    listed = {line[0]: tuple(int(cell.split()[0].replace(",", "")) for cell in line[2:4]) for line in figure6.table[1:]}
+    assert listed == {name: (before, count) for name, count in after.items()}
     assert len(set(after.values())) > 2
     figure(
         "paper-figures",
-        f"{len(after)} of {len(said)} counts equal the reference: {sorted(set(after.values()))} saturated sites",
+        f"{len(after)} of {len(listed)} counts equal the reference: {sorted(set(after.values()))} saturated sites",
     )
 
 
