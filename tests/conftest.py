@@ -39,8 +39,11 @@ hypothesis.settings.load_profile("tests")
 
 np.seterr(all="raise")  # in every test: no NaN, overflow, underflow or division by zero goes by unseen
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a background job of a shell: commands would ignore it too
+# a shell's background job ignores SIGINT, and nohup ignores SIGHUP; the commands under test would ignore them too
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda number, frame: None)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -39,20 +39,22 @@ def source(tmp_path: Path) -> Path:
     return fill(tmp_path / "p", 3)
 
 
-def test_every_combination_has_its_own_dataset(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+def test_every_combination_has_its_own_dataset_and_row(
+    run_main: RunMain, source: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
     done = run_main(*TWO_BY_TWO, "n_jobs=1")
     assert done.code == 0, done.err
     assert sorted(os.listdir(tmp_path / "sweep")) == sorted([*FOLDERS, "sweep.csv"])
     assert sorted(os.listdir(tmp_path)) == ["p", "sweep"]
 
-
-def test_sweep_csv_has_a_row_for_every_job(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    run_main(*TWO_BY_TWO, "n_jobs=1")
     rows = table(tmp_path / "sweep")
-
     assert [row["folder"] for row in rows] == [row["overrides"] for row in rows] == FOLDERS
     assert [(row["camera"], row["noise"]) for row in rows] == COMBINATIONS
     assert [(row["rows"], row["failed"], row["exit"]) for row in rows] == [("3", "0", "0")] * 4
+
+    for (camera, noise), folder in zip(COMBINATIONS, FOLDERS, strict=True):
+        make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}")
+        assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
 
 
 def test_sweep_csv_has_the_columns_of_the_contract(run_main: RunMain, source: Path, tmp_path: Path) -> None:
@@ -96,28 +98,13 @@ def test_sweeps_over_other_keys_share_one_table(run_main: RunMain, source: Path,
     assert sorted((row["seed"], row["isp"]) for row in rows) == [("", "linear"), ("", "srgb"), ("1", ""), ("2", "")]
 
 
-def test_datasets_of_a_sweep_equal_those_of_single_runs(
-    run_main: RunMain, source: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
-) -> None:
-    run_main(*TWO_BY_TWO, "n_jobs=1")
-    for (camera, noise), folder in zip(COMBINATIONS, FOLDERS, strict=True):
-        make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}")
-        assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
-
-
-def test_failing_job_does_not_stop_others_and_decides_exit_code(
-    run_main: RunMain, source: Path, tmp_path: Path
-) -> None:
+def test_failing_job_gives_one_line_and_decides_exit_code(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     done = run_main("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     assert done.code == 2
     assert [(row["folder"], row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [
         ("gains.red=0", "", "", "2"), ("gains.red=2", "3", "0", "0"),
     ]  # fmt: skip
     assert (tmp_path / "sweep/gains.red=2/dataset.json").exists()
-
-
-def test_error_of_a_job_is_one_line_with_its_name(run_main: RunMain, source: Path) -> None:
-    done = run_main("-m", "gains.red=0,2", "source.root=p", "out=sweep", "n_jobs=1")
     errors = [line for line in done.err.splitlines() if "images/s" not in line]
     assert errors == ["gen-dataset: gains.red=0: gains.red=0: expected a gain above 0, from 0.001 to 1000"]
 
@@ -174,11 +161,17 @@ def test_config_error_is_worse_than_a_failed_image(run_main: RunMain, source: Pa
     assert run_main("-m", "gains.red=2,0", "source.root=p", "out=sweep", "n_jobs=1").code == 2
 
 
-def test_repeated_sweep_changes_nothing(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+def test_repeated_sweep_and_its_plan_change_nothing(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    sweep = ("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+    done = run_main(*sweep)
+    assert ("1/2 seed=1" in done.err, "2/2 seed=2" in done.err) == (True, True)
     before = (tmp_path / "sweep/sweep.csv").read_bytes()
-    done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
+
+    done = run_main(*sweep)
     assert (done.code, done.out.count("nothing to do")) == (0, 2)
+    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
+
+    run_main("plan", *sweep)
     assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
 
 
@@ -188,13 +181,9 @@ def test_rows_of_a_second_sweep_follow_earlier_rows(run_main: RunMain, source: P
     assert [row["folder"] for row in table(tmp_path / "sweep")] == ["seed=2", "seed=1", "seed=3"]
 
 
-@pytest.mark.parametrize(
-    "excluded", ["n_jobs=2", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on", "hydra.mode=MULTIRUN"]
-)
-def test_folder_names_omit_keys_that_do_not_decide_data(
-    excluded: str, run_main: RunMain, source: Path, tmp_path: Path
-) -> None:
-    run_main("-m", "seed=1", "source.root=p", "out=sweep", "n_jobs=1", excluded)
+def test_folder_names_omit_keys_that_do_not_decide_data(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    excluded = ("n_jobs=1", "out=sweep", "source.root=p", "check_disk=false", "self_test=go_on", "hydra.mode=MULTIRUN")
+    run_main("-m", "seed=1", *excluded)
     assert sorted(os.listdir(tmp_path / "sweep")) == ["seed=1", "sweep.csv"]
 
 
@@ -231,13 +220,6 @@ def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: 
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
-def test_plan_does_not_change_sweep_csv(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
-    before = (tmp_path / "sweep/sweep.csv").read_bytes()
-    run_main("plan", "-m", "seed=1,2", "source.root=p", "out=sweep")
-    assert (tmp_path / "sweep/sweep.csv").read_bytes() == before
-
-
 def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 12)
     arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")
@@ -262,12 +244,6 @@ def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash:
     for (camera, noise), folder in zip(COMBINATIONS, folders, strict=True):
         make(source, tmp_path / folder, f"camera={camera}", f"noise={noise}", "output.pairs_per_shard=1")
         assert tree_hash(tmp_path / "sweep" / folder) == tree_hash(tmp_path / folder)
-
-
-def test_jobs_are_announced_with_their_place(run_main: RunMain, source: Path) -> None:
-    done = run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1")
-    assert "1/2 seed=1" in done.err
-    assert "2/2 seed=2" in done.err
 
 
 def test_too_many_jobs_are_refused_at_once(run_main: RunMain, tmp_path: Path) -> None:

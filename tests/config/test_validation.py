@@ -16,9 +16,10 @@ from helpers.published import CRVD
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from omegaconf import OmegaConf, open_dict
 
 from unprocess_gen.config import distributions
-from unprocess_gen.config.composition import load_config
+from unprocess_gen.config.composition import compose_node
 from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.limits import Choice
@@ -34,6 +35,7 @@ from unprocess_gen.config.serialization import (
 )
 from unprocess_gen.config.settings import Setting
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.config.yaml_files import parse_yaml_mapping
 from unprocess_gen.core import tone_curves
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, MOSAIC, PACKED, UINT16, Distribution, Facts
@@ -64,10 +66,21 @@ SHA256 = "0" * 64
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
-def test_every_option_composes_and_is_valid(file: Path, settings: Settings) -> None:
-    """Also show that the fixture ``settings`` builds the config that Hydra composes."""
-    overrides = [f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])]
-    assert load_config(overrides) == settings(*overrides)
+def test_every_option_is_valid(file: Path, settings: Settings) -> None:
+    validate_config(settings(f"{file.parent}={file.stem}", *NEEDS.get(str(file), [])))
+
+
+def test_fixture_settings_builds_what_hydra_composes(settings: Settings) -> None:
+    """Every option occurs; one composition takes an option of each group."""
+    groups = {str(file.parent): [one for one in FILES if one.parent == file.parent] for file in FILES}
+    for number in range(max(map(len, groups.values()))):
+        files = [options[number % len(options)] for options in groups.values()]
+        overrides = [f"{file.parent}={file.stem}" for file in files]
+        overrides += [override for file in files for override in NEEDS.get(str(file), [])]
+        composed = compose_node(overrides)
+        with open_dict(composed):
+            del composed["hydra"]
+        assert OmegaConf.to_object(composed) == settings(*overrides), overrides
 
 
 @pytest.mark.parametrize("file", FILES, ids=str)
@@ -525,6 +538,9 @@ HOSTILE = [
 """Values that a careless or hostile editor could write anywhere in a ``config.yaml``."""
 
 
+DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
 def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in items:
@@ -538,7 +554,7 @@ def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 def test_edited_config_yaml_is_refused_in_one_line_or_can_be_planned(
     overrides: tuple[str, ...], data: st.DataObject, settings: Settings, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    tree = yaml.safe_load(dataset_yaml(settings(*overrides)))
+    tree = parse_yaml_mapping(dataset_yaml(settings(*overrides)))
     *parents, key = data.draw(st.sampled_from(list(paths_of(tree))))
     group = reduce(lambda node, name: node[name], parents, tree)
     if data.draw(st.booleans()):
@@ -546,7 +562,7 @@ def test_edited_config_yaml_is_refused_in_one_line_or_can_be_planned(
     elif isinstance(group, dict):
         del group[key]
     path = tmp_path_factory.mktemp("hostile") / "config.yaml"
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    path.write_text(yaml.dump(tree, Dumper=DUMPER), encoding="utf-8")
     try:
         config, _ = read_dataset_yaml(path)
     except ConfigError as error:

@@ -129,8 +129,18 @@ def test_omitted_effects_are_masked_by_the_noise(
     hold(config, {name: pictures[name] for name in ("gradients-0", "gray 255")}, 1, frozenset(EFFECTS) - ASSUMED)
 
 
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("noise", PROFILES)
+QUICK = {(noise, list(SCENES)[number % len(SCENES)]) for number, noise in enumerate(PROFILES)}
+"""Each profile with one scene; all combinations are slow."""
+
+
+@pytest.mark.parametrize(
+    ("noise", "scene"),
+    [
+        pytest.param(noise, scene, marks=() if (noise, scene) in QUICK else pytest.mark.slow)
+        for noise in PROFILES
+        for scene in SCENES
+    ],
+)
 def test_omitted_effects_are_masked_if_auto_decides_about_all(
     settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
 ) -> None:
@@ -516,6 +526,7 @@ def test_selection_does_not_depend_on_order_of_pixels(settings: Settings) -> Non
     assert switched(config, "auto", srgb, 0) == switched(config, "auto", np.ascontiguousarray(srgb[::-1, ::-1]), 0)
 
 
+@pytest.mark.slow  # `test_selection_does_not_depend_on_order_of_pixels`: only facts of the image enter it
 def test_number_of_workers_does_not_change_the_selection(
     make: Callable[..., generate.Summary], tree_hash: Callable[[Path], str], tmp_path: Path
 ) -> None:
