@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import RunMain
+from helpers.commands import RunMain, messages
 from helpers.datasets import Make
 from helpers.photographs import fill
 
@@ -52,11 +52,6 @@ def shell(line: str, folder: Path, *arguments: str, **more: Any) -> subprocess.C
     """Run a line of sh in which ``"$@"`` is the command with its arguments."""
     command = ["sh", "-c", line, "sh", sys.executable, "-m", "unprocess_gen", *arguments]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False, **more)
-
-
-def messages(text: str) -> list[str]:
-    """Return the lines of stderr without those of progress."""
-    return [line for line in text.splitlines() if " images, " not in line and ": compiling kernels" not in line]
 
 
 FULL = "gen-dataset: stdout: cannot be written (No space left on device); redirect it elsewhere and rerun"

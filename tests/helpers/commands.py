@@ -30,3 +30,8 @@ RunMain = Callable[..., Done]
 
 Cli = Callable[..., "subprocess.CompletedProcess[str]"]
 """Type of the fixture `cli`."""
+
+
+def messages(text: str) -> list[str]:
+    """Return the lines of stderr, except those of progress and of compiling, which depend on machine and cache."""
+    return [line for line in text.splitlines() if "images/s" not in line and "compiling kernels" not in line]
