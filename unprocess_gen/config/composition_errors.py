@@ -11,7 +11,8 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import BranchConfig, Config, all_settings
+from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.suggestions import did_you_mean
 
@@ -40,6 +41,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
             return f"{link.override}: not a valid override ({error_in_one_line(link)})"
         key = getattr(link, "full_key", None)
         if isinstance(link, OmegaConfBaseException) and key:
+            if link.object_type is BranchConfig:
+                return _in_branch(key)
             if isinstance(link, ConfigAttributeError | ConfigKeyError):
                 return unknown_key(key, overrides)
             message = str(link.msg or link).splitlines()[0]
@@ -108,13 +111,37 @@ EXPECTED = {
 """What is allowed, by a part of OmegaConf's message."""
 
 
+WRONG_KIND = ("Cannot merge", "Invalid type assigned")
+"""Parts of OmegaConf's messages about a mapping, a list or a value in place of one another."""
+
+
 def _wrong_value(key: str, message: str, overrides: Sequence[str]) -> str:
     """Return what is expected where OmegaConf refuses the type of a value, else its message."""
     message = re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)
     if "is not a ListConfig, list or tuple" in message:
         value = assignment(key, overrides).partition("=")[2]
         return f"expected a list{f', such as [{value}]' if value and value[0] not in '[{' else ''}"
-    return next((expected for part, expected in EXPECTED.items() if part in message), message)
+    if any(part in message for part in WRONG_KIND) and (setting := _setting(key.partition("[")[0])) is not None:
+        return f"expected {setting.allowed}"
+    expected = next((expected for part, expected in EXPECTED.items() if part in message), None)
+    setting = _setting(key)
+    if expected is None or setting is None:
+        return expected or message
+    allowed = f"expected {setting.allowed}"
+    return allowed if allowed.startswith(expected) else f"{expected}: {setting.allowed}"
+
+
+def _setting(key: str) -> Setting | None:
+    """Return the declaration of a key, such as ``noise.a``; None if it is no setting."""
+    return next((setting for group, name, setting in all_settings() if key == f"{group}.{name}".lstrip(".")), None)
+
+
+def _in_branch(key: str) -> str:
+    """Return the sentence about a key of a branch, whose place in the config OmegaConf does not name."""
+    settings = settings_of(BranchConfig)
+    if key in settings:
+        return f"noise.branches: {key}: expected {settings[key].allowed}"
+    return f"noise.branches: {key}: no such key; a branch has {', '.join(settings)}{did_you_mean(key, list(settings))}"
 
 
 def _missing_file(error: MissingConfigException) -> str:

@@ -266,7 +266,7 @@ VARIANCE_SLOPE = Drawn(
 VARIANCE_OFFSET = Drawn((*VARIANCE_SLOPE.kinds, "log_linear_in_a"), -MAX_VARIANCE, MAX_VARIANCE)
 
 SCENE_KINDS = ("uniform", "log_uniform", "choice")
-ISO = Drawn(SCENE_KINDS)
+ISO = Drawn(SCENE_KINDS, math.nextafter(0, 1), MAX_ISO, f"an ISO above 0, up to {MAX_ISO:g}")
 EXPOSURE_S = Drawn(SCENE_KINDS, 1e-7, 1e5)
 TEMPERATURE_C = Drawn(SCENE_KINDS, -100.0, 150.0)
 EXPOSURE_RATIO = Drawn(SCENE_KINDS, 1e-3, 1e6)
