@@ -100,7 +100,7 @@ def kill_group(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
-def assert_whole(out: Path) -> None:
+def assert_complete(out: Path) -> None:
     assert sorted(os.listdir(out)) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
     entries = json.loads((out / "dataset.json").read_text())["shards"]
     assert sorted(os.listdir(out / "shards")) == [Path(entry["file"]).name for entry in entries]

@@ -31,7 +31,7 @@ from helpers.processes import (
     ONE,
     SLOW_DISK,
     Killed,
-    assert_whole,
+    assert_complete,
     committed,
     handles_signals,
     imported_first,
@@ -141,7 +141,7 @@ def test_run_killed_at_random_moments_resumes_to_the_same_bytes(
         unfinished += out.exists() and not (out / "dataset.json").exists()
         make(photographs, out, ONE)
         assert tree_hash(out) == undisturbed, kill
-        assert_whole(out)
+        assert_complete(out)
         shutil.rmtree(out)
     print(f"{whom}: {hits} of {kills} kills hit a running process, {unfinished} left an unfinished folder")
     assert hits >= kills / 2 and unfinished >= kills / 4
@@ -172,7 +172,7 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
         assert all("its worker died twice" in line for line in lines) and len(lines) <= 1, err
         make(photographs, out, ONE)
         assert tree_hash(out) == undisturbed, kill
-        assert_whole(out)
+        assert_complete(out)
         shutil.rmtree(out)
     print(f"worker: {hits} of {kills} kills hit a running process; exit codes {dict(codes)}")
     assert hits >= kills / 2
@@ -202,7 +202,7 @@ def test_orphaned_workers_do_not_disturb_the_next_run(
         assert make(photographs, out, ONE).made == COUNT - done
         wait_for_the_end(process.pid)
     assert tree_hash(out) == undisturbed
-    assert_whole(out)
+    assert_complete(out)
 
 
 def test_file_added_by_an_orphan_at_the_start_is_harmless(
@@ -225,7 +225,7 @@ def test_file_added_by_an_orphan_at_the_start_is_harmless(
     monkeypatch.setattr(os, "rmdir", adds_first)
     make(photographs, out, ONE)
     assert tree_hash(out) == undisturbed
-    assert_whole(out)
+    assert_complete(out)
 
 
 # Workers --------------------------------------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ def test_killed_worker_is_noticed_within_five_seconds(
     assert (process.returncode, own_lines(err)) == (0, []), err
     assert f"{COUNT} pairs in {COUNT} shards" in said
     assert tree_hash(tmp_path / "ds") == undisturbed
-    assert_whole(tmp_path / "ds")
+    assert_complete(tmp_path / "ds")
     figure("dead-worker", f"noticed after {noticed_s:.1f} s")
 
 
@@ -437,10 +437,10 @@ def fulls(request: pytest.FixtureRequest, disk: Disk, six: Path, make: Make, tre
             make(six, out, ONE, "check_disk=false", n_jobs=request.param)
         except UnprocessGenError as raised:
             error = raised
-            place, whole = place_of(out), intact(out)
+            place, is_intact = place_of(out), intact(out)
             disk.remount("size=4m")
             make(six, out, ONE)
-            seen.append(Full(kilobytes, error, place, whole, tree_hash(out)))
+            seen.append(Full(kilobytes, error, place, is_intact, tree_hash(out)))
     shutil.rmtree(out)
     disk.remount("size=4m")
     return seen
@@ -562,11 +562,11 @@ def test_deleted_source_ends_with_5_and_a_rerun_completes(
 ) -> None:  # fmt: skip
     """A network share that is away for a minute must not give a finished dataset without its photographs."""
     shutil.copytree(six, tmp_path / "p")
-    gone = tmp_path / "p" if what == "folder" else tmp_path / "p/004.png"
-    after_commits(2, lambda: gone.rename(tmp_path / "away"), monkeypatch)
+    moved = tmp_path / "p" if what == "folder" else tmp_path / "p/004.png"
+    after_commits(2, lambda: moved.rename(tmp_path / "away"), monkeypatch)
     done = run_main("source.root=p", ONE, "n_jobs=1")
     assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
-    (tmp_path / "away").rename(gone)
+    (tmp_path / "away").rename(moved)
     make(tmp_path / "p", tmp_path / "ds", ONE)
     assert tree_hash(tmp_path / "ds") == six_undisturbed
 
@@ -733,7 +733,7 @@ def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
         assert [line for line in own_lines(err) if not line.startswith("gen-dataset: ")] == []
         make(photographs, out, ONE)
         assert tree_hash(out) == undisturbed, kill
-        assert_whole(out)
+        assert_complete(out)
     print(f"exit codes of {number} signals: {dict(codes)}")
     assert codes[130] + codes[143] >= number / 2
     figure("resume", f"signals: same bytes in {kill + 1} of {number} runs")

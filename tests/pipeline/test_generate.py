@@ -180,9 +180,9 @@ def test_shard_size_leaves_images_unchanged(make: Make, dataset: Path, photos: P
 
 def test_source_limit_leaves_kept_images_unchanged(make: Make, dataset: Path, photos: Path, tmp_path: Path) -> None:
     make(photos, tmp_path / "ds", "source.limit=4")
-    kept, whole = by_source(tmp_path / "ds"), by_source(dataset)
+    kept, every = by_source(tmp_path / "ds"), by_source(dataset)
     assert list(kept) == list(PHOTOS[:4])
-    assert kept == {name: whole[name] for name in kept}
+    assert kept == {name: every[name] for name in kept}
 
 
 def test_another_noise_profile_leaves_other_draws_unchanged(
@@ -195,33 +195,33 @@ def test_another_noise_profile_leaves_other_draws_unchanged(
 
 
 @pytest.fixture
-def twins(tmp_path: Path) -> Path:
+def identical(tmp_path: Path) -> Path:
     source = fill(tmp_path / "p", 3)
     for name in ("z.png", "a.png"):
         (source / name).write_bytes((source / "001.png").read_bytes())
     return source
 
 
-def test_identical_files_get_different_parameters_and_noise(twins: Path, make: Make, tmp_path: Path) -> None:
-    make(twins, tmp_path / "ds")
+def test_identical_files_get_different_parameters_and_noise(identical: Path, make: Make, tmp_path: Path) -> None:
+    make(identical, tmp_path / "ds")
     same = [row for row in rows(tmp_path / "ds") if row["source"] in ("001.png", "a.png", "z.png")]
     assert len({row["source_sha256"] for row in same}) == 1
     assert len({row["stream_key"] for row in same}) == 3
     assert len({row["noisy_xxh3"] for row in same}) == 3
 
 
-def test_first_of_identical_files_by_name_is_as_if_alone(twins: Path, make: Make, tmp_path: Path) -> None:
-    make(twins, tmp_path / "three")
+def test_first_of_identical_files_by_name_is_as_if_alone(identical: Path, make: Make, tmp_path: Path) -> None:
+    make(identical, tmp_path / "three")
     for name in ("a.png", "z.png"):
-        (twins / name).unlink()
-    make(twins, tmp_path / "one")
+        (identical / name).unlink()
+    make(identical, tmp_path / "one")
     assert by_source(tmp_path / "three")["001.png"] == by_source(tmp_path / "one")["001.png"]
 
 
-def test_identical_files_are_numbered_in_name_order(twins: Path, make: Make, tmp_path: Path) -> None:
-    make(twins, tmp_path / "before")
-    (twins / "a.png").rename(twins / "m.png")
-    make(twins, tmp_path / "after")
+def test_identical_files_are_numbered_in_name_order(identical: Path, make: Make, tmp_path: Path) -> None:
+    make(identical, tmp_path / "before")
+    (identical / "a.png").rename(identical / "m.png")
+    make(identical, tmp_path / "after")
     before, after = by_source(tmp_path / "before"), by_source(tmp_path / "after")
     assert after["m.png"][1:] == before["a.png"][1:]
     assert after["z.png"] == before["z.png"]
@@ -287,8 +287,8 @@ def test_unsafe_file_names_are_percent_encoded(make: Make, tmp_path: Path) -> No
 def broken(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a dataset of 9 photographs in shards of 2; all of shard 1 and one of shard 2 fail."""
     source = fill(tmp_path_factory.mktemp("broken") / "p", 9)
-    whole = (source / "002.png").read_bytes()
-    (source / "002.png").write_bytes(whole[: len(whole) // 2])
+    intact = (source / "002.png").read_bytes()
+    (source / "002.png").write_bytes(intact[: len(intact) // 2])
     (source / "003.png").write_bytes(b"")
     (source / "005.png").write_bytes(b"not a photograph")
     (source / "006.png").unlink()

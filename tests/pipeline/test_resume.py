@@ -24,7 +24,7 @@ from helpers.processes import (
     SLOW_DISK,
     WAIT_S,
     Killed,
-    assert_whole,
+    assert_complete,
     committed,
     imported_first,
     kill_group,
@@ -83,7 +83,7 @@ def test_run_killed_repeatedly_ends_as_if_undisturbed(
         assert committed(out) >= 3 * kill
     make(forty, out, ONE)
     assert tree_hash(out) == undisturbed
-    assert_whole(out)
+    assert_complete(out)
     figure("resume", f"same bytes after {kill + 1} kills of one run")
 
 
@@ -127,7 +127,7 @@ def test_run_killed_around_any_rename_can_be_resumed(
             make(source, out, TWO)
         make(source, out, TWO)
         assert tree_hash(out) == tree_hash(six / "ds"), renamed
-        assert_whole(out)
+        assert_complete(out)
     figure("resume", "same bytes after a kill before or after each rename")
 
 
@@ -221,7 +221,7 @@ def test_unfinished_files_are_deleted_at_the_end(begun: Path, make: Make) -> Non
     (begun / "ds/.work/tmp/shard-00002.tar.1.1").write_bytes(b"half")
     (begun / "ds/.work/manifest.csv.part").write_text("half")
     make(begun / "p", begun / "ds", TWO)
-    assert_whole(begun / "ds")
+    assert_complete(begun / "ds")
 
 
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: os.truncate(path, 600)], ids=["deleted", "cut off"])
@@ -354,13 +354,13 @@ def test_unreadable_dataset_file_is_reported_in_one_line(
 def test_committed_shard_with_unreadable_rows_is_regenerated(begun: Path, make: Make) -> None:
     (begun / "ds/.work/rows/00000.json").write_text("{[")
     make(begun / "p", begun / "ds", TWO)
-    assert_whole(begun / "ds")
+    assert_complete(begun / "ds")
 
 
 def test_work_folder_left_by_a_kill_is_deleted(finished: Path, make: Make) -> None:
     (finished / "ds/.work/rows").mkdir(parents=True)
     make(finished / "p", finished / "ds", TWO)
-    assert_whole(finished / "ds")
+    assert_complete(finished / "ds")
 
 
 # Lock and foreign files -----------------------------------------------------------------------------------------------
@@ -435,7 +435,7 @@ def test_two_runs_at_once_make_one_dataset(forty: Path, undisturbed: str, tree_h
 def test_empty_folder_is_accepted(make: Make, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     make(fill(tmp_path / "p", 1), tmp_path / "ds")
-    assert_whole(tmp_path / "ds")
+    assert_complete(tmp_path / "ds")
 
 
 # Stopped --------------------------------------------------------------------------------------------------------------

@@ -233,7 +233,7 @@ def changed(path: Path) -> None:
         (os.unlink, "its source cannot be used (unreadable: "),
         (lambda path: os.truncate(path, 9), "changed since it was listed"),
     ],
-    ids=["changed", "gone", "cut"],
+    ids=["changed", "deleted", "cut"],
 )
 def test_changed_or_deleted_source_is_named(
     harm: Callable[[Path], None], complaint: str, intact: Path, tmp_path: Path

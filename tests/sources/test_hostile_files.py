@@ -299,7 +299,7 @@ def test_folder_that_links_to_itself_is_listed_once(odd: Run) -> None:
 
 
 @pytest.fixture
-def nobody() -> Iterator[None]:
+def unprivileged() -> Iterator[None]:
     """The tests run as a user whom permissions bind."""
     if os.geteuid() != 0:
         yield
@@ -318,7 +318,7 @@ def test_a_file_without_permission_to_read_is_unreadable(
     (tmp_path / "a.jpg").write_bytes(OURS["baseline.jpg"])
     (tmp_path / "a.jpg").chmod(0)
     monkeypatch.chdir(tmp_path)  # the folders above are not for everyone to walk through
-    request.getfixturevalue("nobody")
+    request.getfixturevalue("unprivileged")
     (source,) = list_folder(".", ["*.jpg"], True, None).sources
     with pytest.raises(SourceError, match=r"^unreadable: a\.jpg: Permission denied"):
         read_bytes(".", source)

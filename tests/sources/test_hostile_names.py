@@ -102,7 +102,7 @@ NAMES: tuple[bytes, ...] = (
         "👩‍👩‍👧‍👦.jpg".encode(),
         "\U000e0041.jpg".encode(),
     ),
-    # twins: by case, by normal form, by look
+    # alike: by case, by normal form, by look
     *(b"case.jpg", b"CASE.jpg", b"Case.JPG", "ß.jpg".encode(), b"ss.jpg", "ı.jpg".encode(), b"i.jpg", b"I.jpg"),
     *(unicodedata.normalize(form, "é.jpg").encode() for form in ("NFC", "NFD")),
     *(unicodedata.normalize(form, "각Å.jpg").encode() for form in ("NFC", "NFD")),

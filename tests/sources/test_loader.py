@@ -89,8 +89,8 @@ def test_channels_are_moved_independently(dithered: object) -> None:
 
 def test_dither_of_a_crop_is_the_crop_of_the_dither(dithered: object) -> None:
     srgb = pixels(3, 40, 90)
-    whole = dequantise(srgb, dithered, CURVE)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(dequantise(srgb[7:, 65:], dithered, CURVE, (7, 65)), whole[7:, 65:])  # type: ignore[arg-type]
+    full = dequantise(srgb, dithered, CURVE)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(dequantise(srgb[7:, 65:], dithered, CURVE, (7, 65)), full[7:, 65:])  # type: ignore[arg-type]
 
 
 def test_kernels_dither_like_the_reference(dithered: object) -> None:

@@ -63,12 +63,6 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(sources: Path, make: Make) -> Path:
-    make(sources, sources.parent / "whole", *LEVELS)
-    return sources.parent / "whole"
-
-
-@pytest.fixture(scope="module")
 def cut_up(sources: Path, make: Make) -> Path:
     """Random patches of two levels and two draws; a shard holds two photographs."""
     make(sources, sources.parent / "cut_up", *LEVELS, RANDOM, "output.pairs_per_shard=2")
@@ -84,9 +78,9 @@ def pair_of(row: dict[str, Any]) -> tuple[Any, ...]:
     return row["source"], int(row["level"]), int(row["draw"])
 
 
-def assert_cut_outs(patched: Path, whole: Path) -> int:
+def assert_cut_outs(patched: Path, full: Path) -> int:
     """Compare every pair of a dataset of patches with the crop of the full image's pair; return their number."""
-    frames = {pair_of(sample.row): sample for sample in RawPairs(whole)}
+    frames = {pair_of(sample.row): sample for sample in RawPairs(full)}
     for clean, noisy, row in RawPairs(patched):
         frame, (height, width), (y, x) = frames[pair_of(row)], clean.shape, (row["patch_y"], row["patch_x"])
         np.testing.assert_array_equal(clean, frame.clean[y : y + height, x : x + width])
@@ -113,11 +107,11 @@ def assert_cut_outs(patched: Path, whole: Path) -> int:
 def test_patch_equals_the_crop_of_its_full_pair(
     overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path, figure: Figure
 ) -> None:
-    make(sources, tmp_path / "whole", *overrides)
+    make(sources, tmp_path / "full", *overrides)
     equal = 0
     for number, patch in enumerate((GRID, STRIDE, RANDOM)):
         make(sources, tmp_path / f"patched{number}", *overrides, patch)
-        crops = assert_cut_outs(tmp_path / f"patched{number}", tmp_path / "whole")
+        crops = assert_cut_outs(tmp_path / f"patched{number}", tmp_path / "full")
         assert crops >= 14, patch
         equal += crops
     figure("patches", f"{equal} patches are crops of their frames")
@@ -125,9 +119,9 @@ def test_patch_equals_the_crop_of_its_full_pair(
 
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
 def test_patch_has_the_pattern_of_its_full_frame(pattern: str, sources: Path, make: Make, tmp_path: Path) -> None:
-    for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=[grid,32,14]")):
+    for name, patch in (("full", "source.patch=null"), ("patched", "source.patch=[grid,32,14]")):
         make(sources, tmp_path / name, patch, f"sensor.pattern={pattern}", "gains=fixed")
-    assert_cut_outs(tmp_path / "patched", tmp_path / "whole")
+    assert_cut_outs(tmp_path / "patched", tmp_path / "full")
     assert {row["pattern"] for row in rows(tmp_path / "patched") if row["status"] == "ok"} == {pattern}
 
 
@@ -135,9 +129,9 @@ def test_frames_of_a_clip_have_patches_at_the_same_places(make: Make, tmp_path: 
     for clip, frame in ((clip, frame) for clip in ("one", "two") for frame in range(3)):
         (tmp_path / "clips" / clip).mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels(frame + 7 * len(clip), 60, 80)).save(tmp_path / "clips" / clip / f"{clip}{frame}.png")
-    for name, patch in (("whole", "source.patch=null"), ("patched", RANDOM)):
+    for name, patch in (("full", "source.patch=null"), ("patched", RANDOM)):
         make(tmp_path / "clips", tmp_path / name, "source.clips=true", *EVERY_EFFECT, "noise.draws=2", patch)
-    assert assert_cut_outs(tmp_path / "patched", tmp_path / "whole") == 6 * 5 * 2
+    assert assert_cut_outs(tmp_path / "patched", tmp_path / "full") == 6 * 5 * 2
     corners = {
         (row["clip"], row["frame"], row["patch"], row["patch_y"], row["patch_x"]) for row in rows(tmp_path / "patched")
     }
@@ -146,9 +140,9 @@ def test_frames_of_a_clip_have_patches_at_the_same_places(make: Make, tmp_path: 
 
 
 def test_patches_are_cut_after_downscaling(sources: Path, make: Make, tmp_path: Path) -> None:
-    for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=[grid,16,8]")):
+    for name, patch in (("full", "source.patch=null"), ("patched", "source.patch=[grid,16,8]")):
         make(sources, tmp_path / name, "source.downscale=2", "source.dequantize=dither", patch)
-    assert assert_cut_outs(tmp_path / "patched", tmp_path / "whole") > 0
+    assert assert_cut_outs(tmp_path / "patched", tmp_path / "full") > 0
 
 
 OWN = {
@@ -162,9 +156,9 @@ OWN = {
 def test_patches_share_the_plan_of_their_image(
     overrides: tuple[str, ...], sources: Path, make: Make, tmp_path: Path
 ) -> None:
-    for name, patch in (("whole", "source.patch=null"), ("patched", "source.patch=16")):
+    for name, patch in (("full", "source.patch=null"), ("patched", "source.patch=16")):
         make(sources, tmp_path / name, *overrides, patch, "source.limit=1")
-    shared = {pair_of(row): {name: row[name] for name in row if name not in OWN} for row in rows(tmp_path / "whole")}
+    shared = {pair_of(row): {name: row[name] for name in row if name not in OWN} for row in rows(tmp_path / "full")}
     for row in rows(tmp_path / "patched"):
         assert {name: row[name] for name in row if name not in OWN} == shared[pair_of(row)]
 
@@ -172,7 +166,7 @@ def test_patches_share_the_plan_of_their_image(
 def test_counts_of_tiling_patches_add_up_to_the_image(sources: Path, make: Make, tmp_path: Path) -> None:
     """64 x 96 pixels, all of them in one patch of 32 x 32."""
     settings = ("source.limit=1", "noise=imx385_iso25600")
-    one = make(sources, tmp_path / "whole", *settings)
+    one = make(sources, tmp_path / "full", *settings)
     many = make(sources, tmp_path / "patched", *settings, GRID)
     assert many.sites == one.sites
     assert min(many.sites["saturated"], many.sites["noisy_clipped_high"]) > 0
@@ -539,9 +533,9 @@ def test_plan_reports_bytes_and_pairs_exactly(patch: str, sources: Path, make: M
     made = make(sources, tmp_path / "ds", patch, *LEVELS, "output.pairs_per_shard=2")
     config, _ = read_dataset_yaml(tmp_path / "ds" / "config.yaml")
     config.source.root = str(sources)
-    told = estimate_run(config, 1, read_all=True)
-    assert (told.bytes, told.pairs) == (made.bytes, made.pairs)
-    assert f"pairs     {made.pairs}, in 2 shards of 2" in format_estimate(config, told)
+    estimated = estimate_run(config, 1, read_all=True)
+    assert (estimated.bytes, estimated.pairs) == (made.bytes, made.pairs)
+    assert f"pairs     {made.pairs}, in 2 shards of 2" in format_estimate(config, estimated)
 
 
 @pytest.mark.parametrize(

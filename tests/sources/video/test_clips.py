@@ -71,8 +71,8 @@ def test_frames_of_a_video_have_its_digest_and_size(filmed: Path, films: Path) -
     import hashlib
 
     content = (films / "h264.mp4").read_bytes()
-    told = {(row["source_sha256"], row["source_bytes"]) for row in text_rows(filmed) if row["source"] == "h264.mp4"}
-    assert told == {(hashlib.sha256(content).hexdigest(), str(len(content)))}
+    recorded = {(row["source_sha256"], row["source_bytes"]) for row in text_rows(filmed) if row["source"] == "h264.mp4"}
+    assert recorded == {(hashlib.sha256(content).hexdigest(), str(len(content)))}
 
 
 def test_frames_share_their_draws_and_identical_videos_do_not(filmed: Path) -> None:

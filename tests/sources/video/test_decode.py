@@ -252,16 +252,16 @@ def test_other_primaries_are_refused_under_icc_refuse(tmp_path: Path) -> None:
 
 def damaged(folder: Path) -> tuple[Path, Path]:
     """A film of closed groups of five frames, and a copy with bytes of frame 7's packet overwritten."""
-    whole = film(folder / "whole.mkv", "ffv1", "yuv420p", scene(20), {"g": "5", "slicecrc": "1", "level": "3"})
-    with av.open(str(whole)) as container:
+    intact = film(folder / "intact.mkv", "ffv1", "yuv420p", scene(20), {"g": "5", "slicecrc": "1", "level": "3"})
+    with av.open(str(intact)) as container:
         packet = next(itertools.islice(container.demux(video=0), 7, 8))
         content = bytes(packet)
-    data = bytearray(whole.read_bytes())
+    data = bytearray(intact.read_bytes())
     at = data.index(content)
     data[at + 40 : at + 60] = bytes(20)
     broken = folder / "broken.mkv"
     broken.write_bytes(data)
-    return whole, broken
+    return intact, broken
 
 
 def reason_of(video: Video, number: int) -> str:
@@ -273,7 +273,7 @@ def reason_of(video: Video, number: int) -> str:
 
 
 def test_damage_affects_its_frame_and_dependent_ones(tmp_path: Path) -> None:
-    whole, broken = map(opened, damaged(tmp_path))
+    intact, broken = map(opened, damaged(tmp_path))
     wanted = [""] * 7 + ["corrupt"] * 3 + [""] * 10
     assert [reason_of(broken, number) for number in range(20)] == wanted
     numbers = list(range(20)) * 2
@@ -281,7 +281,7 @@ def test_damage_affects_its_frame_and_dependent_ones(tmp_path: Path) -> None:
     for number in numbers:
         assert reason_of(broken, number) == wanted[number]
         if not wanted[number]:
-            np.testing.assert_array_equal(rgb(broken, number), rgb(whole, number))
+            np.testing.assert_array_equal(rgb(broken, number), rgb(intact, number))
 
 
 @pytest.mark.parametrize("kind", [kind for kind in ENCODED if kind != "av1"])
@@ -289,7 +289,7 @@ def test_damage_is_the_same_in_any_order_of_reading(kind: str, encoded: Callable
     """Frames before the damage are intact; later ones are the same each time, whether the decoder finds it or not."""
     path = Path(shutil.copy(encoded(kind), tmp_path))
     video = opened(path)
-    whole = [outcome(video, number) for number in range(30)]
+    intact = [outcome(video, number) for number in range(30)]
     with av.open(str(path)) as container:
         content = bytes(next(itertools.islice(container.demux(video=0), 10, 11)))
     data = bytearray(path.read_bytes())
@@ -301,8 +301,8 @@ def test_damage_is_the_same_in_any_order_of_reading(kind: str, encoded: Callable
     numbers = list(range(30))
     random.Random(3).shuffle(numbers)
     assert [outcome(broken, number) for number in numbers] == [in_turn[number] for number in numbers]
-    assert in_turn[:7] == whole[:7]
-    assert in_turn != whole
+    assert in_turn[:7] == intact[:7]
+    assert in_turn != intact
 
 
 def outcome(video: Video, number: int) -> bytes | str:
@@ -311,7 +311,7 @@ def outcome(video: Video, number: int) -> bytes | str:
 
 def test_frames_that_fail_are_rows_and_the_others_pairs(make: Make, tmp_path: Path) -> None:
     _, broken = damaged(tmp_path / "in")
-    (tmp_path / "in" / "whole.mkv").unlink()
+    (tmp_path / "in" / "intact.mkv").unlink()
     made = {per: tmp_path / f"ds{per}" for per in (3, 8)}
     for per, out in made.items():
         make(tmp_path / "in", out, "source.clips=true", f"output.pairs_per_shard={per}")
