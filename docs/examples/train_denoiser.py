@@ -219,7 +219,7 @@ def main() -> None:
     results |= dict([best(gaussians, few), best(bilaterals, few)]) | {"network": network(model)}
     for name, one in results.items():
         print(f"  {name:32} {psnr(one, new):5.2f} dB")
-    draw(options.out / "denoiser.jpg", network(model), new[: 2 * (len(new) // 2) : max(len(new) // 2, 1)])
+    draw(options.out / "denoiser.jpg", network(model), new[:: max(len(new) // 2, 1)][:2])
 
 
 if __name__ == "__main__":
