@@ -102,7 +102,11 @@ PROMISES = (
     Promise(
         "effects",
         "Each physical effect follows its distribution, and none changes the values of another.",
-        ("tests/simulation/kernels/test_physical.py",),
+        (
+            "tests/simulation/test_effects.py",
+            "tests/simulation/test_read_noise.py",
+            "tests/simulation/test_effect_independence.py",
+        ),
     ),
     Promise(
         "poisson",

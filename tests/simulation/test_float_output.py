@@ -103,12 +103,12 @@ def test_compiled_counts_equal_the_reference() -> None:
 @pytest.mark.parametrize("name", PLANS)
 def test_kernels_equal_the_reference_byte_for_byte(name: str, clip: str, figure: Figure) -> None:
     plan, picture = normalised(PLANS[name], clip), selftest.golden_image()
-    ours, theirs = (make_pair(picture, one, ORIGIN) for one in (plan, replace(plan, methods=(REFERENCE_METHOD,))))
-    assert ours.clean.tobytes() == theirs.clean.tobytes()
-    assert ours.noisy.tobytes() == theirs.noisy.tobytes()
-    assert ours.counts == theirs.counts
-    changed = int((ours.noisy != theirs.noisy).sum())
-    figure("float-output", f"{changed} of {theirs.noisy.size} sites differ from the reference")
+    compiled, expected = (make_pair(picture, one, ORIGIN) for one in (plan, replace(plan, methods=(REFERENCE_METHOD,))))
+    assert compiled.clean.tobytes() == expected.clean.tobytes()
+    assert compiled.noisy.tobytes() == expected.noisy.tobytes()
+    assert compiled.counts == expected.counts
+    changed = int((compiled.noisy != expected.noisy).sum())
+    figure("float-output", f"{changed} of {expected.noisy.size} sites differ from the reference")
 
 
 @pytest.mark.parametrize("name", PLANS)
@@ -189,11 +189,11 @@ def test_levels_and_draws_equal_separate_pairs(noise: str, overrides: tuple[str,
     picture = selftest.golden_image()[:18, :82]
     plans = plan_pairs(config, "0" * 64, facts=facts_for(config, picture))
     assert len(plans) == 4
-    for plan, ours in zip(plans, make_pairs(picture, plans), strict=True):
+    for plan, pair in zip(plans, make_pairs(picture, plans), strict=True):
         alone = make_pair(picture, plan)
-        assert ours.clean.tobytes() == alone.clean.tobytes()
-        assert ours.noisy.tobytes() == alone.noisy.tobytes()
-        assert (ours.noisy.shape, ours.counts) == (alone.noisy.shape, alone.counts)
+        assert pair.clean.tobytes() == alone.clean.tobytes()
+        assert pair.noisy.tobytes() == alone.noisy.tobytes()
+        assert (pair.noisy.shape, pair.counts) == (alone.noisy.shape, alone.counts)
 
 
 def test_numpys_instruction_sets_change_no_byte() -> None:

@@ -83,8 +83,10 @@ def test_the_pairs_of_an_image_differ_in_noise_only(many: Path) -> None:
         assert all(one == shared[0] for one in shared)
 
 
-def test_the_end_of_a_run_counts_pairs(run_main: RunMain) -> None:
-    said = run_main("source.limit=1", "noise.levels=2", "noise.draws=2", "noise=brooks2019", "n_jobs=1").out
+def test_the_end_of_a_run_counts_pairs(run_main: RunMain, tmp_path: Path) -> None:
+    photographs = fill(tmp_path / "p", 1)
+    overrides = ("noise.levels=2", "noise.draws=2", "noise=brooks2019", "n_jobs=1")
+    said = run_main(f"source.root={photographs}", *overrides).out
     assert said.startswith("ds: 4 pairs in 1 shard")
     assert "; 4 of 4 rows generated in this run, " in said
 
@@ -119,12 +121,8 @@ def test_every_pair_is_regenerated_from_its_row(many: Path, photographs: Path, f
     figure("levels", f"{sum(not one.complaint for one in replayed)} of {len(replayed)} pairs regenerated")
 
 
-def test_a_damaged_draw_is_named_and_repaired(
-    many: Path, photographs: Path, make: Make, run_main: RunMain, tmp_path: Path
-) -> None:
-    make(
-        photographs, tmp_path / "ds", "noise=brooks2019", "noise.levels=3", "noise.draws=2", "output.pairs_per_shard=2"
-    )
+def test_a_damaged_draw_is_named_and_repaired(many: Path, run_main: RunMain, tmp_path: Path) -> None:
+    shutil.copytree(many, tmp_path / "ds")
     path = tmp_path / "ds" / "shards" / "shard-00000.tar"
     content = bytearray(path.read_bytes())
     content[content.index(b"00000001.noisy.l01d01.npy") + 512 + 200] ^= 1

@@ -1,0 +1,384 @@
+"""Each physical effect has its distribution, and fixed patterns belong to a sensor unit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.datasets import Settings
+from helpers.flats import (
+    BLACK,
+    COUNT,
+    SHA256,
+    SILENT,
+    assert_same,
+    bounds_off,
+    flat,
+    noisy_dn,
+    picture,
+    plan_with,
+    planned,
+    poisson_reach,
+    signal_dn,
+    with_physics,
+)
+from helpers.moments import REACH, bernstein
+
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.lookup_tables import exponential_levels
+from unprocess_gen.planning.effect_selection import facts_of
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference import noise as effects
+
+# Shot noise -----------------------------------------------------------------------------------------------------------
+
+
+def assert_poisson(counts: np.ndarray, rate: float) -> None:
+    """Check mean, variance, third moment and fraction of zeros; words resolve probabilities to 2**-32."""
+    reach = poisson_reach(rate)
+    deviation = counts - rate
+    for order, moment, variance in (
+        (1, 0.0, rate),
+        (2, rate, rate + 2 * rate**2),
+        (3, rate, rate + 24 * rate**2 + 15 * rate**3),
+    ):
+        bound = bernstein(variance, reach**order + moment, counts.size) + 2.0**-31 * reach**order
+        assert abs(float((deviation**order).mean()) - moment) <= bound, order
+    zero = math.exp(-min(rate, 700.0))
+    assert abs(float((counts == 0).mean()) - zero) <= bernstein(zero * (1 - zero), 1, counts.size) + 2.0**-31
+
+
+@pytest.mark.parametrize("code", [1, 9, 43, 170, 600, 5000, 60000])
+def test_shot_noise_is_poisson_count_of_electrons(code: int) -> None:
+    counts = noisy_dn(plan_with("shot"), code) / 8
+    assert (counts == np.rint(counts)).all()
+    assert_poisson(counts, signal_dn(code) / 8)
+
+
+def test_poisson_check_rejects_another_rate() -> None:
+    counts = noisy_dn(plan_with("shot"), 600) / 8
+    with pytest.raises(AssertionError):
+        assert_poisson(counts, signal_dn(600) / 8 * 1.01)
+
+
+def test_no_light_gives_no_shot_noise() -> None:
+    assert (noisy_dn(plan_with("shot"), 0) == 0).all()
+
+
+@pytest.mark.parametrize("code", [0, 300, 5000, 40000])
+def test_poisson_form_has_mean_variance_and_skewness(code: int) -> None:
+    """Only counts have a third moment, a²·u. The fourth is that of a normal plus a⁴·rate; the sixth is a bound."""
+    a, b = 12.5, 900.0
+    plan = replace(
+        plan_with(), physics=None, effects=("heteroscedastic", "quantise"), noise_law="poisson", a_dn=a, b_dn2=b
+    )
+    deviation = noisy_dn(plan, code) - signal_dn(code)
+    rate = signal_dn(code) / a
+    variance = a * a * rate + b + 1 / 12
+    reach = a * poisson_reach(rate) + REACH * math.sqrt(b) + 1
+    fourth = 3 * variance**2 + a**4 * rate
+    sixth = 15 * variance**3 + 25 * a**4 * rate * variance + 10 * (a**3 * rate) ** 2 + a**6 * rate
+    assert bounds_off(deviation, 0, variance, reach) <= 1
+    assert bounds_off(deviation**2, variance, fourth - variance**2, reach**2) <= 1
+    assert bounds_off(deviation**3, a**3 * rate, sixth, reach**3) <= 1
+
+
+# Rows and columns -----------------------------------------------------------------------------------------------------
+
+OFFSETS = 2**15
+
+
+def assert_normal_offsets(offsets: np.ndarray, std: float) -> None:
+    """Check mean and variance of rounded normals."""
+    variance, reach = std**2 + 1 / 12, REACH * std + 1
+    assert bounds_off(offsets, 0, variance, reach) <= 1
+    assert bounds_off(offsets**2, variance, 2 * variance**2, reach**2) <= 1
+
+
+def test_row_has_one_offset_of_given_standard_deviation() -> None:
+    deviation = noisy_dn(plan_with("row", row_std_dn=300.0), 0, OFFSETS, 5)
+    assert (deviation == deviation[:, :1]).all()
+    assert_normal_offsets(deviation[:, 0], 300.0)
+
+
+def test_row_offsets_differ_between_frames() -> None:
+    one, other = (noisy_dn(plan_with("row", row_std_dn=300.0, frame=frame), 0, OFFSETS, 1) for frame in (1, 2))
+    assert_normal_offsets((one - other)[:, 0] / math.sqrt(2), 300.0)
+
+
+def test_column_has_one_offset_of_given_standard_deviation() -> None:
+    deviation = noisy_dn(plan_with("column", column_std_dn=300.0), 0, 5, OFFSETS)
+    assert (deviation == deviation[:1]).all()
+    assert_normal_offsets(deviation[0], 300.0)
+
+
+def test_column_offsets_are_fixed_per_sensor_unit() -> None:
+    plan = plan_with("column", column_std_dn=300.0)
+    one, later, other = (
+        noisy_dn(one, 0, 1, OFFSETS) for one in (plan, replace(plan, stream_key=2), with_physics(plan, body_key=9))
+    )
+    assert (one == later).all()
+    assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
+
+
+# Dark current ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dark_e", [0.5, 7.0, 150.0])
+def test_dark_current_is_independent_poisson_count(dark_e: float) -> None:
+    plan = plan_with("dark_current", dark_e=dark_e, dark_offset="kept")
+    assert_poisson(noisy_dn(plan, 0) / 8, dark_e)
+    assert_poisson((noisy_dn(plan, 32000) - round(signal_dn(32000))) / 8, dark_e)
+
+
+def test_removed_dark_offset_keeps_variance() -> None:
+    removed = noisy_dn(plan_with("dark_current", dark_e=7.0, dark_offset="removed"), 0)
+    kept = noisy_dn(plan_with("dark_current", dark_e=7.0, dark_offset="kept"), 0)
+    assert (kept - removed == 7 * 8).all()
+    assert bounds_off(removed, 0, 7.0 * 64, 8 * poisson_reach(7.0)) <= 1
+
+
+@pytest.mark.parametrize("doubling", [7.0, 5.5])
+def test_dark_current_scales_with_temperature_and_exposure_time(settings: Settings, doubling: float) -> None:
+    def dark_e(celsius: float, seconds: float) -> float:
+        overrides = ("noise=sony_a7s2", f"noise.dark_doubling_c={doubling}", "noise.dark_e_per_s=3")
+        plan = planned(settings, picture(), *overrides, f"scene.temperature_c={celsius}", f"scene.exposure_s={seconds}")
+        assert plan.physics is not None
+        assert plan.physics.hot_pixel_e == pytest.approx(plan.physics.dark_e * 50 / 3, rel=1e-12)
+        return plan.physics.dark_e
+
+    assert dark_e(25, 2) == 6
+    for times in (-3, -1, 1, 2, 5):
+        assert dark_e(25 + times * doubling, 2) == pytest.approx(6 * 2.0**times, rel=1e-12)
+    assert dark_e(25 + doubling / 2, 4) == pytest.approx(12 * math.sqrt(2), rel=1e-12)
+
+
+# Hot and dead pixels --------------------------------------------------------------------------------------------------
+
+SHARE = 0.01
+
+
+@pytest.fixture(scope="module")
+def hot() -> np.ndarray:
+    """Return the mean excess of about 10,000 hot pixels of a sensor unit, 0 for other pixels."""
+    return effects.hot_pixel_means(replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0), (1024, 1024))
+
+
+def test_hot_pixels_have_given_fraction(hot: np.ndarray) -> None:
+    assert bounds_off(hot > 0, SHARE, SHARE * (1 - SHARE), 1) <= 1
+
+
+def test_hot_pixel_means_are_exponential(hot: np.ndarray) -> None:
+    """Bound the Kolmogorov distance (Dvoretzky, Kiefer, Wolfowitz, Massart); levels have steps of 1/1024."""
+    means = np.sort(hot[hot > 0])
+    rank = np.arange(len(means) + 1) / len(means)
+    cdf = 1 - np.exp(-means / 200)
+    distance = max((rank[1:] - cdf).max(), (cdf - rank[:-1]).max())
+    assert distance <= math.sqrt(math.log(2 / 1e-12) / (2 * len(means))) + 1 / 1024
+
+
+def test_exponential_levels_have_its_mean_and_nearly_its_variance() -> None:
+    """The variance is 1 minus the variance within the steps, mostly the last: 3e-3."""
+    levels = exponential_levels()
+    assert float(levels.mean()) == pytest.approx(1, rel=1e-14)
+    assert 0.995 < float(levels.var()) < 1
+    assert (np.diff(levels) > 0).all()
+
+
+def test_hot_pixels_add_poisson_count_of_their_mean(hot: np.ndarray) -> None:
+    plan = plan_with("hot_pixels", hot_pixel_share=SHARE, hot_pixel_e=200.0)
+    counts = noisy_dn(plan, 0) / 8
+    assert (counts[hot == 0] == 0).all()
+    expected, highest = float(hot.mean()), float(hot.max())
+    assert bounds_off(counts, expected, expected, poisson_reach(highest)) <= 1
+    score = ((counts - hot) ** 2)[hot > 0] - hot[hot > 0]  # each of mean 0 and variance m + 2 m²
+    bound = bernstein(float((hot + 2 * hot**2)[hot > 0].mean()), poisson_reach(highest) ** 2, score.size)
+    assert abs(float(score.mean())) <= bound
+
+
+def test_hot_and_dead_pixels_are_fixed_per_sensor_unit() -> None:
+    plan = plan_with("hot_pixels", "dead_pixels", hot_pixel_share=SHARE, hot_pixel_e=1e4, dead_pixel_share=SHARE)
+    one, later = (noisy_dn(replace(plan, stream_key=frame), 0) for frame in (1, 2))
+    shining = [np.abs(frame) > 8 * 500 for frame in (one, later)]  # hot enough, or dead
+    assert ((one == -BLACK) == (later == -BLACK)).all()
+    assert (shining[0] != shining[1]).mean() < SHARE / 50  # those whose mean is 500
+    assert (one != later).any()
+
+
+def test_hot_and_dead_pixels_differ_between_sensor_units(hot: np.ndarray) -> None:
+    physics = replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0, dead_pixel_share=SHARE)
+    other = replace(physics, body_key=9)
+    both = (hot > 0) & (effects.hot_pixel_means(other, (1024, 1024)) > 0)
+    assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
+    both = effects.dead(physics, (1024, 1024)) & effects.dead(other, (1024, 1024))
+    assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
+
+
+def test_hot_and_dead_pixels_are_independent(hot: np.ndarray) -> None:
+    dead = effects.dead(replace(SILENT, dead_pixel_share=SHARE), (1024, 1024))
+    assert bounds_off(dead & (hot > 0), SHARE**2, SHARE**2, 1) <= 1
+
+
+def test_dead_pixels_read_0_and_have_given_fraction() -> None:
+    plan = plan_with("read", "dead_pixels", dead_pixel_share=SHARE, read_std_dn=30.0)
+    frame = make_pair(flat(40000), plan).noisy
+    assert bounds_off(frame == 0, SHARE, SHARE * (1 - SHARE), 1) <= 1
+    assert frame[frame > 0].min() > 30000
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_none_or_all_pixels_can_be_dead_or_hot(share: float) -> None:
+    assert ((noisy_dn(plan_with("dead_pixels", dead_pixel_share=share), 500, 64, 64) == -BLACK) == (share == 1)).all()
+    means = effects.hot_pixel_means(replace(SILENT, hot_pixel_share=share, hot_pixel_e=9.0), (64, 64))
+    assert ((means > 0) == (share == 1)).all()
+    assert_same(flat(500, 64, 64), plan_with("hot_pixels", hot_pixel_share=share, hot_pixel_e=9.0))
+
+
+# Fixed patterns -------------------------------------------------------------------------------------------------------
+
+
+def test_prnu_has_mean_1_and_given_standard_deviation() -> None:
+    pattern = effects.response(replace(SILENT, prnu_std=0.01), (1024, 1024))
+    assert bounds_off(pattern, 1, 1e-4, REACH * 0.01) <= 1
+    assert bounds_off((pattern - 1) ** 2, 1e-4, 2e-8, (REACH * 0.01) ** 2) <= 1
+
+
+def test_prnu_response_is_never_negative() -> None:
+    pattern = effects.response(replace(SILENT, prnu_std=0.5), (1024, 1024))
+    assert pattern.min() == 0
+
+
+@pytest.mark.parametrize("code", [0, 800, 20000, 50000])
+def test_prnu_scales_with_signal_and_is_fixed_between_frames(code: int) -> None:
+    plan = plan_with("prnu", prnu_std=0.01)
+    pattern = effects.response(plan.physics, (1024, 1024))  # type: ignore[arg-type]
+    frame = noisy_dn(plan, code)
+    np.testing.assert_array_equal(frame, np.rint(signal_dn(code) * pattern + BLACK) - BLACK)
+    np.testing.assert_array_equal(frame, noisy_dn(replace(plan, stream_key=2), code))
+
+
+def test_prnu_differs_between_sensor_units() -> None:
+    physics = replace(SILENT, prnu_std=0.01)
+    one, other = (effects.response(replace(physics, body_key=key), (1024, 1024)) - 1 for key in (1, 2))
+    assert bounds_off(one * other, 0, 1e-8, (REACH * 0.01) ** 2) <= 1
+
+
+def test_black_error_depends_on_cfa_site_alone() -> None:
+    plan = plan_with("black_error", black_error_dn=(1.0, -2.0, 3.0, -4.0))
+    assert noisy_dn(plan, 0, 4, 5).tolist() == [[1, -2, 1, -2, 1], [3, -4, 3, -4, 3]] * 2
+    assert (make_pair(flat(0, 2, 2), plan, (1, 1)).noisy.astype(int) - BLACK).tolist() == [[-4, 3], [-2, 1]]
+
+
+@pytest.mark.parametrize(
+    ("iso", "row"), [(100, 0), (141, 0), (142, 1), (199, 1), (201, 2), (282, 2), (283, 3), (400, 3)]
+)
+def test_black_error_table_divides_iso_range_evenly_in_logarithm(settings: Settings, iso: int, row: int) -> None:
+    config = settings("noise=nikon_d850", f"noise.iso={iso}")
+    config.noise.branches[0].iso = [100, 400]
+    config.noise.branches[0].black_error_dn = ["by_log_iso", *([n, 10 * n, -n, 0.5] for n in range(4))]
+    validate_config(config)
+    physics = plan_image(config, SHA256, facts=facts_of(picture())).physics
+    scale = (4095 - 240) / (16383 - 400)
+    assert physics is not None
+    assert physics.black_error_dn == pytest.approx([scale * one for one in (row, 10 * row, -row, 0.5)], rel=1e-12)
+
+
+def test_black_error_table_accepts_a_single_iso(settings: Settings) -> None:
+    config = settings("noise=nikon_d850", "noise.iso=100")
+    config.noise.branches[0].iso = [100, 100]
+    validate_config(config)
+    physics = plan_image(config, SHA256, facts=facts_of(picture())).physics
+    assert physics is not None
+    assert physics.black_error_dn[0] < 0
+
+
+def test_full_well_clips_clean_and_noisy_frames() -> None:
+    plan = plan_with("shot", "full_well", full_well_e=5000.0)
+    pair = make_pair(flat(60000), plan)  # 7031 electrons
+    assert (pair.clean == BLACK + 8 * 5000).all()
+    assert pair.counts.clean_clipped_high == COUNT
+    pair = make_pair(flat(42600), plan)  # 4992 electrons
+    assert (pair.clean == round(signal_dn(42600) + BLACK)).all()
+    full = pair.noisy == BLACK + 8 * 5000
+    assert 0.4 < full.mean() < 0.5
+    assert pair.noisy[~full].max() < BLACK + 8 * 5000
+
+
+def test_read_noise_is_added_after_full_well() -> None:
+    frame = noisy_dn(plan_with("full_well", "read", full_well_e=5000.0, read_std_dn=100.0), 60000)
+    assert bounds_off(frame, 8 * 5000, 100.0**2 + 1 / 12, REACH * 100 + 1) <= 1
+
+
+def test_clean_frame_with_fixed_patterns_is_mean_of_noisy_frames() -> None:
+    """It contains hot-pixel means, columns, black-level errors and dead pixels, but no temporal noise."""
+    size, frames = (24, 31), 400
+    plan = plan_with(
+        *("prnu", "shot", "dark_current", "hot_pixels", "read", "row", "column", "black_error", "dead_pixels"),
+        prnu_std=0.05, dark_e=5.0, hot_pixel_share=0.2, hot_pixel_e=100.0, read_std_dn=20.0, row_std_dn=10.0,
+        column_std_dn=150.0, black_error_dn=(20.0, -30.0, 40.0, -50.0), dead_pixel_share=0.1,
+        fixed_pattern_in_clean=True,
+    )  # fmt: skip
+    clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
+    noisy = [make_pair(flat(5000, *size), replace(plan, stream_key=frame)) for frame in range(frames)]
+    assert all((one.clean == clean).all() for one in noisy)
+    mean = np.mean([one.noisy for one in noisy], axis=0)
+    electrons = 5000 * 1.3 / 8 + 5 + 800  # no pixel has more, in the mean
+    variance, reach = 64 * electrons + 20**2 + 10**2, 8 * poisson_reach(electrons) + REACH * 30
+    assert np.abs(mean - clean).max() <= bernstein(variance, reach, frames, 1e-15) + 0.5
+    assert (clean[mean == 0] == 0).all()
+
+
+def test_clean_frame_with_fixed_patterns_keeps_dark_offset_of_frames() -> None:
+    """If the dark mean is removed, the clean frame contains light only."""
+    size, frames, dark_e = (16, 31), 200, 7.3
+    plan = plan_with("shot", "dark_current", dark_e=dark_e, dark_offset="kept", fixed_pattern_in_clean=True)
+    clean = make_pair(flat(5000, *size), plan).clean
+    assert (clean == round(signal_dn(5000) + BLACK + 8 * dark_e)).all()
+    mean = np.mean([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)], axis=0)
+    rate = signal_dn(5000) / 8 + dark_e
+    assert np.abs(mean - clean).max() <= bernstein(64 * rate, 16 * poisson_reach(rate), frames, 1e-15) + 0.5
+    removed = make_pair(flat(5000, *size), with_physics(plan, dark_offset="removed")).clean
+    assert (removed == round(signal_dn(5000) + BLACK)).all()
+
+
+def test_mean_of_frames_does_not_exceed_full_well() -> None:
+    """Hot pixels and dark current fill wells too; column offsets in DN are added afterwards."""
+    size, frames = (24, 31), 100
+    plan = plan_with(
+        *("shot", "dark_current", "hot_pixels", "full_well", "column"),
+        dark_e=50.0, dark_offset="kept", hot_pixel_share=0.3, hot_pixel_e=4000.0, full_well_e=2000.0,
+        column_std_dn=20.0, fixed_pattern_in_clean=True,
+    )  # fmt: skip
+    clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
+    columns_dn = effects.offsets(plan, size, fixed_only=True)
+    full = np.rint(8 * 2000 + BLACK + columns_dn)
+    assert (clean <= full).all()
+    assert 0.1 < (clean == full).mean() < 0.3
+    noisy = np.array([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)])
+    assert (noisy.mean(axis=0) <= full).all()
+    overfull = effects.hot_pixel_means(plan.physics, size) > 3000  # type: ignore[arg-type]
+    assert overfull.any()
+    assert (noisy[:, overfull] == full[overfull]).all()
+    assert (clean[overfull] == full[overfull]).all()
+
+
+# Sensor units ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_image_has_its_own_sensor_unit_by_default(settings: Settings) -> None:
+    config = settings("noise=sony_a7s2")
+    facts = facts_of(picture())
+    bodies = {plan_image(config, f"{n:064x}", facts=facts).physics.body_key for n in range(40)}  # type: ignore[union-attr]
+    assert len(bodies) == 40
+
+
+def test_images_share_given_number_of_sensor_units(settings: Settings) -> None:
+    config = settings("noise=sony_a7s2", "sensor.units=3")
+    facts = facts_of(picture())
+    physics = [plan_image(config, f"{n:064x}", facts=facts).physics for n in range(40)]
+    bodies = {(one.sensor_unit, one.body_key) for one in physics if one is not None}
+    assert {unit for unit, _ in bodies} == {"0", "1", "2"}
+    assert len(bodies) == 3

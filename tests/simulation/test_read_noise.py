@@ -1,0 +1,146 @@
+"""Read noise has the standard deviation and the distribution of its profile."""
+
+from __future__ import annotations
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from helpers.datasets import Settings
+from helpers.flats import ISOS, bounds_off, noisy_dn, picture, plan_with, planned, signal_dn
+from helpers.moments import REACH
+from helpers.published import CRVD
+
+from unprocess_gen.config.interpretation import branch_of
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.exact_distributions import tukey_std
+from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, tukey_table
+from unprocess_gen.planning.effect_selection import facts_of
+from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.reference import noise as effects
+
+SHAPES = (0.0, 1e-13, 0.015, 0.1571, 1.0, -0.1, -0.2429)
+
+
+def tukey(tail: mpmath.mpf, shape: float) -> mpmath.mpf:
+    """Return the quantile of a tail probability in the Tukey lambda distribution of scale 1."""
+    if abs(shape) < 1e-12:
+        return mpmath.log((1 - tail) / tail)
+    return ((1 - tail) ** mpmath.mpf(shape) - tail ** mpmath.mpf(shape)) / mpmath.mpf(shape)
+
+
+def tukey_deviation(shape: float) -> mpmath.mpf:
+    """Return the standard deviation by numerical integration of the squared quantile function."""
+    halves = [mpmath.mpf(10) ** -power for power in (60, 30, 15, 8, 4, 2, 1)] + [mpmath.mpf(1) / 2]
+    beyond = 0
+    if shape < 0:  # contribution below 1e-60: the square is nearly u**(2·shape) / shape**2
+        beyond = mpmath.mpf(10) ** (-60 * (2 * mpmath.mpf(shape) + 1)) / (2 * mpmath.mpf(shape) + 1) / shape**2
+    return mpmath.sqrt(2 * (mpmath.quad(lambda u: tukey(u, shape) ** 2, halves) + beyond))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tukey_standard_deviation_matches_quantiles(shape: float) -> None:
+    with mpmath.workdps(30):
+        exact = tukey_deviation(shape)
+    assert float(tukey_std(shape)) == pytest.approx(float(exact), rel=1e-9)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tukey_quantiles_match_closed_form(shape: float) -> None:
+    rng = np.random.Generator(np.random.Philox(key=3))
+    spread = np.concatenate([2 ** np.arange(31), rng.integers(0, 2 ** np.arange(2, 32).repeat(5))])
+    found = effects.by_inverse_cdf(spread.astype(np.uint32), tukey_table(shape))
+    std = float(tukey_std(shape))
+    for index, z in zip(spread.tolist(), found.tolist(), strict=True):
+        exact = float(tukey((mpmath.mpf(index) + 0.5) / 2**32, shape)) / std
+        assert abs(z - exact) <= 2e-7 * (1 + exact)
+
+
+def table_moment(table: np.ndarray, order: int) -> float:
+    """Return the exact moment of draws from a table, of both signs; each segment is a fraction of all words."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    t = (nodes + 1) / 2 / SEGMENTS
+    values = table[:, :1] + t * (table[:, 1:2] + t * table[:, 2:3])
+    share = np.repeat(2.0 ** (np.arange(OCTAVES) - 33.0), SEGMENTS) / SEGMENTS
+    return float(2 * (share * ((values**order) @ (weights / 2))).sum())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_tukey_table_has_variance_1(shape: float) -> None:
+    """Except for the part beyond the least tail probability, 2**-33: below 1e-4 at shape -0.24."""
+    with mpmath.workdps(20):
+        ends = [mpmath.mpf(10) ** -40, mpmath.mpf(10) ** -20, mpmath.mpf(2) ** -33]
+        beyond = 2 * mpmath.quad(lambda u: tukey(u, shape) ** 2, ends) / tukey_deviation(shape) ** 2
+    assert 0 <= 1 - table_moment(tukey_table(shape), 2) <= float(beyond) + 1e-6
+
+
+@pytest.mark.parametrize(("distribution", "shape"), [("gaussian", 0.0), *(("tukey", shape) for shape in SHAPES)])
+def test_read_noise_has_given_standard_deviation_for_every_distribution(distribution: str, shape: float) -> None:
+    std = 300.0
+    plan = plan_with("read", read_law=distribution, read_shape=shape, read_std_dn=std)
+    deviation = noisy_dn(plan, 32000) - signal_dn(32000)
+    table = effects.read_table(plan.physics)  # type: ignore[arg-type]
+    second, fourth, reach = table_moment(table, 2), table_moment(table, 4), float(np.abs(table[0]).sum()) * std + 1
+    variance = std**2 * second + 1 / 12
+    assert abs(second - 1) <= 1e-4
+    assert bounds_off(deviation, 0, variance, reach) <= 1
+    spread = std**4 * fourth + std**2 / 2 + 1 / 80 - variance**2
+    assert bounds_off(deviation**2, variance, spread, reach**2) <= 1
+
+
+def test_read_noise_check_rejects_another_standard_deviation() -> None:
+    deviation = noisy_dn(plan_with("read", read_std_dn=303.0), 32000) - signal_dn(32000)
+    assert bounds_off(deviation**2, 300.0**2, 2 * 300.0**4, (REACH * 300) ** 2) > 1
+
+
+@pytest.mark.parametrize("iso", CRVD)
+def test_imx385_read_noise_has_variance_of_crvd(settings: Settings, iso: int) -> None:
+    plan = planned(settings, picture(), "noise=imx385", f"noise.iso={iso}")
+    assert plan.physics is not None
+    assert plan.physics.dn_per_e == CRVD[iso][0]
+    assert plan.physics.read_std_dn**2 == pytest.approx(CRVD[iso][1], rel=1e-12)
+    assert plan.b_dn2 == plan.physics.read_std_dn**2
+
+
+@pytest.mark.parametrize("iso", CRVD)
+def test_pmn_scale_gives_almost_twice_the_standard_deviation(iso: int) -> None:
+    """PMN gives ln scale = 0.9550 ln K + 0.0162 and shape 0.015 for the same recordings."""
+    gain, variance = CRVD[iso]
+    scale = math.exp(0.9550 * math.log(gain) + 0.0162)
+    assert 1.7 < scale * float(tukey_std(0.015)) / math.sqrt(variance) < 1.9
+
+
+@pytest.mark.parametrize("noise", ISOS)
+def test_plan_has_gain_and_read_variance_of_profile(settings: Settings, noise: str) -> None:
+    plan = planned(settings, picture(), f"noise={noise}", f"noise.iso={ISOS[noise]}")
+    assert plan.physics is not None
+    assert branch_of(settings(f"noise={noise}").noise, ISOS[noise]) is not None
+    assert (plan.a_dn, plan.b_dn2) == (plan.physics.dn_per_e, plan.physics.read_std_dn**2)
+    assert plan.physics.dn_per_e > 0
+    assert plan.physics.read_std_dn > 0
+
+
+def test_tukey_scale_is_multiplied_by_standard_deviation_of_shape(settings: Settings) -> None:
+    """Sony A7S II from ISO 200 to 1600, without scatter: ln scale = 0.740 ln K + 0.862, ln row = 0.788 ln K - 0.342."""
+    plan = planned(settings, picture(), "noise=sony_a7s2", "noise.iso=800")
+    assert plan.physics is not None
+    gain, scale = 9.563e-4 * 800, (4095 - 240) / (16383 - 512)
+    assert plan.physics.dn_per_e == pytest.approx(gain * scale, rel=1e-15)
+    deviation = math.exp(0.740 * math.log(gain) + 0.862) * float(tukey_deviation(plan.physics.read_shape))
+    assert plan.physics.read_std_dn == pytest.approx(deviation * scale, rel=1e-9)
+    assert plan.physics.row_std_dn == pytest.approx(math.exp(0.788 * math.log(gain) - 0.342) * scale, rel=1e-12)
+
+
+def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:
+    config = settings("noise=oppo_reno10x", "noise.iso=800")
+    config.noise.branches[0].read_std_dn = ["line", 0.5, 1.25, 0.25]
+    validate_config(config)
+    facts = facts_of(picture())
+    plans = [plan_image(config, f"{n:064x}", facts=facts) for n in range(150)]
+    scale = (4095 - 240) / (1023 - 64)
+    centre = 0.5 * math.log(0.0005995267 * 800 + 0.00868861) + 1.25
+    normals = np.array([(math.log(math.sqrt(plan.b_dn2) / scale) - centre) / 0.25 for plan in plans])
+    assert bounds_off(normals, 0, 1, REACH) <= 1
+    assert bounds_off(normals**2, 1, 2, REACH**2) <= 1
+    assert 0.11 < float((normals > 0.5).mean()) < 0.5  # 0.309, five standard deviations
