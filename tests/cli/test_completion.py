@@ -18,6 +18,9 @@ from helpers.commands import COMMAND, RunMain
 
 from unprocess_gen.cli.completion import FILES, FOLDERS, SHELLS, WORDS, complete
 from unprocess_gen.cli.verbs import VERBS
+from unprocess_gen.config.option_files import option_summary
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.settings import settings_of
 
 CANDIDATES = [
     ("gen-dataset ver", ["verify"]),
@@ -82,6 +85,21 @@ def test_options_below_config_dir_are_completed(tmp_path: Path) -> None:
     (tmp_path / "noise/quiet.yaml").touch()
     for flag in (f"--config-dir {tmp_path}", f"-cd={tmp_path}"):
         assert complete(f"gen-dataset {flag} noise=qu", VERBS) == (WORDS, ["noise=quiet"])
+
+
+def test_candidates_are_described_as_in_the_help(run_main: RunMain) -> None:
+    lines = {
+        "gen-dataset ver": ("verify", VERBS["verify"].summary),
+        "gen-dataset noise=imx385_iso16": ("noise=imx385_iso1600", option_summary("noise", "imx385_iso1600")),
+        "gen-dataset -m camera=sony_a7r,nex": ("camera=sony_a7r,nexus_6p", option_summary("camera", "nexus_6p")),
+        "gen-dataset +experiment=ipol": ("+experiment=ipol_demo", option_summary("experiment", "ipol_demo")),
+        "gen-dataset see": ("seed=", settings_of(Config)["seed"].meaning),
+        "gen-dataset verify --rep": ("--repair", "restore damaged files to the same bytes"),
+        "gen-dataset --mul": ("--multirun", "sweep over comma-separated values"),
+        "gen-dataset output.dtype=u": ("output.dtype=uint16", ""),
+    }
+    for line, (candidate, text) in lines.items():
+        assert run_main("completion", "describe", line).out == f"words\n{candidate}\t{text}\n", line
 
 
 @pytest.mark.parametrize("arguments", [(), ("fish",), ("bash", "zsh"), ("bsh",)])

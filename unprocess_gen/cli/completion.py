@@ -1,7 +1,8 @@
 """Complete command lines in bash and zsh: verbs, flags, settings and options.
 
 ``gen-dataset completion bash`` prints a script. Its function calls ``gen-dataset completion query LINE`` with the line
-up to the cursor. The query prints the kind of completion (``words``, ``folders``, ``files``) and the candidates.
+up to the cursor. The query prints the kind of completion (``words``, ``folders``, ``files``) and the candidates. The
+script for zsh calls ``describe`` instead of ``query``, since zsh can show a description next to each candidate.
 
 Design: ``docs/design/command_line.md``.
 """
@@ -16,15 +17,15 @@ from pathlib import Path
 
 from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Argument, Call, Verb
 from unprocess_gen.config.limits import Boolean, Choice
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import conf_dir, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.suggestions import did_you_mean
 
 SHELLS = ("bash", "zsh")
-QUERY = "query"
-"""Word of the completion scripts; not for users."""
+QUERY, DESCRIBE = "query", "describe"
+"""Words of the completion scripts, not for users: candidates alone, or each with a tab and its description."""
 
 WORDS, FOLDERS, FILES = "words", "folders", "files"
 
@@ -52,14 +53,23 @@ complete -F _gen_dataset gen-dataset
 
 ZSH = r"""
 _gen_dataset() {
-    local -a lines
-    lines=("${(@f)$("${words[1]}" completion query "${(j: :)words[1,CURRENT-1]} $PREFIX" 2>/dev/null)}")
+    local line word
+    local -a lines closed closed_shown open open_shown
+    lines=("${(@f)$("${words[1]}" completion describe "${(j: :)words[1,CURRENT-1]} $PREFIX" 2>/dev/null)}")
     case ${lines[1]} in
         folders) compset -P '*='; _files -/ ;;
         files) compset -P '*='; _files ;;
         words)
-            compadd -- ${(M)lines[2,-1]:#*[^.=]}
-            compadd -S '' -- ${(M)lines[2,-1]:#*[.=]} ;;
+            for line in "${(@)lines[2,-1]}"; do
+                word=${line%%$'\t'*}
+                if [[ $word == *[.=] ]]; then
+                    open+=("$word") open_shown+=("${line/$'\t'/  }")
+                else
+                    closed+=("$word") closed_shown+=("${line/$'\t'/  }")
+                fi
+            done
+            (( $#closed )) && compadd -l -d closed_shown -- "${(@)closed}"
+            (( $#open )) && compadd -l -S '' -d open_shown -- "${(@)open}" ;;
     esac
 }
 (( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }
@@ -73,7 +83,7 @@ def print_completion(call: Call, verbs: Mapping[str, Verb]) -> int:
     Parameters
     ----------
     call : Call
-        Parsed command line: the name of a shell, or ``query`` and the line up to the cursor.
+        Parsed command line: the name of a shell, or a word of the scripts and the line up to the cursor.
     verbs : mapping of str to Verb
         The verbs by name.
 
@@ -88,8 +98,10 @@ def print_completion(call: Call, verbs: Mapping[str, Verb]) -> int:
         If the shell is unknown.
     """
     words = call.words
-    if words[:1] == [QUERY] and len(words) == 2:
+    if len(words) == 2 and words[0] in (QUERY, DESCRIBE):
         kind, candidates = complete(words[1], verbs)
+        if words[0] == DESCRIBE:
+            candidates = [f"{candidate}\t{description(candidate, words[1], verbs)}" for candidate in candidates]
         print("\n".join([kind, *candidates]))
         return 0
     scripts = dict(zip(SHELLS, (BASH, ZSH), strict=True))
@@ -148,6 +160,43 @@ def complete(line: str, verbs: Mapping[str, Verb]) -> tuple[str, list[str]]:
     if verb.place is not None and not current:
         return verb.place.completes, []
     return WORDS, found
+
+
+def description(candidate: str, line: str, verbs: Mapping[str, Verb]) -> str:
+    """Return what a candidate means, as ``--help`` explains it.
+
+    Parameters
+    ----------
+    candidate : str
+        A candidate of `complete` for this line.
+    line : str
+        The command line up to the cursor.
+    verbs : mapping of str to Verb
+        The verbs by name.
+
+    Returns
+    -------
+    str
+        One line; empty for candidates that need no explanation, such as the words of a setting.
+    """
+    before = _split(line)[:-1]
+    name = next(iter(before[1:2]), "")
+    verb = verbs.get(name, verbs["generate"])
+    if candidate in verbs and len(before) == 1:
+        return verbs[candidate].summary
+    for argument in (*verb.arguments, *STANDARD):
+        if candidate in argument.flags or candidate.removesuffix("=") in argument.settings:
+            return argument.help
+    for spellings, (_, text) in HYDRA_FLAGS.items():
+        if candidate in spellings:
+            return text
+    key, _, value = candidate.lstrip("+").partition("=")
+    option = value.rpartition(",")[2]
+    for folder in _option_folders(before):
+        if (folder / key / f"{option}.yaml").is_file():
+            return option_summary(key, option, folder)
+    settings = {f"{group}.{name}".lstrip("."): setting for group, name, setting in all_settings()}
+    return settings[key].meaning if key in settings and not value else ""
 
 
 def _split(line: str) -> list[str]:

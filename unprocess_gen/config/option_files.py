@@ -88,7 +88,7 @@ def option_summary(group: str, option: str, folder: Path | None = None) -> str:
         One line; empty if the file does not begin with a comment.
     """
     path = (folder or conf_dir()) / group / f"{option}.yaml"
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     head = [line for line in lines if not line.startswith(PACKAGE_DIRECTIVE)][:1]
     return head[0].lstrip("# ") if head and head[0].startswith("#") else ""
 
