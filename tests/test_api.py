@@ -147,7 +147,7 @@ def test_big_endian_arrays_have_the_identity_of_native_ones(config: ug.Config) -
     assert np.array_equal(ug.make_pair(deep.astype(">u2"), config).noisy, ug.make_pair(deep, config).noisy)
 
 
-def test_digest_of_a_source_as_key_gives_the_pair_of_the_dataset(make: Make, tmp_path: Path) -> None:
+def test_digest_of_a_source_as_key_gives_its_pair(make: Make, tmp_path: Path) -> None:
     make(fill(tmp_path / "p", 2), tmp_path / "ds", "noise=sony_a7s2", "seed=5")
     config = ug.load_config(["noise=sony_a7s2", "seed=5"])
     for sample in ug.RawPairs(tmp_path / "ds"):

@@ -99,7 +99,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), REFUSED, ids=[" ".join(arguments) for arguments, _ in REFUSED])
-def test_mistake_gives_one_line_and_exit_code_2_and_writes_nothing(
+def test_mistake_gives_one_line_exit_code_2_and_no_files(
     arguments: list[str], sentence: str, run_main: RunMain, tmp_path: Path, figure: Figure
 ) -> None:
     done = run_main(*arguments)
@@ -125,7 +125,7 @@ def test_flag_with_a_wrong_value_is_refused_in_one_line(arguments: tuple[str, ..
     assert (done.code, done.err.count("\n")) == (2, 1)
 
 
-def test_process_reports_a_mistake_in_one_line_with_exit_code_2(cli: Cli, tmp_path: Path) -> None:
+def test_process_reports_a_mistake_in_one_line(cli: Cli, tmp_path: Path) -> None:
     done = cli("camera=nope", "out=there")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert list(tmp_path.iterdir()) == []
@@ -247,7 +247,7 @@ def test_help_of_a_group_explains_its_options_and_keys(group: str, run_main: Run
     assert max(map(len, done.out.splitlines())) <= 100
 
 
-def test_help_of_a_word_is_that_of_the_verb_or_group(run_main: RunMain) -> None:
+def test_help_of_a_word_describes_the_verb_or_group(run_main: RunMain) -> None:
     assert run_main("--help", "verify") == run_main("verify", "--help")
     both = run_main("-h", "accuracy").out
     assert both.startswith(run_main("accuracy", "--help").out) and "Keys of accuracy" in both
@@ -599,7 +599,7 @@ def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, m
     assert ("; 1 failed row skipped" in done.out) == ("-" in keys)
 
 
-def test_folder_of_a_sweep_is_refused_where_one_dataset_is_needed(
+def test_folder_of_a_sweep_is_refused_instead_of_a_dataset(
     moved: Path, run_main: RunMain, tmp_path: Path
 ) -> None:
     (tmp_path / "sweep").mkdir()

@@ -160,7 +160,7 @@ def test_unwritable_stdout_ends_a_sweep_and_keeps_the_row(code: int, plugin: lis
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_that_a_library_turns_into_its_own_error_ends_a_sweep(
+def test_signal_hidden_by_a_library_error_ends_a_sweep(
     sent: signal.Signals, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started = []

@@ -554,7 +554,7 @@ def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 @pytest.mark.parametrize("overrides", [(), ("noise=sony_a7s2", "scene=low_light")], ids=str)
 @hypothesis_settings(max_examples=150)
 @given(data=st.data())
-def test_edited_config_yaml_is_refused_in_one_line_or_can_be_planned(
+def test_edited_config_yaml_is_refused_or_can_be_planned(
     overrides: tuple[str, ...], data: st.DataObject, settings: Settings, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     tree = parse_yaml_mapping(dataset_yaml(settings(*overrides)))

@@ -136,7 +136,7 @@ def test_negative_b_without_slope_has_a_text(settings: Settings, tmp_path: Path)
     assert "b_dn2 -5" in format_estimate(config, estimate_run(config, 1, True))
 
 
-def test_every_effect_of_a_physical_profile_has_a_line_and_a_reason(settings: Settings, tmp_path: Path) -> None:
+def test_every_effect_of_a_profile_has_line_and_reason(settings: Settings, tmp_path: Path) -> None:
     config = settings("noise=sony_a7s2", "scene=night", f"source.root={fill(tmp_path / 'p', 2)}")
     estimate = format_estimate(config, estimate_run(config, 1, True))
     assert "scene     night: ISO 6400" in estimate
