@@ -599,9 +599,7 @@ def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, m
     assert ("; 1 failed row skipped" in done.out) == ("-" in keys)
 
 
-def test_folder_of_a_sweep_is_refused_instead_of_a_dataset(
-    moved: Path, run_main: RunMain, tmp_path: Path
-) -> None:
+def test_folder_of_a_sweep_is_refused_instead_of_a_dataset(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
     (tmp_path / "sweep").mkdir()
     (tmp_path / "ds").rename(tmp_path / "sweep/seed=1")
     (tmp_path / "sweep/sweep.csv").touch()

@@ -9,11 +9,10 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from helpers.commands import COMMAND, RunMain, environment
+from helpers.commands import RunMain, environment
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
 
@@ -220,22 +219,36 @@ def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: 
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
+KILLED = """
+import os, signal, sys
+from unprocess_gen.cli.main import main
+from unprocess_gen.pipeline.workspace import Workspace
+
+commit, made = Workspace.commit, []
+
+
+def commits(self, shard):
+    commit(self, shard)
+    made.append(shard)
+    if len(made) == 18:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+Workspace.commit = commits
+main()
+"""
+"""A command that is killed once it has committed 18 shards."""
+
+
 def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 12)
     arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")
     folders = [f"{folder},output.pairs_per_shard=1" for folder in FOLDERS]
-    process = subprocess.Popen(
-        [str(COMMAND), *arguments], cwd=tmp_path, env=environment(), stderr=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
-    until = time.monotonic() + 60
-    while len(list((tmp_path / "sweep").glob("*/shards/*.tar"))) < 18 and process.poll() is None:
-        assert time.monotonic() < until
-        time.sleep(0.002)
-    assert process.poll() is None
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    assert len(list((tmp_path / "sweep").glob("*/dataset.json"))) in (1, 2)
+    command = [sys.executable, "-c", KILLED, *arguments]
+    killed = subprocess.run(command, cwd=tmp_path, env=environment(PYTHONPATH=PATHS), capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert len(list((tmp_path / "sweep").glob("*/shards/*.tar"))) == 18
+    assert len(list((tmp_path / "sweep").glob("*/dataset.json"))) == 1
 
     done = run_main(*arguments)
     assert (done.code, done.out.count("nothing to do") >= 1) == (0, True)

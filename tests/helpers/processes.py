@@ -91,6 +91,11 @@ def wait_for(what: Callable[[], Any], seconds: float = WAIT_S) -> Any:
     return found
 
 
+def processes_per_core() -> float:
+    """Return how many running processes share a core, at least 1, for limits of time on a busy machine."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 def committed(out: Path) -> int:
     return len(list((out / "shards").glob("*.tar")))
 

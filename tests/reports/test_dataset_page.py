@@ -489,9 +489,7 @@ def test_unfinished_dataset_is_damage(copy: Path, run_main: RunMain) -> None:
 
 
 @pytest.mark.slow
-def test_size_and_memory_do_not_grow_with_rows(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_size_and_memory_do_not_grow_with_rows(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = list(read_rows(made / "manifest.csv"))
 
     def rows(count: int) -> Iterator[Row]:
