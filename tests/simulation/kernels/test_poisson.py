@@ -1,4 +1,4 @@
-"""Poisson counts: their distribution to one word in 2**32 at every rate; kernels equal to the reference."""
+"""Poisson counts follow their distribution to one word in 2**32 at every rate; kernels equal the reference."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def fast(words: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """The compiled form, called as `poisson` is."""
+    """Return the counts of the kernel, with the arguments of `poisson`."""
     out = np.full(words.shape, np.nan)
     room = allocate_count_buffers((len(words) + 7) // 8 * 8)
     _draw(words.astype(np.uint32), rates, normal_quantile_tables(), poisson_tables(), room, out)
@@ -51,13 +51,13 @@ def _draw(
 
 
 def word(rank: np.ndarray) -> np.ndarray:
-    """The word whose normal is the ``rank``-th of all, counted from the least."""
+    """Return the word whose normal is the ``rank``-th of all, counted from the smallest."""
     rank = np.asarray(rank, dtype=np.int64)
     return np.where(rank < SIGN, rank | SIGN, WORDS - 1 - rank).astype(np.uint32)
 
 
 def random_rates(count: int, seed: int) -> np.ndarray:
-    """Rates of all magnitudes: by their logarithm, by their square root where tables are, and around the limit."""
+    """Return rates of all magnitudes: uniform in their logarithm, in the square root below 64, and around the limit."""
     uniform = np.random.default_rng(seed).random((3, count // 3))
     return np.concatenate([10 ** (21 * uniform[0] - 12), (8.1 * uniform[1]) ** 2, 50 + 150 * uniform[2]])
 
@@ -67,10 +67,10 @@ def random_rates(count: int, seed: int) -> np.ndarray:
 
 @functools.cache
 def law(rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Counts that matter at this rate and P(K <= k), to 1e-12: the shares from the mode outwards, summed from the ends.
+    """Return the counts k that matter at this rate and P(K <= k), to 1e-12.
 
-    Each share is its neighbour's times k / rate or its inverse, and the mode's comes from `mpmath`. Terms are taken
-    until they fall below 1e-18 of it.
+    The probability of the mode comes from `mpmath`. Others follow from their neighbour by the factor k / rate, until
+    they are below 1e-18 of it; they are summed from both ends.
     """
     mode = math.floor(rate)
     width = math.ceil(9 * math.sqrt(rate) + 20)
@@ -97,7 +97,7 @@ def test_the_tests_distribution_function_equals_mpmath(rate: float) -> None:
 
 
 def words_up_to(counts: np.ndarray, rate: np.ndarray, drawn: Draw) -> np.ndarray:
-    """How many of all 2**32 words give ``counts`` or less: bisection, since the draw rises with the rank."""
+    """Return how many of all 2**32 words give ``counts`` or less, by bisection: counts increase with the rank."""
     low, high = np.zeros(counts.shape, dtype=np.int64), np.full(counts.shape, WORDS)
     while (low < high).any():
         middle = np.minimum((low + high) // 2, WORDS - 1)
@@ -107,7 +107,7 @@ def words_up_to(counts: np.ndarray, rate: np.ndarray, drawn: Draw) -> np.ndarray
 
 
 def error_in_words(rate: float, drawn: Draw = fast, most: int = 400) -> np.ndarray:
-    """Words that give k or less, minus what the law says, for up to ``most`` counts from one tail to the other."""
+    """Return the words that give k or less minus their expected number, for up to ``most`` counts between the tails."""
     counts, cdf = law(rate)
     chosen = np.unique(np.linspace(0, len(counts) - 1, most).astype(np.int64))
     found = words_up_to(counts[chosen], np.full(len(chosen), rate), drawn)
@@ -120,7 +120,7 @@ LEAST_ERROR, COMPUTED_ERROR = 0.5, 0.05
 
 @pytest.mark.parametrize("rate", PROFILE_RANGES)
 def test_counts_follow_the_distribution_to_one_word(rate: float, figure: Figure) -> None:
-    """The promise is one word in 2**32; what is kept is little more than half of one, the least there can be."""
+    """The promise is one word in 2**32. The error is little more than half a word, the smallest possible."""
     error = np.abs(error_in_words(rate)).max()
     assert error <= LEAST_ERROR + COMPUTED_ERROR
     figure("poisson", f"at most {error:.2f} of 2^32 words off")
@@ -161,7 +161,7 @@ def test_the_probability_of_zero_is_exp_of_minus_the_rate(rate: float) -> None:
 def test_a_wrong_coefficient_breaks_the_distribution(
     coefficients: str, factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first of each; the last two count for so little that a thousandth of them is no error at all."""
+    """The first coefficient of each polynomial is changed; the last two need larger changes to matter."""
     first, *others = getattr(poissons, coefficients)
     monkeypatch.setattr(poissons, coefficients, (first * factor, *others))
     assert np.abs(error_in_words(LIMIT, poisson)).max() > LEAST_ERROR + COMPUTED_ERROR
@@ -169,7 +169,7 @@ def test_a_wrong_coefficient_breaks_the_distribution(
 
 @pytest.mark.parametrize("n", range(8))
 def test_a_wrong_table_entry_breaks_the_distribution(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Coefficient n of the middle row of a cell, off by the more the less it counts for."""
+    """Coefficient n of the middle row of a cell is changed; higher coefficients need larger changes to matter."""
     right = poisson_tables()
     cell = 55
     wrong = right.cdf.copy()
@@ -185,7 +185,7 @@ def test_a_wrong_table_entry_breaks_the_distribution(n: int, monkeypatch: pytest
 
 @pytest.mark.parametrize("rate", PROFILE_RANGES)
 def test_counts_increase_with_the_words_normal(rate: float) -> None:
-    """Around the words where the count changes, in both tails, and at random."""
+    """Words are tested where the count changes, in both tails, and at random."""
     counts, _ = law(rate)
     chosen = counts[np.unique(np.linspace(0, len(counts) - 1, 100).astype(np.int64))]
     edges = words_up_to(chosen, np.full(len(chosen), rate), fast)
@@ -221,7 +221,7 @@ TINY_RATES = [5e-324, 2.0**-1050, 2.3e-308, 1e-300, 1e-100, 1e-20, 2.0**-53, 2.0
 
 
 def pairs(words: list[int], rates: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Every word with every rate."""
+    """Return every word with every rate."""
     return np.repeat(np.array(words, dtype=np.uint32), len(rates)), np.tile(np.array(rates), len(words))
 
 
@@ -258,7 +258,7 @@ def test_kernels_equal_the_reference_where_counts_change() -> None:
 
 
 def test_the_guess_leaves_two_counts_in_every_cell() -> None:
-    """Rates at the ends of each cell of the table and within, normals at the edges of theirs and between."""
+    """Rates are at the ends of each cell and within it; normals are at the edges of their cells and between."""
     rng = np.random.default_rng(10)
     z = np.clip(np.concatenate([np.arange(-51, 52) / 8, rng.uniform(-6.3, 6.3, 200)]), -6.33, 6.33)
     indices = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in z]
@@ -292,7 +292,7 @@ def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndar
 
 
 def real_quantile(rate: float, w: float) -> float:
-    """The x with Gamma(x, rate) / Gamma(x) = Phi(w), by an independent library."""
+    """Return the x with Gamma(x, rate) / Gamma(x) = Phi(w), computed by mpmath."""
     with mpmath.workdps(20):
         share = mpmath.ncdf(w)
         near = float(poissons.expansion(np.array([rate]), np.array([w]))[0])
@@ -307,7 +307,7 @@ def real_quantile(rate: float, w: float) -> float:
     "rate", [6.0, 6.7, 8.3, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
 )
 def test_the_short_form_is_within_its_error(rate: float) -> None:
-    """One and a half times over, so that what lies between the words that are tried is safe too."""
+    """The margin is a factor of 1.5, for the words between those that are tested."""
     w = np.linspace(-poissons.SHORT_REACH, poissons.SHORT_REACH, 37 if rate < LIMIT else 4001)
     index = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in w]
     words = np.array([min(int(i), SIGN - 1) | SIGN * (v < 0) for i, v in zip(index, w, strict=True)], dtype=np.uint32)
@@ -353,7 +353,7 @@ COUNT = 2**20
 
 @pytest.mark.parametrize("rate", [0.01, 0.3, 3.7, 30.0, 64.0, 1e3, 1e6])
 def test_moments_are_those_of_the_distribution(rate: float) -> None:
-    """Mean, variance and third central moment are all the rate; bounds from those up to the sixth.
+    """Mean, variance and third central moment equal the rate; bounds follow from moments up to the sixth.
 
     No count is farther out than the law's 2**-33; half a word at each of its counts moves a moment by that much less.
     """
@@ -395,7 +395,7 @@ def test_the_hash_covers_every_table() -> None:
 
 
 def test_the_refined_normal_has_a_cdf_error_below_1e_12() -> None:
-    """Where the normal of the table was off by 1.5e-7; at the word's tail probability, with an independent library."""
+    """The normal of the table has an error of up to 1.5e-7; mpmath gives the exact tail probability."""
     rng = np.random.default_rng(11)
     indices = [0, 1, 5, SIGN - 1, SIGN - 2, *rng.integers(0, SIGN, 60), *(2 ** (31 * rng.random(60))).astype(np.int64)]
     tails = poisson_tables().tails
@@ -416,7 +416,7 @@ def test_poisson_kernels_are_compiled_without_fast_math() -> None:
 
 ORDERS = 12
 Polynomial = list[Fraction]
-"""In the normal, lowest power first."""
+"""Coefficients of a polynomial in the normal, lowest power first."""
 
 
 def times(p: Polynomial, q: Polynomial) -> Polynomial:
@@ -436,7 +436,7 @@ def combined(*terms: tuple[Fraction | int, Polynomial]) -> Polynomial:
 
 
 def logarithm(series: list[Polynomial]) -> list[Polynomial]:
-    """Of a power series that starts with 1: n·l_n = n·u_n - the sum of i·l_i·u_(n-i)."""
+    """Return the logarithm of a power series that starts with 1: n·l_n = n·u_n - the sum of i·l_i·u_(n-i)."""
     logs: list[Polynomial] = [[]]
     for n in range(1, len(series)):
         mixed = [(-i, times(logs[i], series[n - i])) for i in range(1, n)]
@@ -469,7 +469,10 @@ def gamma_quantiles() -> list[Polynomial]:
 
 
 def derived() -> list[Polynomial]:
-    """b_n(w): x = rate·(1 + b_1·d + b_2·d² + …), d = rate**-½, by solving rate = quantile of Gamma(x) at Phi(-w)."""
+    """Return b_n(w) of x = rate·(1 + b_1·d + b_2·d² + …) with d = rate**-½.
+
+    They follow from the condition that rate is the quantile of Gamma(x) at Phi(-w).
+    """
     ys = [[a * (-1) ** i for i, a in enumerate(y)] for y in gamma_quantiles()]
     b: list[Polynomial] = [[Fraction(1)]]
     powers = [[[Fraction(1)]] for _ in ys]  # of 1 + b_1·d + …, to the power (1 - n) / 2
@@ -493,7 +496,7 @@ def test_the_coefficients_are_those_of_the_expansion() -> None:
 
 @pytest.mark.parametrize("rate", [64.0, 100.0, 1e4])
 def test_the_expansion_solves_its_equation(rate: float) -> None:
-    """Gamma(x, rate) / Gamma(x) = Phi(w) to 5e-12, by an independent library."""
+    """Gamma(x, rate) / Gamma(x) = Phi(w) to 5e-12, as computed by mpmath."""
     w = np.linspace(-6.2, 6.2, 21)
     x = poissons.expansion(np.full(w.shape, rate), w)
     with mpmath.workdps(30):
@@ -514,7 +517,7 @@ def test_the_cdf_table_is_right_at_every_cell_end() -> None:
 
 
 def test_the_tail_table_and_the_normal_table_share_cells() -> None:
-    """The reference makes the normal of a word as `effects.normals` does, bit for bit."""
+    """The normal of a word equals that of `noise.normals` bit for bit."""
     words = np.random.default_rng(12).integers(0, SIGN, 100_000, dtype=np.uint32)
     assert (poissons._quantile(poissons._tail(words)) == normals(words)).all()
     assert tables.SEGMENTS == 32

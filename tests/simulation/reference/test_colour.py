@@ -23,7 +23,7 @@ matrices = st.tuples(*[entries] * 9)
 
 @st.composite
 def weights(draw: st.DrawFn) -> tuple[float, ...]:
-    """Four uniform numbers divided by their sum, including corners and edges."""
+    """Draw four uniform numbers divided by their sum, including corners and edges."""
     uniforms = draw(st.tuples(*[st.floats(0, 1)] * 4))
     total = sum(uniforms)
     assume(total > 1e-6)
@@ -91,7 +91,7 @@ def test_rows_of_custom_matrices_sum_to_exactly_1(count: int) -> None:
 
 
 def hold_near_exact(xyz2cam: Matrix, exact_xyz2cam: list[Fraction], mixed_of: int) -> None:
-    """Hold each entry to the exactly normalised exact product.
+    """Compare each entry with the exactly normalised exact product.
 
     A sum of n rounded products is off by n·u of the sum of their sizes; a quotient by the sizes' share of the row sum;
     the grid by two units of 2**-52 of the largest entry. All to first order, hence the last factor.
@@ -118,7 +118,7 @@ def test_a_camera_is_the_exactly_normalised_product(camera: str) -> None:
 
 @given(weights())
 def test_a_mixture_is_the_exactly_normalised_product(mix: tuple[float, ...]) -> None:
-    """Positive weights: what a mix may be off is relative to matrices of which some entries cancel between cameras."""
+    """The error is relative to the sizes of the entries, because some of them cancel between cameras."""
     mixed = colour.mix(tuple(CAMERAS.values()), mix)
     exact = [sum(Fraction(w) * Fraction(m[i]) for w, m in zip(mix, CAMERAS.values(), strict=True)) for i in range(9)]
     for i in range(9):
@@ -129,7 +129,7 @@ def test_a_mixture_is_the_exactly_normalised_product(mix: tuple[float, ...]) -> 
 
 @given(weights())
 def test_the_grid_moves_entries_by_at_most_three_units(mix: tuple[float, ...]) -> None:
-    """Half a step of the grid and the roundings of a quotient for two entries; the largest takes up what they leave."""
+    """Units are 2**-52 of the largest entry. Two entries are rounded to the grid; the largest is the rest to 1."""
     product = colour.multiply(colour.mix(tuple(CAMERAS.values()), mix), RGB2XYZ)
     for plain, found in zip(rows(product), rows(colour.normalise_rows(product)), strict=True):
         total = sum(Fraction(entry) for entry in plain)
@@ -208,7 +208,10 @@ def test_a_singular_matrix_is_refused(singular: Matrix) -> None:
 
 
 def nearly_singular(condition: float) -> Matrix:
-    """Two rows that differ by e: the norm is 2 + e, the inverse's (2 + e) / e; the condition number 4 / e + 4 + e."""
+    """Return a matrix with two rows that differ by e.
+
+    Its norm is 2 + e, that of its inverse (2 + e) / e, so the condition number is 4 / e + 4 + e.
+    """
     e = 4 / condition
     return (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 1.0 + e)
 

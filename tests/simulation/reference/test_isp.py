@@ -50,7 +50,7 @@ def plan() -> Plan:
 
 
 def colours(step: int) -> Iterator[np.ndarray]:
-    """All 8-bit colours whose codes are multiples of ``step`` (a divisor of 255), in slabs ``[n, n, 3]``."""
+    """Yield all 8-bit colours whose codes are multiples of ``step`` (a divisor of 255), in slabs ``[n, n, 3]``."""
     levels = np.arange(0, 256, step, dtype=np.uint8)
     green, blue = np.meshgrid(levels, levels, indexing="ij")
     for red in levels:
@@ -75,7 +75,7 @@ def unclipped(light: np.ndarray) -> np.ndarray:
 def test_unclipped_colours_return_to_their_codes(
     plan: Plan, camera: str, gains: str, step: int, figure: Figure
 ) -> None:
-    """As many colours as are not clipped is asserted too: between a fifth of the cube and all of it."""
+    """At least a fifth of all colours is not clipped, so that the test checks enough of them."""
     planned = plan_with(plan, camera, gains, "per_channel")
     returned = checked = 0
     for srgb in colours(step):
@@ -115,7 +115,7 @@ def test_every_16_bit_gray_returns_through_every_curve(plan: Plan, tone: str, ga
 @pytest.mark.parametrize("gains", GAINS)
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 def test_kernels_give_the_references_dn_for_every_colour(plan: Plan, camera: str, gains: str, step: int) -> None:
-    """Four origins put each of the four sites on every pixel, so that every colour is seen through every filter."""
+    """Four origins put each of the four sites on every pixel, so that every filter records every colour."""
     planned = plan_with(plan, camera, gains, "per_channel")
     black, white = planned.black_level_dn, planned.white_level_dn
     for srgb in colours(step):
@@ -140,7 +140,7 @@ def test_white_and_black_are_preserved_for_any_camera_and_gains(plan: Plan) -> N
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:
-    """Floats whose products do not underflow."""
+    """Draw floats whose products do not underflow."""
     return st.floats(low, high).filter(lambda value: value == 0 or abs(value) > 1e-100)
 
 
@@ -150,7 +150,7 @@ def numbers(low: float, high: float) -> st.SearchStrategy[float]:
     threshold=numbers(0, 0.99),
 )
 def test_gains_are_inverted_for_any_value_gain_and_threshold(i: list[float], k: list[float], threshold: float) -> None:
-    """The inverse is worth what it gives: put back, it must give the value, to the rounding of a dozen operations."""
+    """Applying the gains and inverting them again must give the value, to the rounding of a dozen operations."""
     gains = (k[0], k[1], k[2])
     y = unprocess.invert_gains(np.array([[i]]), gains, "per_channel", threshold)
 
@@ -181,7 +181,7 @@ def test_smoothstep_by_hand() -> None:
 
 
 def test_srgb_by_hand() -> None:
-    """The standard's own figures: 0.0031308 is where the line ends, 0.5 becomes 0.735357."""
+    """The line of the standard ends at 0.0031308; 0.5 becomes 0.735357."""
     found = process.compress_gamma(np.array([0, 0.001, 0.5, 1]), "srgb")
 
     np.testing.assert_allclose(found, [0, 0.01292, 0.7353569830524495, 1], rtol=1e-12)
@@ -196,7 +196,7 @@ def test_colours_outside_the_cube_are_clipped(plan: Plan) -> None:
 # --------------------------------------------------------------------------------------------- through integer DN
 
 LOST = {16: 0, 14: 1, 12: 2, 10: 7}
-"""Codes by which rounding to a sensor's DN moves an 8-bit colour at most, whatever the camera and the gains."""
+"""Largest change of an 8-bit colour by rounding to a sensor's DN, in codes, for any camera and gains."""
 
 LEVELS_DN = {16: (4096, 65535), 14: (1024, 16383), 12: (240, 4095), 10: (64, 1023)}
 """Black and white level of the sensors in ``conf/sensor``, by their bits."""
@@ -208,7 +208,7 @@ def on_sensor(plan: Plan, bits: int) -> Plan:
 
 
 def codes_lost(plan: Plan, step: int) -> float:
-    """By how many codes the colours that are not clipped change, source to DN of all three channels and back."""
+    """Return the largest change, in codes, of unclipped colours that are converted to DN and back."""
     worst = 0.0
     for srgb in colours(step):
         light = unprocess.camera_light(srgb, plan)
@@ -268,14 +268,14 @@ def test_flat_colours_survive_the_mosaic(pattern: str, figure: Figure) -> None:
 
 
 def ramp(height: int, width: int) -> np.ndarray:
-    """Each channel rises or falls along both axes, each at a rate of its own."""
+    """Return an image whose channels increase or decrease along both axes, each at its own rate."""
     y, x = np.mgrid[:height, :width][..., None].astype(float)
     return y * [0.5, -1.0, 0.25] + x * [-0.75, 0.5, 1.0] + [10, 20, 30]
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_colour_ramps_survive_except_at_the_edges(pattern: str) -> None:
-    """A mirrored row lies off the ramp by twice its distance from the edge, 4 steps at most."""
+    """A mirrored row differs from the ramp by twice its distance from the edge, at most 4 steps."""
     whole = ramp(11, 14)
 
     error = np.abs(process.demosaic(mosaic(whole, pattern), pattern) - whole)
@@ -333,7 +333,7 @@ def test_a_mosaic_without_all_channels_is_refused(size: tuple[int, int]) -> None
 @pytest.mark.parametrize("highlight", HIGHLIGHTS)
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_flat_colours_return_from_a_raw_frame(plan: Plan, pattern: str, highlight: str, figure: Figure) -> None:
-    """64 flat squares in one frame; the inner sites of each see nothing but their own."""
+    """A frame has 64 flat squares; the inner sites of each depend only on their own square."""
     side = 8
     levels = np.array(list(itertools.product((0, 100, 250, 255), repeat=3)), dtype=np.uint8).reshape(8, 8, 3)
     source = levels.repeat(side, axis=0).repeat(side, axis=1)
@@ -367,7 +367,7 @@ def developed_codes(source: np.ndarray, plan: Plan) -> np.ndarray:
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_a_smooth_image_returns_within_two_codes(plan: Plan, pattern: str) -> None:
-    """Colours that change by a code a pixel: the demosaic loses no more than rounding to 8 bits and to 14 does."""
+    """Colours change by one code per pixel; demosaicking loses no more than rounding to 8 bits and to 14."""
     planned = replace(plan_with(plan, "sony_a7r", "more", "per_channel"), pattern=pattern)
     y, x = np.mgrid[:140, :180]
     source = np.stack([40 + y, 60 + x // 2, 200 - (x + y) // 2], axis=-1).astype(np.uint8)
@@ -379,7 +379,7 @@ def test_a_smooth_image_returns_within_two_codes(plan: Plan, pattern: str) -> No
 
 
 def test_demosaicking_beats_opencvs_bilinear_method(plan: Plan) -> None:
-    """Edges are what a mosaic loses: the figures of two scenes, PSNR of unclipped pixels."""
+    """A mosaic loses edges: compare the PSNR of unclipped pixels in two scenes."""
     planned = on_sensor(plan_with(plan, "olympus_em10", "more", "per_channel"), 14)
     for scene, stated_db in (("dead_leaves-0", 32.9), ("highlights-0", 34.4)):
         source = synthetic.scene(scene)
@@ -398,7 +398,7 @@ def psnr_db(found: np.ndarray, wanted: np.ndarray) -> float:
 
 
 def test_a_saturated_highlight_on_gray_has_no_coloured_rim(plan: Plan) -> None:
-    """Light that falls off by 8 codes a pixel. With gains applied after the demosaic the rim is 125 codes of colour."""
+    """With gains applied after demosaicking, the channels of the rim would differ by 125 codes."""
     y, x = np.mgrid[:60, :60]
     gray = np.clip(255 - (np.hypot(y - 30, x - 30) - 9) * 8, 90, 255).astype(np.uint8)
     planned = on_sensor(plan_with(plan, "nexus_6p", "less", "per_channel"), 14)

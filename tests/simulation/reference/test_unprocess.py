@@ -23,7 +23,7 @@ EPS = 2.0**-52
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:
-    """Floats whose products do not underflow: light is a sum of table entries, which are far greater."""
+    """Draw floats whose products do not underflow: light is a sum of table entries, which are far larger."""
     return st.floats(low, high).filter(lambda value: value == 0 or abs(value) > 1e-100)
 
 
@@ -41,17 +41,17 @@ def codes(top: int, step: int = 1) -> np.ndarray:
 
 
 def tone_of(code: np.ndarray, top: int) -> np.ndarray:
-    """As `unprocess.unprocess` calls it."""
+    """Return the inverse tone curve of codes, as `unprocess.unprocess` computes it."""
     return unprocess.inverse_smoothstep(code / top, (top - code) / top)
 
 
 def true_tone(code: int, top: int) -> mpmath.mpf:
-    """The article's formula in 60 digits."""
+    """Return the result of the article's formula, computed with 60 digits."""
     return mpmath.mpf("0.5") - mpmath.sin(mpmath.asin(1 - 2 * mpmath.mpf(int(code)) / top) / 3)
 
 
 def worst_units(found: np.ndarray, exact: list[mpmath.mpf]) -> float:
-    """The largest error in units in the last place of the true value."""
+    """Return the largest error in units in the last place of the true value."""
     errors = [abs(mpmath.mpf(float(f)) - e) / math.ulp(float(e)) for f, e in zip(found, exact, strict=True)]
     return float(max(errors))
 
@@ -74,7 +74,7 @@ def test_the_tone_curve_is_within_5_units_of_rounding(top: int, step: int) -> No
 
 @pytest.mark.parametrize(("top", "step"), GRIDS)
 def test_tone_and_gamma_are_within_12_units_of_rounding(top: int, step: int) -> None:
-    """Gamma as the double it is; it lies 1.8e-16 above 2.2, which would be three units more at the 14th 16-bit code."""
+    """The exact value uses the double next to 2.2; 2.2 itself would add three units at the 14th 16-bit code."""
     inner = codes(top, step)[1:-1]
     with mpmath.workdps(60):
         exact = [true_tone(code, top) ** mpmath.mpf(2.2) for code in inner]
@@ -95,7 +95,7 @@ def test_the_tone_curve_increases_with_the_code(top: int) -> None:
 
 @pytest.mark.parametrize("top", [255, 65535])
 def test_the_tone_curve_inverts_the_cubic(top: int) -> None:
-    """Five units in y, through a slope of at most 1.5, and the five operations of the cubic, whose terms reach 3."""
+    """The bound is five units in y times a slope of at most 1.5, plus five operations with terms of up to 3."""
     y = tone_of(codes(top), top)
     assert np.abs(y * y * (3 - 2 * y) - codes(top) / top).max() <= (1.5 * 5 + 5) * EPS
 
@@ -116,7 +116,7 @@ def test_a_gamma_of_1_changes_nothing() -> None:
 
 
 def test_srgb_equals_the_standard() -> None:
-    """Within 8 units: a sum and a quotient, 1 unit each at the most, to the power of 2.4, and the power's own 4."""
+    """The bound is at most 1 unit each for a sum and a quotient, times 2.4, plus 4 units for the power."""
     inner = codes(65535, 37)[1:]
     with mpmath.workdps(60):
         v = [mpmath.mpf(int(code)) / 65535 for code in inner]
@@ -130,7 +130,7 @@ def test_srgb_equals_the_standard() -> None:
 
 
 def test_srgb_has_only_the_standards_step() -> None:
-    """IEC 61966-2-1 rounds its constants, so the pieces meet to 2.4e-9: a millionth of the light there."""
+    """IEC 61966-2-1 rounds its constants, so the pieces differ by 2.4e-9 at their joint, a millionth of the light."""
     joint = 0.04045
     below, above = unprocess.expand_gamma(np.array([joint, math.nextafter(joint, 1)]), "srgb")
     with mpmath.workdps(30):
@@ -151,7 +151,7 @@ def test_the_matrix_is_applied_to_each_triplet() -> None:
 
 @given(st.lists(numbers(-2, 2), min_size=9, max_size=9), st.lists(numbers(0, 1), min_size=3, max_size=3))
 def test_products_are_added_from_left_to_right(ccm: list[float], rgb: list[float]) -> None:
-    """The order is part of the definition: the fused form must give the same last bit."""
+    """The order is part of the definition: kernels must give the same last bit."""
     found = unprocess.apply_ccm(np.array([[rgb]]), tuple(ccm))[0, 0]
     r, g, b = rgb
     assert found.tolist() == [(ccm[i] * r + ccm[i + 1] * g) + ccm[i + 2] * b for i in (0, 3, 6)]
