@@ -28,7 +28,7 @@ from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.sources import loader
 from unprocess_gen.sources.scenes import synthetic
 
-pytest_plugins = ["helpers.promise_report"]
+pytest_plugins = ["helpers.linux_only", "helpers.promise_report"]
 
 # the same examples in every run, and none refused because the machine is busy; new examples with
 # --hypothesis-profile=default

@@ -293,6 +293,7 @@ def test_replay_of_an_unknown_key_is_a_config_error(dataset: Path) -> None:
         ug.replay(dataset, keys=[99])
 
 
+@pytest.mark.linux_only("names signals that Windows lacks")
 def test_functions_leave_signals_and_stdout_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE)
     before = [signal.getsignal(number) for number in numbers]

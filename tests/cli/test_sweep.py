@@ -240,6 +240,7 @@ main()
 """A command that is killed once it has committed 18 shards."""
 
 
+@pytest.mark.linux_only("kills a process by a signal")
 def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 12)
     arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")

@@ -92,6 +92,7 @@ def test_huge_file_is_refused_without_reading_all_of_it(tmp_path: Path) -> None:
         read_yaml_mapping(path)
 
 
+@pytest.mark.linux_only("makes a pipe")
 def test_missing_file_folder_and_pipe_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for name, problem in (("nothing", "cannot be read"), ("", "regular file"), ("pipe", "regular file")):

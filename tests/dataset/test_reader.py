@@ -119,6 +119,7 @@ def test_writing_to_a_row_does_not_touch_the_next_one(dataset: Path) -> None:
     assert pairs[0].row["source"] != "mine"
 
 
+@pytest.mark.linux_only("Windows deletes no file that is mapped")
 def test_arrays_outlive_the_reader_and_the_file(dataset: Path, tmp_path: Path) -> None:
     shutil.copytree(dataset, tmp_path / "ds")
     sample = RawPairs(tmp_path / "ds")[0]
@@ -130,6 +131,7 @@ def open_files() -> int:
     return len(os.listdir("/proc/self/fd"))
 
 
+@pytest.mark.linux_only("counts open files in /proc")
 def test_no_file_stays_open(dataset: Path) -> None:
     before = open_files()
     pairs = RawPairs(dataset)

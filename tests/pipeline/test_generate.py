@@ -116,6 +116,7 @@ def test_place_locale_clock_and_hash_seed_change_no_byte(
     figure("workers", f"same bytes in {len(rows(tmp_path / 'ds'))} of {len(rows(dataset))} pairs")
 
 
+@pytest.mark.linux_only("sets the umask")
 def test_umask_changes_no_byte(
     make: Make, photos: Path, dataset: Path, tree_hash: TreeHash, tmp_path: Path, figure: Figure
 ) -> None:
@@ -270,6 +271,7 @@ def test_file_names_survive_the_csv(dataset: Path) -> None:
         assert [row["source"] for row in csv.DictReader(stream)] == list(PHOTOS)
 
 
+@pytest.mark.linux_only("names that other systems do not allow")
 def test_unsafe_file_names_are_percent_encoded(make: Make, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 1)
     names = [b"@at.png", b"a\nb.png", b"bad\xff.png", b'quote".png', "right\u202eleft.png".encode()]

@@ -17,6 +17,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[2]
 CURVES = "unprocess_gen/core/data/curves_16bit.npz"
+PROJECT_FILES = ("CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE")
 OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
 
 
@@ -63,7 +64,7 @@ def test_the_sdist_holds_options_tests_and_readme(built: Path) -> None:
     with tarfile.open(archive) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}
 
-    assert {*OPTIONS, "README.md", "pyproject.toml", "tests/project/test_packaging.py", CURVES} <= names
+    assert {*OPTIONS, *PROJECT_FILES, "README.md", "pyproject.toml", "tests/project/test_packaging.py", CURVES} <= names
 
 
 def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
@@ -74,6 +75,7 @@ def test_the_wheel_holds_every_option_inside_the_package(built: Path) -> None:
     assert CURVES in names
     assert not any(name.startswith(("conf/", "tests/")) for name in names)
     assert "unprocess_gen/py.typed" in names
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
 def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path: Path) -> None:
