@@ -35,7 +35,7 @@ def test_licence_is_mit_everywhere() -> None:
 
 
 def test_citation_has_the_version_and_both_references() -> None:
-    """The file was validated with cffconvert 2.0.0; this checks the keys that the format requires, and our values."""
+    """The file was validated with cffconvert 2.0.0; this checks required keys and the values of this project."""
     citation = read_yaml("CITATION.cff")
     assert {"cff-version", "message", "title", "authors"} <= citation.keys()
     assert citation["version"] == PROJECT["version"] == unprocess_gen.__version__
