@@ -21,6 +21,7 @@ from unprocess_gen.config.accuracy import STAGES, methods_of_stage
 from unprocess_gen.config.schema import PHYSICAL_NUMBERS
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source
+from unprocess_gen.dataset import columns
 from unprocess_gen.dataset.columns import COLUMNS, NAMES, NO_VIDEO, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
@@ -316,6 +317,18 @@ PHYSICAL_NAMES = NAMES[NAMES.index("iso") : NAMES.index("level")]
 NUMBERED = ("level", "draw", "frame", "downscale", "dequantize")
 NEEDED = [name for name in NAMES if name in {*CONTRACT[9:39], "sensor_clip", "accuracy"}]
 NEEDED_PHYSICAL = ["scene", "exposure_ratio", "saturated_as", "noise_law", *PHYSICAL_NAMES, *NUMBERED]
+
+
+def test_field_of_a_later_column_keeps_its_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of an older version lacks the columns that hold the field."""
+    later = tuple(dataclasses.replace(one, since="9.0") if one.name == "draw" else one for one in COLUMNS)
+    row = row_of(dataclasses.replace(PLAN, draw=2)) | {"draw": None}
+    with pytest.raises(DamageError, match="draw is empty"):
+        plan_from_row(row)
+    monkeypatch.setattr(columns, "COLUMNS", later)
+
+    assert plan_from_row(row) == dataclasses.replace(PLAN, draw=0)
+    assert plan_from_row(row | {"draw": 2}).draw == 2
 
 
 @pytest.mark.parametrize(("plan", "names"), [(PLAN, NEEDED), (PHYSICAL, NEEDED_PHYSICAL)], ids=["normal", "physical"])

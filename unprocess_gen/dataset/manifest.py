@@ -248,9 +248,14 @@ def patch_from_row(row: Row) -> Patch:
 
 
 def _fields(row: Row, record: Record) -> dict[str, Any]:
-    """Return the fields of a record from the columns that hold it; ValueError names the column."""
+    """Return the fields of a record from the columns that hold it; ValueError names the column.
+
+    A field is omitted, and keeps its default, if its columns are newer than the row and thus empty.
+    """
     fields: dict[str, Any] = {}
     for field, columns in columns_of(record).items():
+        if all(column.since != FIRST and row.get(column.name, column.empty) == column.empty for column in columns):
+            continue
         values = tuple(column.to_field(row) for column in columns)
         fields[field] = values if len(values) > 1 else values[0]
     return fields
