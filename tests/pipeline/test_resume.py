@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import itertools
 import os
 import random
 import shutil
@@ -441,6 +442,7 @@ def test_empty_folder_is_accepted(make: Make, tmp_path: Path) -> None:
 # Stopped --------------------------------------------------------------------------------------------------------------
 
 LONG = ("source.limit=400", ONE, "n_jobs=2")
+"""A run whose workers are busy with scenes for minutes."""
 
 
 class Stopped(NamedTuple):
@@ -453,23 +455,30 @@ class Stopped(NamedTuple):
     out: Path
 
 
-SIGNALS = [(number, group) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) for group in (False, True)]
-QUICK = {(signal.SIGINT, True), (signal.SIGTERM, False), (signal.SIGHUP, True)}
-"""What a terminal sends for Ctrl-C, `kill` sends to one process, and a terminal that closes sends."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SENT = [
+    (signal.SIGINT, "group", "photographs"),  # Ctrl-C
+    (signal.SIGTERM, "process", "photographs"),  # kill
+    (signal.SIGHUP, "group", "photographs"),  # a terminal that closes
+    *itertools.product(SIGNALS, ("process", "group"), ("scenes",)),
+]
 
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(sent, marks=() if sent in QUICK else pytest.mark.slow) for sent in SIGNALS],
-    ids=[f"{number.name}{' to the group' if group else ''}" for number, group in SIGNALS],
+    params=[pytest.param(sent, marks=pytest.mark.slow if "scenes" in sent else ()) for sent in SENT],
+    ids=[f"{number.name} to the {whom}, {sources}" for number, whom, sources in SENT],
 )
-def stopped(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
-    number, group = request.param
+def stopped(request: pytest.FixtureRequest, forty: Path, tmp_path_factory: pytest.TempPathFactory) -> Stopped:
+    number, whom, sources = request.param
     folder = tmp_path_factory.mktemp("stopped")
-    with running(*LONG, cwd=folder) as process:
+    arguments, env = LONG, {}
+    if sources == "photographs":
+        arguments, env = (f"source.root={forty}", ONE, "n_jobs=2"), imported_first(folder, SLOW_DISK)
+    with running(*arguments, cwd=folder, **env) as process:
         wait_for(lambda: committed(folder / "ds") or process.poll() is not None)
         assert workers(process.pid), process.communicate()
-        (os.killpg if group else os.kill)(process.pid, number)
+        (os.killpg if whom == "group" else os.kill)(process.pid, number)
         _, err = process.communicate(timeout=15)
         until = time.monotonic() + 5
         while (left := session(process.pid)) and time.monotonic() < until:
