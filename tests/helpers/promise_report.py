@@ -89,7 +89,7 @@ def status(promise: Promise, reports: list[tuple[str, pytest.TestReport]]) -> st
     if failed:
         return f"FAILED ({failed} of {len(own)} tests)"
     if passed:
-        return f"passed ({passed} tests{f', {len(skipped)} skipped' if skipped else ''})"
+        return f"passed ({passed} {'test' if passed == 1 else 'tests'}{f', {len(skipped)} skipped' if skipped else ''})"
     return f"skipped ({skip_reason(skipped[0])})" if skipped else "not run"
 
 

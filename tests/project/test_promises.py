@@ -56,7 +56,7 @@ def test_table_shows_figures_failures_and_reasons(pytester: pytest.Pytester) -> 
     result = pytester.runpytest_inprocess("--promises", "-p", "no:cacheprovider")
     result.stdout.fnmatch_lines(
         [
-            "workers: passed (1 tests)",
+            "workers: passed (1 test)",
             "    shown in this run: 3 of 3 runs",
             "video: skipped (no camera here)",
             "verify: FAILED (1 of 1 tests)",
