@@ -375,7 +375,7 @@ def code(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         [sys.executable, SCRIPT, "code.json", "--code"],
         cwd=folder,
         env=environment(NUMBA_CACHE_DIR=str(folder), **other),
-        timeout=120,
+        timeout=600,
         check=True,
     )
     return dict(json.loads((folder / "code.json").read_text(encoding="utf-8")))
