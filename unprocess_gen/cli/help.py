@@ -35,15 +35,10 @@ Settings are key=value, in any order. group=option chooses an option, group.key=
 value. gen-dataset --help GROUP explains the options and keys of a group. Groups, options and keys:
 """
 
-ENDING = """
-Flags:
-  --cfg job           print the settings and stop
-  --config-dir DIR    add a folder of your own options
-  -m, --multirun      sweep over comma-separated values
-  -q, --quiet         show only warnings and errors; -v, --verbose: details; --log-file FILE
-  --version, --help [VERB or GROUP], --hydra-help
-  --                  everything after it is a file or folder, even with a leading hyphen
+SHOWN_HYDRA_FLAGS = (("-m", "--multirun"), ("-c", "--cfg"), ("-cd", "--config-dir"), ("--hydra-help",))
+"""Flags of Hydra that the help of the program names; that of a verb names all."""
 
+ENDING = """
 Tab completion: eval "$(gen-dataset completion bash)", or zsh.
 
 """
@@ -71,6 +66,14 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
         for name, setting in settings_of(Config).items()
     ]
     blocks = [INTRODUCTION + "\n".join(lines), SETTINGS + "\n".join(groups), "\nKeys at the top level:", *keys]
+    flags = [(hydra_flag(spellings), HYDRA_FLAGS[spellings][1]) for spellings in SHOWN_HYDRA_FLAGS]
+    flags += [(spelled(argument), argument.help) for argument in STANDARD]
+    flags += [
+        ("-h, --help [VERB or GROUP]", "show this help, or that of a verb or group"),
+        ("--version", "show the version"),
+        ("--", "everything after it is a file or folder, even with a leading hyphen"),
+    ]
+    blocks += ["\nFlags:", *(_two_columns(*flag) for flag in flags)]
     return "\n".join(blocks) + "\n" + ENDING + exit_code_lines()
 
 
