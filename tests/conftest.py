@@ -42,7 +42,7 @@ np.seterr(all="raise")  # in every test: no NaN, overflow, underflow or division
 # a shell's background job ignores SIGINT, and nohup ignores SIGHUP; the commands under test would ignore them too
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
     signal.signal(signal.SIGHUP, lambda number, frame: None)
 
 
