@@ -65,7 +65,7 @@ def wrongly_rounded(tone: str, gamma: str, codes: int) -> list[int]:
 def test_every_8_bit_entry_is_correctly_rounded(tone: str, gamma: str, figure: Figure) -> None:
     wrong = wrongly_rounded(tone, gamma, 256)
     assert wrong == []
-    figure("curves", f"{256 - len(wrong)} of 256 entries correctly rounded")
+    figure("curves", f"{256 - len(wrong)} of 256 entries of an 8-bit curve correctly rounded")
 
 
 @pytest.mark.parametrize(("tone", "gamma"), CURVES_16)
@@ -84,7 +84,7 @@ def test_16_bit_entries_are_correctly_rounded_at_every_97th_code(tone: str, gamm
 def test_every_16_bit_entry_is_correctly_rounded(tone: str, gamma: str, figure: Figure) -> None:
     wrong = wrongly_rounded(tone, gamma, 65536)
     assert wrong == []
-    figure("curves", f"{65536 - len(wrong):,} of 65,536 entries correctly rounded")
+    figure("curves", f"{65536 - len(wrong):,} of 65,536 entries of a 16-bit curve correctly rounded")
 
 
 @pytest.mark.parametrize("gamma", ["1.8", "2.4", "0.45", "10", "3.3333333333333335"])
