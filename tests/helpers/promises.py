@@ -277,20 +277,30 @@ def _exists(test: str) -> bool:
 def one_line(figures: dict[str, dict[str, int]]) -> str:
     """Return the figures of a promise's tests in one line.
 
-    Figures that differ only in their numbers become one, with the range of each number and the number of cases.
+    Figures that differ only in their numbers become one, with sums or ranges of the numbers and the number of cases.
     """
     alike: dict[tuple[str, ...], Counter[str]] = {}
     for texts in figures.values():
         for text, cases in texts.items():
             alike.setdefault(tuple(_NUMBER.split(text)), Counter())[text] += cases
-    return "; ".join(_with_ranges(words, texts) for words, texts in alike.items())
+    return "; ".join(_combined(words, texts) for words, texts in alike.items())
 
 
-def _with_ranges(words: tuple[str, ...], texts: Counter[str]) -> str:
-    """Return one figure for all ``texts``, which have the same words between their numbers."""
+def _combined(words: tuple[str, ...], texts: Counter[str]) -> str:
+    """Return one figure for all ``texts``, which have the same words between their numbers.
+
+    The counts of "3 of 4" are added over all cases; other numbers become a range.
+    """
+    numbers = {text: [float(number.replace(",", "")) for number in _NUMBER.findall(text)] for text in texts}
+    counts = [number for number, word in enumerate(words) if 0 < number < len(words) - 1 and word == " of "]
     shown = words[0]
-    for word, numbers in zip(words[1:], zip(*map(_NUMBER.findall, texts), strict=True), strict=True):
-        low, high = (choose(numbers, key=lambda text: float(text.replace(",", ""))) for choose in (min, max))
+    for place, word in enumerate(words[1:]):
+        if place + 1 in counts or place in counts:
+            total = sum(values[place] * texts[text] for text, values in numbers.items())
+            shown += f"{total:,.0f}{word}"
+            continue
+        spelt = [_NUMBER.findall(text)[place] for text in texts]
+        low, high = (choose(spelt, key=lambda text: float(text.replace(",", ""))) for choose in (min, max))
         shown += (low if low == high else f"{low} to {high}") + word
     cases = texts.total()
     return shown if cases == 1 else f"{shown} ({cases} cases)"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.promises import BY_ID, PROMISES, ROOT, reporting_files
+from helpers.promises import BY_ID, PROMISES, ROOT, one_line, reporting_files
 
 pytest_plugins = ["pytester"]
 
@@ -64,3 +64,10 @@ def test_table_shows_figures_failures_and_reasons(pytester: pytest.Pytester) -> 
         ]
     )
     assert "never shown" not in result.stdout.str().split(" promises ")[1]
+
+
+def test_counts_of_cases_are_added_and_other_numbers_become_ranges() -> None:
+    figures = {
+        "tests/test_a.py::test_b": {"3 of 4 files": 2, "1,000 of 1,000 files": 1, "0.5 codes": 1, "0.25 codes": 1}
+    }
+    assert one_line(figures) == "1,006 of 1,008 files (3 cases); 0.25 to 0.5 codes (2 cases)"
