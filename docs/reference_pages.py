@@ -62,8 +62,8 @@ A number of a branch is constant, or one of these forms:"""
 BRANCH_INTRODUCTION = """\
 ### Keys of a branch
 
-Each item of `noise.branches` holds the numbers of a physical profile for one range of ISO. Ranges may touch. An ISO
-that no branch contains is refused."""
+Each item of `noise.branches` holds the numbers of a physical profile for one range of ISO. Two ranges may share an end.
+An ISO that no branch contains is refused."""
 
 EFFECTS_INTRODUCTION = """\
 ### Numbers that an effect needs
@@ -162,7 +162,7 @@ COLUMNS_INTRODUCTION = """\
 # Manifest columns
 
 `manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order; later
-versions append columns. `KEY.json` in the shards holds the same values, typed.
+versions append columns. `KEY.json` in the shards holds the same values, typed, without `detail`.
 
 An empty cell means that the value does not exist. Numbers are written so that they read back exactly. The columns of
 physical profiles, marked with an asterisk, are 0 or `none` in rows of other profiles."""

@@ -58,7 +58,7 @@ PROMISES = (
     ),
     Promise(
         "resume",
-        "A run that was killed and started again ends with the bytes of an undisturbed run.",
+        "A run that was killed and rerun ends with the bytes of an uninterrupted run.",
         ("tests/pipeline/test_resume.py", "tests/pipeline/test_faults.py"),
         ("pytest -m slow tests/pipeline/test_faults.py",),
     ),
@@ -69,7 +69,7 @@ PROMISES = (
     ),
     Promise(
         "dead-worker",
-        "The death of a worker is noticed within five seconds, and its shard is generated again.",
+        "The death of a worker is noticed within five seconds, and its shard is regenerated.",
         ("tests/pipeline/test_faults.py",),
     ),
     Promise(
@@ -79,7 +79,8 @@ PROMISES = (
     ),
     Promise(
         "photon-transfer",
-        "The noise in the arrays is what the rows state, for every kind of noise, where it is above 0.7 DN.",
+        "The noise in the arrays is what the rows state, for every kind of noise, where its standard deviation is above "
+        "0.7 DN.",
         ("tests/reports/test_photon_transfer.py",),
         ("gen-dataset verify DIR --noise",),
     ),
@@ -153,7 +154,8 @@ PROMISES = (
     ),
     Promise(
         "developing",
-        "A developed raw frame is its photograph: flat colours and ramps exactly, for all four patterns.",
+        "A developed raw frame has the codes of its photograph in flat areas; demosaicing restores linear ramps except at "
+        "the border, for all four patterns.",
         ("tests/simulation/reference/test_isp.py",),
     ),
     Promise(

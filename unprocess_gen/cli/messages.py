@@ -1,7 +1,7 @@
 """Write results to stdout, and messages to stderr and a log file.
 
-Messages go through the logger ``unprocess_gen``; the verbs' flags decide where they appear. A full or closed stdout is
-a system error. A full or closed stderr is ignored: it must not end a run.
+Messages go through the logger ``unprocess_gen``; the verbs' flags decide where they appear. A full stdout is a system
+error, while a full stderr is ignored: it must not end a run. Streams that the caller closed become ``/dev/null``.
 """
 
 from __future__ import annotations

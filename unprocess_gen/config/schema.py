@@ -82,8 +82,8 @@ class SourceConfig:
     )
     dequantize: str = key(
         "off",
-        "dither moves 8-bit codes by up to half a code at random, so that 256 codes do not become 256 raw levels; 0, "
-        "255 and highlights keep their codes",
+        "dither moves 8-bit codes by up to half a code at random, so that raw frames have more than 256 levels; 0, 255 "
+        "and highlights keep their codes",
         limits.DEQUANTIZE,
     )
     patch: Any = key(
@@ -99,8 +99,8 @@ class CameraConfig:
     name: str = key("convex", "name of the camera, recorded in each row", Name())
     law: str = key(
         "convex",
-        "how the matrix of an image is chosen: fixed is the camera called name, convex a mix of four cameras, choice "
-        "one of the four, identity linear sRGB, custom xyz2cam",
+        "choice of an image's matrix: fixed is the camera called name, convex a mix of four cameras, choice one of the "
+        "four, identity linear sRGB, custom xyz2cam",
         limits.CAMERA_LAWS,
     )
     xyz2cam: Optional[list[float]] = key(
@@ -293,8 +293,8 @@ class NoiseConfig:
     )
     law: str = key(
         "gaussian",
-        "distribution of the noise of a two-parameter profile: gaussian is one normal distribution, poisson a Poisson "
-        "count times a plus a normal distribution of variance b",
+        "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a plus "
+        "a normal distribution of variance b",
         Choice(("gaussian", "poisson")),
         section=CHOSEN,
     )
