@@ -79,8 +79,8 @@ PROMISES = (
     ),
     Promise(
         "photon-transfer",
-        "The noise in the arrays is what the rows state, for every kind of noise, where its standard deviation is above "
-        "0.7 DN.",
+        "The noise in the arrays is what the rows state, for every kind of noise, where its standard deviation is "
+        "above 0.7 DN.",
         ("tests/reports/test_photon_transfer.py",),
         ("gen-dataset verify DIR --noise",),
     ),
@@ -154,8 +154,8 @@ PROMISES = (
     ),
     Promise(
         "developing",
-        "A developed raw frame has the codes of its photograph in flat areas; demosaicing restores linear ramps except at "
-        "the border, for all four patterns.",
+        "A developed raw frame has the codes of its photograph in flat areas; demosaicing restores linear ramps except "
+        "at the border, for all four patterns.",
         ("tests/simulation/reference/test_isp.py",),
     ),
     Promise(

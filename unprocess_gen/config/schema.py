@@ -293,8 +293,8 @@ class NoiseConfig:
     )
     law: str = key(
         "gaussian",
-        "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a plus "
-        "a normal distribution of variance b",
+        "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a "
+        "plus a normal distribution of variance b",
         Choice(("gaussian", "poisson")),
         section=CHOSEN,
     )
