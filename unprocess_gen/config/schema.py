@@ -82,8 +82,8 @@ class SourceConfig:
     )
     dequantize: str = key(
         "off",
-        "dither moves 8-bit codes by up to half a code at random, so that raw frames have more than 256 levels; 0, 255 "
-        "and highlights keep their codes",
+        "dither moves 8-bit codes by up to half a code at random, so that gray areas have more than 256 raw levels; 0, "
+        "255 and highlights keep their codes",
         limits.DEQUANTIZE,
     )
     patch: Any = key(
