@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +21,6 @@ from unprocess_gen.config.accuracy import (
     methods_of_stage,
 )
 from unprocess_gen.config.interpretation import accuracy_budget
-from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.planning.effect_selection import facts_for
@@ -29,8 +28,6 @@ from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.poisson import gaussian_distance, gaussian_from
 from unprocess_gen.sources.scenes import synthetic
-
-Settings = Callable[..., Config]
 
 EXACT = Budget("exact", False, 0.0, 0.0, 1e-6, 0.0)
 ALL = Budget("anything", False, math.inf, 1.0, math.inf, 1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import yaml
 from helpers.commands import RunMain
+from helpers.datasets import Settings
 from helpers.published import CRVD
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -45,7 +46,6 @@ from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.simulation.reference import cfa, unprocess
 from unprocess_gen.sources.image.decode import ICC_CHOICES
 
-Settings = Callable[..., Config]
 FILES = sorted(
     path.relative_to(conf_dir()) for path in conf_dir().glob("*/*.yaml") if path.parent.name not in ADDED_GROUPS
 )
@@ -363,9 +363,8 @@ REFUSED = [
     ("effects.prnu=on", r"effects.prnu=on: noise=imx385_iso3200 offers heteroscedastic only"),
     ("noise=sony_a7s2;effects.heteroscedastic=on", r"effects.heteroscedastic=on: noise=sony_a7s2 offers the physical"),
     ("noise=sony_a7s2;effects.column=on", r"effects.column=on: noise=sony_a7s2 gives no column_std_dn"),
-    ("scene.iso=-1", r"scene.iso=-1: expected an ISO above 0, up to 1e\+07"),
-    ("scene.iso=x", r"scene.iso=x: expected a finite number or a distribution"),
-    ("noise.prnu_std=0.6", r"noise.prnu_std=0.6: expected 0 to 0.5 or null"),
+    ("noise=nikon_d850;scene.iso=-1", r"scene.iso=-1: expected an ISO above 0, up to 1e\+07"),
+    ("noise=nikon_d850;scene.iso=x", r"scene.iso=x: expected a finite number or a distribution"),
     ("scene.exposure_ratio=0", r"scene.exposure_ratio=0: expected 0.001 to 1e\+06"),
     ("scene.exposure_s=[uniform,1,1e6]", r"scene.exposure_s=\[uniform, 1, 1000000.0\]: expected 1e-07 to 100000"),
     ("scene.temperature_c=[choice]", r"scene.temperature_c=\[choice\]: expected at least one value"),
@@ -608,6 +607,24 @@ def test_config_yaml_with_missing_key_is_refused_with_its_name(settings: Setting
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"missing key gains\.threshold"):
         read_dataset_yaml(tmp_path / "config.yaml")
+
+
+IGNORED = [
+    *[(one,) for one in ("scene.iso=-1", "scene.iso=x", "noise.prnu_std=0.6", "noise.dark_doubling_c=0")],
+    ("noise=brooks2019", "noise.bits=99"), ("noise.a=-1", "noise.levels=[{a: 1, b: 2}]"),
+    ("noise=nikon_d850", "noise.iso=100", "scene.iso=0"), ("noise=nikon_d850", "noise.iso=x", "noise.levels=[100,800]"),
+]  # fmt: skip
+"""Values that the noise profile does not use. Version 0.1 accepted them, so datasets with them exist."""
+
+
+def test_config_yaml_with_ignored_values_of_version_0_1_is_read(settings: Settings, tmp_path: Path) -> None:
+    for overrides in IGNORED:
+        config = settings(*overrides)
+        (tmp_path / "config.yaml").write_text(dataset_yaml(config), encoding="utf-8")
+        again, _ = read_dataset_yaml(tmp_path / "config.yaml")
+        assert dataset_yaml(again) == dataset_yaml(config), overrides
+        validate_config(again)
+        assert plan_pairs(again, SHA256, facts=Facts(64, 48, 256, 3, 250)), overrides
 
 
 def test_again_refuses_hostile_config_yaml_with_exit_2(run_main: RunMain, tmp_path: Path) -> None:

@@ -80,6 +80,7 @@ def _check_calibration(noise: NoiseConfig) -> None:
             f"got {', '.join(value_text(level) for level in levels)}"
         )
     assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
+    settings_of(NoiseConfig)["bits"].check("noise.bits", noise.bits)
     BLACK_LEVEL.check_in("noise.black_level_dn", noise.black_level_dn, noise)
     WHITE_LEVEL.check_in("noise.white_level_dn", noise.white_level_dn, noise)
 

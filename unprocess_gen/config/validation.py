@@ -25,10 +25,16 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import CAMERA_LAWS, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise
-from unprocess_gen.config.schema import CameraConfig, Config, SourceConfig, all_settings
+from unprocess_gen.config.schema import PHYSICAL, CameraConfig, Config, SourceConfig, all_settings
 from unprocess_gen.config.values import one_of, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.simulation.reference import colour
+
+CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
+"""Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
+
+Recorded configs may contain any other value of them, and their datasets must stay usable.
+"""
 
 # --------------------------------------------------------------------------------------------------- public functions
 
@@ -76,10 +82,13 @@ def check_values(config: Config) -> None:
 
 
 def _check_settings(config: Config) -> None:
-    """Check each value against the limit that the schema declares for it."""
+    """Check each value against the limit that the schema declares for it, except values that the profile ignores."""
+    physical = is_physical(config.noise)
     for group, name, setting in all_settings():
         values = getattr(config, group) if group else config
         key, value, limit = f"{group}.{name}".lstrip("."), getattr(values, name), setting.limit
+        if key in CHECKED_WHERE_USED or (setting.section == PHYSICAL and not physical):
+            continue
         if isinstance(limit, Drawn) and not (value is None and setting.null):
             parse_drawn(key, value, limit)
         elif isinstance(limit, LevelRange) and group == "sensor":
