@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
+import sysconfig
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-COMMAND = Path(sys.executable).with_name("gen-dataset")
+COMMAND = Path(sysconfig.get_path("scripts"), "gen-dataset")
 
 
 def environment(**changes: str) -> dict[str, str]:
