@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from helpers.commands import Cli, RunMain
+from helpers.commands import Cli, RunMain, messages
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.processes import (
@@ -60,11 +60,6 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def undisturbed(photographs: Path, make: Make, tree_hash: TreeHash) -> str:
     make(photographs, photographs.parent / "ds", ONE)
     return tree_hash(photographs.parent / "ds")
-
-
-def own_lines(err: str) -> list[str]:
-    """Return the lines of stderr that are not progress."""
-    return [line for line in err.splitlines() if "images/s" not in line and "compiling kernels" not in line]
 
 
 def wait_for_the_end(leader: int) -> None:
@@ -168,7 +163,7 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
             codes[process.returncode] += 1
             assert process.returncode in (0, 3), err
             wait_for_the_end(process.pid)
-        lines = own_lines(err)
+        lines = messages(err)
         assert all("its worker died twice" in line for line in lines) and len(lines) <= 1, err
         make(photographs, out, ONE)
         assert tree_hash(out) == undisturbed, kill
@@ -282,7 +277,7 @@ def test_killed_worker_is_noticed_within_five_seconds(
         wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # loky ends all workers
         noticed_s = time.monotonic() - killed
         said, err = process.communicate(timeout=20)
-    assert (process.returncode, own_lines(err)) == (0, []), err
+    assert (process.returncode, messages(err)) == (0, []), err
     assert f"{COUNT} pairs in {COUNT} shards" in said
     assert tree_hash(tmp_path / "ds") == undisturbed
     assert_complete(tmp_path / "ds")
@@ -329,8 +324,8 @@ def test_out_of_memory_is_reported_and_rerun_completes_dataset(
     (tmp_path / "note").write_text(str(megabytes))
     done = cli(f"source.root={with_large}", ONE, LEVELS, f"n_jobs={n_jobs}", **env)
     assert done.returncode in (3, 5), done.stderr
-    assert len(own_lines(done.stderr)) == 1, done.stderr
-    assert "large.png" in own_lines(done.stderr)[0]
+    assert len(messages(done.stderr)) == 1, done.stderr
+    assert "large.png" in messages(done.stderr)[0]
     make(with_large, tmp_path / "ds", ONE, LEVELS)
     assert tree_hash(tmp_path / "ds") == with_large_undisturbed
 
@@ -485,7 +480,7 @@ def test_full_disk_ends_with_5_within_five_seconds(
         seconds = time.time() - (out / "shards").stat().st_mtime  # since the last commit
         wait_for_the_end(process.pid)
     assert (process.returncode, said) == (5, "")
-    assert len(own_lines(err)) == 1 and " bytes free)" in err, err
+    assert len(messages(err)) == 1 and " bytes free)" in err, err
     assert seconds < 5
     assert 0 < committed(out) < COUNT and intact(out)
     empty_disk.remount("size=4m")
@@ -510,7 +505,7 @@ def test_disk_that_becomes_read_only_ends_the_run_with_5(
     out = empty_disk.folder / "ds"
     after_commits(number, lambda: empty_disk.remount("ro"), monkeypatch)
     done = run_main(f"source.root={six}", f"out={out}", ONE, "n_jobs=1")
-    assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
+    assert (done.code, done.out, len(messages(done.err))) == (5, "", 1), done.err
     assert "Read-only file system" in done.err
     empty_disk.remount("rw")
     make(six, out, ONE)
@@ -532,7 +527,7 @@ def test_out_deleted_after_any_shard_ends_the_run_with_5(
 ) -> None:
     after_commits(number, lambda: shutil.rmtree(tmp_path / "ds"), monkeypatch)
     done = run_main(f"source.root={six}", ONE, "n_jobs=1")
-    assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
+    assert (done.code, done.out, len(messages(done.err))) == (5, "", 1), done.err
     assert not (tmp_path / "ds").exists()
 
 
@@ -549,7 +544,7 @@ def test_folder_deleted_under_two_workers_ends_the_run_with_5(
         (tmp_path / "note").unlink()
         said, err = process.communicate(timeout=10)
         wait_for_the_end(process.pid)
-    assert (process.returncode, said, len(own_lines(err))) == (5, "", 1), err
+    assert (process.returncode, said, len(messages(err))) == (5, "", 1), err
     (tmp_path / "away").rename(tmp_path / what)
     make(tmp_path / "p", tmp_path / "ds", ONE)
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -565,7 +560,7 @@ def test_deleted_source_ends_with_5_and_a_rerun_completes(
     moved = tmp_path / "p" if what == "folder" else tmp_path / "p/004.png"
     after_commits(2, lambda: moved.rename(tmp_path / "away"), monkeypatch)
     done = run_main("source.root=p", ONE, "n_jobs=1")
-    assert (done.code, done.out, len(own_lines(done.err))) == (5, "", 1), done.err
+    assert (done.code, done.out, len(messages(done.err))) == (5, "", 1), done.err
     (tmp_path / "away").rename(moved)
     make(tmp_path / "p", tmp_path / "ds", ONE)
     assert tree_hash(tmp_path / "ds") == six_undisturbed
@@ -673,7 +668,7 @@ def test_signal_at_exit_prints_nothing(
     with running(f"source.root={photographs}", ONE, "n_jobs=1", cwd=tmp_path, **env) as process:
         _, err = process.communicate(timeout=60)
     assert process.returncode in (0, 128 + sent, -sent)
-    assert own_lines(err) == []
+    assert messages(err) == []
     assert tree_hash(tmp_path / "ds") == undisturbed
 
 
@@ -730,7 +725,7 @@ def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
             assert process.returncode in (0, 128 + sent, -sent), err
         else:
             assert process.returncode == 128 + sent, err
-        assert [line for line in own_lines(err) if not line.startswith("gen-dataset: ")] == []
+        assert [line for line in messages(err) if not line.startswith("gen-dataset: ")] == []
         make(photographs, out, ONE)
         assert tree_hash(out) == undisturbed, kill
         assert_complete(out)

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 from helpers.commands import COMMAND, RunMain, environment
-from helpers.datasets import Make
+from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 
 from unprocess_gen.cli.messages import logging_to
@@ -36,7 +36,6 @@ from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import have_same_rows, verify, verify_sweep
 from unprocess_gen.pipeline.workspace import Workspace, dataset_facts, dataset_text, read_dataset
 
-Settings = Callable[..., Any]
 ONE = "output.pairs_per_shard=1"
 
 

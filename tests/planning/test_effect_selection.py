@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import RunMain, messages
+from helpers.datasets import Settings
 from helpers.omissions import SCENES, omission
 from helpers.photographs import fill
 from hypothesis import given
@@ -31,8 +32,6 @@ from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import camera_light, unprocess
 from unprocess_gen.sources.scenes import synthetic
-
-Settings = Callable[..., Config]
 
 PROFILES = ("imx385", "sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")
 ASSUMED = frozenset({"prnu", "dark_current", "hot_pixels", "dead_pixels"})

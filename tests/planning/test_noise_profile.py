@@ -10,6 +10,7 @@ from typing import Any
 
 import mpmath
 import pytest
+from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,8 +20,6 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Facts, Physics
 from unprocess_gen.planning.noise_profile import number, plan_physics
 from unprocess_gen.planning.plan import PARAMETERS, plan_image
-
-Settings = Callable[..., Config]
 
 MIDDLE = dict.fromkeys(PARAMETERS, 0.5)
 FACTS = Facts(64, 48, 256, 0, 255)

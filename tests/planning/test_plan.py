@@ -8,12 +8,12 @@ import math
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
 from fractions import Fraction
 
 import mpmath
 import numpy as np
 import pytest
+from helpers.datasets import Settings
 from helpers.moments import bernstein
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,8 +25,6 @@ from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Distribution, Plan
 from unprocess_gen.planning.plan import PARAMETERS, plan_camera, plan_image, plan_noise
 from unprocess_gen.simulation.reference import colour
-
-Settings = Callable[..., Config]
 
 SHA = hashlib.sha256(b"a photograph").hexdigest()
 FIRST, LAST = 2.0**-53, 1 - 2.0**-53

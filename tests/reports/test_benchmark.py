@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.commands import RunMain
+from helpers.datasets import Settings
 from helpers.photographs import fill
 from helpers.promise_report import Figure
 from hypothesis import given
@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
 from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SensorConfig
+from unprocess_gen.config.schema import AccuracyConfig, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
@@ -38,8 +38,6 @@ from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, BenchmarkP
 from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.simulation.reference import noise
 from unprocess_gen.simulation.reference.poisson import gaussian_distance
-
-Settings = Callable[..., Config]
 
 LITTLE = SampleSizes(
     photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32), compiled=(48, 64), flat=128, positions=16

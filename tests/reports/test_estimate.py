@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from helpers.commands import RunMain
+from helpers.datasets import Settings
 from helpers.photographs import fill
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,8 +18,6 @@ from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Source
 from unprocess_gen.reports.estimate import SAMPLE, estimate_run, format_estimate
 from unprocess_gen.simulation.reference.noise import EFFECTS
-
-Settings = Callable[..., Any]
 
 
 def listing(count: int) -> tuple[Source, ...]:

@@ -19,17 +19,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.datasets import Settings
 from helpers.moments import REACH, SAMPLER_ERROR, Moments, bernstein, moments, shares
 from helpers.promise_report import Figure
 
-from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
-Settings = Callable[..., Config]
 Law = Callable[[Plan, float], tuple[float, float]]
 """Mean and standard deviation before rounding and clipping, at the clean value x."""
 

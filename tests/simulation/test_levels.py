@@ -6,26 +6,22 @@ import csv
 import itertools
 import shutil
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make
+from helpers.datasets import Make, Settings
 from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
-
-Settings = Callable[..., Config]
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import csv
 import json
 import shutil
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.commands import RunMain
-from helpers.datasets import Make, TreeHash
+from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
 from hypothesis import given
@@ -22,7 +22,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
@@ -37,8 +36,6 @@ from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.sources import loader as photographs
 from unprocess_gen.sources import patches as patches_module
 from unprocess_gen.sources.patches import list_patches, pixels_in_none
-
-Settings = Callable[..., Config]
 
 GRID, STRIDE, RANDOM = "source.patch=32", "source.patch=[grid,32,18]", "source.patch=[random,30,5]"
 LEVELS = ("noise=brooks2019", "noise.levels=2", "noise.draws=2")
