@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import ntpath
 import subprocess
@@ -16,7 +18,9 @@ from helpers.datasets import Make
 from helpers.photographs import pixels
 
 from unprocess_gen.core import files
+from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.locks import FolderLock
+from unprocess_gen.pipeline.workspace import Workspace
 
 SCRIPT = """
 import json, sys
@@ -123,3 +127,14 @@ def test_folder_is_locked_once_and_can_be_locked_after_release(tmp_path: Path) -
     second.acquire(wait=True)
     second.release()
     first.release()
+
+
+def test_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(handle: int, mode: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(
+        ConfigError, match=r"file system cannot lock it \(No locks available\); choose another out"
+    ):
+        Workspace(tmp_path, "seed: 0\n").hold()
