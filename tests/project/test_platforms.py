@@ -134,7 +134,5 @@ def test_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytes
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(
-        ConfigError, match=r"file system cannot lock it \(No locks available\); choose another out"
-    ):
+    with pytest.raises(ConfigError, match=r"file system cannot lock it \(No locks available\); choose another out"):
         Workspace(tmp_path, "seed: 0\n").hold()
