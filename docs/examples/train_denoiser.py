@@ -56,7 +56,7 @@ def noise_std(light: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
     """Return the standard deviation of the noise at each site, on the scale of ``light``, from the noisy frame."""
     span = row["white_level_dn"] - row["black_level_dn"]
     variance = row["a_dn"] / span * np.maximum(light, 0) + row["b_dn2"] / span**2
-    return np.sqrt(variance, dtype=np.float32)
+    return np.sqrt(np.maximum(variance, 0), dtype=np.float32)  # a fitted b_dn2 may be below 0
 
 
 class RandomCrops(Dataset):

@@ -14,7 +14,7 @@ from typing import Any
 
 from helpers.commands import COMMAND, environment
 
-WAIT_S = 60
+WAIT_S = 300
 
 
 ONE = "output.pairs_per_shard=1"
