@@ -20,6 +20,7 @@ from helpers.commands import COMMAND, Cli, Done, RunMain, environment
 from helpers.configs import composed
 from helpers.datasets import Make, Settings
 from helpers.photographs import pixels
+from helpers.processes import WAIT_S
 from PIL import Image
 
 from unprocess_gen.cli import main as entry_point
@@ -148,7 +149,7 @@ def cli(tmp_path: Path) -> Cli:
             env=environment(**env),
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=WAIT_S,
             check=False,
         )
 

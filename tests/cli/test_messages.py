@@ -16,7 +16,7 @@ import pytest
 from helpers.commands import RunMain, messages
 from helpers.datasets import Make
 from helpers.photographs import fill
-from helpers.processes import processes_per_core
+from helpers.processes import WAIT_S, processes_per_core, wait_for
 
 from unprocess_gen.cli import verbs
 
@@ -52,7 +52,7 @@ def folder(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shell(line: str, folder: Path, *arguments: str, **more: Any) -> subprocess.CompletedProcess[str]:
     """Run a line of sh in which ``"$@"`` is the command with its arguments."""
     command = ["sh", "-c", line, "sh", sys.executable, "-m", "unprocess_gen", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False, **more)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=WAIT_S, check=False, **more)
 
 
 FULL = "gen-dataset: stdout: cannot be written (No space left on device); redirect it elsewhere and rerun"
@@ -246,19 +246,12 @@ def start(folder: Path, *arguments: str, prefix: tuple[str, ...] = ()) -> subpro
     )
 
 
-def wait_for(path: Path, seconds: float = 60) -> None:
-    until = time.monotonic() + seconds
-    while not path.exists():
-        assert time.monotonic() < until, path
-        time.sleep(0.02)
-
-
 @pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
 def test_signal_during_a_run_gives_one_line(number: signal.Signals, tmp_path: Path) -> None:
     process = start(tmp_path, "source.limit=2000", "output.pairs_per_shard=1", "n_jobs=1")
-    wait_for(tmp_path / "ds/.work")
+    wait_for((tmp_path / "ds/.work").exists)
     process.send_signal(number)
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=WAIT_S)
     assert process.returncode == 128 + number
     assert messages(err) == [f"gen-dataset: {ENDS[number]}; finished shards are kept; rerun to resume"]
 
@@ -273,7 +266,7 @@ def test_signal_while_settings_are_composed_ends_within_two_seconds(
     time.sleep(delay_s)
     process.send_signal(number)
     sent = time.monotonic()
-    _, err = process.communicate(timeout=20)
+    _, err = process.communicate(timeout=WAIT_S)
     assert time.monotonic() - sent < 2 * processes_per_core()
     if process.returncode == 128 + number:
         assert messages(err) == [f"gen-dataset: {ENDS[number]}"]
@@ -301,14 +294,14 @@ sys.exit(main.main())
 @pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
 def test_error_that_replaces_a_signal_is_reported_as_the_signal(number: signal.Signals) -> None:
     command = [sys.executable, "-c", MASKED, str(int(number))]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert done.returncode == 128 + number
     assert done.stderr.startswith(f"gen-dataset: {ENDS[number]}")
 
 
 def test_nohup_is_respected(tmp_path: Path) -> None:
     process = start(tmp_path, "source.limit=2", "n_jobs=1", "out=ds", prefix=("nohup",))
-    wait_for(tmp_path / "ds/.work")
+    wait_for((tmp_path / "ds/.work").exists)
     process.send_signal(signal.SIGHUP)
-    process.communicate(timeout=60)
+    process.communicate(timeout=WAIT_S)
     assert process.returncode == 0

@@ -15,6 +15,7 @@ import pytest
 from helpers.commands import RunMain, environment
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
+from helpers.processes import WAIT_S
 
 from unprocess_gen.cli.sweep import SHARES, folder_name, overrides_text
 
@@ -284,7 +285,7 @@ def test_processes_that_share_a_folder_keep_each_others_rows(tmp_path: Path) -> 
         subprocess.Popen([sys.executable, "-c", code, name], cwd=tmp_path, env=environment(PYTHONPATH=PATHS))
         for name in "ab"
     ]
-    assert [process.wait(60) for process in running] == [0, 0]
+    assert [process.wait(WAIT_S) for process in running] == [0, 0]
     assert sorted(row["folder"] for row in table(tmp_path)) == sorted(f"{name}{i}" for name in "ab" for i in range(60))
     assert os.listdir(tmp_path) == ["sweep.csv"]
 

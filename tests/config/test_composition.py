@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hydra
 import pytest
-from helpers.processes import processes_per_core
+from helpers.processes import WAIT_S, processes_per_core
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 
@@ -256,7 +256,7 @@ def test_signals_end_composing_within_two_seconds(name: str, code: int, own: Pat
         time.sleep(0.01)
     process.send_signal(number)
     started = time.monotonic()
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=WAIT_S)
 
     assert time.monotonic() - started < 2 * processes_per_core()
     assert process.returncode in (code, -number)

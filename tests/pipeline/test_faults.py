@@ -30,11 +30,13 @@ from helpers.photographs import fill, pixels
 from helpers.processes import (
     ONE,
     SLOW_DISK,
+    WAIT_S,
     Killed,
     assert_complete,
     committed,
     handles_signals,
     imported_first,
+    processes_per_core,
     running,
     session,
     wait_for,
@@ -63,8 +65,10 @@ def undisturbed(photographs: Path, make: Make, tree_hash: TreeHash) -> str:
 
 
 def wait_for_the_end(leader: int) -> None:
-    """Wait until every process of a run has ended, ten seconds at most."""
-    wait_for(lambda: not session(leader), seconds=10)  # a worker that still imports has no watchdog
+    """Wait until every process of a run has ended, ten seconds at most if the machine is idle."""
+    wait_for(
+        lambda: not session(leader), seconds=10 * processes_per_core()
+    )  # a worker that still imports has no watchdog
 
 
 def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +103,7 @@ def course(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Cours
         with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=out) as process:
             wait_for(lambda pid=process.pid: workers_of(pid))
             worker = time.monotonic() - start
-            assert process.wait(60) == 0, i
+            assert process.wait(WAIT_S) == 0, i
     return Course(worker, time.monotonic() - start)
 
 
@@ -159,7 +163,7 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
             with suppress(ProcessLookupError):
                 os.kill(draw.choice(found), signal.SIGKILL)
                 hits += process.poll() is None
-            _, err = process.communicate(timeout=30)
+            _, err = process.communicate(timeout=WAIT_S)
             codes[process.returncode] += 1
             assert process.returncode in (0, 3), err
             wait_for_the_end(process.pid)
@@ -274,9 +278,11 @@ def test_killed_worker_is_noticed_within_five_seconds(
         assert len(idle) == 1
         os.kill(asleep, signal.SIGKILL)
         killed = time.monotonic()
-        wait_for(lambda: not idle & set(session(process.pid)), seconds=5)  # loky ends all workers
+        wait_for(
+            lambda: not idle & set(session(process.pid)), seconds=5 * processes_per_core()
+        )  # loky ends all workers
         noticed_s = time.monotonic() - killed
-        said, err = process.communicate(timeout=20)
+        said, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, messages(err)) == (0, []), err
     assert f"{COUNT} pairs in {COUNT} shards" in said
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -476,7 +482,7 @@ def test_full_disk_ends_with_5_within_five_seconds(
     with running(
         f"source.root={photographs}", f"out={out}", ONE, f"n_jobs={n_jobs}", "check_disk=false", cwd=tmp_path
     ) as process:
-        said, err = process.communicate(timeout=30)
+        said, err = process.communicate(timeout=WAIT_S)
         seconds = time.time() - (out / "shards").stat().st_mtime  # since the last commit
         wait_for_the_end(process.pid)
     assert (process.returncode, said) == (5, "")
@@ -542,7 +548,7 @@ def test_folder_deleted_under_two_workers_ends_the_run_with_5(
         wait_for((tmp_path / "note").exists)
         (tmp_path / what).rename(tmp_path / "away")
         (tmp_path / "note").unlink()
-        said, err = process.communicate(timeout=10)
+        said, err = process.communicate(timeout=10 * processes_per_core())
         wait_for_the_end(process.pid)
     assert (process.returncode, said, len(messages(err))) == (5, "", 1), err
     (tmp_path / "away").rename(tmp_path / what)
@@ -666,7 +672,7 @@ def test_signal_at_exit_prints_nothing(
     """Pressing Ctrl-C twice has the same effect."""
     env = imported_first(tmp_path, AT_THE_END) | {"SIGNAL": str(int(sent))}
     with running(f"source.root={photographs}", ONE, "n_jobs=1", cwd=tmp_path, **env) as process:
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=WAIT_S)
     assert process.returncode in (0, 128 + sent, -sent)
     assert messages(err) == []
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -694,7 +700,7 @@ sys.exit(cli.main())
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", IN_A_CALLBACK, str(int(sent))]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, restore_signals=True)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, restore_signals=True)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (128 + sent, "", 1)
     assert "finished shards are kept; rerun to resume" in done.stderr
 
@@ -718,7 +724,7 @@ def test_signal_at_any_moment_ends_the_run_and_rerun_completes(
             time.sleep(draw.uniform(0, 1.3 * n_jobs))
             with suppress(ProcessLookupError):
                 (os.killpg if group else os.kill)(process.pid, sent)
-            _, err = process.communicate(timeout=5)
+            _, err = process.communicate(timeout=5 * processes_per_core())
             wait_for_the_end(process.pid)
         codes[process.returncode] += 1
         if (out / "dataset.json").exists():

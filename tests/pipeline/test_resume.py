@@ -29,6 +29,7 @@ from helpers.processes import (
     committed,
     imported_first,
     kill_group,
+    processes_per_core,
     running,
     session,
     wait_for,
@@ -479,8 +480,8 @@ def stopped(request: pytest.FixtureRequest, forty: Path, tmp_path_factory: pytes
         wait_for(lambda: committed(folder / "ds") or process.poll() is not None)
         assert workers(process.pid), process.communicate()
         (os.killpg if whom == "group" else os.kill)(process.pid, number)
-        _, err = process.communicate(timeout=15)
-        until = time.monotonic() + 5
+        _, err = process.communicate(timeout=15 * processes_per_core())
+        until = time.monotonic() + 5 * processes_per_core()
         while (left := session(process.pid)) and time.monotonic() < until:
             time.sleep(0.05)
     return Stopped(number, process.returncode, err, left, folder / "ds")
@@ -511,7 +512,7 @@ def test_workers_end_when_their_coordinator_is_killed(tmp_path: Path) -> None:
         wait_for(lambda: committed(tmp_path / "ds"))
         assert len(workers(process.pid)) == 2
         os.kill(process.pid, signal.SIGKILL)
-        wait_for(lambda: not session(process.pid), seconds=10)
+        wait_for(lambda: not session(process.pid), seconds=10 * processes_per_core())
 
 
 DEADLY = """
@@ -595,7 +596,7 @@ def test_failed_write_ends_with_5_and_a_rerun_finishes(make: Make, tree_hash: Tr
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=WAIT_S,
         check=False,
     )
     assert (done.returncode, done.stdout) == (5, ""), done.stderr
