@@ -504,14 +504,14 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "accuracy",
-            "measure error and time of each tier; write a report to out, by default accuracy",
+            "measure error and time of each tier; write a report to out (accuracy)",
             run_accuracy,
             (SETTINGS_SOURCE,),
             composes=True,
         ),
         Verb(
             "figures",
-            "draw the article's figures for the first photograph, in out, by default figures",
+            "draw the article's figures for the first photograph, in out (figures)",
             run_figures,
             (SETTINGS_SOURCE,),
             composes=True,
