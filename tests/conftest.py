@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from helpers.commands import COMMAND, Cli, Done, RunMain, environment
 from helpers.configs import composed
-from helpers.datasets import Make, Settings
+from helpers.datasets import MadeHash, Make, Settings, TreeHash
 from helpers.photographs import pixels
 from helpers.processes import WAIT_S
 from PIL import Image
@@ -135,6 +135,17 @@ def _tree_hash(folder: Path) -> str:
 def tree_hash() -> Callable[[Path], str]:
     """Return a function that hashes what a dataset's data are: names and bytes of shards, manifest and config."""
     return _tree_hash
+
+
+@pytest.fixture(scope="session")
+def made_hash(make: Make, tree_hash: TreeHash) -> MadeHash:
+    """Return a function that makes a dataset of a folder, next to it as ``ds``, and returns its `tree_hash`."""
+
+    def made(root: Path, *overrides: str) -> str:
+        make(root, root.parent / "ds", *overrides)
+        return tree_hash(root.parent / "ds")
+
+    return made
 
 
 @pytest.fixture

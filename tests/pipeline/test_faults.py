@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from helpers.commands import Cli, RunMain, messages
-from helpers.datasets import Make, TreeHash
+from helpers.datasets import MadeHash, Make, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.processes import (
     ONE,
@@ -59,9 +59,8 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(photographs: Path, make: Make, tree_hash: TreeHash) -> str:
-    make(photographs, photographs.parent / "ds", ONE)
-    return tree_hash(photographs.parent / "ds")
+def undisturbed(photographs: Path, made_hash: MadeHash) -> str:
+    return made_hash(photographs, ONE)
 
 
 def wait_for_the_end(leader: int) -> None:
@@ -306,9 +305,8 @@ LEVELS = "noise.levels=5"
 
 
 @pytest.fixture(scope="module")
-def with_large_undisturbed(with_large: Path, make: Make, tree_hash: TreeHash) -> str:
-    make(with_large, with_large.parent / "ds", ONE, LEVELS)
-    return tree_hash(with_large.parent / "ds")
+def with_large_undisturbed(with_large: Path, made_hash: MadeHash) -> str:
+    return made_hash(with_large, ONE, LEVELS)
 
 
 @pytest.mark.parametrize(
@@ -388,9 +386,8 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def six_undisturbed(six: Path, make: Make, tree_hash: TreeHash) -> str:
-    make(six, six.parent / "ds", ONE)
-    return tree_hash(six.parent / "ds")
+def six_undisturbed(six: Path, made_hash: MadeHash) -> str:
+    return made_hash(six, ONE)
 
 
 class Full(NamedTuple):

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from helpers.commands import COMMAND, Cli, RunMain, environment
-from helpers.datasets import Make, TreeHash
+from helpers.datasets import MadeHash, Make, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.processes import (
     ONE,
@@ -54,9 +54,8 @@ def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(forty: Path, make: Make, tree_hash: TreeHash) -> str:
-    make(forty, forty.parent / "ds", ONE)
-    return tree_hash(forty.parent / "ds")
+def undisturbed(forty: Path, made_hash: MadeHash) -> str:
+    return made_hash(forty, ONE)
 
 
 # Killed ---------------------------------------------------------------------------------------------------------------

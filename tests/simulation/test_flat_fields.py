@@ -151,13 +151,14 @@ def test_exact_moments_without_noise_have_no_variance() -> None:
 # Mean and variance ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("repeats", [1, pytest.param(32, marks=pytest.mark.slow)])  # 32: four million sites
 @pytest.mark.parametrize("clip", ["sensor", "black"])
 @pytest.mark.parametrize("noise", OPTIONS)
 def test_mean_and_variance_of_flats_follow_the_distribution(
-    settings: Settings, noise: str, clip: str, figure: Figure
+    settings: Settings, noise: str, clip: str, repeats: int, figure: Figure
 ) -> None:
     plan = plan_of(settings, noise, f"sensor.clip={clip}")
-    found = histograms(plan, 1)
+    found = histograms(plan, repeats)
     assert misfits(plan, found) == []
     figure("noise-moments", f"{len(CODES)} levels of {found[0].sum()} sites: mean and variance within their bounds")
 
@@ -178,18 +179,6 @@ def test_mean_and_variance_of_flats_hold_on_every_sensor(settings: Settings, sen
 def test_mean_and_variance_of_flats_hold_for_extreme_noise(settings: Settings, a: float, b: float) -> None:
     plan = with_noise(plan_of(settings, "none"), a, b)
     assert misfits(plan, histograms(plan, 1)) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("clip", ["sensor", "black"])
-@pytest.mark.parametrize("noise", OPTIONS)
-def test_mean_and_variance_of_flats_hold_for_four_million_pixels(
-    settings: Settings, noise: str, clip: str, figure: Figure
-) -> None:
-    plan = plan_of(settings, noise, f"sensor.clip={clip}")
-    found = histograms(plan, 32)
-    assert misfits(plan, found) == []
-    figure("noise-moments", f"{len(CODES)} levels of {found[0].sum()} sites: mean and variance within their bounds")
 
 
 @pytest.mark.parametrize("noise", OPTIONS)
