@@ -1,0 +1,361 @@
+"""Kernels equal the reference on random plans: every field of `Plan` and `Physics`, up to the limits of the config.
+
+Plans are drawn as records, so that they combine effects, levels and layouts that no config of another test combines.
+A failure lists numbers of cases; ``case(kind, number)`` returns the same case on every machine.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import pytest
+import xxhash
+from helpers.flats import IDENTITY, SILENT
+from helpers.promise_report import Figure
+
+from unprocess_gen.config.accuracy import is_steep
+from unprocess_gen.core.random_streams import words
+from unprocess_gen.core.types import (
+    FLOAT32,
+    FLOAT32_METHOD,
+    MOSAIC,
+    PACKED,
+    REFERENCE_METHOD,
+    UINT16,
+    Pair,
+    Physics,
+    Plan,
+    Srgb,
+)
+from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
+from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
+from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.self_test import GOLDEN_PLAN
+from unprocess_gen.sources.scenes import synthetic
+
+T = TypeVar("T")
+
+KINDS = ("gaussian", "poisson", "shot and read", "physical", "averaged")
+"""Noise of a case: two numbers as one normal or as counts, a physical profile without and with all effects, and fixed
+patterns in the clean frame."""
+
+SENSORS = (
+    *((8, 0, 255), (10, 64, 1023), (12, 240, 4095), (12, 0, 4095), (14, 513, 15520), (14, 1024, 16383)),
+    *((16, 0, 65535), (16, 4096, 65535), (10, 1022, 1023)),
+)
+"""Bits, black level and white level of sensors."""
+
+HEIGHTS = (1, 2, 3, 5, 8, 17, 33)
+WIDTHS = (1, 2, 15, 16, 17, 33, 63, 64, 65, 127, 129, 255, 257, 511, 512, 513, 577, 1023, 1025, 2049)
+"""Sides at and next to the sizes of vectors, blocks of random words and segments."""
+
+MAX_SITES = 9000
+READ_SHAPES = (0.0, -0.1, 0.1571, -0.45, 5.0)
+"""Shapes of Tukey's distribution; few, because each table takes 0.2 s."""
+
+QUICK, SLOW = 50, 1000
+"""Cases of each kind and dtype."""
+
+
+class Dice(random.Random):
+    """Draw parameters by operations that round alike on every machine."""
+
+    def pick(self, options: Sequence[T]) -> T:
+        return options[int(self.random() * len(options))]
+
+    def chance(self, share: float) -> bool:
+        return self.random() < share
+
+    def between(self, low: float, high: float) -> float:
+        return low + (high - low) * self.random()
+
+    def power(self, low: int, high: int) -> float:
+        """Return a number from 2**low to 2**high, about uniform in its logarithm."""
+        return math.ldexp(1 + self.random(), int(self.between(low, high)))
+
+    def at_most(self, high: int) -> float:
+        """Return 0, a number from 2**-10 to 2**high, or rarely a tiny number."""
+        return self.pick((0.0, *(self.power(-10, high) for _ in range(4)), self.power(-30, -10)))
+
+
+@dataclass(frozen=True)
+class Case:
+    """Arguments of `make_pair`."""
+
+    srgb: Srgb
+    plan: Plan
+    origin: tuple[int, int]
+
+
+def case(kind: str, number: int, dtype: str = UINT16) -> Case:
+    """Draw a case of one of `KINDS`."""
+    dice = Dice(f"{kind} {dtype} {number}")
+    bits, black, white = dice.pick(SENSORS)
+    layout = PACKED if dice.chance(0.2) else MOSAIC
+    plan = replace(
+        GOLDEN_PLAN,
+        **drawn_curve(dice),
+        **drawn_colour(dice),
+        stream_key=dice.pick((0, 2**64 - 1, *(int(dice.random() * 2**53) << 11 for _ in range(6)))),
+        dequantize="dither" if dice.chance(0.1) else "off",
+        exposure_ratio=dice.pick((1.0, 1.0, dice.power(-6, 10))),
+        pattern=dice.pick(PATTERNS),
+        bits=bits,
+        black_level_dn=black,
+        white_level_dn=white,
+        sensor_clip=dice.pick(("sensor", "sensor", "black", "none" if dtype == FLOAT32 else "sensor")),
+        saturated=dice.pick(("noisy", "noisy", "pinned")),
+        level=dice.pick((0, 0, 1, 99, 4095)),
+        draw=dice.pick((0, 0, 1, 99, 4095)),
+        frame=dice.pick((0, 0, 1, 12345, 2**31)),
+        dtype=dtype,
+        layout=layout,
+    )
+    plan = with_noise(plan, kind, dice)
+    origin = dice.pick(((0, 0), *((int(dice.power(0, 13)), int(dice.power(0, 13))) for _ in range(3)), (2**20 + 1, 63)))
+    return Case(drawn_image(dice, even=layout == PACKED), plan, origin)
+
+
+def drawn_curve(dice: Dice) -> dict[str, object]:
+    tone, gamma = dice.pick((("smoothstep", 2.2), ("smoothstep", 2.2), ("none", 2.2), ("none", "srgb"), ("none", 1.0)))
+    return {"tone": tone, "gamma": gamma}
+
+
+def drawn_colour(dice: Dice) -> dict[str, object]:
+    """Draw matrix, gains and highlights: of cameras, or any matrix whose rows sum to 1."""
+    rows = [(a, b, 1 - (a + b)) for a, b in ((dice.between(-2, 2), dice.between(-2, 2)) for _ in range(3))]
+    matrices = [IDENTITY, tuple(itertools.chain(*rows)), *map(colour.rgb2cam, colour.CAMERAS.values())]
+    return {
+        "rgb2cam": dice.pick(matrices),
+        "red_gain": dice.between(0.5, 3),
+        "blue_gain": dice.between(0.5, 3),
+        "inverse_rgb_gain": dice.pick((0.5, 1.0 - 2**-53, 1.0, dice.between(0.4, 2.1), dice.between(0.4, 2.1))),
+        "highlight": dice.pick(("per_channel", "per_channel", "gray_mean", "none")),
+        "highlight_threshold": dice.pick((0.9, 0.9, 0.0, dice.between(0, 0.99))),
+    }
+
+
+def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
+    """Draw the noise of a plan; its other fields stay as they are."""
+    span_dn = plan.white_level_dn - plan.black_level_dn
+    if kind == "gaussian":
+        a_dn = dice.at_most(10)
+        b_dn2 = dice.pick((dice.at_most(20), dice.power(-6, 12), -a_dn * span_dn * dice.random(), 1e15))
+        return replace(plan, a_dn=a_dn, b_dn2=b_dn2, effects=dice.pick(((), *[("heteroscedastic", "quantise")] * 9)))
+    light = ((-7, 3), (2, 7), (6, 14), (6, 14), (13, 26))
+    brightest_e = dice.power(*dice.pick(light))
+    dn_per_e = span_dn * min(1.0, plan.exposure) / brightest_e
+    if kind == "poisson":
+        a_dn, b_dn2 = dice.pick((dn_per_e, dn_per_e, dn_per_e, 0.0)), dice.at_most(12)
+        effects = ("heteroscedastic", "quantise")
+        return replace(plan, noise_law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=effects)
+    physics = drawn_physics(dice, dn_per_e, brightest_e)
+    on = ("shot", "read", "row", "black_error", "quantise")
+    if kind == "shot and read":
+        physics, omitted = replace(physics, read_std_dn=physics.read_std_dn + 2**-10), dice.pick((*on[2:], "none"))
+        on = tuple(one for one in on if one != omitted)
+    else:
+        share = dice.pick((0.0, 0.2, 0.5))
+        on = tuple(one for one in EFFECTS if not dice.chance(share))
+    physics = replace(physics, fixed_pattern_in_clean=kind == "averaged")
+    return replace(plan, a_dn=dn_per_e, b_dn2=physics.read_std_dn * physics.read_std_dn, effects=on, physics=physics)
+
+
+def drawn_physics(dice: Dice, dn_per_e: float, brightest_e: float) -> Physics:
+    """Draw the numbers of a physical profile with ``brightest_e`` electrons at white."""
+    errors = [dice.pick((0.0, dice.between(-4, 4), dice.between(-600, 600))) for _ in range(4)]
+    return replace(
+        SILENT,
+        dn_per_e=dn_per_e,
+        prnu_std=dice.pick((0.0, 0.005, 0.05, 0.5)),
+        dark_e=dice.pick((dice.at_most(3), dice.at_most(10), dice.power(20, 26))),
+        dark_offset=dice.pick(("removed", "kept")),
+        hot_pixel_share=dice.pick((0.0, 2**-9, 0.02, 0.5, 1.0)),
+        hot_pixel_e=dice.pick((dice.at_most(3), dice.at_most(10), dice.power(20, 26))),
+        full_well_e=max(1.0, brightest_e * dice.pick((0.01, 0.4, 0.9, 1.0, 3.0))),
+        read_law=dice.pick(("gaussian", "tukey")),
+        read_shape=dice.pick(READ_SHAPES),
+        read_std_dn=dice.at_most(13),
+        row_std_dn=dice.at_most(9),
+        column_std_dn=dice.at_most(9),
+        black_error_dn=(errors[0], errors[1], errors[2], errors[3]),
+        dead_pixel_share=dice.pick((0.0, 2**-9, 0.02, 0.5, 1.0)),
+        body_key=dice.pick((0, 2**64 - 1, int(dice.random() * 2**53) << 11)),
+    )
+
+
+def drawn_image(dice: Dice, even: bool) -> Srgb:
+    """Draw an image of 8 or 16 bits: random codes, shadows, highlights, one code, a ramp, or part of a scene."""
+    height = dice.pick(HEIGHTS)
+    width = dice.pick([width for width in WIDTHS if width * height <= MAX_SITES])
+    if even:
+        height, width = height + height % 2, width + width % 2
+    dtype = np.dtype(dice.pick((np.uint8, np.uint8, np.uint16)))
+    most, kind = np.iinfo(dtype).max, dice.pick(("codes", "dark", "bright", "flat", "ramp", "scene"))
+    drawn = words(int(dice.random() * 2**53), "parameters", (height, 3 * width)).reshape(height, width, 3)
+    codes = (drawn >> np.uint32(32 - 8 * dtype.itemsize)).astype(dtype)
+    if kind == "dark":
+        codes >>= 4
+    elif kind == "bright":
+        codes = most - (codes >> 4)
+    elif kind == "flat":
+        codes[:] = dice.pick((0, most, int(dice.random() * most)))
+    elif kind == "ramp":
+        codes[:] = (np.arange(width) * most // max(width - 1, 1)).astype(dtype)[:, None]
+    elif kind == "scene":
+        picture = scene()
+        y, x = (int(dice.random() * max(1, side - 50)) for side in picture.shape[:2])
+        codes = np.tile(picture[y : y + 40, x : x + 200], (1, 12, 1))[:height, :width].astype(dtype) * (most // 255)
+    return codes[..., ::-1] if dice.chance(0.2) else codes
+
+
+@functools.lru_cache(maxsize=1)
+def scene() -> Srgb:
+    return synthetic.scene("highlights-0")
+
+
+def simulate(one: Case) -> Pair:
+    return make_pair(one.srgb, one.plan, one.origin)
+
+
+def simulate_reference(one: Case) -> Pair:
+    """Simulate the reference: with its formulas for integer frames, with the exact curve for frames in float32."""
+    if one.plan.dtype == UINT16:
+        return reference_pair(one.srgb, one.plan, one.origin)
+    return make_pair(one.srgb, replace(one.plan, methods=(REFERENCE_METHOD,)), one.origin)
+
+
+def differences(found: Pair, expected: Pair) -> str:
+    """Return in what two pairs differ, as text; "" if all bytes and counts are equal."""
+    texts = []
+    for name in ("clean", "noisy"):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        if (ours.dtype, ours.shape) != (theirs.dtype, theirs.shape):
+            texts.append(f"{name}: {ours.dtype} {ours.shape} instead of {theirs.dtype} {theirs.shape}")
+        elif ours.tobytes() != theirs.tobytes():
+            at = np.argwhere(ours != theirs)
+            first = tuple(at[0]) if len(at) else "only signs of 0"
+            texts.append(f"{name}: {len(at)} of {ours.size} sites, first {first}")
+    if found.counts != expected.counts:
+        texts.append(f"{found.counts} instead of {expected.counts}")
+    return "; ".join(texts)
+
+
+@pytest.fixture(autouse=True)
+def _underflow() -> Iterator[None]:
+    """Allow underflow: numbers far below the tolerance of any effect are drawn too."""
+    with np.errstate(under="ignore"):
+        yield
+
+
+COUNTS = [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("kind", KINDS)
+def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count: int, figure: Figure) -> None:
+    failed = {}
+    for number in range(count):
+        one = case(kind, number, dtype)
+        if text := differences(simulate(one), simulate_reference(one)):
+            failed[f"case({kind!r}, {number}, {dtype!r})"] = text
+    assert failed == {}
+    figure("kernels", f"{count} random plans, {kind}, {dtype}: 0 pairs differ from the reference")
+
+
+# Crops and levels -----------------------------------------------------------------------------------------------------
+
+
+def mosaics(pair: Pair, one: Case) -> tuple[np.ndarray, np.ndarray]:
+    if one.plan.layout == PACKED:
+        clean, noisy = (unpack(frame, one.plan.pattern, one.origin) for frame in (pair.clean, pair.noisy))
+        return clean, noisy
+    return pair.clean, pair.noisy
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("kind", KINDS)
+def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, count: int) -> None:
+    failed = []
+    for number in range(count):
+        one, dice = case(kind, number, dtype), Dice(number)
+        height, width = one.srgb.shape[:2]
+        top, left = int(dice.random() * height), int(dice.random() * width)
+        bottom, right = (at + 1 + int(dice.random() * (side - at)) for at, side in ((top, height), (left, width)))
+        rows, columns = slice(top, bottom), slice(left, right)
+        origin = one.origin[0] + top, one.origin[1] + left
+        crop = make_pair(one.srgb[rows, columns], replace(one.plan, layout=MOSAIC), origin)
+        for found, expected in zip((crop.clean, crop.noisy), mosaics(simulate(one), one), strict=True):
+            if found.tobytes() != expected[rows, columns].tobytes():
+                failed.append(f"case({kind!r}, {number}, {dtype!r}): rows {top} to {bottom}, columns {left} to {right}")
+    assert failed == []
+
+
+def with_other_noise(plan: Plan, kinds: Sequence[str], dice: Dice) -> Plan:
+    """Draw another noise, level, draw and clipping; the parameters of the clean frame stay as they are."""
+    plan = replace(plan, noise_law="gaussian", physics=None)
+    plan = with_noise(plan, dice.pick(kinds), dice)
+    return replace(
+        plan,
+        effects=tuple(one for one in plan.effects if one != "full_well"),
+        level=int(dice.random() * 100),
+        draw=int(dice.random() * 100),
+        sensor_clip=dice.pick(("sensor", "black")),
+        saturated=dice.pick(("noisy", "noisy", "pinned")),
+    )
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("kinds", [KINDS[:1], KINDS[1:4], KINDS[:4]], ids=["one normal", "counts", "mixed"])
+def test_levels_of_random_plans_equal_separate_pairs(kinds: Sequence[str], dtype: str, count: int) -> None:
+    failed = {}
+    for number in range(count // 5):
+        one, dice = case(kinds[0], number, dtype), Dice(number)
+        plans = [with_other_noise(one.plan, kinds, dice) for _ in range(2 + int(6 * dice.random()))]
+        for level, pair in enumerate(make_pairs(one.srgb, plans, one.origin)):
+            if text := differences(pair, simulate(replace(one, plan=plans[level]))):
+                failed[f"{kinds}, case {number}, level {level} of {len(plans)}"] = text
+    assert failed == {}
+
+
+# Methods without a reference ------------------------------------------------------------------------------------------
+
+
+FAST_XXH3 = {
+    "gaussian": "ed9a9d5c2629e4bdc645c2f86e720ebe",
+    "poisson": "415a70b4ddd8950d59553185d4fa44d4",
+    "shot and read": "322f39fb8d06bc4f56bcb0c65ad4fb52",
+    "physical": "98a32f29f8c25f386c1b0c0aa365b1a5",
+    "averaged": "afacea806ad121938c151af76c29c9b6",
+}
+"""XXH3-128 of the frames and counts of `FAST_CASES` pairs by the methods of ``accuracy=fast``, which datasets of 0.1
+contain."""
+
+FAST_CASES = 50
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fast_pairs_of_random_plans_keep_their_digest(kind: str) -> None:
+    digest = xxhash.xxh3_128()
+    for number in range(FAST_CASES):
+        one = case(kind, number)
+        if kind == "gaussian":
+            methods = () if is_steep(one.plan) else (FLOAT32_METHOD,)
+        else:
+            methods = ("shot:gaussian_where_near",)
+        pair = simulate(replace(one, plan=replace(one.plan, methods=methods, law_distance=5e-3)))
+        for frame in (pair.clean, pair.noisy):
+            digest.update(frame.astype("<u2").tobytes())
+        digest.update(repr(astuple(pair.counts)).encode())
+    assert digest.hexdigest() == FAST_XXH3[kind]
