@@ -1,11 +1,13 @@
 """Parse the distributions of parameters and draw from them.
 
-Each draw is a function of one uniform in (0, 1). Exponentials, logarithms and quantiles are computed in `decimal` and
-rounded once, because the last bit of libm's results differs between machines. A draw takes up to one millisecond.
+Each draw is a function of one uniform in (0, 1). Exponentials, logarithms and quantiles are defined in `decimal` and
+rounded once, because the last bit of libm's results differs between machines. `core.fixed_point` finds nearly all of
+them some fifty times faster.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from decimal import Decimal, localcontext
@@ -14,6 +16,7 @@ from typing import Any
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, spelled
 from unprocess_gen.config.limits import Drawn
 from unprocess_gen.config.values import is_number, value_text
+from unprocess_gen.core import fixed_point
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
 from unprocess_gen.core.types import Distribution
@@ -36,7 +39,12 @@ def draw_parameter(distribution: Distribution, uniform: float, a: float = 0.0) -
     float
         The correctly rounded value; within three roundings for ``uniform``.
     """
-    return DISTRIBUTIONS[distribution.kind](uniform, a, *distribution.numbers)
+    kind, numbers = distribution.kind, distribution.numbers
+    if kind in FIXED_POINT:
+        value = FIXED_POINT[kind](uniform, a, *numbers)
+        if value is not None:
+            return value
+    return DISTRIBUTIONS[kind](uniform, a, *numbers)
 
 
 def _constant(u: float, a: float, value: float) -> float:
@@ -95,6 +103,60 @@ DISTRIBUTIONS: dict[str, Callable[..., float]] = {
     "log_linear_in_a": _log_linear_in_a,
 }
 """Each distribution as a function of a uniform in (0, 1), the slope a, and its numbers."""
+
+
+def _nearest_log_uniform(u: float, a: float, low: float, high: float) -> float | None:
+    (bottom, bottom_error), (top, top_error) = fixed_point.logarithm(low), fixed_point.logarithm(high)
+    exponent = bottom + fixed_point.times(top - bottom, u)
+    return fixed_point.nearest_exp(exponent, bottom_error + top_error + 1 + fixed_point.DECIMAL_ERROR)
+
+
+@functools.lru_cache(maxsize=256)
+def _truncated_cdf(mean: float, std: float, low: float, high: float) -> tuple[int, int]:
+    """Return the CDF at the lower limit of a truncated normal distribution, and its increase to the upper limit."""
+    with localcontext(prec=DIGITS):
+        bottom, top = (normal_cdf((Decimal(limit) - Decimal(mean)) / Decimal(std)) for limit in (low, high))
+        return fixed_point.fixed(bottom), fixed_point.fixed(top - bottom)
+
+
+def _nearest_truncated(u: float, mean: float, std: float, low: float, high: float) -> tuple[int, int] | None:
+    """Draw from a truncated normal distribution and return the value and its error, fixed-point.
+
+    Roundings to 40 digits, to units, and of the product with ``u`` move the probability by less than 4 units. Returns
+    None next to a limit, where `_truncated` clips.
+    """
+    bottom, increase = _truncated_cdf(mean, std, low, high)
+    normal = fixed_point.normal_quantile(bottom + fixed_point.times(increase, u), 4)
+    if normal is None:
+        return None
+    one = fixed_point.ONE
+    value = fixed_point.times(one, mean) + fixed_point.times(normal[0], std)
+    error = fixed_point.times(normal[1], std) + 3
+    within = fixed_point.times(one, low) < value - 2 * error and value + 2 * error < fixed_point.times(one, high)
+    return (value, error) if within else None
+
+
+def _nearest_truncated_normal(u: float, a: float, mean: float, std: float, low: float, high: float) -> float | None:
+    drawn = _nearest_truncated(u, mean, std, low, high)
+    return None if drawn is None else fixed_point.nearest(*drawn)
+
+
+def _nearest_inverse(u: float, a: float, mean: float, std: float, low: float, high: float) -> float | None:
+    drawn = _nearest_truncated(u, mean, std, low, high)
+    return None if drawn is None else fixed_point.nearest_inverse(*drawn)
+
+
+def _nearest_log_linear(u: float, a: float, slope: float, intercept: float, std: float) -> float | None:
+    return fixed_point.nearest_log_linear(u, a, slope, intercept, std)
+
+
+FIXED_POINT: dict[str, Callable[..., float | None]] = {
+    "log_uniform": _nearest_log_uniform,
+    "truncated_normal": _nearest_truncated_normal,
+    "inverse_truncated_normal": _nearest_inverse,
+    "log_linear_in_a": _nearest_log_linear,
+}
+"""The functions of `DISTRIBUTIONS` that need an exponential, logarithm or quantile; None where they are undecided."""
 
 
 def _check_increasing(low: float, high: float) -> str | None:

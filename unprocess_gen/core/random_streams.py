@@ -19,7 +19,9 @@ This module is the NumPy reference; `simulation.kernels.philox` contains the com
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import struct
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,8 +229,29 @@ def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:
     list of float
         (k + ½)·2**-52 with a 52-bit integer k; in (0, 1).
     """
-    zero = np.zeros(count, dtype=np.uint64)
-    counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("parameters", level)), zero)
-    high, low, _, _ = philox4x32(counter, key)
-    bits = [(int(h) << 20) | (int(w) >> 12) for h, w in zip(high, low, strict=True)]
-    return [(k + 0.5) * 2.0**-52 for k in bits]
+    return [(k + 0.5) * 2.0**-52 for k in _packed_bits(key, count, purpose("parameters", level))]
+
+
+@functools.cache
+def _packed(count: int) -> tuple[int, int]:
+    """Return ``count`` ones, and the numbers below ``count``, at intervals of 64 bits."""
+    return sum(1 << 64 * n for n in range(count)), sum(n << 64 * n for n in range(count))
+
+
+def _packed_bits(key: int, count: int, purpose_word: int) -> tuple[int, ...]:
+    """Return the first 52 bits of the counters (0, n, ``purpose_word``, 0) for n below ``count``.
+
+    It is `philox4x32` for few counters: 4 µs for 19, and 60 µs with NumPy. One integer holds a word of all counters, at
+    intervals of 64 bits, so that the product of a word and a multiplier does not reach the next one.
+    """
+    ones, numbers = _packed(count)
+    low = 0xFFFFFFFF * ones
+    c0, c1, c2, c3 = 0, numbers, purpose_word * ones, 0
+    k0, k1 = key & 0xFFFFFFFF, key >> 32
+    for _ in range(ROUNDS):
+        p0, p1 = MULTIPLIERS[0] * c0, MULTIPLIERS[1] * c2
+        c0, c1 = (p1 >> 32 & low) ^ c1 ^ k0 * ones, p1 & low
+        c2, c3 = (p0 >> 32 & low) ^ c3 ^ k1 * ones, p0 & low
+        k0, k1 = (k0 + KEY_STEPS[0]) & 0xFFFFFFFF, (k1 + KEY_STEPS[1]) & 0xFFFFFFFF
+    bits = c0 << 20 | (c1 >> 12 & 0xFFFFF * ones)
+    return struct.unpack(f"<{count}Q", bits.to_bytes(8 * count, "little"))

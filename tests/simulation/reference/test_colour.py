@@ -230,6 +230,22 @@ def test_a_nearly_singular_matrix_is_refused(condition: float) -> None:
         colour.normalise_rows(nearly_singular(condition))
 
 
+of_any_size = st.floats(-1, 1) | st.floats(-1e-3, 1e-3) | st.sampled_from([0.0, 1.0, -1.0])
+
+
+@given(st.lists(of_any_size, min_size=9, max_size=9), st.integers(-320, 308))
+def test_the_determinant_accepts_only_invertible_matrices(numbers: list[float], power: int) -> None:
+    """The quick test of the determinant may refuse what fractions accept, but not the reverse."""
+    own = colour.matrix([number * 10.0**power for number in numbers])
+    if colour._is_well_conditioned(own):
+        assert colour.condition(own) <= 2e9
+
+
+@pytest.mark.parametrize("name", colour.CAMERAS)
+def test_the_determinant_accepts_every_camera(name: str) -> None:
+    assert colour._is_well_conditioned(colour.multiply(colour.CAMERAS[name], colour.RGB2XYZ))
+
+
 def test_a_condition_number_by_hand() -> None:
     """Largest row sums 7 and 3 (of (1, 2; 3, 4)⁻¹ = (-2, 1; 1.5, -0.5)): 21."""
     assert colour.condition((1.0, 2.0, 0.0, 3.0, 4.0, 0.0, 0.0, 0.0, 1.0)) == 21.0

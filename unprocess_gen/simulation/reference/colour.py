@@ -149,7 +149,7 @@ def normalise_rows(entries: Matrix) -> Matrix:
     """
     if not all(math.isfinite(entry) for entry in entries):
         raise ValueError("a camera matrix has finite entries")
-    if not condition(entries) <= MAX_CONDITION:
+    if not _is_well_conditioned(entries) and not condition(entries) <= MAX_CONDITION:
         raise ValueError(f"the camera matrix is not invertible (condition number above {MAX_CONDITION:g})")
     return matrix([entry for row in (entries[0:3], entries[3:6], entries[6:9]) for entry in _unit_row(row)])
 
@@ -207,6 +207,19 @@ def condition(entries: Matrix) -> float:
     except (ValueError, OverflowError):
         return math.inf
     return _norm(entries) * _norm(inverse)
+
+
+def _is_well_conditioned(entries: Matrix) -> bool:
+    """Return whether the determinant alone proves a condition number of at most 2e9; False if it does not.
+
+    With m the largest entry, the norms of the matrix and its adjoint are at most 3m and 6m², so the condition number is
+    at most 18m³ divided by the determinant. The determinant in float64 is within 40 · 2**-53 · m³. Exact fractions, as
+    in `condition`, take 0.2 ms, a fifth of the time to plan an image.
+    """
+    a, b, c, d, e, f, g, h, i = entries
+    largest = max(map(abs, entries))
+    determinant = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+    return 1e-50 < largest < 1e50 and abs(determinant) > 1e-8 * largest * largest * largest
 
 
 def _norm(entries: Matrix) -> float:
