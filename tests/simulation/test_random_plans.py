@@ -17,7 +17,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 import xxhash
-from helpers.flats import IDENTITY, SILENT
+from helpers.flats import IDENTITY, SILENT, plan_with
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import is_steep
@@ -38,6 +38,7 @@ from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
 from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
 from unprocess_gen.sources.scenes import synthetic
 
@@ -52,6 +53,9 @@ SENSORS = (
     *((16, 0, 65535), (16, 4096, 65535), (10, 1022, 1023)),
 )
 """Bits, black level and white level of sensors."""
+
+TWO = ("heteroscedastic", "quantise")
+"""Effects of noise with two numbers."""
 
 HEIGHTS = (1, 2, 3, 5, 8, 17, 33)
 WIDTHS = (1, 2, 15, 16, 17, 33, 63, 64, 65, 127, 129, 255, 257, 511, 512, 513, 577, 1023, 1025, 2049)
@@ -149,14 +153,13 @@ def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
     if kind == "gaussian":
         a_dn = dice.at_most(10)
         b_dn2 = dice.pick((dice.at_most(20), dice.power(-6, 12), -a_dn * span_dn * dice.random(), 1e15))
-        return replace(plan, a_dn=a_dn, b_dn2=b_dn2, effects=dice.pick(((), *[("heteroscedastic", "quantise")] * 9)))
+        return replace(plan, a_dn=a_dn, b_dn2=b_dn2, effects=dice.pick(((), *[TWO] * 9)))
     light = ((-7, 3), (2, 7), (6, 14), (6, 14), (13, 26))
     brightest_e = dice.power(*dice.pick(light))
     dn_per_e = span_dn * min(1.0, plan.exposure) / brightest_e
     if kind == "poisson":
         a_dn, b_dn2 = dice.pick((dn_per_e, dn_per_e, dn_per_e, 0.0)), dice.at_most(12)
-        effects = ("heteroscedastic", "quantise")
-        return replace(plan, noise_law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=effects)
+        return replace(plan, noise_law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=TWO)
     physics = drawn_physics(dice, dn_per_e, brightest_e)
     on = ("shot", "read", "row", "black_error", "quantise")
     if kind == "shot and read":
@@ -327,6 +330,108 @@ def test_levels_of_random_plans_equal_separate_pairs(kinds: Sequence[str], dtype
             if text := differences(pair, simulate(replace(one, plan=plans[level]))):
                 failed[f"{kinds}, case {number}, level {level} of {len(plans)}"] = text
     assert failed == {}
+
+
+# Counts of few electrons ----------------------------------------------------------------------------------------------
+
+
+def sweep(low_e: float, high_e: float, read_std_dn: float, height: int) -> Case:
+    """Return a ramp of rates from ``low_e`` to ``high_e``; one electron is one DN, and read noise is small."""
+    codes = np.linspace(low_e / high_e * 65535, 65535, 8192).astype(np.uint16)
+    srgb = np.ascontiguousarray(np.broadcast_to(codes[None, :, None], (height, codes.size, 3)))
+    plan = plan_with("shot", "read", dn_per_e=1.0, read_std_dn=read_std_dn)
+    return Case(srgb, replace(plan, black_level_dn=0, white_level_dn=65535, exposure_ratio=65535 / high_e), (0, 0))
+
+
+RATES_E = [(0, 0.3), (0, 6), (5.9, 9), (9, 66), (60, 65535)]
+"""Ranges of rates with and between the limits of the methods for counts."""
+
+
+@pytest.mark.parametrize("read_std_dn", [0.0, 2**-6], ids=["shot", "shot and read"])
+@pytest.mark.parametrize(("low_e", "high_e"), RATES_E)
+def test_counts_equal_the_reference_at_every_rate(low_e: float, high_e: float, read_std_dn: float) -> None:
+    ramp = sweep(low_e, high_e, read_std_dn, 16)
+    two_numbers = replace(ramp.plan, physics=None, noise_law="poisson", effects=TWO)
+    for plan in (ramp.plan, replace(ramp.plan, dtype=FLOAT32), two_numbers):
+        one = replace(ramp, plan=plan)
+        assert differences(simulate(one), simulate_reference(one)) == ""
+
+
+@functools.lru_cache(maxsize=1)
+def words_of_counts(key: int, height: int, width: int) -> np.ndarray:
+    return words(key, "shot", (height, width))
+
+
+@pytest.mark.parametrize("height", [256, pytest.param(1024, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("read_std_dn", [0.0, 2**-6], ids=["shot", "shot and read"])
+@pytest.mark.parametrize(("low_e", "high_e"), RATES_E)
+def test_counts_in_the_tails_equal_the_reference(low_e: float, high_e: float, read_std_dn: float, height: int) -> None:
+    """Of millions of sites, those with a deviate beyond 2.5 are compared, where approximations are worst."""
+    ramp = sweep(low_e, high_e, read_std_dn, height)
+    drawn = words_of_counts(ramp.plan.stream_key, *ramp.srgb.shape[:2])
+    is_tail = (drawn & np.uint32(2**31 - 1)) < np.uint32(0.0124 * 2**31)
+    rates_e = (ramp.srgb[..., 0][is_tail] / 65535 * ramp.plan.exposure) * 65535
+    counts = poisson(drawn[is_tail], rates_e)
+    assert counts.size > 20_000
+    np.testing.assert_array_equal(simulate(ramp).noisy[is_tail], np.minimum(counts, 65535))
+
+
+# Rare words -----------------------------------------------------------------------------------------------------------
+
+KEY = 0x0123456789ABCDEF
+RARE = {
+    "heteroscedastic": ((0, 49837, 17997), (1, 18026, 63500), (0, 53401, 16385), (1, 26937, 13841)),
+    "prnu": ((0, 22632, 14441), (0, 48838, 51041), (0, 16288, 12010), (0, 72673, 7802)),
+    "shot": ((0, 675, 38241), (0, 51258, 14216), (0, 20065, 61296), (0, 18466, 32516)),
+    "dark_current": ((0, 2032, 52597), (0, 18752, 17133), (0, 51615, 15391), (0, 43635, 26859)),
+    "hot_pixels": ((0, 45917, 45079), (0, 13961, 27783), (1, 39153, 35967), (0, 64749, 18531)),
+    "read": ((0, 8015, 56090), (0, 6307, 63778), (0, 17818, 31596), (0, 52392, 15060)),
+}
+"""Frame, row and column of sites whose word of a stream of `KEY` is rare: the farthest and the nearest positive
+deviate, the nearest and the farthest negative one. They were found by search; random plans hardly have such words."""
+WORDS = (0, 2**31 - 1, 2**31, 2**32 - 1)
+SITES = [(stream, word, at) for stream, places in RARE.items() for word, at in zip(WORDS, places, strict=True)]
+
+
+@pytest.mark.parametrize(("stream", "word", "at"), SITES)
+def test_rare_words_are_where_they_were_found(stream: str, word: int, at: tuple[int, int, int]) -> None:
+    frame, y, x = at
+    assert words(KEY, stream, (1, 1), origin=(y, x), frame=frame).item() == word
+
+
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize(("stream", "word", "at"), SITES)
+def test_pairs_at_rare_words_equal_the_reference(stream: str, word: int, at: tuple[int, int, int], dtype: str) -> None:
+    kinds = KINDS[:2] if stream == "heteroscedastic" else KINDS[2:4] if stream in ("shot", "read") else KINDS[3:]
+    kinds = (*kinds, "poisson") if stream == "shot" else kinds
+    frame, y, x = at
+    failed = {}
+    for kind, number in itertools.product(kinds, range(12)):
+        plan = replace(case(kind, number, dtype).plan, layout=MOSAIC, stream_key=KEY, frame=frame, level=0, draw=0)
+        if plan.physics is not None:
+            plan = replace(plan, physics=replace(plan.physics, body_key=KEY))
+        code = np.full((1, 1, 3), (0, 1, 9, 40, 90, 128, 180, 220, 243, 252, 254, 255)[number], dtype=np.uint8)
+        one = Case(code, plan, (y, x))
+        if text := differences(simulate(one), simulate_reference(one)):
+            failed[f"case({kind!r}, {number}, {dtype!r})"] = text
+    assert failed == {}
+
+
+@pytest.mark.parametrize("effect", ["hot_pixels", "dead_pixels"])
+def test_pixels_at_the_limit_of_a_share_equal_the_reference(effect: str) -> None:
+    """A share of w / 2**32 excludes the pixel with word w, a share of (w + 1) / 2**32 includes it."""
+    one = case("physical", 0)
+    plan = replace(one.plan, effects=EFFECTS, layout=MOSAIC, bits=16, black_level_dn=4096, white_level_dn=65535)
+    srgb, numbers = np.full((3, 70, 3), 128, dtype=np.uint8), {"dark_e": 0.0, "dn_per_e": 8.0, "read_std_dn": 0.5}
+    found = []
+    for word in words(KEY, effect, (3, 70))[:, ::23].ravel().tolist():
+        for share in (word / 2**32, (word + 1) / 2**32):
+            shares = {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0} | {f"{effect.removesuffix('s')}_share": share}
+            physics = replace(plan.physics, **numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
+            one = Case(srgb, replace(plan, physics=physics), (0, 0))
+            found.append(simulate(one).noisy)
+            assert differences(simulate(one), simulate_reference(one)) == ""
+    assert all((without != with_one).sum() == 1 for without, with_one in zip(found[::2], found[1::2], strict=True))
 
 
 # Methods without a reference ------------------------------------------------------------------------------------------
