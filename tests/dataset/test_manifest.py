@@ -36,7 +36,7 @@ from unprocess_gen.dataset.manifest import (
     write_rows,
 )
 from unprocess_gen.planning.effect_contributions import STATISTICS
-from unprocess_gen.planning.plan import plan_image, plan_with_reasons
+from unprocess_gen.planning.plan import plan_image, plan_levels
 from unprocess_gen.simulation.reference.noise import EFFECTS
 
 CONTRACT = [
@@ -470,7 +470,7 @@ def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
         config.noise.iso = 3200
     found: dict[str, list[str]] = {effect: [] for effect in EFFECTS}
     for config in (lacking, half, all_given, assumed, settings("noise=nikon_d850", "effects.all=off")):
-        for one in plan_with_reasons(config, SHA256, facts=FACTS)[1]:
+        for one in plan_levels(config, SHA256, facts=FACTS)[0][1]:
             found[one.effect].append(widened(one.reason))
     return {effect: max(reasons, key=len) for effect, reasons in found.items()}
 

@@ -24,8 +24,8 @@ from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics, Plan, Srgb
 from unprocess_gen.pipeline import generate
 from unprocess_gen.planning.effect_contributions import SignalRange, signal_range
-from unprocess_gen.planning.effect_selection import Prediction, facts_of, select_effects
-from unprocess_gen.planning.plan import plan_image, plan_with_reasons
+from unprocess_gen.planning.effect_selection import Prediction, effect_rules, facts_of, select_effects
+from unprocess_gen.planning.plan import plan_image, plan_levels
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.simulation.reference.noise import EFFECTS, black_error, noise_variance, response
 from unprocess_gen.simulation.reference.poisson import poisson
@@ -243,8 +243,12 @@ def automatic(config: Config, tolerance: float = TOLERANCE) -> Config:
     return replace(config, effects=effects, noise=noise)
 
 
+def all_predictions(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[Prediction, ...]:
+    return select_effects(effect_rules(config), physics, facts, light).predictions()
+
+
 def chosen(config: Config, physics: Physics, facts: Facts, light: SignalRange) -> tuple[str, ...]:
-    return tuple(one.effect for one in select_effects(config, physics, facts, light) if one.simulated)
+    return tuple(one.effect for one in all_predictions(config, physics, facts, light) if one.simulated)
 
 
 def test_only_rounding_masks_fixed_patterns_of_clean_frames(settings: Settings, pictures: dict[str, Srgb]) -> None:
@@ -348,7 +352,7 @@ def test_pattern_masked_in_one_frame_is_simulated_for_a_clip(
     config, physics = base
     physics = replace(physics, **numbers)
     assert effect not in chosen(config, physics, FACTS, LIGHT)
-    predictions = select_effects(config, physics, replace(FACTS, frames=100_000), LIGHT)
+    predictions = all_predictions(config, physics, replace(FACTS, frames=100_000), LIGHT)
     found = next(one for one in predictions if one.effect == effect)
     assert found.simulated
     assert found.statistic.startswith("clip's")
@@ -358,8 +362,8 @@ def test_temporal_noise_is_no_stronger_in_a_clip(base: tuple[Config, Physics]) -
     config, physics = base
     physics = replace(physics, row_std_dn=0.01, dark_e=0.01)
     for one, many in zip(
-        select_effects(config, physics, FACTS, LIGHT),
-        select_effects(config, physics, replace(FACTS, frames=100), LIGHT),
+        all_predictions(config, physics, FACTS, LIGHT),
+        all_predictions(config, physics, replace(FACTS, frames=100), LIGHT),
         strict=True,
     ):
         if one.effect in ("shot", "dark_current", "read", "row"):
@@ -412,7 +416,7 @@ def test_hot_pixels_are_simulated_from_a_tenth_of_an_outlier(
     facts = replace(FACTS, width=side, height=side)
     expected = expected_hot(physics, facts, dark)
     hot = next(
-        one for one in select_effects(config, physics, facts, SignalRange(dark, 3000.0)) if one.effect == "hot_pixels"
+        one for one in all_predictions(config, physics, facts, SignalRange(dark, 3000.0)) if one.effect == "hot_pixels"
     )
     assert hot.simulated == (expected >= 0.1)
     assert math.isclose(hot.outliers, expected, rel_tol=0.01)  # what else is left out hid a little of it
@@ -546,7 +550,7 @@ def test_number_of_workers_does_not_change_the_selection(
 def test_smallest_images_have_a_plan(settings: Settings, shape: tuple[int, int], code: int) -> None:
     config = configured(settings, "noise=canon_70d", "scene=night", "noise.assumed=[]", "noise.full_well_e=3000")
     srgb = np.full((*shape, 3), code, dtype=np.uint8)
-    _, predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(srgb))
+    ((_, predictions),) = plan_levels(config, "0" * 64, 0, facts_of(srgb))
     assert [one.effect for one in predictions] == list(EFFECTS)
     assert all(math.isfinite(one.predicted_dn) and one.ratio >= 0 for one in predictions)
 
@@ -582,7 +586,7 @@ def test_tiny_tolerance_simulates_every_contribution(
 ) -> None:
     config, physics = base
     physics = replace(physics, **sensor)
-    for one in select_effects(automatic(config, 1e-12), physics, FACTS, SignalRange(dark, dark + more)):
+    for one in all_predictions(automatic(config, 1e-12), physics, FACTS, SignalRange(dark, dark + more)):
         assert one.simulated == (one.predicted_dn > 1e-9 * one.masking_dn) or 1e-15 < one.ratio < 1e-9
 
 
@@ -592,7 +596,7 @@ def test_effect_above_tolerance_alone_is_always_simulated(
 ) -> None:
     config, physics = base
     physics = replace(physics, **sensor)
-    for one in select_effects(automatic(config, tolerance), physics, FACTS, SignalRange(dark, dark + more)):
+    for one in all_predictions(automatic(config, tolerance), physics, FACTS, SignalRange(dark, dark + more)):
         assert one.simulated or (one.ratio <= tolerance * (1 + 1e-9) and one.outliers < 0.1)
 
 
@@ -601,7 +605,7 @@ def test_effect_above_tolerance_alone_is_always_simulated(
 
 def predictions_of(settings: Settings, *overrides: str) -> dict[str, Prediction]:
     config = configured(settings, "noise=sony_a7s2", "scene=indoor", *overrides)
-    predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(cut("highlights-0", 40, 56)))[1]
+    ((_, predictions),) = plan_levels(config, "0" * 64, 0, facts_of(cut("highlights-0", 40, 56)))
     return {one.effect: one for one in predictions}
 
 
@@ -654,7 +658,7 @@ def test_reasons_contain_numbers_and_fit_a_row(
     base: tuple[Config, Physics], sensor: dict[str, float], dark: float, more: float, tolerance: float
 ) -> None:
     config, physics = base
-    for one in select_effects(
+    for one in all_predictions(
         automatic(config, tolerance), replace(physics, **sensor), FACTS, SignalRange(dark, dark + more)
     ):
         assert not {";", "\n"} & set(one.reason)
@@ -670,7 +674,7 @@ def test_reasons_of_the_config_fit_a_row(settings: Settings) -> None:
 
 def test_plan_lists_skipped_effects_with_reasons(settings: Settings) -> None:
     config = configured(settings, "noise=nikon_d850", "scene=daylight", "noise.assumed=[]")
-    plan, predictions = plan_with_reasons(config, "0" * 64, 0, facts_of(flat(200, 200, 200)))
+    ((plan, predictions),) = plan_levels(config, "0" * 64, 0, facts_of(flat(200, 200, 200)))
     assert plan.effects == tuple(one.effect for one in predictions if one.simulated)
     assert plan.skipped == tuple(f"{one.effect}: {one.reason}" for one in predictions if not one.simulated)
     dark = next(reason for reason in plan.skipped if reason.startswith("dark_current"))
@@ -707,7 +711,7 @@ def test_predictions_match_measurements(
     facts, span_dn = facts_of(srgb), float(plan.white_level_dn - plan.black_level_dn)
     light = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
     everything = replace(config, effects=replace(config.effects, all="on"))
-    predicted = next(one for one in select_effects(everything, physics, facts, light) if one.effect == effect)
+    predicted = next(one for one in all_predictions(everything, physics, facts, light) if one.effect == effect)
     squares = np.concatenate(
         [
             omission(
@@ -728,7 +732,7 @@ def test_masking_noise_is_the_noise_of_the_plan(base: tuple[Config, Physics]) ->
     config, physics = base
     plan = replace(switched(config, "auto", flat(0, 0, 0), 0), physics=physics, a_dn=1.0, b_dn2=9.0)
     column = next(
-        one for one in select_effects(config, physics, FACTS, SignalRange(0.0, 3000.0)) if one.effect == "column"
+        one for one in all_predictions(config, physics, FACTS, SignalRange(0.0, 3000.0)) if one.effect == "column"
     )
     variance = float(noise_variance(np.full((1, 1), float(plan.black_level_dn)), plan)[0, 0]) + 1 / 12
     assert math.isclose(column.masking_dn, math.sqrt(variance / FACTS.height), rel_tol=1e-12)

@@ -18,7 +18,7 @@ from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import Facts, Physics
-from unprocess_gen.planning.noise_profile import number, plan_physics
+from unprocess_gen.planning.noise_profile import PhysicalNoise, number
 from unprocess_gen.planning.plan import PARAMETERS, plan_image
 
 MIDDLE = dict.fromkeys(PARAMETERS, 0.5)
@@ -46,7 +46,7 @@ def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: st
 
 
 def physics(config: Config, key: int = 0, **uniforms: float) -> Physics:
-    return plan_physics(config, MIDDLE | uniforms, key)
+    return PhysicalNoise(config).draw(MIDDLE | uniforms, key, config.seed)
 
 
 def close(value: float, expected: Any, rel: float = 1e-15) -> bool:

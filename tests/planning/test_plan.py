@@ -23,7 +23,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Distribution, Plan
-from unprocess_gen.planning.plan import PARAMETERS, plan_camera, plan_image, plan_noise
+from unprocess_gen.planning.plan import PARAMETERS, TwoNumberLevel, plan_camera, plan_image
 from unprocess_gen.simulation.reference import colour
 
 SHA = hashlib.sha256(b"a photograph").hexdigest()
@@ -340,7 +340,7 @@ def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     """Slope times s, intercept times s², s = 15359/3855; two conversions would give s² and s⁴."""
     config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
     s = Fraction(15359, 3855)
-    a, b = plan_noise(config, named())
+    a, b = TwoNumberLevel(config).draw(named())
     assert abs(Fraction(a) / (Fraction(6.955588) * s) - 1) <= Fraction(21, 10) / 2**53
     assert abs(Fraction(b) / (Fraction(38.117816) * s * s) - 1) <= Fraction(41, 10) / 2**53
     plan = plan_image(config, SHA)

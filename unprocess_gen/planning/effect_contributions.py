@@ -10,10 +10,13 @@ are the same on every machine and in every tier. Derivations: ``docs/design/effe
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal, localcontext
+from functools import cached_property
+from operator import add
 
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics
@@ -86,14 +89,12 @@ def signal_range(
     """
     curve = linear_table(tone, gamma, facts.codes)
     low, high = float(curve[facts.dark_code]), float(curve[facts.bright_code])
-    rows = [rgb2cam[at : at + 3] for at in (0, 3, 6)]
-    lowest = min(
-        sum(entry * (low if entry > 0 else high) for entry in row) * k for row, k in zip(rows, gains, strict=True)
-    )
-    highest = max(
-        sum(entry * (high if entry > 0 else low) for entry in row) * max(k, 1.0)
-        for row, k in zip(rows, gains, strict=True)
-    )
+    lowest, highest = math.inf, -math.inf
+    for channel, k in enumerate(gains):
+        r, g, b = rgb2cam[3 * channel : 3 * channel + 3]
+        least = r * (low if r > 0 else high) + g * (low if g > 0 else high) + b * (low if b > 0 else high)
+        most = r * (high if r > 0 else low) + g * (high if g > 0 else low) + b * (high if b > 0 else low)
+        lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
     return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
 
 
@@ -103,67 +104,107 @@ def ratio_to_noise(size: float, noise: float) -> float:
 
 
 PerStatistic = tuple[float, ...]
-"""One value for each of `STATISTICS`."""
+"""One value for each of `STATISTICS`, or for the first half of them if there is one frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """Hold what an effect contributes: a variance in each of `STATISTICS`, DN², and an offset of all pixels, DN."""
+    """Hold what an effect contributes: a variance in each statistic, DN², and an offset of all pixels, DN."""
 
     variances: PerStatistic
     offset_dn: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FrameModel:
-    """Hold what predictions depend on: numbers of the sensor, size and signal range of the frame, black level."""
+    """Hold what predictions depend on: numbers of the sensor, size and signal range of the frame, black level.
+
+    All frames of a photograph are one, so its statistics are the first half of `STATISTICS`; the other half would have
+    the same values. Results that several predictions share are computed once for each frame.
+    """
 
     physics: Physics
     facts: Facts
     signals: SignalRange
     black_level_dn: float
+    _known: dict[tuple[str, float, float], _Ratios] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def levels(self, on: frozenset[str]) -> tuple[float, float]:
         """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
         full_dn = self.physics.full_well_e * self.physics.dn_per_e if "full_well" in on else math.inf
         return min(self.signals.dark_dn, full_dn), min(self.signals.bright_dn, full_dn)
 
-    @property
-    def counts(self) -> PerStatistic:
-        """Return the number of sites that each statistic is a mean of."""
-        width, height, frames = self.facts.width, self.facts.height, float(self.facts.frames)
+    @cached_property
+    def per_frame(self) -> PerStatistic:
+        """Return the number of sites of one frame that each statistic is a mean of."""
+        width, height = self.facts.width, self.facts.height
         counts = 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
-        return *counts, *(count * frames for count in counts)
+        return counts if self.facts.frames == 1 else (*counts, *counts)
+
+    @cached_property
+    def counts(self) -> PerStatistic:
+        """Return the number of sites that each statistic is a mean of, those of all frames of a clip included."""
+        frames = float(self.facts.frames)
+        return (*self.per_frame[:4], *(count * frames for count in self.per_frame[4:]))
+
+    @cached_property
+    def roots(self) -> PerStatistic:
+        """Return the square root of each of `counts`."""
+        return tuple(map(math.sqrt, self.counts))
 
     def masking_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
         """Return the variance of a pixel at a signal due to all random effects in ``on`` except ``effect``, DN²."""
-        rounding = QUANTISATION_VARIANCE if "quantise" in on - {effect} else 0.0
+        rounding = QUANTISATION_VARIANCE if "quantise" in on and effect != "quantise" else 0.0
         if effect in FIXED_PATTERNS and self.physics.fixed_pattern_in_clean:
             return rounding
-        return rounding + sum(
-            variance(self.physics, level_dn) for name, variance in VARIANCES.items() if name in on - {effect}
-        )
+        variance = 0.0
+        for name, of_physics in VARIANCES.items():
+            if name in on and name != effect:
+                variance += of_physics(self.physics, level_dn)
+        return rounding + variance
+
+    def _ratios_of(self, effect: str, level_dn: float, masking: float) -> _Ratios:
+        """Return the ratios of one effect to a masking noise at a signal."""
+        known = self._known.get((effect, level_dn, masking))
+        if known is None:
+            contribution = CONTRIBUTIONS[effect](self, level_dn, masking)
+            variances = zip(contribution.variances, self.counts, strict=True)
+            squares = [ratio_to_noise(variance * count, masking) for variance, count in variances]
+            offset_dn, offsets = abs(contribution.offset_dn), None
+            if offset_dn:
+                std = math.sqrt(masking)
+                offsets = [ratio_to_noise(offset_dn * root, std) for root in self.roots]
+            known = _Ratios(squares, offsets, contribution.variances[0])
+            self._known[effect, level_dn, masking] = known
+        return known
 
     def ratios(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> PerStatistic:
         """Return the ratio of several effects together to the masking noise, in each statistic.
 
         Variances add; offsets add linearly.
         """
-        squares, offsets = [0.0] * len(STATISTICS), [0.0] * len(STATISTICS)
+        return tuple(map(math.sqrt, self._squares(effects, level_dn, on)))
+
+    def _squares(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> list[float]:
+        """Return the square of each of `ratios`."""
+        squares, offsets = [0.0] * len(self.counts), None
         before_well = 0.0
         for effect in effects:
-            masking = self.masking_variance(effect, level_dn, on)
-            contribution = CONTRIBUTIONS[effect](self, level_dn, masking)
-            before_well += contribution.variances[0] if effect in BEFORE_WELL else 0.0
-            for at, count in enumerate(self.counts):
-                squares[at] += ratio_to_noise(contribution.variances[at] * count, masking)
-                offsets[at] += ratio_to_noise(abs(contribution.offset_dn) * math.sqrt(count), math.sqrt(masking))
+            of_effect = self._ratios_of(effect, level_dn, self.masking_variance(effect, level_dn, on))
+            squares = list(map(add, squares, of_effect.squares))
+            if of_effect.offsets is not None:
+                offsets = of_effect.offsets if offsets is None else list(map(add, offsets, of_effect.offsets))
+            if effect in BEFORE_WELL:
+                before_well += of_effect.pixel_variance
         if before_well and "full_well" in on:
             masking = self.masking_variance("full_well", level_dn, on)
             lost_dn = self.lost_in_well(before_well, level_dn, on)
-            for at, count in enumerate(self.counts):
-                offsets[at] += lost_dn * math.sqrt(ratio_to_noise(count, masking)) if lost_dn else 0.0
-        return tuple(math.sqrt(square + offset * offset) for square, offset in zip(squares, offsets, strict=True))
+            if lost_dn:
+                lost = [lost_dn * math.sqrt(ratio_to_noise(count, masking)) for count in self.counts]
+                offsets = lost if offsets is None else list(map(add, offsets, lost))
+        if offsets is None:
+            return squares
+        return [square + offset * offset for square, offset in zip(squares, offsets, strict=True)]
 
     def lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:
         """Return by how much ``variance`` before the full well lowers the mean signal behind it, DN.
@@ -173,12 +214,15 @@ class FrameModel:
         """
         if CONTRIBUTIONS["full_well"](self, level_dn, 0.0).offset_dn == 0:
             return 0.0
-        other = sum(VARIANCES[name](self.physics, level_dn) for name in VARIANCES if name in on & BEFORE_WELL)
+        other = 0.0
+        for name, of_physics in VARIANCES.items():
+            if name in on and name in BEFORE_WELL:
+                other += of_physics(self.physics, level_dn)
         return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
 
     def ratio(self, effects: Sequence[str], on: frozenset[str]) -> float:
         """Return the largest ratio of several effects together, over all statistics and both signals."""
-        return max(max(self.ratios(effects, level_dn, on)) for level_dn in self.levels(on))
+        return math.sqrt(max(max(self._squares(effects, level_dn, on)) for level_dn in self.levels(on)))
 
     def outliers(self, effect: str, on: frozenset[str]) -> float:
         """Return the expected number of pixels per frame that an effect moves by more than one standard deviation."""
@@ -186,6 +230,19 @@ class FrameModel:
             return 0.0
         shares = (OUTLIERS[effect](self, level, self.masking_variance(effect, level, on)) for level in self.levels(on))
         return self.facts.width * self.facts.height * max(shares)
+
+
+@dataclass(frozen=True, slots=True)
+class _Ratios:
+    """Hold ratios of one effect to the masking noise in each statistic.
+
+    ``squares``: of its variances; ``offsets``: of its offset, None without one; ``pixel_variance``: its variance in
+    single pixels, DN².
+    """
+
+    squares: list[float]
+    offsets: list[float] | None
+    pixel_variance: float
 
 
 VARIANCES: dict[str, Callable[[Physics, float], float]] = {
@@ -203,14 +260,14 @@ def _independent(
 
     ``variance``: of the part that is new in every frame; ``fixed_variance``: of the part that all frames share.
     """
-    per_frame = frame.counts[: len(frame.counts) // 2]
-    return Contribution(
-        tuple(
-            variance / count + fixed_variance / sites
-            for count, sites in zip(frame.counts, (*per_frame, *per_frame), strict=True)
-        ),
-        offset_dn,
-    )
+    if fixed_variance:
+        pairs = zip(frame.counts, frame.per_frame, strict=True)
+        variances = tuple(variance / count + fixed_variance / sites for count, sites in pairs)
+    elif variance:
+        variances = tuple(variance / count for count in frame.counts)
+    else:
+        variances = (0.0,) * len(frame.counts)
+    return Contribution(variances, offset_dn)
 
 
 def _prnu(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
@@ -276,13 +333,14 @@ def _read(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
 def _row(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
     variance, height = frame.physics.row_std_dn * frame.physics.row_std_dn, frame.facts.height
     per_frame = variance, variance, variance / height, variance / max(height // 2, 1)
-    return Contribution((*per_frame, *(each / frame.facts.frames for each in per_frame)))
+    of_clip = (each / frame.facts.frames for each in per_frame) if frame.facts.frames > 1 else ()
+    return Contribution((*per_frame, *of_clip))
 
 
 def _column(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
     variance, width = frame.physics.column_std_dn * frame.physics.column_std_dn, frame.facts.width
     per_frame = variance, variance / width, variance, variance / max(width // 2, 1)
-    return Contribution((*per_frame, *per_frame))
+    return Contribution(per_frame if frame.facts.frames == 1 else (*per_frame, *per_frame))
 
 
 def _black_error(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
@@ -316,11 +374,17 @@ def _share_of_bright_hot_pixels(frame: FrameModel, level_dn: float, masking: flo
     """
     physics = frame.physics
     least = math.floor(math.sqrt(masking) / physics.dn_per_e) + 1
+    return _share_of_counts(physics.hot_pixel_share, physics.hot_pixel_e, least)
+
+
+@functools.lru_cache(maxsize=256)
+def _share_of_counts(share: float, mean_e: float, least: int) -> float:
+    """Return the fraction of pixels that are hot and have at least so many electrons."""
     with localcontext(prec=20):
-        mean_e = Decimal(physics.hot_pixel_e)
-        if not mean_e:
+        mean = Decimal(mean_e)
+        if not mean:
             return 0.0
-        return float(Decimal(physics.hot_pixel_share) * (least * (mean_e / (1 + mean_e)).ln()).exp())
+        return float(Decimal(share) * (least * (mean / (1 + mean)).ln()).exp())
 
 
 def _share_of_dead_pixels(frame: FrameModel, level_dn: float, masking: float) -> float:

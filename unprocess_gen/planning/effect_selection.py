@@ -12,7 +12,7 @@ instead, and simulated if at least `MIN_OUTLIERS` are expected per frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,33 +134,6 @@ class Prediction:
         return ratio_to_noise(self.predicted_dn, self.masking_dn)
 
 
-def select_effects(config: Config, physics: Physics, facts: Facts, signals: SignalRange) -> tuple[Prediction, ...]:
-    """Decide about every effect of a physical noise profile.
-
-    Parameters
-    ----------
-    config : Config
-        Switches, tolerance and black level.
-    physics : Physics
-        Numbers of the sensor for this image.
-    facts : Facts
-        Integer facts about the pixels.
-    signals : SignalRange
-        Signal range of the image.
-
-    Returns
-    -------
-    tuple of Prediction
-        One for each of `noise.EFFECTS`, in the order in which light meets them.
-    """
-    forced = {effect: _forced_decision(config, effect) for effect in EFFECTS}
-    frame = FrameModel(physics, facts, signals, float(config.sensor.black_level_dn))
-    free = [effect for effect, decision in forced.items() if decision is None]
-    on = frozenset([*free, *(effect for effect, decision in forced.items() if decision is not None and decision.on)])
-    on = omit_weakest(config.effects.tolerance, frame, on, free)
-    return tuple(_prediction(effect, frame, on, forced[effect], config.effects.tolerance) for effect in EFFECTS)
-
-
 NOT_ROUNDED = "float output is not rounded"  # recorded: decides bytes of datasets
 """Reason for which float32 frames skip ``quantise``."""
 
@@ -196,6 +169,109 @@ def _forced_decision(config: Config, effect: str) -> ForcedDecision | None:
         advice = "on only where switched on"  # recorded: decides bytes of datasets
         return ForcedDecision(False, f"{assumed} is assumed, no source gives it: {advice}")
     return None
+
+
+@dataclass(frozen=True, slots=True)
+class EffectRules:
+    """Decisions of a configuration about the effects of a physical noise profile.
+
+    Attributes
+    ----------
+    forced : mapping of str to ForcedDecision or None
+        For each of `noise.EFFECTS` the decision of the configuration; None if the image decides.
+    tolerance : float
+        Largest ratio of the omitted effects to the masking noise.
+    black_level_dn : float
+        Black level of the sensor, DN.
+    """
+
+    forced: Mapping[str, ForcedDecision | None]
+    tolerance: float
+    black_level_dn: float
+
+
+def effect_rules(config: Config) -> EffectRules:
+    """Return what a configuration decides about the effects of its physical noise profile.
+
+    Parameters
+    ----------
+    config : Config
+        Switches, numbers of the profile, tolerance and black level.
+
+    Returns
+    -------
+    EffectRules
+        The same for all images.
+    """
+    forced = {effect: _forced_decision(config, effect) for effect in EFFECTS}
+    return EffectRules(forced, config.effects.tolerance, float(config.sensor.black_level_dn))
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The effects selected for one image, and predictions for all effects on demand.
+
+    Attributes
+    ----------
+    rules : EffectRules
+        What the configuration decides.
+    frame : FrameModel
+        The frame, with `Facts` and numbers of the sensor.
+    on : frozenset of str
+        Simulated effects.
+    """
+
+    rules: EffectRules
+    frame: FrameModel
+    on: frozenset[str]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Return the simulated effects, in the order in which light meets them."""
+        return tuple(effect for effect in EFFECTS if effect in self.on)
+
+    @property
+    def skipped(self) -> tuple[str, ...]:
+        """Return the other effects with the reasons that rows record; predicts only what the image decided."""
+        off = (effect for effect in EFFECTS if effect not in self.on)
+        return tuple(f"{effect}: {self._reason(effect)}" for effect in off)
+
+    def _reason(self, effect: str) -> str:
+        forced = self.rules.forced[effect]
+        return forced.reason if forced is not None else self.prediction(effect).reason
+
+    def prediction(self, effect: str) -> Prediction:
+        """Return the prediction of one effect."""
+        return _prediction(effect, self.frame, self.on, self.rules.forced[effect], self.rules.tolerance)
+
+    def predictions(self) -> tuple[Prediction, ...]:
+        """Return the prediction of each of `noise.EFFECTS`, in the order in which light meets them."""
+        return tuple(self.prediction(effect) for effect in EFFECTS)
+
+
+def select_effects(rules: EffectRules, physics: Physics, facts: Facts, signals: SignalRange) -> Selection:
+    """Decide about every effect of a physical noise profile.
+
+    Parameters
+    ----------
+    rules : EffectRules
+        What the configuration decides.
+    physics : Physics
+        Numbers of the sensor for this image.
+    facts : Facts
+        Integer facts about the pixels.
+    signals : SignalRange
+        Signal range of the image.
+
+    Returns
+    -------
+    Selection
+        The simulated effects, and why.
+    """
+    frame = FrameModel(physics, facts, signals, rules.black_level_dn)
+    free = [effect for effect, decision in rules.forced.items() if decision is None]
+    on = frozenset(effect for effect, decision in rules.forced.items() if decision is None or decision.on)
+    return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free))
 
 
 def omit_weakest(tolerance: float, frame: FrameModel, on: frozenset[str], free: Sequence[str]) -> frozenset[str]:

@@ -6,8 +6,10 @@ A pair is a pure function of pixels and plan. Draws come from the stream ``param
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
@@ -24,11 +26,18 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
+from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.planning.effect_contributions import signal_range
-from unprocess_gen.planning.effect_selection import NOT_ROUNDED, Prediction, select_effects
-from unprocess_gen.planning.noise_profile import plan_physics
+from unprocess_gen.planning.effect_selection import (
+    NOT_ROUNDED,
+    Prediction,
+    Selection,
+    effect_rules,
+    select_effects,
+)
+from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
 
@@ -69,7 +78,8 @@ def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: F
     ValueError
         If the noise profile is physical and ``facts`` is None.
     """
-    return plan_with_reasons(config, source_sha256, occurrence, facts)[0]
+    plan, _ = next(_planner(config).levels(config.seed, source_sha256, occurrence, facts))
+    return plan
 
 
 def plan_pairs(
@@ -100,8 +110,8 @@ def plan_pairs(
     ValueError
         If the noise profile is physical and ``facts`` is None.
     """
-    levels = plan_levels(config, source_sha256, occurrence, facts)
-    return with_draws(config, [plan for plan, _ in levels], frame)
+    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts)
+    return with_draws(config, (plan for plan, _ in levels), frame)
 
 
 def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
@@ -112,7 +122,7 @@ def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[
     config : Config
         ``noise.draws`` is the number of draws.
     levels : iterable of Plan
-        One plan for each noise level.
+        One plan for each noise level, of draw 0 and frame 0.
     frame : int
         Number of the frame in its clip.
 
@@ -121,7 +131,11 @@ def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[
     tuple of Plan
         Draw by draw within each level.
     """
-    return tuple(replace(plan, draw=draw, frame=frame) for plan in levels for draw in range(config.noise.draws))
+    return tuple(
+        replace(plan, draw=draw, frame=frame) if draw or frame else plan
+        for plan in levels
+        for draw in range(config.noise.draws)
+    )
 
 
 PlanAndPredictions = tuple[Plan, tuple[Prediction, ...]]
@@ -149,93 +163,194 @@ def plan_levels(
     tuple of (Plan, tuple of Prediction)
         One for each noise level; no predictions for a profile with two numbers.
     """
-    levels = range(len(noise_levels(config.noise)))
-    return tuple(plan_with_reasons(config, source_sha256, occurrence, facts, level) for level in levels)
+    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts)
+    return tuple((plan, () if selection is None else selection.predictions()) for plan, selection in levels)
 
 
-def plan_with_reasons(
-    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, level: int = 0
-) -> PlanAndPredictions:
-    """Draw the parameters of one image at one noise level, with the predictions behind the selected effects.
+# --------------------------------------------------------------------------------------------------------- one config
 
-    Parameters are those of `plan_levels`, and the number of the level.
+
+def _planner(config: Config) -> Planner:
+    """Return the planner of a config's content: a config that was changed has another one."""
+    content = snapshot(config)
+    return Planner(config) if content is None else _planner_of(content)
+
+
+@functools.lru_cache(maxsize=64)
+def _planner_of(content: bytes) -> Planner:
+    return Planner(restored(content))
+
+
+class Planner:
+    """Draw plans for the images of one configuration, which is interpreted once.
+
+    Parsing distributions, choosing methods and interpreting the noise profile take longer than all draws of an image.
+
+    Parameters
+    ----------
+    config : Config
+        A configuration that `validate_config` accepts, and that does not change. Its seed is not used.
     """
-    key = stream_key(config.seed, source_sha256, occurrence)
-    uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
-    if level:
-        at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), level), strict=True))
-        uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
-    config = replace(config, noise=noise_levels(config.noise)[level])
-    plan = _plan(config, key, uniforms, level)
-    if not is_physical(config.noise):
-        return plan, ()
-    if facts is None:
-        raise ValueError("a physical profile needs the facts of the pixels")
-    physics = plan_physics(config, uniforms, key)
-    span_dn = float(plan.white_level_dn - plan.black_level_dn)
-    signals = signal_range(facts, plan.tone, plan.gamma, plan.inverse_gains, plan.exposure, span_dn, plan.rgb2cam)
-    predictions = select_effects(config, physics, facts, signals)
-    return (
-        replace(
-            plan,
+
+    def __init__(self, config: Config) -> None:
+        self._camera = config.camera
+        self._red, self._blue, self._inverse_rgb = gain_distributions(config.gains)
+        self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
+        levels = [replace(config, noise=noise) for noise in noise_levels(config.noise)]
+        self._levels = [PhysicalLevel(one) if is_physical(one.noise) else TwoNumberLevel(one) for one in levels]
+        budget, counts_electrons = accuracy_budget(config.accuracy), uses_physics(config.noise)
+        self._methods, self._steep_methods = (
+            choose_methods(budget, counts_electrons, is_normalised(config), steep) for steep in (False, True)
+        )
+        self._recorded: dict[str, Any] = {
+            "downscale": config.source.downscale,
+            "dequantize": dequantize_method(config.source),
+            "scene": config.scene.name,
+            "tone": config.isp.tone,
+            "gamma": "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma),
+            "highlight": config.gains.highlight,
+            "highlight_threshold": config.gains.threshold,
+            "pattern": config.sensor.pattern,
+            "bits": config.sensor.bits,
+            "black_level_dn": config.sensor.black_level_dn,
+            "white_level_dn": config.sensor.white_level_dn,
+            "sensor_clip": config.sensor.clip,
+            "saturated": config.sensor.saturated,
+            "noise": config.noise.name,
+            "noise_law": config.noise.law,
+            "accuracy": config.accuracy.name,
+            "law_distance": config.accuracy.law_distance,
+            "dtype": config.output.dtype,
+            "layout": config.output.layout,
+        }
+
+    def levels(
+        self, seed: int, source_sha256: str, occurrence: int = 0, facts: Facts | None = None
+    ) -> Iterator[tuple[Plan, Selection | None]]:
+        """Yield the plan of one image at each noise level, and the selection of effects of a physical profile.
+
+        Parameters
+        ----------
+        seed : int
+            Seed of the dataset.
+        source_sha256, occurrence, facts : str, int, Facts or None
+            As for `plan_pairs`.
+
+        Yields
+        ------
+        plan : Plan
+            Of draw 0 and frame 0.
+        selection : Selection or None
+            None for a profile with two numbers.
+
+        Raises
+        ------
+        ValueError
+            If the noise profile is physical and ``facts`` is None.
+        """
+        key = stream_key(seed, source_sha256, occurrence)
+        uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
+        clean = self._clean(seed, key, uniforms)
+        for number, level in enumerate(self._levels):
+            if number:
+                at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), number), strict=True))
+                uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
+            yield level.plan(clean, number, uniforms, facts)
+
+    def _clean(self, seed: int, key: int, uniforms: Mapping[str, float]) -> Plan:
+        """Return a plan without noise, which all levels of an image share."""
+        camera, weights, rgb2cam = plan_camera(self._camera, uniforms)
+        plan = Plan(
+            seed=seed,
+            stream_key=key,
+            exposure_ratio=draw_parameter(self._exposure_ratio, uniforms["exposure_ratio"]),
+            camera=camera,
+            weights=weights,
+            rgb2cam=rgb2cam,
+            red_gain=draw_parameter(self._red, uniforms["red"]),
+            blue_gain=draw_parameter(self._blue, uniforms["blue"]),
+            inverse_rgb_gain=draw_parameter(self._inverse_rgb, uniforms["inverse_rgb"]),
+            a_dn=0.0,
+            b_dn2=0.0,
+            effects=(),
+            skipped=(),
+            methods=self._methods,
+            **self._recorded,
+        )
+        return replace(plan, methods=self._steep_methods) if is_steep(plan) else plan
+
+
+class TwoNumberLevel:
+    """One noise level of a profile with two numbers.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration, with the profile of this level.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._distributions = noise_distributions(config.noise)
+
+    def plan(
+        self, clean: Plan, level: int, uniforms: Mapping[str, float], facts: Facts | None
+    ) -> tuple[Plan, Selection | None]:
+        """Complete a plan with the two numbers and the effects at this level."""
+        a_dn, b_dn2 = self.draw(uniforms)
+        effects, skipped = plan_effects(self._config, a_dn, b_dn2, clean.white_level_dn - clean.black_level_dn)
+        return replace(clean, a_dn=a_dn, b_dn2=b_dn2, effects=effects, skipped=skipped, level=level), None
+
+    def draw(self, uniforms: Mapping[str, float]) -> tuple[float, float]:
+        """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
+        noise, sensor = self._config.noise, self._config.sensor
+        a = draw_parameter(self._distributions[0], uniforms["a"])
+        b = draw_parameter(self._distributions[1], uniforms["b"], a)
+        return noise_in_dn(
+            a,
+            b,
+            units=noise.units or "",
+            black=noise.black or "",
+            profile_levels_dn=(noise.black_level_dn or 0, noise.white_level_dn or 0),
+            sensor_levels_dn=(sensor.black_level_dn, sensor.white_level_dn),
+        )
+
+
+class PhysicalLevel:
+    """One noise level of a physical profile.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration, with the profile of this level.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._noise = PhysicalNoise(config)
+        self._rules = effect_rules(config)
+
+    def plan(
+        self, clean: Plan, level: int, uniforms: Mapping[str, float], facts: Facts | None
+    ) -> tuple[Plan, Selection | None]:
+        """Complete a plan with the numbers of the sensor and the effects at this level."""
+        if facts is None:
+            raise ValueError("a physical profile needs the facts of the pixels")
+        physics = self._noise.draw(uniforms, clean.stream_key, clean.seed)
+        span_dn = float(clean.white_level_dn - clean.black_level_dn)
+        signals = signal_range(
+            facts, clean.tone, clean.gamma, clean.inverse_gains, clean.exposure, span_dn, clean.rgb2cam
+        )
+        selection = select_effects(self._rules, physics, facts, signals)
+        plan = replace(
+            clean,
+            level=level,
             physics=physics,
             a_dn=physics.dn_per_e,
             b_dn2=physics.read_std_dn * physics.read_std_dn,
-            effects=tuple(each.effect for each in predictions if each.simulated),
-            skipped=tuple(f"{each.effect}: {each.reason}" for each in predictions if not each.simulated),
-        ),
-        predictions,
-    )
-
-
-def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> Plan:
-    """Return the plan without the numbers and effects of a physical profile."""
-    camera, weights, rgb2cam = plan_camera(config.camera, uniforms)
-    red, blue, inverse_rgb = gain_distributions(config.gains)
-    exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
-    a_dn, b_dn2 = (0.0, 0.0) if is_physical(config.noise) else plan_noise(config, uniforms)
-    span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
-    effects, skipped = plan_effects(config, a_dn, b_dn2, span_dn)
-    plan = Plan(
-        seed=config.seed,
-        stream_key=key,
-        downscale=config.source.downscale,
-        dequantize=dequantize_method(config.source),
-        scene=config.scene.name,
-        exposure_ratio=draw_parameter(exposure_ratio, uniforms["exposure_ratio"]),
-        camera=camera,
-        weights=weights,
-        rgb2cam=rgb2cam,
-        red_gain=draw_parameter(red, uniforms["red"]),
-        blue_gain=draw_parameter(blue, uniforms["blue"]),
-        inverse_rgb_gain=draw_parameter(inverse_rgb, uniforms["inverse_rgb"]),
-        tone=config.isp.tone,
-        gamma="srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma),
-        highlight=config.gains.highlight,
-        highlight_threshold=config.gains.threshold,
-        pattern=config.sensor.pattern,
-        bits=config.sensor.bits,
-        black_level_dn=config.sensor.black_level_dn,
-        white_level_dn=config.sensor.white_level_dn,
-        sensor_clip=config.sensor.clip,
-        saturated=config.sensor.saturated,
-        noise=config.noise.name,
-        noise_law=config.noise.law,
-        a_dn=a_dn,
-        b_dn2=b_dn2,
-        effects=effects,
-        skipped=skipped,
-        accuracy=config.accuracy.name,
-        methods=(),
-        law_distance=config.accuracy.law_distance,
-        level=level,
-        dtype=config.output.dtype,
-        layout=config.output.layout,
-    )
-    counts_electrons, normalised = uses_physics(config.noise), is_normalised(config)
-    return replace(
-        plan, methods=choose_methods(accuracy_budget(config.accuracy), counts_electrons, normalised, is_steep(plan))
-    )
+            effects=selection.effects,
+            skipped=selection.skipped,
+        )
+        return plan, selection
 
 
 # ---------------------------------------------------------------------------------------------------------- camera
@@ -243,7 +358,7 @@ def _plan(config: Config, key: int, uniforms: dict[str, float], level: int) -> P
 Weights = tuple[float, float, float, float]
 
 
-def plan_camera(camera: CameraConfig, uniforms: dict[str, float]) -> tuple[str, Weights, colour.Matrix]:
+def plan_camera(camera: CameraConfig, uniforms: Mapping[str, float]) -> tuple[str, Weights, colour.Matrix]:
     """Return the name of the camera, the weights of the four known cameras in it, and its matrix from linear sRGB."""
     names = tuple(colour.CAMERAS)
     if camera.law == "identity":
@@ -258,7 +373,7 @@ def plan_camera(camera: CameraConfig, uniforms: dict[str, float]) -> tuple[str, 
     return name, (w0, w1, w2, w3), colour.rgb2cam(colour.CAMERAS[name])
 
 
-def convex_weights(uniforms: dict[str, float]) -> Weights:
+def convex_weights(uniforms: Mapping[str, float]) -> Weights:
     """Return four uniforms, each divided by their sum (Brooks et al. 2019, random_ccm())."""
     u0, u1, u2, u3 = (uniforms[f"weight_{i}"] for i in range(4))
     total = u0 + u1 + u2 + u3
@@ -266,22 +381,6 @@ def convex_weights(uniforms: dict[str, float]) -> Weights:
 
 
 # ----------------------------------------------------------------------------------------------------------- noise
-
-
-def plan_noise(config: Config, uniforms: dict[str, float]) -> tuple[float, float]:
-    """Draw the two numbers of a noise profile and convert them to the sensor's DN: (a_dn, b_dn2)."""
-    noise, sensor = config.noise, config.sensor
-    a_distribution, b_distribution = noise_distributions(noise)
-    a = draw_parameter(a_distribution, uniforms["a"])
-    b = draw_parameter(b_distribution, uniforms["b"], a)
-    return noise_in_dn(
-        a,
-        b,
-        units=noise.units or "",
-        black=noise.black or "",
-        profile_levels_dn=(noise.black_level_dn or 0, noise.white_level_dn or 0),
-        sensor_levels_dn=(sensor.black_level_dn, sensor.white_level_dn),
-    )
 
 
 def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
