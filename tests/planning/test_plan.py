@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import decimal
 import hashlib
 import itertools
 import math
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from fractions import Fraction
 
 import mpmath
@@ -18,12 +20,15 @@ from helpers.moments import bernstein
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unprocess_gen.config import distributions
 from unprocess_gen.config.distributions import draw_parameter as draw
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
-from unprocess_gen.core.types import Distribution, Plan
-from unprocess_gen.planning.plan import PARAMETERS, TwoNumberLevel, plan_camera, plan_image
+from unprocess_gen.core.types import Distribution, Facts, Plan
+from unprocess_gen.planning import noise_profile
+from unprocess_gen.planning.plan import PARAMETERS, TwoNumberLevel, plan_camera, plan_image, plan_pairs
 from unprocess_gen.simulation.reference import colour
 
 SHA = hashlib.sha256(b"a photograph").hexdigest()
@@ -407,3 +412,51 @@ def test_noise_with_negative_variance_at_all_signals_is_skipped(settings: Settin
 def test_planning_imports_neither_numba_nor_opencv() -> None:
     code = "import sys, unprocess_gen.planning.plan; print({'numba', 'cv2', 'hydra', 'omegaconf'} & set(sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
+
+
+# Cost -----------------------------------------------------------------------------------------------------------------
+
+PHYSICAL_PROFILES = ("sony_a7s2", "nikon_d850", "canon_5d4", "imx385", "oppo_reno10x")
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("noise=brooks2019",),
+        ("noise=brooks2019", "noise.levels=3", "gains=paper_literal"),
+        *((f"noise={noise}", "noise.iso=1600", "scene=night", "noise.assumed=[]") for noise in PHYSICAL_PROFILES),
+        ("noise=canon_70d", "noise.iso=[log_uniform,100,6400]", "scene.exposure_s=[log_uniform,0.001,1]"),
+    ],
+    ids=" ".join,
+)
+@pytest.mark.parametrize("count", [20, pytest.param(2000, marks=pytest.mark.slow)])
+def test_plans_have_the_digits_of_decimal(
+    settings: Settings, overrides: tuple[str, ...], count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, facts = settings(*overrides), Facts(128, 128, 256, 3, 250)
+    plans = [plan_pairs(config, f"{image:064x}", facts=facts) for image in range(count)]
+    monkeypatch.setattr(distributions, "FIXED_POINT", {})
+    monkeypatch.setattr(fixed_point, "nearest_log_linear", lambda *numbers: None)
+    for image, plan in enumerate(plans):
+        assert plan_pairs(config, f"{image:064x}", facts=facts) == plan
+
+
+@pytest.mark.parametrize("iso", [200, 400, 800, 1600, 3200])
+def test_plans_do_not_depend_on_the_decimal_context(settings: Settings, iso: int) -> None:
+    """At these ISOs a row of the table of black-level errors begins, so the last digits of logarithms matter."""
+    config = settings("noise=canon_5d4", f"noise.iso={iso}", "noise.assumed=[]")
+    facts, narrow = Facts(128, 128, 256, 3, 250), plan_image(config, SHA, facts=Facts(128, 128, 256, 3, 250))
+    for function in (noise_profile._place, noise_profile._number_of_iso, noise_profile._tukey_std):
+        function.cache_clear()  # type: ignore[attr-defined]
+    with decimal.localcontext(prec=60):
+        assert plan_image(config, SHA, facts=facts) == narrow
+
+
+def test_plans_of_one_config_are_independent(settings: Settings) -> None:
+    """What is kept for a config contains nothing of an image or a seed."""
+    config, facts = settings("noise=sony_a7s2", "scene=night", "noise.assumed=[]"), Facts(128, 128, 256, 3, 250)
+    first = plan_pairs(config, SHA, facts=facts)
+    plan_pairs(config, "0" * 64, 3, Facts(7, 5, 65536, 100, 200, 12), 2)
+    plan_pairs(replace(config, seed=9), SHA, facts=facts)
+    assert plan_pairs(config, SHA, facts=facts) == first
+    assert plan_pairs(replace(config, seed=9), SHA, facts=facts)[0].seed == 9

@@ -10,6 +10,7 @@ import pickle
 
 from unprocess_gen.config.schema import GROUPS, Config
 
+CLASSES = list(GROUPS.values())
 TOP_LEVEL = tuple(name for name in Config.__dataclass_fields__ if name not in (*GROUPS, "seed"))
 
 
@@ -28,9 +29,9 @@ def snapshot(config: Config) -> bytes | None:
         cannot be pickled; no valid config has such values.
     """
     groups = [getattr(config, name) for name in GROUPS]
-    if any(type(group) is not kind for group, kind in zip(groups, GROUPS.values(), strict=True)):
+    if [type(group) for group in groups] != CLASSES:
         return None
-    values = [*(vars(group) for group in groups), *(getattr(config, name) for name in TOP_LEVEL)]
+    values = [*map(vars, groups), *(getattr(config, name) for name in TOP_LEVEL)]
     try:
         return pickle.dumps(values, pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError):

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, localcontext
 from functools import cached_property
-from operator import add
+from operator import add, mul
 
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics
@@ -103,7 +103,12 @@ def ratio_to_noise(size: float, noise: float) -> float:
     return size / noise if noise else math.inf if size else 0.0
 
 
-PerStatistic = tuple[float, ...]
+def ratios_to_noise(sizes: Iterable[float], noise: float) -> list[float]:
+    """Return `ratio_to_noise` of each size."""
+    return [size / noise for size in sizes] if noise else [ratio_to_noise(size, noise) for size in sizes]
+
+
+PerStatistic = Sequence[float]
 """One value for each of `STATISTICS`, or for the first half of them if there is one frame."""
 
 
@@ -128,10 +133,17 @@ class FrameModel:
     signals: SignalRange
     black_level_dn: float
     _known: dict[tuple[str, float, float], _Ratios] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _known_variances: dict[float, list[tuple[str, float]]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def levels(self, on: frozenset[str]) -> tuple[float, float]:
         """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
-        full_dn = self.physics.full_well_e * self.physics.dn_per_e if "full_well" in on else math.inf
+        return self._levels_in_well if "full_well" in on else (self.signals.dark_dn, self.signals.bright_dn)
+
+    @cached_property
+    def _levels_in_well(self) -> tuple[float, float]:
+        full_dn = self.physics.full_well_e * self.physics.dn_per_e
         return min(self.signals.dark_dn, full_dn), min(self.signals.bright_dn, full_dn)
 
     @cached_property
@@ -158,22 +170,26 @@ class FrameModel:
         if effect in FIXED_PATTERNS and self.physics.fixed_pattern_in_clean:
             return rounding
         variance = 0.0
-        for name, of_physics in VARIANCES.items():
+        for name, of_effect in self._known_variances.get(level_dn) or self._variances(level_dn):
             if name in on and name != effect:
-                variance += of_physics(self.physics, level_dn)
+                variance += of_effect
         return rounding + variance
+
+    def _variances(self, level_dn: float) -> list[tuple[str, float]]:
+        """Return the variance of a pixel due to each of `VARIANCES` at a signal, DN²."""
+        found = [(name, of_physics(self.physics, level_dn)) for name, of_physics in VARIANCES.items()]
+        self._known_variances[level_dn] = found
+        return found
 
     def _ratios_of(self, effect: str, level_dn: float, masking: float) -> _Ratios:
         """Return the ratios of one effect to a masking noise at a signal."""
         known = self._known.get((effect, level_dn, masking))
         if known is None:
             contribution = CONTRIBUTIONS[effect](self, level_dn, masking)
-            variances = zip(contribution.variances, self.counts, strict=True)
-            squares = [ratio_to_noise(variance * count, masking) for variance, count in variances]
+            squares = ratios_to_noise(map(mul, contribution.variances, self.counts), masking)
             offset_dn, offsets = abs(contribution.offset_dn), None
             if offset_dn:
-                std = math.sqrt(masking)
-                offsets = [ratio_to_noise(offset_dn * root, std) for root in self.roots]
+                offsets = ratios_to_noise([offset_dn * root for root in self.roots], math.sqrt(masking))
             known = _Ratios(squares, offsets, contribution.variances[0])
             self._known[effect, level_dn, masking] = known
         return known
@@ -187,11 +203,12 @@ class FrameModel:
 
     def _squares(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> list[float]:
         """Return the square of each of `ratios`."""
-        squares, offsets = [0.0] * len(self.counts), None
+        squares: list[float] = []
+        offsets: list[float] | None = None
         before_well = 0.0
         for effect in effects:
             of_effect = self._ratios_of(effect, level_dn, self.masking_variance(effect, level_dn, on))
-            squares = list(map(add, squares, of_effect.squares))
+            squares = list(map(add, squares, of_effect.squares)) if squares else of_effect.squares
             if of_effect.offsets is not None:
                 offsets = of_effect.offsets if offsets is None else list(map(add, offsets, of_effect.offsets))
             if effect in BEFORE_WELL:
@@ -215,20 +232,21 @@ class FrameModel:
         if CONTRIBUTIONS["full_well"](self, level_dn, 0.0).offset_dn == 0:
             return 0.0
         other = 0.0
-        for name, of_physics in VARIANCES.items():
+        for name, of_effect in self._variances(level_dn):
             if name in on and name in BEFORE_WELL:
-                other += of_physics(self.physics, level_dn)
+                other += of_effect
         return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
 
     def ratio(self, effects: Sequence[str], on: frozenset[str]) -> float:
         """Return the largest ratio of several effects together, over all statistics and both signals."""
-        return math.sqrt(max(max(self._squares(effects, level_dn, on)) for level_dn in self.levels(on)))
+        dark_dn, bright_dn = self.levels(on)
+        return math.sqrt(max(*self._squares(effects, dark_dn, on), *self._squares(effects, bright_dn, on)))
 
     def outliers(self, effect: str, on: frozenset[str]) -> float:
         """Return the expected number of pixels per frame that an effect moves by more than one standard deviation."""
         if effect not in OUTLIERS:
             return 0.0
-        shares = (OUTLIERS[effect](self, level, self.masking_variance(effect, level, on)) for level in self.levels(on))
+        shares = [OUTLIERS[effect](self, level, self.masking_variance(effect, level, on)) for level in self.levels(on)]
         return self.facts.width * self.facts.height * max(shares)
 
 
@@ -262,11 +280,11 @@ def _independent(
     """
     if fixed_variance:
         pairs = zip(frame.counts, frame.per_frame, strict=True)
-        variances = tuple(variance / count + fixed_variance / sites for count, sites in pairs)
+        variances = [variance / count + fixed_variance / sites for count, sites in pairs]
     elif variance:
-        variances = tuple(variance / count for count in frame.counts)
+        variances = [variance / count for count in frame.counts]
     else:
-        variances = (0.0,) * len(frame.counts)
+        variances = [0.0] * len(frame.counts)
     return Contribution(variances, offset_dn)
 
 

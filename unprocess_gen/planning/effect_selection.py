@@ -288,7 +288,7 @@ def omit_weakest(tolerance: float, frame: FrameModel, on: frozenset[str], free: 
     for effect in sorted(free, key=strength):
         omitted.append(effect)
         rest = on - {effect}
-        if any(frame.outliers(each, rest) >= MIN_OUTLIERS for each in omitted):
+        if any(frame.outliers(each, rest) >= MIN_OUTLIERS for each in omitted if each in OUTLIERS):
             break
         if frame.ratio(omitted, rest) > tolerance:
             break
@@ -300,8 +300,8 @@ def _prediction(
     effect: str, frame: FrameModel, on: frozenset[str], forced: ForcedDecision | None, tolerance: float
 ) -> Prediction:
     """Describe an effect at the signal and in the statistic where it is strongest; the first one if several are."""
-    level_dn = max(frame.levels(on - {effect}), key=lambda level: max(frame.ratios([effect], level, on)))
-    ratios = frame.ratios([effect], level_dn, on)
+    found = [(level_dn, frame.ratios([effect], level_dn, on)) for level_dn in frame.levels(on - {effect})]
+    level_dn, ratios = max(found, key=lambda one: max(one[1]))
     at = next(n for n, ratio in enumerate(ratios) if ratio >= max(ratios) * (1 - 1e-9))
     masking = frame.masking_variance(effect, level_dn, on)
     contribution = CONTRIBUTIONS[effect](frame, level_dn, masking)
