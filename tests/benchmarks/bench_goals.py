@@ -138,7 +138,7 @@ class Measured:
         row, ratio = self.row, statistics.median(self.ratios)
         is_met = ratio >= row.goal if row.least else ratio <= row.goal
         unit = " µs" if row.against is None else ""
-        digits = 0 if ratio >= 20 else 2
+        digits = 1 if ratio >= 20 else 2
         found, lowest, highest = (f"{value:.{digits}f}" for value in (ratio, min(self.ratios), max(self.ratios)))
         sides = [f"{statistics.median(side):.1f}" for side in zip(*self.times_ns, strict=True)]
         return (
