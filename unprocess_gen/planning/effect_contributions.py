@@ -190,9 +190,13 @@ class FrameModel:
             offset_dn, offsets = abs(contribution.offset_dn), None
             if offset_dn:
                 offsets = ratios_to_noise([offset_dn * root for root in self.roots], math.sqrt(masking))
-            known = _Ratios(squares, offsets, contribution.variances[0])
+            known = _Ratios(contribution, squares, offsets)
             self._known[effect, level_dn, masking] = known
         return known
+
+    def contribution(self, effect: str, level_dn: float, masking: float) -> Contribution:
+        """Return what an effect contributes at a signal, where the other noise has the variance ``masking``, DN²."""
+        return self._ratios_of(effect, level_dn, masking).contribution
 
     def ratios(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> PerStatistic:
         """Return the ratio of several effects together to the masking noise, in each statistic.
@@ -212,7 +216,7 @@ class FrameModel:
             if of_effect.offsets is not None:
                 offsets = of_effect.offsets if offsets is None else list(map(add, offsets, of_effect.offsets))
             if effect in BEFORE_WELL:
-                before_well += of_effect.pixel_variance
+                before_well += of_effect.contribution.variances[0]
         if before_well and "full_well" in on:
             masking = self.masking_variance("full_well", level_dn, on)
             lost_dn = self.lost_in_well(before_well, level_dn, on)
@@ -252,15 +256,14 @@ class FrameModel:
 
 @dataclass(frozen=True, slots=True)
 class _Ratios:
-    """Hold ratios of one effect to the masking noise in each statistic.
+    """Hold a contribution, and its ratios to the masking noise in each statistic.
 
-    ``squares``: of its variances; ``offsets``: of its offset, None without one; ``pixel_variance``: its variance in
-    single pixels, DN².
+    ``squares``: of its variances; ``offsets``: of its offset, None without one.
     """
 
+    contribution: Contribution
     squares: list[float]
     offsets: list[float] | None
-    pixel_variance: float
 
 
 VARIANCES: dict[str, Callable[[Physics, float], float]] = {

@@ -27,7 +27,6 @@ from unprocess_gen.config.interpretation import (
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Facts, Physics, Srgb
 from unprocess_gen.planning.effect_contributions import (
-    CONTRIBUTIONS,
     OUTLIERS,
     STATISTICS,
     FrameModel,
@@ -304,7 +303,7 @@ def _prediction(
     level_dn, ratios = max(found, key=lambda one: max(one[1]))
     at = next(n for n, ratio in enumerate(ratios) if ratio >= max(ratios) * (1 - 1e-9))
     masking = frame.masking_variance(effect, level_dn, on)
-    contribution = CONTRIBUTIONS[effect](frame, level_dn, masking)
+    contribution = frame.contribution(effect, level_dn, masking)
     predicted_dn = math.sqrt(contribution.variances[at] + contribution.offset_dn * contribution.offset_dn)
     simulated, outliers = effect in on, frame.outliers(effect, on)
     why = f"{ratios[at]:.3g} of the noise there"  # recorded: decides bytes of datasets
