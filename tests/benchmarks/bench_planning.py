@@ -4,9 +4,9 @@
 
 Prints a Markdown table with a row for each setting: microseconds of CPU time per image, and their ratio to the time of
 the yardstick, a pair of 128 x 128 pixels with two-number noise and a finished plan. Every image has draws of its own.
-Each round plans one image of each setting, in turns. The columns are the median of the images, the lowest of them, the
-ratio of the medians, and the first image of the process, for which the config is interpreted. Last come the steps that
-`unprocess_gen.make_pair` adds for a small array: the check of its config, the facts and the digest of its pixels.
+All settings take turns. The columns are the median of the images, the shortest time, the ratio of the medians, and the
+first image, for which the config is interpreted. The last rows are steps that `unprocess_gen.make_pair` adds for small
+arrays: the check of the config, the facts and the digest of the pixels.
 """
 
 from __future__ import annotations
