@@ -66,10 +66,10 @@ GRIDS = [
 
 
 @pytest.mark.parametrize(("top", "step"), GRIDS)
-def test_the_tone_curve_is_within_5_units_of_rounding(top: int, step: int) -> None:
+def test_the_tone_curve_is_within_6_units_of_rounding(top: int, step: int) -> None:
     inner = codes(top, step)[1:-1]
     with mpmath.workdps(60):
-        assert worst_units(tone_of(inner, top), [true_tone(code, top) for code in inner]) <= 5
+        assert worst_units(tone_of(inner, top), [true_tone(code, top) for code in inner]) <= 6
 
 
 @pytest.mark.parametrize(("top", "step"), GRIDS)
@@ -95,9 +95,9 @@ def test_the_tone_curve_increases_with_the_code(top: int) -> None:
 
 @pytest.mark.parametrize("top", [255, 65535])
 def test_the_tone_curve_inverts_the_cubic(top: int) -> None:
-    """The bound is five units in y times a slope of at most 1.5, plus five operations with terms of up to 3."""
+    """The bound is six units in y times a slope of at most 1.5, plus five operations with terms of up to 3."""
     y = tone_of(codes(top), top)
-    assert np.abs(y * y * (3 - 2 * y) - codes(top) / top).max() <= (1.5 * 5 + 5) * EPS
+    assert np.abs(y * y * (3 - 2 * y) - codes(top) / top).max() <= (1.5 * 6 + 5) * EPS
 
 
 def test_no_tone_does_not_change_the_image() -> None:
