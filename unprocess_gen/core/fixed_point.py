@@ -189,7 +189,7 @@ REACH = Decimal(1) / 80
 MAX_QUANTILE = 8.4
 """Largest magnitude of a quantile. At most 8.3 belongs to a uniform of 53 bits."""
 
-_SERIES_ERROR = Decimal(2) ** -80
+_SERIES_ERROR = Decimal(1) / (1 << 80)
 _NORMAL = NormalDist()
 
 
@@ -244,13 +244,10 @@ def _node(number: int) -> _Node:
     """Return the series at the quantile ``number / 64``, with so many terms that they lack at most 2**-80."""
     with localcontext(prec=DIGITS + 10):
         z = Decimal(number) / NODES
-        coefficients, power, order = [], Decimal(1), 0
-        while True:
-            order += 1
-            power *= REACH / order
-            if _evaluate(_derivative(order), z + REACH) * power <= _SERIES_ERROR:
-                break
-            coefficients.append(_evaluate(_derivative(order), z) * power / REACH**order)
+        coefficients, order, factorial, power = [], 1, 1, REACH
+        while _evaluate(_derivative(order), z + REACH) * power > _SERIES_ERROR * factorial:
+            coefficients.append(_evaluate(_derivative(order), z) / factorial)
+            order, factorial, power = order + 1, factorial * (order + 1), power * REACH
         density = normal_density(z)
         return _Node(
             quantile=fixed(z),

@@ -214,7 +214,7 @@ def _is_well_conditioned(entries: Matrix) -> bool:
 
     With m the largest entry, the norms of the matrix and its adjoint are at most 3m and 6m², so the condition number is
     at most 18m³ divided by the determinant. The determinant in float64 is within 40 · 2**-53 · m³. Exact fractions, as
-    in `condition`, take 0.2 ms, a fifth of the time to plan an image.
+    in `condition`, take 0.1 ms longer, as long as the rest of a plan.
     """
     a, b, c, d, e, f, g, h, i = entries
     largest = max(map(abs, entries))
