@@ -29,7 +29,7 @@ from unprocess_gen.cli import main as cli
 from unprocess_gen.pipeline import workspace
 from unprocess_gen.pipeline.executors import local
 from unprocess_gen.simulation import self_test as selftest
-selftest.check("one_normal")
+selftest.check("gaussian")
 spent = {}
 make = local.make_shard
 def timed(*given, **more):

@@ -237,7 +237,7 @@ import os, sys, time
 from unprocess_gen.cli import main
 from unprocess_gen.config import yaml_files, composition
 def slowly(path):
-    open("started", "w").close()
+    os.close(os.open("started", os.O_CREAT))
     time.sleep(60)
 composition.read_yaml_mapping = slowly
 sys.argv = ["gen-dataset", "--config-dir", "mine", "noise=own"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import shutil
 import subprocess
@@ -9,14 +10,13 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numba
-import numpy as np
 import pytest
 
 from unprocess_gen.core import jit
-from unprocess_gen.core.jit import KERNEL_PACKAGES, inner, is_cached, kernel
+from unprocess_gen.core.jit import KERNEL_PACKAGES, by_class, has_run, inner, kernel, note_run
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "unprocess_gen"
@@ -42,9 +42,10 @@ def quarter(x):
 """
 CALL = """
 import sys
-from unprocess_gen.core.jit import is_cached
+from unprocess_gen.core.jit import has_run, note_run
 from unprocess_gen.simulation.caller import quarter
-print(is_cached(quarter), quarter(8.0), len(quarter.stats.cache_hits))
+print(has_run("quarter"), quarter(8.0), len(quarter.stats.cache_hits))
+note_run("quarter")
 """
 
 
@@ -60,7 +61,7 @@ class Copy:
         (self.package / name).write_text(text)
 
     def call(self, **env: str) -> str:
-        """Call the outer kernel in a new process; return whether it was cached, its result, and its cache hits."""
+        """Call the outer kernel in a new process; return whether it ran before, its result, and its cache hits."""
         return subprocess.run(
             [sys.executable, "-c", CALL],
             cwd=self.folder,
@@ -199,7 +200,7 @@ def test_functions_without_a_file_are_compiled_without_a_cache() -> None:
     exec("@inner\ndef square(x):\n    return x * x\n@kernel\ndef power(x):\n    return square(x) * x", names)
 
     assert names["power"](3.0) == 27.0
-    assert is_cached(names["power"])
+    assert names["power"].stats.cache_path is None
 
 
 def test_kernels_of_other_packages_call_no_unhashed_files() -> None:
@@ -217,20 +218,94 @@ def test_kernels_of_other_packages_call_no_unhashed_files() -> None:
     assert len(kernels) > 80
     for function in kernels:
         for name in function.__code__.co_names:
-            called = getattr(function.__globals__.get(name), "py_func", None)
-            if called is not None:
+            for called in callees(function.__globals__.get(name)):
                 file = called.__code__.co_filename
                 assert file == function.__code__.co_filename or file.startswith(hashed), (function, called)
 
 
-def test_a_kernel_compiled_in_this_process_counts_as_cached(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Path, "glob", lambda path, pattern: iter(()))  # an empty cache
-    never_called = kernel(_first_is_one)
-
-    assert not is_cached(never_called)
-    never_called(np.zeros(1))
-    assert is_cached(never_called)
+def callees(value: Any) -> list[Any]:
+    """Return the functions that a compiled call of ``value`` may execute."""
+    if getattr(value, "__qualname__", "") == "by_class.<locals>.call":
+        return [one.py_func for one in inspect.getclosurevars(value).nonlocals["implementations"].values()]
+    return [value.py_func] if hasattr(value, "py_func") else []
 
 
-def _first_is_one(x: np.ndarray) -> None:
-    x[0] = 1.0
+# Sets of kernels that have run ----------------------------------------------------------------------------------------
+
+
+def test_a_set_has_run_after_it_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "kernel_cache_folder", lambda: tmp_path)
+
+    assert not has_run("gaussian")
+    note_run("gaussian")
+    note_run("gaussian")
+    assert has_run("gaussian")
+    assert not has_run("electrons")
+
+
+def test_a_set_has_not_run_with_other_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("before", "after"):
+        (tmp_path / name).mkdir()
+        monkeypatch.setattr(jit, "kernel_cache_folder", lambda folder=tmp_path / name: folder)
+        assert not has_run("gaussian")
+        note_run("gaussian")
+
+
+def test_without_a_cache_no_set_has_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for folder in (None, tmp_path / "removed"):
+        monkeypatch.setattr(jit, "kernel_cache_folder", lambda folder=folder: folder)
+        note_run("gaussian")
+        assert not has_run("gaussian")
+
+
+def test_every_set_has_run_if_nothing_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jit, "kernel_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+
+    assert has_run("gaussian")
+
+
+# Kernels chosen by class ----------------------------------------------------------------------------------------------
+
+
+class Metres(NamedTuple):
+    value: float
+
+
+class Feet(NamedTuple):
+    value: float
+    metres_per_foot: float
+
+
+def _of_metres(length: Metres, factor: float) -> float:
+    return length.value * factor
+
+
+def _of_feet(length: Feet, factor: float) -> float:
+    return length.value * length.metres_per_foot * factor
+
+
+scaled = by_class({Metres: inner(_of_metres), Feet: inner(_of_feet)})
+in_python = by_class({Metres: _of_metres, Feet: _of_feet})
+
+
+@kernel
+def _scaled(length: Any, factor: float) -> float:
+    return scaled(length, factor)
+
+
+@pytest.mark.parametrize(("length", "expected"), [(Metres(3.0), 6.0), (Feet(4.0, 0.25), 2.0)])
+def test_class_of_first_argument_chooses_the_kernel(length: Any, expected: float) -> None:
+    """Metres have no ``metres_per_foot``, so code that contained both kernels could not be compiled."""
+    assert _scaled(length, 2.0) == in_python(length, 2.0) == expected
+
+
+def test_a_class_without_a_kernel_is_refused() -> None:
+    with pytest.raises(TypeError, match="Miles: no kernel takes it"):
+        in_python(Miles(1.0), 2.0)
+    with pytest.raises(TypeError, match="Miles: no kernel takes it"):
+        _scaled(Miles(1.0), 2.0)
+
+
+class Miles(NamedTuple):
+    value: float

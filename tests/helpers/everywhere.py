@@ -33,7 +33,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -42,27 +42,18 @@ from typing import Any
 import llvmlite.binding as llvm
 import numba
 import numpy as np
+from numba.core.typing.templates import builtin_registry
 
 from unprocess_gen.cli import main as cli
-from unprocess_gen.core.jit import kernel
-from unprocess_gen.core.lookup_tables import normal_table
-from unprocess_gen.core.random_streams import BLOCK
+from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.kernels import (
-    clean,
-    float_draws,
-    gaussian,
-    gaussian_float32,
-    philox,
-    physical,
-    poisson,
-    readout,
-    segments,
-)
-from unprocess_gen.simulation.kernels.normal import fill_coarse_normals, fill_fine_normals, normal_quantile_tables
-from unprocess_gen.simulation.kernels.simd import load, pointer_to
-from unprocess_gen.simulation.pair import make_pair, make_pairs
-from unprocess_gen.simulation.reference.poisson import poisson_tables
+from unprocess_gen.simulation.kernels import body, render
+from unprocess_gen.simulation.kernels.electrons import Electrons
+from unprocess_gen.simulation.kernels.philox import philox_keys
+from unprocess_gen.simulation.kernels.readout import readout_of
+from unprocess_gen.simulation.kernels.render import uses_scene32
+from unprocess_gen.simulation.kernels.strips import STRIP
+from unprocess_gen.simulation.pair import make_pair
 
 KERNELS = {
     f"{module_name}.{name}": value
@@ -111,16 +102,24 @@ def facts(given: str) -> dict[str, Any]:
 
 def hash_kernel_arguments() -> Any:
     """Hash all arguments of later calls of the outer kernel, except the last three, which it fills."""
-    kernel, arguments_digest = gaussian._fill_pairs, hashlib.sha256()
+    kernel, arguments_digest = render._render, hashlib.sha256()
 
     def hash_and_call(*arguments: Any) -> None:
-        for argument in arguments[:-3]:
-            for one in argument if isinstance(argument, tuple) else (argument,):
-                arguments_digest.update(np.asarray(one).tobytes())
+        for one in members(arguments[:-3]):
+            arguments_digest.update(np.asarray(one).tobytes())
         kernel(*arguments)
 
-    gaussian._fill_pairs = hash_and_call
+    render._render = hash_and_call
     return arguments_digest
+
+
+def members(value: Any) -> Iterator[Any]:
+    """Yield the arrays and numbers of a tuple, also those of tuples inside."""
+    if isinstance(value, tuple):
+        for one in value:
+            yield from members(one)
+    else:
+        yield value
 
 
 LIBM: tuple[Callable[[float], float], ...] = (math.sin, math.asin, math.exp, math.log, lambda x: x**2.2)
@@ -154,75 +153,38 @@ def kernels() -> dict[str, Any]:
 # Doubles before they are rounded --------------------------------------------------------------------------------------
 
 
-@kernel
-def _draw(words: Any, rates: Any, normal: Any, tables: Any, buffers: Any, out: Any) -> None:
-    poisson.fill_counts(words, rates, normal, tables, buffers, out)
-
-
-@kernel
-def _digitise(counts: Any, words: Any, body: Any, buffers: Any, out: Any) -> None:
-    physical._convert_to_dn(counts, words, body, (0, 0), 64.0, buffers, out)
-
-
-@kernel
-def _light(
-    codes: Any, scene: Any, buffers: Any, camera: Any, gray: Any, dim: Any, lit: Any, unrounded: Any, clean_dn: Any,
-    tally: Any,
-) -> None:  # fmt: skip
-    count, of_photograph, run = clean_dn.shape[0], clean.parameter_pointers(scene), segments.buffer_pointers(buffers)
-    gains, headroom = load(pointer_to(scene.site_gains, 0), 0), load(pointer_to(scene.site_headroom, 0), 0)
-    clean.fill_signal(pointer_to(codes, 0), True, 0, count, of_photograph, pointer_to(camera, 0))
-    clean._fill_gray_mean_signal(pointer_to(codes, 0), 0, count, of_photograph, pointer_to(gray, 0))
-    clean.fill_linear(count // BLOCK, gains, of_photograph, run, run.clean)
-    segments.copy_values(count, run.unrounded_dn, dim)
-    clean.recompute_bright(count // BLOCK, gains, headroom, of_photograph, run, run.clean)
-    clean.fill_scene_light(buffers.signal[:count], scene.site_gains[0], scene.site_headroom[0], scene, lit)
-    clean.fill_clean_from_light(lit, scene, unrounded, clean_dn, tally)
-
-
-@kernel
-def _draws(key: Any, words: Any) -> None:
-    philox.fill_segment_words(key, (3, 0), np.uint64(4), words.shape[0], words)
-
-
-@kernel
-def _round(dn: Any, noisy: Any, tally: Any) -> None:
-    readout.round_and_clip(dn, (0.0, 4095.0), noisy, tally)
-
-
 def doubles() -> str:
     """Return the digest of the kernels' values before rounding to DN, which shows a change of one bit.
 
-    Frames would show such a change once in 10^12 sites. Kernels return the noisy frame rounded only, so its signals end
-    half-way between two DN.
+    Frames would show such a change once in 10^12 sites. After the kernel has run, the workspace holds the values of all
+    stages for the last strip, including counts and deviates.
     """
-    count = segments.LONG_SEGMENT
-    n = np.arange(count)
-    tally = np.zeros(6, dtype=np.int64)
-    codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8)
-    camera, gray, lit, unrounded, counts, digitised, dim = (np.empty(count) for _ in range(7))
-    words = np.empty(count, dtype=np.uint32)
-    clean_dn, noisy = np.empty(count, dtype=np.uint16), np.empty(count, dtype=np.uint16)
+    n = np.arange(2 * STRIP)
+    codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8).reshape(2, STRIP, 3)
+    found = []
+    for plan in plans():
+        shape, origin, dtype = codes.shape[:2], (5, 7), np.float32 if plan.normalised else np.uint16
+        scene, noise, workspace = render._records([plan], shape, 256, origin)
+        clean, noisy = np.empty(codes[..., 0].size, dtype=dtype), np.empty((1, codes[..., 0].size), dtype=dtype)
+        counts = np.zeros((1, 6), dtype=np.int64)
+        readout = readout_of([plan], shape, origin, uses_scene32(plan))
+        render._render(codes, scene, noise, philox_keys([plan]), origin, readout, workspace, clean, noisy, counts)
+        found += [clean, noisy, counts, *workspace]
+        if isinstance(noise, Electrons):
+            found += members(noise.body)
+    return digest(*map(np.ascontiguousarray, found))
 
-    buffers, of_counts = segments.allocate_buffers(count), poisson.allocate_count_buffers(count)
-    buffers.signal[:count] = n / 999.0
-    plan = replace(selftest.GOLDEN_PLANS["physical"], saturated="noisy")
-    scene = clean.pair_parameters(plan, np.arange(256) / 255.0, (1, count), (0, 0))
-    _light(codes, scene, buffers, camera, gray, dim, lit, unrounded, clean_dn, tally)
-    key = philox.philox_key(2**33 + 1, 5, 6, 7)
-    _draws(key, words)
-    normals = float_draws.by_inverse_cdf(words[None], normal_table())[0]
-    _draw(words, 10.0 ** (n % 10 - 1.0), normal_quantile_tables(), poisson_tables(), of_counts, counts)
-    body = physical._sensor_parameters(plan, (1, count), (0, 0))
-    _digitise(counts, words, body, of_counts, digitised)
-    _round(n % 9 + 0.5, noisy, tally)
-    deep, fine, coarse = np.empty((3, count), dtype=np.float32)
-    fill_fine_normals(words, deep, fine)
-    fill_coarse_normals(words, deep, coarse)
-    return digest(
-        camera, gray, lit, unrounded, clean_dn, normals, counts, digitised, body.response, dim, words, fine, coarse,
-        noisy, tally, buffers.unrounded_dn[:count], buffers.bright_light[:count],
-    )  # fmt: skip
+
+def plans() -> list[Plan]:
+    """Return plans that need all kernels."""
+    golden = [plan for plan in selftest.GOLDEN_PLANS.values() if not plan.uses_reference]
+    full = selftest.GOLDEN_PLANS["physical"]
+    averaged = replace(full, physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True))
+    dark = replace(selftest.GOLDEN_PLAN, a_dn=0.01, b_dn2=-1.0)
+    few = replace(selftest.GOLDEN_PLAN, noise_law="poisson", a_dn=900.0)
+    float32 = replace(selftest.GOLDEN_PLANS["float32"], highlight="gray_mean")
+    pinned = replace(full, saturated="pinned", exposure_ratio=9.0)
+    return [*golden, averaged, replace(averaged, dtype="float32"), dark, few, float32, pinned]
 
 
 # Machine code ---------------------------------------------------------------------------------------------------------
@@ -237,13 +199,15 @@ def code() -> dict[str, Any]:
     free = numba.njit(fastmath=True)(multiply_and_add)
     free.compile((numba.float64[::1],) * 3)
     compile_kernels()
-    kernels = [one for one in KERNELS.values() if one.signatures]
+    chosen = kernels_chosen_by_class()
+    kernels = [one for one in (*KERNELS.values(), *chosen) if one.signatures]
+    compiled = {one.py_func for one in kernels}
     asm, free_asm = ("".join(code for one in of for code in one.inspect_asm().values()) for of in (kernels, [free]))
     ir, free_ir = ([code for one in of for code in one.inspect_llvm().values()] for of in (kernels, [free]))
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     return {
-        "not compiled": [name for name, one in KERNELS.items() if not one.signatures],
+        "not compiled": [name for name, one in KERNELS.items() if one.py_func not in compiled],
         "instructions": {
             "Numba's own": [instructions(asm), instructions(free_asm)],
             **{
@@ -258,34 +222,24 @@ def code() -> dict[str, Any]:
 
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for the arguments of their calls; execute none."""
-    black = np.zeros((2, 2, 3), dtype=np.uint8)
-    outer = ((gaussian, "_fill_pairs"), (clean, "_fill_clean_frame"), (gaussian_float32, "_fill_pairs32"))
-    of_counts = (
-        "_fill_physical_pair",
-        "_fill_shot_read_pair",
-        "_fill_physical_noisy",
-        "_fill_prnu_response",
-    )
-    of_floats = ("_fill_words", "_fill_by_inverse_cdf", "_fill_poisson")
-    for module, name in (
-        *outer,
-        *((physical, name) for name in of_counts),
-        *((float_draws, name) for name in of_floats),
-    ):
+    for module, name in ((render, "_render"), (body, "_fill_words"), (body, "_fill_response")):
         setattr(module, name, compiler(getattr(module, name)))
-    for plan in selftest.GOLDEN_PLANS.values():
-        make_pair(black, plan)
-    for name in ("per_channel", "plain", "physical"):
-        plan = selftest.GOLDEN_PLANS[name]
-        plan = replace(plan, effects=tuple(one for one in plan.effects if one != "full_well"))
-        list(make_pairs(black, [plan] * 2))
-    for normals in (fill_fine_normals, fill_coarse_normals):
-        normals.compile((numba.uint32[::1], numba.float32[::1], numba.float32[::1]))
-    three = (numba.float64[::1],) * 3
-    selftest._product_and_sum.compile(three)
-    words, doubles = np.zeros(1, dtype=np.uint32), np.zeros(1)
-    given = words, doubles, normal_quantile_tables(), poisson_tables(), poisson.allocate_count_buffers(8), doubles
-    _draw.compile(tuple(map(numba.typeof, given)))
+    for dtype in (np.uint8, np.uint16):
+        for plan in plans():
+            make_pair(np.zeros((2, 2, 3), dtype=dtype), plan)
+    selftest._product_and_sum.compile((numba.float64[::1],) * 3)
+
+
+def kernels_chosen_by_class() -> list[Any]:
+    """Return the kernels that Numba has compiled for functions of `jit.by_class`: it compiles them separately."""
+    return [
+        entry[0]
+        for function, kind in builtin_registry.globals
+        if getattr(function, "__qualname__", "") == "by_class.<locals>.call"
+        for template in kind.templates
+        for entry in template._impl_cache.values()
+        if entry is not None
+    ]
 
 
 def compiler(kernel: Any) -> Callable[..., None]:

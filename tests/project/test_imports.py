@@ -64,9 +64,21 @@ def test_libraries_are_imported_in_listed_modules_only(library: str) -> None:
 
 
 def test_no_fast_math_on_the_way_to_the_output() -> None:
-    from unprocess_gen.simulation.kernels import clean, gaussian, normal, philox, physical, poisson, readout
+    from unprocess_gen.simulation.kernels import (
+        body,
+        clean,
+        electrons,
+        gaussian,
+        normal,
+        philox,
+        poisson,
+        readout,
+        render,
+        rounding,
+        strips,
+    )
 
-    modules = (philox, clean, normal, poisson, gaussian, physical, readout)
+    modules = (body, clean, electrons, gaussian, normal, philox, poisson, readout, render, rounding, strips)
     kernels = [value for module in modules for value in vars(module).values()]
     kernels = [value for value in kernels if hasattr(value, "targetoptions")]
 

@@ -13,15 +13,13 @@ from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL, is_steep, method
 from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
-from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import FLOAT32_METHOD, Pair, Plan
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.kernels import gaussian_float32 as single
+from unprocess_gen.simulation.kernels.render import pass_key
 from unprocess_gen.simulation.pair import FRAMES_PER_PASS, make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS
 from unprocess_gen.simulation.reference.noise import EFFECTS
-from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.simulation.self_test import GOLDEN_PHYSICS
 from unprocess_gen.sources.scenes import synthetic
 
@@ -184,6 +182,49 @@ def test_levels_with_different_noise_models_equal_separate_pairs(scene: np.ndarr
             assert pair.counts == alone.counts
 
 
+UNITS = (
+    {}, {"dn_per_e": 0.5, "row_std_dn": 9.0}, {"read_law": "gaussian", "dark_e": 0.0}, {"read_std_dn": 0.0},
+    {"dark_offset": "kept", "black_error_dn": (9.0, 0.0, -3.0, 0.5)}, {"column_std_dn": 0.0}, {"dark_e": 1e7},
+    {"body_key": 7}, {"body_key": 7, "dn_per_e": 0.25}, {"body_key": 7, "prnu_std": 0.1}, {"prnu_std": 0.0},
+    {"hot_pixel_share": 0.5}, {"hot_pixel_e": 1e7}, {"dead_pixel_share": 0.5}, {},
+)  # fmt: skip
+"""Changes of `GOLDEN_PHYSICS`: more plans of one body than a pass has, then other bodies."""
+
+
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+@pytest.mark.parametrize("layout", ["mosaic", "packed"])
+def test_levels_of_several_bodies_equal_separate_pairs(scene: np.ndarray, plan: Plan, dtype: str, layout: str) -> None:
+    on = tuple(effect for effect in EFFECTS if effect != "full_well")
+    plan = replace(plan, dtype=dtype, layout=layout, physics=GOLDEN_PHYSICS)
+    plans = [
+        replace(plan, level=n, effects=on, physics=replace(GOLDEN_PHYSICS, **changes))  # type: ignore[arg-type]
+        for n, changes in enumerate(UNITS)
+    ]
+    assert len({pass_key(one) for one in plans}) > 2
+    assert len({pass_key(one) for one in plans[: FRAMES_PER_PASS + 1]}) == 1
+
+    assert_equal_separate_pairs(scene[:58, :296], plans)
+
+
+def test_levels_of_different_effects_equal_separate_pairs(scene: np.ndarray, plan: Plan) -> None:
+    sets = (("shot", "read"), ("read",), ("prnu", "shot"), ("dark_current",), ("hot_pixels", "read"), ("dead_pixels",))
+    plans = [replace(plan, physics=GOLDEN_PHYSICS, effects=(*on, "quantise")) for on in (*sets, *sets[::-1], ())]
+    plans += levels_of(plan)[:3]
+    plans = [replace(one, level=n) for n, one in enumerate(plans)]
+
+    assert_equal_separate_pairs(scene[:59, :297], plans)
+
+
+def assert_equal_separate_pairs(srgb: np.ndarray, plans: list[Plan]) -> None:
+    pairs = list(make_pairs(srgb, plans, origin=(3, 130)))
+    assert len(pairs) == len(plans) > FRAMES_PER_PASS
+    for one, pair in zip(plans, pairs, strict=True):
+        alone = make_pair(srgb, one, origin=(3, 130))
+        np.testing.assert_array_equal(pair.clean, alone.clean)
+        np.testing.assert_array_equal(pair.noisy, alone.noisy)
+        assert pair.counts == alone.counts
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (1, 1025), (3, 1024), (513, 1)])
 def test_levels_are_equal_for_every_shape_and_16_bit_sources(plan: Plan, shape: tuple[int, int]) -> None:
     srgb = np.random.Generator(np.random.Philox(key=3)).integers(0, 65536, (*shape, 3)).astype(np.uint16)
@@ -227,9 +268,7 @@ def test_plans_of_different_clean_frames_are_refused(scene: np.ndarray, plan: Pl
 
 
 def in_float32(srgb: np.ndarray, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
-    curve = linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
-    limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    return single.make_pairs(srgb, [plan], curve, [limits_dn], origin)[0]
+    return make_pair(srgb, replace(plan, methods=(FLOAT32_METHOD,)), origin)
 
 
 def assert_within(differing: int, worst: int, sites: int) -> None:

@@ -209,8 +209,8 @@ def choose_methods(
     counts_electrons : bool
         Whether the noise has Poisson counts, which have no float32 implementation.
     normalised : bool
-        Whether frames are normalised floats. They are not rounded and are exact under every budget: float64 or NumPy,
-        with the effects in NumPy.
+        Whether frames are normalised floats. They are not rounded and are exact under every budget. Their stage
+        ``effects`` is recorded as NumPy, as 0.1 computed it.
     steep : bool
         Whether `is_steep` excludes float32.
 

@@ -12,15 +12,17 @@ only kernels of these two packages or of its own file, which Numba checks itself
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import numba
+from numba.extending import overload
 
 numba_config: Any = numba.config
 """Numba's settings: public names without types, assigned when Numba is imported."""
@@ -66,24 +68,72 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compile(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
-def is_cached(function: Callable[..., Any]) -> bool:
-    """Return whether a kernel is compiled in this process or has machine code in the cache.
+_INNER_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function that calls one of several kernels, chosen by the class of its first argument.
+
+    Compiled kernels contain only the chosen one, because Numba knows the class when it compiles them.
 
     Parameters
     ----------
-    function : callable
-        Return value of `kernel`.
+    implementations : mapping of class to callable
+        Return values of `inner` by class of named tuple; all take the same number of arguments.
+
+    Returns
+    -------
+    callable
+        Function for use in kernels.
+    """
+
+    def call(*arguments: Any) -> Any:
+        return _implementation(implementations, type(arguments[0]))(*arguments)
+
+    def choose(*types: Any) -> Any:
+        chosen = _implementation(implementations, types[0].instance_class)
+        return getattr(chosen, "py_func", chosen)
+
+    overload(call, jit_options=_INNER_OPTIONS, strict=False)(choose)
+    return call
+
+
+def _implementation(implementations: Mapping[type, Callable[..., Any]], record_class: type) -> Any:
+    if record_class not in implementations:
+        raise TypeError(f"{record_class.__name__}: no kernel takes it")
+    return implementations[record_class]
+
+
+def has_run(kernels: str) -> bool:
+    """Return whether `note_run` was called with this name since the sources changed, so that nothing is compiled.
+
+    Parameters
+    ----------
+    kernels : str
+        Name of a set of kernels.
 
     Returns
     -------
     bool
-        True also if nothing is compiled at all (``NUMBA_DISABLE_JIT=1``).
+        True also if nothing is compiled at all (``NUMBA_DISABLE_JIT=1``). Another processor or version of Numba may
+        compile again.
     """
-    dispatcher = cast(Any, function)
-    if not hasattr(dispatcher, "stats") or dispatcher.signatures:
-        return True
-    folder = dispatcher.stats.cache_path
-    return folder is not None and any(Path(folder).glob(f"*.{function.__qualname__}-*.nbi"))
+    folder = kernel_cache_folder()
+    return bool(numba_config.DISABLE_JIT) or (folder is not None and (folder / f"{kernels}.run").exists())
+
+
+def note_run(kernels: str) -> None:
+    """Record next to the machine code that a set of kernels has run.
+
+    Parameters
+    ----------
+    kernels : str
+        Name of a set of kernels.
+    """
+    folder = kernel_cache_folder()
+    if folder is not None and not numba_config.DISABLE_JIT:
+        with contextlib.suppress(OSError):  # only a message of progress depends on it
+            (folder / f"{kernels}.run").touch()
 
 
 @functools.cache

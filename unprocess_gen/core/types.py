@@ -333,7 +333,7 @@ class Plan:
     @property
     def counts_electrons(self) -> bool:
         """True if the noise contains Poisson counts, not only one normal deviate per site."""
-        return self.physics is not None or self.noise_law == "poisson"
+        return self.physics is not None or (self.noise_law == "poisson" and self.variance_line[0] > 0)
 
     @property
     def averaged(self) -> bool:

@@ -11,15 +11,13 @@ clip and round both frames (`_read_out`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, fields, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import PACKED, Counts, Float, Frame, Normalised, Pair, Plan, Srgb
-from unprocess_gen.simulation.kernels import float_draws, gaussian, gaussian_float32, physical
-from unprocess_gen.simulation.kernels.clean import make_clean
+from unprocess_gen.core.types import PACKED, Counts, Float, Frame, Pair, Plan, Srgb
+from unprocess_gen.simulation.kernels.render import pass_key, render_pairs
 from unprocess_gen.simulation.reference import noise
 from unprocess_gen.simulation.reference.cfa import pack
 from unprocess_gen.simulation.reference.sensor import noisy_limits, normalise, quantise, to_dn
@@ -51,15 +49,7 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     ValueError
         If ``srgb`` has another dtype or shape, or an odd side with ``layout="packed"``.
     """
-    _check_image(srgb, plan)
-    srgb = _dequantise(srgb, plan, origin)
-    if plan.uses_reference:
-        return _arrange_pair(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
-    if plan.normalised:
-        return _float_pair(srgb, plan, origin)
-    if plan.counts_electrons:
-        return _arrange_pair(physical.make_pair(srgb, plan, _curve(srgb, plan), _limits_dn(plan), origin), plan, origin)
-    return next(_gaussian_pairs(srgb, [plan], origin))
+    return next(make_pairs(srgb, [plan], origin))
 
 
 def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> Iterator[Pair]:
@@ -88,60 +78,46 @@ def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 
     """
     for plan in plans:
         _check_image(srgb, plan)
-    if any(_clean_frame_parameters(plan) != _clean_frame_parameters(plans[0]) for plan in plans):
+    if any(_clean_frame_parameters(plan) != _clean_frame_parameters(plans[0]) for plan in plans[1:]):
         raise ValueError(
             "the clean frames of the plans differ; expected plans that differ in noise, level and draw only"
         )
-    kinds = {(plan.normalised, plan.counts_electrons) for plan in plans}
-    if len(plans) < 2 or not all(map(_needs_only_clean_frame, plans)) or len(kinds) > 1:
-        return (make_pair(srgb, plan, origin) for plan in plans)
-    simulate = _gaussian_pairs if (False, False) in kinds else _pairs_from_clean_frame
-    return simulate(_dequantise(srgb, plans[0], origin), plans, origin)
+    return _pairs(srgb, plans, origin)
+
+
+def _pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
+    """Yield the pair of each plan, several from each pass over the image."""
+    if not plans:
+        return
+    srgb = _dequantise(srgb, plans[0], origin)
+    clean: Frame | None = None
+    for some in _passes(plans):
+        if some[0].uses_reference:
+            for plan in some:
+                yield _arrange_pair(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
+            continue
+        for pair in render_pairs(srgb, some, origin):
+            clean = pair.clean if clean is None else clean
+            yield Pair(clean, pair.noisy, pair.counts)
 
 
 FRAMES_PER_PASS = 5
 """Noisy frames simulated in one pass over the image: 10 bytes per pixel, and 5 for the image and the clean frame."""
 
 
-def _gaussian_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
-    """Simulate pairs whose noise is one normal deviate per site.
+def _passes(plans: Sequence[Plan]) -> Iterator[list[Plan]]:
+    """Divide plans into consecutive passes, each with one kind of noise and one body.
 
-    Each pass over `FRAMES_PER_PASS` plans recomputes the clean frame, which costs less than storing it unrounded.
+    Each pass recomputes the clean frame, which costs less than storing it unrounded.
     """
-    first = plans[0]
-    curve = _curve(srgb, first)
-    simulate = gaussian_float32.make_pairs if first.uses_float32 else gaussian.make_pairs
-    clean: Frame | None = None
-    for start in range(0, len(plans), FRAMES_PER_PASS):
-        some = plans[start : start + FRAMES_PER_PASS]
-        for plan, pair in zip(some, simulate(srgb, some, curve, [*map(_limits_dn, some)], origin), strict=True):
-            clean = _arrange(pair.clean, plan, origin) if clean is None else clean
-            yield Pair(clean, _arrange(pair.noisy, plan, origin), pair.counts)
-
-
-def _pairs_from_clean_frame(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
-    """Compute the unrounded clean frame once, and add the noise of each plan to it."""
-    first = plans[0]
-    unrounded, rounded, clean_counts = make_clean(srgb, first, _curve(srgb, first), origin)
-    if first.normalised:
-        del rounded
-        clean = _float_frame(unrounded.shape, first)
-        for plan in plans:
-            noisy = _float_frame(unrounded.shape, plan)
-            counts = _fill_floats(unrounded, clean_counts, plan, origin, clean if plan is first else None, noisy)
-            yield Pair(clean, noisy, Counts(*counts.tolist()))
-        return
-    clean_dn = _arrange(rounded, first, origin)
-    del rounded
+    some: list[Plan] = []
     for plan in plans:
-        noisy_dn, noisy_counts = physical.make_noisy(unrounded, plan, _limits_dn(plan), origin)
-        all_counts = (int(count) for count in clean_counts + noisy_counts)
-        yield Pair(clean_dn, _arrange(noisy_dn, plan, origin), Counts(*all_counts))
-
-
-def _needs_only_clean_frame(plan: Plan) -> bool:
-    """Return whether the noisy frame is a function of the unrounded clean frame after its clipping."""
-    return not (plan.uses_reference or plan.averaged or "full_well" in plan.effects)
+        if some and (len(some) == FRAMES_PER_PASS or pass_key(plan) != pass_key(some[0])):
+            yield some
+            some = []
+        some.append(plan)
+    if some:
+        yield some
 
 
 def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
@@ -150,7 +126,7 @@ def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
         plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
         effects=(), skipped=(), physics=None, level=0, draw=0, frame=0,
     )  # fmt: skip
-    return without_noise, plan.brightest, plan.averaged and (plan.physics, plan.effects)
+    return without_noise, plan.brightest, plan.averaged and (plan.physics, plan.effects, plan.sensor_clip)
 
 
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
@@ -181,16 +157,16 @@ def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> 
 
 def _reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None = None) -> Pair:
     """Return the pair before packing; ``curve`` is the exact table of the tone curve, or None to use its formulas."""
-    light = _scene_light(srgb, plan, origin, curve, noise.REFERENCE_DRAWS)
-    return _read_out(_clean_dn(light, plan), _count_clipped(light, plan), plan, origin, noise.REFERENCE_DRAWS)
+    light = _scene_light(srgb, plan, origin, curve)
+    return _read_out(_clean_dn(light, plan), _count_clipped(light, plan), plan, origin)
 
 
-def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None, draws: noise.Draws) -> Float:
+def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None) -> Float:
     """Return the light of the scene at each CFA site, 0 at black and 1 at white, before clipping."""
     light = unprocess(srgb, plan, origin, curve)
     if plan.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
         light = np.minimum(light, 1) * plan.exposure
-    return noise.respond(light, plan, origin, draws) if plan.averaged else light
+    return noise.respond(light, plan, origin) if plan.averaged else light
 
 
 def _clean_dn(light: Float, plan: Plan) -> Float:
@@ -203,17 +179,15 @@ def _count_clipped(light: Float, plan: Plan) -> tuple[int, int]:
     return int((light < 0).sum()), int((light > plan.brightest).sum())
 
 
-def _read_out(
-    clean_dn: Float, clipped: tuple[int, int], plan: Plan, origin: tuple[int, int], draws: noise.Draws
-) -> Pair:
+def _read_out(clean_dn: Float, clipped: tuple[int, int], plan: Plan, origin: tuple[int, int]) -> Pair:
     """Add noise to an unrounded clean frame, clip both frames, then round or normalise them.
 
     ``clipped`` is the result of `_count_clipped` for the clean frame.
     """
-    noisy_dn = noise.noisy(clean_dn, plan, origin, draws)
+    noisy_dn = noise.noisy(clean_dn, plan, origin)
     if plan.saturated == "pinned":
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
-    averaged_dn = noise.average(clean_dn, plan, origin, draws) if plan.averaged else clean_dn
+    averaged_dn = noise.average(clean_dn, plan, origin) if plan.averaged else clean_dn
 
     low, high = _limits_dn(plan)
     levels_dn = plan.black_level_dn, plan.white_level_dn
@@ -235,57 +209,6 @@ def _read_out(
         zero_variance=int((noise.noise_variance(clean_dn, plan) == 0).sum()),
     )
     return Pair(clean, noisy, counts)
-
-
-def _float_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Pair:
-    """Compute the pair of `_reference_pair` in float32, one band of rows after the other."""
-    clean, noisy = (_float_frame(srgb.shape, plan) for _ in range(2))
-    counts = np.zeros(len(fields(Counts)), dtype=np.int64)
-    curve = _curve(srgb, plan)
-    for rows in float_draws.row_bands(srgb.shape, float_draws.BAND_SITES):
-        at = origin[0] + rows.start, origin[1]
-        if plan.averaged:
-            light = _scene_light(srgb[rows], plan, at, curve, float_draws.KERNEL_DRAWS)
-            clean_dn, clean_counts = _clean_dn(light, plan), np.array(_count_clipped(light, plan))
-        else:
-            clean_dn, _, clean_counts = make_clean(srgb[rows], plan, curve, at)
-        counts += _fill_floats(clean_dn, clean_counts, plan, at, _view_rows(clean, rows), _view_rows(noisy, rows))
-    return Pair(clean, noisy, Counts(*counts.tolist()))
-
-
-def _fill_floats(
-    clean_dn: Float,
-    clean_counts: NDArray[np.int64],
-    plan: Plan,
-    origin: tuple[int, int],
-    clean: Normalised | None,
-    noisy: Normalised,
-) -> NDArray[np.int64]:
-    """Fill ``noisy``, and ``clean`` unless it is None, from an unrounded clean frame; return the numbers of `Counts`.
-
-    The first two numbers are copied from ``clean_counts``.
-    """
-    counts = np.zeros(len(fields(Counts)), dtype=np.int64)
-    counts[:2] = clean_counts[:2]
-    for rows in float_draws.row_bands(clean_dn.shape, float_draws.PIECE_SITES):
-        at = origin[0] + rows.start, origin[1]
-        piece = _read_out(clean_dn[rows], (0, 0), plan, at, float_draws.KERNEL_DRAWS)
-        if clean is not None:
-            _view_rows(clean, rows)[:] = _arrange(piece.clean, plan, at)
-        _view_rows(noisy, rows)[:] = _arrange(piece.noisy, plan, at)
-        counts += astuple(piece.counts)
-    return counts
-
-
-def _float_frame(shape: tuple[int, ...], plan: Plan) -> Normalised:
-    """Allocate a float32 frame in the plan's layout for an image ``[H, W, …]``."""
-    height, width = shape[:2]
-    return np.empty((4, height // 2, width // 2) if plan.layout == PACKED else (height, width), dtype=np.float32)
-
-
-def _view_rows(frame: Normalised, rows: slice) -> Normalised:
-    """Return a view of mosaic rows (even start and stop), or of the corresponding rows of packed planes."""
-    return frame[rows] if frame.ndim == 2 else frame[:, rows.start // 2 : rows.stop // 2]
 
 
 def _arrange_pair(pair: Pair, plan: Plan, origin: tuple[int, int]) -> Pair:

@@ -10,49 +10,20 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from helpers.kernels import coarse_normals, exact_values, fine_normals, values_by_lines
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import method
-from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import normal_table, tukey_table
-from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.normal import (
     FINE_ERROR,
     LINES_PER_OCTAVE,
-    QuantileTables,
-    build_quantile_tables,
-    exact_value,
-    fill_approximate_values,
-    fill_coarse_normals,
-    fill_fine_normals,
-    normal_quantile_tables,
+    build_quantiles,
+    normal_quantiles,
 )
 from unprocess_gen.simulation.reference import noise as effects
 
 SIGN = 2**31
-
-
-@kernel
-def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
-    fill_approximate_values(words, lines, pairs, out)
-
-
-@kernel
-def _exact(words: np.ndarray, quadratics: tuple[Float, Float, Float], out: np.ndarray) -> None:
-    for n in range(out.shape[0]):
-        out[n] = exact_value(words[n], quadratics)
-
-
-def quick(words: np.ndarray, law: QuantileTables) -> np.ndarray:
-    out = np.empty(words.shape, dtype=np.float32)
-    _quick(words, law.lines, np.empty(words.shape, dtype=np.uint64), out)
-    return out.astype(np.float64)
-
-
-def exact(words: np.ndarray, law: QuantileTables) -> np.ndarray:
-    out = np.empty(words.shape)
-    _exact(words, law.quadratics, out)
-    return out
 
 
 @functools.cache
@@ -89,8 +60,8 @@ def reference(law: str, random_bits: int) -> np.ndarray:
 @pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("law", LAWS)
 def test_approximate_values_are_within_their_error_bound(law: str, random_bits: int) -> None:
-    form = build_quantile_tables(LAWS[law]())
-    off = np.abs(quick(telling_words(random_bits), form) - reference(law, random_bits))
+    form = build_quantiles(LAWS[law]())
+    off = np.abs(values_by_lines(telling_words(random_bits), form) - reference(law, random_bits))
     assert off.max() <= form.error
     assert off.max() > form.error / 20  # nor is the claim far too wide
 
@@ -98,20 +69,20 @@ def test_approximate_values_are_within_their_error_bound(law: str, random_bits: 
 @pytest.mark.parametrize("random_bits", RANDOM_BITS)
 @pytest.mark.parametrize("law", LAWS)
 def test_the_exact_value_of_a_word_equals_the_reference(law: str, random_bits: int) -> None:
-    found = exact(telling_words(random_bits), build_quantile_tables(LAWS[law]()))
+    found = exact_values(telling_words(random_bits), build_quantiles(LAWS[law]()))
     assert (found == reference(law, random_bits)).all()
 
 
 def test_approximate_normals_are_within_1e_5() -> None:
-    assert normal_quantile_tables().error < 1e-5
+    assert normal_quantiles().error < 1e-5
 
 
 @pytest.mark.slow
 def test_approximate_normals_are_within_their_error_for_every_word(figure: Figure) -> None:
-    form, worst = normal_quantile_tables(), 0.0
+    form, worst = normal_quantiles(), 0.0
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
-        worst = max(worst, float(np.abs(quick(words, form) - exact(words, form)).max()))
+        worst = max(worst, float(np.abs(values_by_lines(words, form) - exact_values(words, form)).max()))
     assert worst <= form.error
     figure("normal", f"lines: at most {worst:.2g} standard deviations off, all words")
 
@@ -119,16 +90,13 @@ def test_approximate_normals_are_within_their_error_for_every_word(figure: Figur
 # Polynomials ----------------------------------------------------------------------------------------------------------
 
 POLYNOMIALS = {
-    "fine": (fill_fine_normals, FINE_ERROR),
-    "coarse": (fill_coarse_normals, method("normal", "polynomial_float32").normal_error),
+    "fine": (fine_normals, FINE_ERROR),
+    "coarse": (coarse_normals, method("normal", "polynomial_float32").normal_error),
 }
 
 
 def by_polynomial(words: np.ndarray, which: str) -> np.ndarray:
-    padded = np.resize(words, -(-words.size // 8) * 8)
-    depths, out = np.empty((2, padded.size), dtype=np.float32)
-    POLYNOMIALS[which][0](padded, depths, out)
-    return out[: words.size].astype(np.float64)
+    return POLYNOMIALS[which][0](words).astype(np.float64)
 
 
 @pytest.mark.parametrize("random_bits", RANDOM_BITS)
@@ -152,9 +120,9 @@ def test_polynomial_normals_have_the_sign_of_their_word(which: str, random_bits:
 @pytest.mark.slow
 @pytest.mark.parametrize("which", POLYNOMIALS)
 def test_polynomial_normals_are_within_their_error_for_every_word(which: str, figure: Figure) -> None:
-    form, worst = normal_quantile_tables(), 0.0
+    form, worst = normal_quantiles(), 0.0
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
-        worst = max(worst, float(np.abs(by_polynomial(words, which) - exact(words, form)).max()))
+        worst = max(worst, float(np.abs(by_polynomial(words, which) - exact_values(words, form)).max()))
     assert worst <= POLYNOMIALS[which][1]
     figure("normal", f"{which} polynomial: at most {worst:.2g} standard deviations off, all words")

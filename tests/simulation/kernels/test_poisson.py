@@ -11,19 +11,20 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
+from helpers.kernels import approximate_counts, exact_counts, values_by_lines
+from helpers.kernels import counts as fast
 from helpers.moments import bernstein
 from helpers.promise_report import Figure
 
 from unprocess_gen.core import lookup_tables as tables
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.jit import kernel
 from unprocess_gen.simulation.kernels import poisson as kernels
-from unprocess_gen.simulation.kernels.normal import QuantileTables, fill_approximate_values, normal_quantile_tables
-from unprocess_gen.simulation.kernels.poisson import CountBuffers, allocate_count_buffers, fill_counts
+from unprocess_gen.simulation.kernels.normal import normal_quantiles
+from unprocess_gen.simulation.kernels.poisson import LOW_ROOT, MAX_FLOAT32_RATE, count_tables
 from unprocess_gen.simulation.reference import poisson as poissons
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.reference.poisson import LIMIT, Tables, poisson, poisson_tables
+from unprocess_gen.simulation.reference.poisson import LIMIT, poisson, poisson_tables
 
 WORDS = 2**32
 SIGN = 2**31
@@ -33,21 +34,6 @@ BIG = (100.0, 1e3, 12345.678, 1e5, 1e6, 1e7, 1e9)
 PROFILE_RANGES = (*SMALL, math.nextafter(LIMIT, 0), LIMIT, math.nextafter(LIMIT, 99), *BIG)
 
 Draw = Callable[[np.ndarray, np.ndarray], np.ndarray]
-
-
-def fast(words: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Return the counts of the kernel, with the arguments of `poisson`."""
-    out = np.full(words.shape, np.nan)
-    room = allocate_count_buffers((len(words) + 7) // 8 * 8)
-    _draw(words.astype(np.uint32), rates, normal_quantile_tables(), poisson_tables(), room, out)
-    return out
-
-
-@kernel
-def _draw(
-    words: np.ndarray, rates: np.ndarray, normal: QuantileTables, tables: Tables, room: CountBuffers, out: np.ndarray
-) -> None:
-    fill_counts(words, rates, normal, tables, room, out)
 
 
 def word(rank: np.ndarray) -> np.ndarray:
@@ -216,7 +202,9 @@ def test_a_larger_rate_never_gives_a_smaller_count() -> None:
 # The two forms --------------------------------------------------------------------------------------------------------
 
 EDGE_WORDS = [0, 1, 2, SIGN // 2, SIGN - 2, SIGN - 1, SIGN, SIGN + 1, SIGN + 2, 3 * (SIGN // 2), WORDS - 2, WORDS - 1]
-NO_RATES = [0.0, -0.0, -5e-324, -1.0, -1e300]
+NO_RATES = [0.0, -0.0, -5e-324]
+NEGATIVE_RATES = [-1.0, -1e300, math.nan]
+"""Rates that `fill_counts` never gets: it gets those of light, which is not negative."""
 TINY_RATES = [5e-324, 2.0**-1050, 2.3e-308, 1e-300, 1e-100, 1e-20, 2.0**-53, 2.0**-34]
 
 
@@ -273,8 +261,7 @@ def test_the_guess_leaves_two_counts_in_every_cell() -> None:
 
 def short(words: np.ndarray, rate: float) -> np.ndarray:
     """Return x by the short form as compiled: approximate normals, float32, without the integer part of the rate."""
-    quick = np.empty(words.shape, dtype=np.float32)
-    _quick(words, normal_quantile_tables().lines, np.empty(words.shape, dtype=np.uint64), quick)
+    quick = values_by_lines(words, normal_quantiles())
     a, b = (np.array(one, dtype=np.float32) for one in (poissons.A, poissons.B))
     root = np.sqrt(np.float32(rate))
     s = quick * (np.float32(1) / root)
@@ -284,11 +271,6 @@ def short(words: np.ndarray, rate: float) -> np.ndarray:
     x = (np.float32(rate - np.rint(rate)) + root * quick) + (quick * quick * powers_a + powers_b)
     assert x.dtype == np.float32
     return np.asarray(np.rint(rate) + x.astype(np.float64))
-
-
-@kernel
-def _quick(words: np.ndarray, lines: np.ndarray, pairs: np.ndarray, out: np.ndarray) -> None:
-    fill_approximate_values(words, lines, pairs, out)
 
 
 def real_quantile(rate: float, w: float) -> float:
@@ -318,6 +300,89 @@ def test_the_short_form_is_within_its_error(rate: float) -> None:
     assert np.abs(short(words, rate) - exact).max() <= claimed / 1.5
 
 
+# Approximate counts ---------------------------------------------------------------------------------------------------
+
+STEPS = np.concatenate([np.arange(3), 2 ** np.arange(2, 26)])
+"""Distances in rank from the words at which a count changes, up to 1 % of all words."""
+
+
+def words_near_changes(rate: float, dense: int) -> np.ndarray:
+    """Return the words at and near every change of the count, and ``dense`` words of evenly spaced normals."""
+    found, _ = law(rate)
+    edges = words_up_to(found, np.full(len(found), rate), poisson)
+    normal = np.linspace(-6.34, 6.34, dense)
+    rank = [math.erfc(-z / math.sqrt(2)) / 2 * WORDS for z in normal]
+    ranks = np.concatenate([(edges[:, None] + STEPS).ravel(), (edges[:, None] - 1 - STEPS).ravel(), np.rint(rank)])
+    return word(np.unique(np.clip(ranks, 0, WORDS - 1)))
+
+
+def wrong_and_not_listed(rate: float, dense: int) -> int:
+    words = words_near_changes(rate, dense)
+    rates = np.full(words.shape, rate)
+    approximate, is_listed = approximate_counts(words, rates)
+    return int(((approximate != poisson(words, rates)) & ~is_listed).sum())
+
+
+CELLS = 16 * LOW_ROOT
+"""Cells of the threshold tables, in the square root of the rate."""
+
+
+@pytest.mark.parametrize(
+    ("inside", "dense"),
+    [
+        pytest.param((1e-7, 0.13, 0.5, 0.87, 1 - 1e-7), 400, id="five rates"),
+        pytest.param(np.linspace(1e-9, 1 - 1e-9, 17), 5000, id="many rates", marks=pytest.mark.slow),
+    ],
+)
+def test_counts_by_thresholds_are_right_or_listed(inside: tuple[float, ...], dense: int) -> None:
+    """Rates are in every cell and next to its ends, words where counts change and everywhere between."""
+    wrong = {}
+    for cell, part in itertools.product(range(CELLS), inside):
+        rate = ((cell + part) / 16) ** 2
+        if number := wrong_and_not_listed(rate, dense):
+            wrong[rate] = number
+    assert wrong == {}
+
+
+@pytest.mark.parametrize("rate", [16.0, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, MAX_FLOAT32_RATE])
+def test_counts_by_expansion_are_right_or_listed(rate: float) -> None:
+    assert wrong_and_not_listed(rate, 20_000) == 0
+
+
+def test_a_wrong_threshold_is_found() -> None:
+    """A threshold is moved by twice its error bound, which shows that the tests above would find it."""
+    rate, right = ((40 + 0.5) / 16) ** 2, count_tables()
+    row = 40 * 64 + math.floor(rate)
+    start = right.thresholds[row : row + 1].view(np.float32)[0] + np.float32(2 * right.errors[40])
+    wrong = right.thresholds.copy()
+    wrong[row : row + 1].view(np.float32)[0] = start
+    words = words_near_changes(rate, 400)
+    rates = np.full(words.shape, rate)
+    approximate, is_listed = approximate_counts(words, rates, right._replace(thresholds=wrong))
+    assert ((approximate != poisson(words, rates)) & ~is_listed).any()
+
+
+@pytest.mark.parametrize(
+    ("rate", "share"),
+    [(0.1, 0.004), (1.0, 0.004), (4.0, 0.004), (15.9, 0.004), (16.1, 0.02), (64.0, 0.004), (1e4, 0.004)],
+)
+def test_few_counts_are_uncertain(rate: float, share: float, figure: Figure) -> None:
+    """Each costs as much as a hundred approximate ones."""
+    words = np.random.default_rng(13).integers(0, WORDS, 2**18, dtype=np.uint32)
+    listed = approximate_counts(words, np.full(words.shape, rate))[1].mean()
+    assert listed <= share
+    figure("poisson", f"{listed:.2%} of counts are computed twice at rate {rate:g}")
+
+
+def test_approximate_counts_of_huge_rates_are_near() -> None:
+    """Counts beyond float32's integers are rounded to float32; the read-out allows for that error."""
+    rates = np.geomspace(MAX_FLOAT32_RATE, 1e9, 20_000)
+    words = np.random.default_rng(14).integers(0, WORDS, rates.size, dtype=np.uint32)
+    approximate, is_listed = approximate_counts(words, rates)
+    off = np.abs(approximate.astype(np.float64) - poisson(words, rates))[~is_listed]
+    assert (off <= rates[~is_listed] * 2.0**-23 + 1).all()
+
+
 @pytest.mark.parametrize("count", [0, 1, 3, 7])
 def test_rows_of_any_length(count: int) -> None:
     words, rates = word(np.arange(count) * 10**9), np.linspace(50, 80, count)
@@ -334,9 +399,15 @@ def test_reference_counts_have_the_shape_of_the_words() -> None:
 # No light and hardly any ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("drawn", [fast, poisson])
+@pytest.mark.parametrize("drawn", [fast, exact_counts, poisson])
 def test_no_light_gives_no_count(drawn: Draw) -> None:
-    words, rates = pairs(EDGE_WORDS, [*NO_RATES, math.nan])
+    words, rates = pairs(EDGE_WORDS, NO_RATES)
+    assert (drawn(words, rates) == 0).all()
+
+
+@pytest.mark.parametrize("drawn", [exact_counts, poisson])
+def test_negative_rates_give_no_count(drawn: Draw) -> None:
+    words, rates = pairs(EDGE_WORDS, NEGATIVE_RATES)
     assert (drawn(words, rates) == 0).all()
 
 
@@ -398,7 +469,7 @@ def test_the_refined_normal_has_a_cdf_error_below_1e_12() -> None:
     """The normal of the table has an error of up to 1.5e-7; mpmath gives the exact tail probability."""
     rng = np.random.default_rng(11)
     indices = [0, 1, 5, SIGN - 1, SIGN - 2, *rng.integers(0, SIGN, 60), *(2 ** (31 * rng.random(60))).astype(np.int64)]
-    tails = poisson_tables().tails
+    tails = poisson_tables().tails.ravel()
     for index in indices:
         tail = (int(index) + 0.5) / WORDS
         w = kernels._refine_normal.py_func(tail, float(normals(np.array([index], dtype=np.uint32))[0]), tails)
@@ -507,12 +578,13 @@ def test_the_expansion_solves_its_equation(rate: float) -> None:
 
 def test_the_cdf_table_is_right_at_every_cell_end() -> None:
     found = poisson_tables()
+    cdf_table = found.cdf.ravel()
     for cell in range(80):
         for rate in ((cell / 10) ** 2 or 1e-12, ((cell + 1) / 10) ** 2):
             counts, cdf = law(rate)
             k = np.arange(max(found.least[cell], counts[0]), min(found.most[cell], counts[-1]) + 1)
             offset = rate - found.middle[cell]
-            tabulated = [kernels._cdf_at.py_func(found.cdf, found.first[cell] + n, offset) for n in k]
+            tabulated = [kernels._cdf_at.py_func(cdf_table, found.first[cell] + n, offset) for n in k]
             assert np.abs(tabulated - cdf[k - counts[0]]).max() < 1e-11
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pytest
@@ -11,18 +11,23 @@ import pytest
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
+    absolute,
     from_bits,
     less_than,
     load,
     load_four_bytes,
+    low_half,
     maximum,
     minimum,
     movemask,
     pointer_to,
+    pointers_of,
+    select,
     square_root,
     store,
     to_bits,
     to_float32,
+    to_float64,
     to_uint32,
     uint32_zeros,
 )
@@ -31,6 +36,7 @@ SINGLES = np.array([-np.inf, -1.5, -0.0, 0.0, 1e-40, 2.5, 7.25, np.inf], dtype=n
 OTHERS = np.array([3.0, -1.5, 0.0, -0.0, 1e-38, 0.1, -7.25, 1.0], dtype=np.float32)
 WORDS = np.array([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 12345, 2**24 + 1, 77], dtype=np.uint32)
 NUMBER, TWO, ZERO = np.float32(0.3), np.float32(2), np.float32(0)
+_32, _EVERY_BIT = np.uint64(32), np.uint64(2**64 - 1)
 SHIFT, MASK = np.uint32(9), np.uint32(0x7FFFFFFF)
 
 
@@ -88,11 +94,68 @@ def _scalars(codes: np.ndarray, wide: np.ndarray, out: np.ndarray) -> None:
     target[4] = numbers[np.uint16(40000)]
 
 
+@kernel
+def _wide(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
+    store(target, 0, to_float64(a))
+    store(target, 8, to_float64(a) * to_float64(b) + 0.1)
+    store(target, 16, square_root(maximum(to_float64(b), 0.1)) / minimum(to_float64(a), 1e300))
+    store(target, 24, to_float64(absolute(a)))
+    store(target, 32, to_float64(select(less_than(a, b), a, b)))
+    store(target, 40, select(less_than(to_float64(a), 0.5) ^ _EVERY_BIT, to_float64(b), to_float64(a)))
+
+
+@kernel
+def _halves(x: np.ndarray, out: np.ndarray) -> None:
+    a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
+    store(target, 0, low_half(a))
+    store(target, 8, low_half(a >> _32))
+    store(target, 16, select(less_than(from_bits(low_half(a)), NUMBER), low_half(a >> _32), low_half(a)))
+    target[24] = movemask(less_than(to_float64(from_bits(low_half(a))), 0.5))
+
+
+class Inside(NamedTuple):
+    values: np.ndarray
+    factor: float
+
+
+class Record(NamedTuple):
+    first: np.ndarray
+    inside: Inside
+    second: np.ndarray
+    count: int
+    steps: tuple[int, int]
+
+
+@kernel
+def _record(record: Record, out: np.ndarray) -> None:
+    pointers, target = pointers_of(record), pointer_to(out, 0)
+    target[0] = pointers.first[3]
+    target[1] = pointers.inside.values[1] * pointers.inside.factor
+    target[2] = pointers.second[np.uint64(4)]
+    target[3] = pointers.count + pointers.steps[1]
+    pointers.second[5] = 99.0
+    again = pointers_of(pointers)
+    target[4] = again.second[5]
+    store(target, 5, load(pointers.inside.values, 2) + load(again.first, 0))
+
+
+def record() -> Record:
+    """Return a record of arrays of one and of two dimensions, with one inside."""
+    doubles = np.arange(12, dtype=np.float64)
+    return Record(doubles.reshape(3, 4) * 2, Inside(doubles + 0.5, 3.0), doubles.reshape(2, 6) * -1, 40, (5, 6))
+
+
+LONG_WORDS = np.array(
+    [0, 1, 2**32 - 1, 2**32, 2**63, 2**64 - 1, 0x3F800000_BF000000, 0x0123456789ABCDEF], dtype=np.uint64
+)
 DOUBLES = np.array([1.1, -2.5e-11, 2.5e-10, 3.5e-10, 1e300, -0.0, 12345.678901234, 0.5e-10])
 CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
     "arithmetic": (_arithmetic, (SINGLES, OTHERS), np.zeros(64, dtype=np.float32)),
     "bits": (_bits, (SINGLES, WORDS), np.zeros(48, dtype=np.uint32)),
     "float64": (_float64, (DOUBLES,), np.zeros(16, dtype=np.float32)),
+    "wide": (_wide, (SINGLES, OTHERS), np.zeros(48)),
+    "halves": (_halves, (LONG_WORDS,), np.zeros(25, dtype=np.uint32)),
     "masks": (_masks, (OTHERS, WORDS), np.zeros(3, dtype=np.uint32)),
     "uint16": (_uint16, (WORDS,), np.zeros(12, dtype=np.uint16)),
     "scalars": (
@@ -138,3 +201,36 @@ def test_index_of_16_bits_is_unsigned() -> None:
     out = np.zeros(5, dtype=np.uint32)
     _scalars(*CASES["scalars"][1], out)
     assert out.tolist() == [0xD0CFCECD, 203, 204, 205, 40002]
+
+
+def test_select_takes_lanes_of_set_masks() -> None:
+    out = np.zeros(48)
+    _wide(SINGLES, OTHERS, out)
+    is_less = SINGLES < OTHERS
+    assert out[32:40].tolist() == np.where(is_less, SINGLES, OTHERS).tolist()
+    assert out[40:].tolist() == np.where(SINGLES >= 0.5, OTHERS, SINGLES).tolist()
+    assert 0 < is_less.sum() < VECTOR_WIDTH
+
+
+def test_absolute_clears_the_sign_of_zero_and_infinity() -> None:
+    out = np.zeros(48)
+    _wide(SINGLES, OTHERS, out)
+    assert out[24:32].tobytes() == np.abs(SINGLES.astype(np.float64)).tobytes()
+    assert not np.signbit(out[24:32]).any()
+
+
+def test_low_half_drops_the_high_bits() -> None:
+    out = np.zeros(25, dtype=np.uint32)
+    _halves(LONG_WORDS, out)
+    assert out[:8].tolist() == [int(word) % 2**32 for word in LONG_WORDS]
+    assert out[8:16].tolist() == [int(word) >> 32 for word in LONG_WORDS]
+
+
+@pytest.mark.parametrize("form", [_record, _record.py_func], ids=["compiled", "uncompiled"])  # type: ignore[attr-defined]
+def test_pointers_of_a_record_reach_all_arrays(form: Callable[..., None]) -> None:
+    """Numbers and tuples are copied, arrays are not."""
+    given, out = record(), np.zeros(13)
+    form(given, out)
+    assert out[:5].tolist() == [6.0, 4.5, -4.0, 46.0, 99.0]
+    assert out[5:].tolist() == [2.5 + n + 2 * n for n in range(8)]
+    assert given.second[0, 5] == 99.0

@@ -47,7 +47,6 @@ from unprocess_gen.reports.benchmark.method_errors import (
     normal_error,
     normal_words,
     polynomial_normals,
-    quadratic_normals,
     shot_error,
 )
 from unprocess_gen.reports.benchmark.session import (
@@ -192,25 +191,25 @@ def _normal_error_of(sampler: Callable[[Words], Float]) -> ErrorFunction:
 
 
 METHOD_BENCHMARKS = (
-    MethodBenchmark("curve:float32_table", _clean_error, times.time_curve32),
-    MethodBenchmark("curve:exact_table", _clean_error, times.time_curve),
+    MethodBenchmark("curve:float32_table", _clean_error, times.time_clean),
+    MethodBenchmark("curve:exact_table", _clean_error, times.time_clean),
     MethodBenchmark("curve:numpy_table", _clean_error, times.time_numpy_curve),
-    MethodBenchmark("colour:fused_float32", _clean_error, times.time_clean32),
+    MethodBenchmark("colour:fused_float32", _clean_error, times.time_clean),
     MethodBenchmark("colour:fused_float64", _clean_error, times.time_clean),
     MethodBenchmark("colour:numpy_float64", _clean_error, times.time_numpy_colour),
-    MethodBenchmark("mosaic:at_site_float32", _clean_error, times.time_clean32),
+    MethodBenchmark("mosaic:at_site_float32", _clean_error, times.time_clean),
     MethodBenchmark("mosaic:at_site", _clean_error, times.time_clean),
     MethodBenchmark("mosaic:after_colour", _clean_error, times.time_numpy_mosaic),
-    MethodBenchmark("normal:polynomial_float32", _normal_error_of(polynomial_normals), times.time_normals32),
-    MethodBenchmark("normal:quadratic_float64", _normal_error_of(quadratic_normals), times.time_normals),
+    MethodBenchmark("normal:polynomial_float32", _normal_error_of(polynomial_normals), times.time_noise),
+    MethodBenchmark("normal:quadratic_float64", _normal_error_of(noise.normals), times.time_noise),
     MethodBenchmark("normal:numpy_float64", _normal_error_of(noise.normals), times.time_numpy_normals),
-    MethodBenchmark("shot:gaussian_where_near", _shot_error, times.time_approximate_shot),
-    MethodBenchmark("shot:inversion", _shot_error, times.time_counts),
-    MethodBenchmark("shot:numpy_inversion", _shot_error, times.time_numpy_shot),
+    MethodBenchmark("shot:gaussian_where_near", _shot_error, times.time_shot),
+    MethodBenchmark("shot:inversion", _shot_error, times.time_shot),
+    MethodBenchmark("shot:numpy_inversion", _shot_error, times.time_shot),
     MethodBenchmark("effects:fused_float64", _effects_error, times.time_effects),
     MethodBenchmark("effects:numpy_float64", _effects_error, times.time_effects),
-    MethodBenchmark("quantise:fused_float32", _clean_error, times.time_readout32),
-    MethodBenchmark("quantise:fused_float64", _clean_error, times.time_readout),
+    MethodBenchmark("quantise:fused_float32", _clean_error, None),
+    MethodBenchmark("quantise:fused_float64", _clean_error, None),
     MethodBenchmark("quantise:numpy_float64", _clean_error, times.time_numpy_readout),
 )
 """How each method of `METHODS` is measured, in the same order."""

@@ -12,15 +12,15 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.config.schema import AccuracyConfig
-from unprocess_gen.core.lookup_tables import normal_table
+from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float, Frame, Pair, Plan
 from unprocess_gen.reports.benchmark.session import PHYSICAL, REFERENCE, BenchmarkSession
-from unprocess_gen.simulation.kernels import float_draws
-from unprocess_gen.simulation.kernels.normal import fill_coarse_normals
-from unprocess_gen.simulation.kernels.segments import LONG_SEGMENT
+from unprocess_gen.simulation.kernels.normal import apply_signs, coarse_normal, fill_coarse_depths
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, store
 from unprocess_gen.simulation.reference import noise
 
 
@@ -127,15 +127,19 @@ def exact_normals(words: Words) -> Float:
     return np.where(words >> np.uint32(31), -upper, upper)
 
 
-def quadratic_normals(words: Words) -> Float:
-    """Return the normal deviates of the float64 kernels for uint32 words ``[n]``."""
-    normals: Float = float_draws.by_inverse_cdf(words[None], normal_table())[0]
-    return normals
-
-
 def polynomial_normals(words: Words) -> Float:
     """Return the normal deviates of the float32 kernels for uint32 words ``[n]``."""
-    padded = np.resize(words, -(-words.size // LONG_SEGMENT) * LONG_SEGMENT)
+    padded = np.resize(words, -(-words.size // VECTOR_WIDTH) * VECTOR_WIDTH)
     depths, out = np.empty((2, padded.size), dtype=np.float32)
-    fill_coarse_normals(padded, depths, out)
+    _fill_coarse_normals(padded, depths, out)
     return out[: words.size].astype(np.float64)
+
+
+@kernel
+def _fill_coarse_normals(words: Words, depths: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """Fill ``out`` with the normal deviates of ``words``; ``depths`` is scratch space."""
+    source, buffer, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
+    fill_coarse_depths(words.size, source, buffer)
+    for n in range(words.size // VECTOR_WIDTH):
+        x = np.uint64(n * VECTOR_WIDTH)
+        store(target, x, apply_signs(coarse_normal(load(buffer, x)), load(source, x)))

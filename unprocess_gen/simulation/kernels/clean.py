@@ -1,35 +1,29 @@
 """Compute the clean frame from sRGB codes: linearise, apply the matrix, invert white balance, convert to DN, round.
 
-Equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit: float64, in the reference's order of
-operations.
-
 Products of each matrix entry and each code are tabulated, so a site's signal is the sum of three look-ups. Only the
 channel recorded at each CFA site is computed (all three for ``highlight="gray_mean"``).
 
-The first pass (`fill_linear`) treats every site as unclipped. The second (`recompute_bright`) recomputes the blocks of
-64 pixels that contain a signal above `PairParameters.linear_limit`: highlights, clipped or saturated values. The other
-blocks need neither its division nor its counts.
+The first pass over a strip treats every site as unclipped. The second recomputes blocks that contain a signal above
+`Scene.linear_limit`: highlights, clipped or saturated values. Other blocks need neither its division nor its counts.
+
+Two forms: `Scene` is equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit (float64, in the
+reference's order of operations). `Scene32` (float32, for accuracy budgets that allow errors) tabulates products that
+include gains, exposure and span, so sums of them are DN above the black level; `config.accuracy` states its errors.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner, kernel
+from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.random_streams import BLOCK
-from unprocess_gen.core.types import Float, Plan, Raw, Srgb
-from unprocess_gen.simulation.kernels.rounding import ROUND
-from unprocess_gen.simulation.kernels.segments import (
-    LONG_SEGMENT,
-    SEGMENT,
-    SegmentBuffers,
-    allocate_buffers,
-    buffer_pointers,
-    copy_values,
-)
+from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
@@ -42,210 +36,167 @@ from unprocess_gen.simulation.kernels.simd import (
     movemask,
     pointer_to,
     store,
+    to_bits,
     to_float32,
+    to_float64,
     to_uint32,
 )
+from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Strip, Workspace
 from unprocess_gen.simulation.reference.cfa import tile
 
 _0, _1, _2, _3, _4, _8 = (np.uint64(number) for number in (0, 1, 2, 3, 4, 8))
 _BYTE, _S8, _S16, _S24 = (np.uint32(number) for number in (0xFF, 8, 16, 24))
 _G, _B = np.uint32(256), np.uint32(512)
+_ZERO32, _ONE32 = np.float32(0), np.float32(1)
+_ROW_SITES = VECTOR_WIDTH + 2
+
+FLOAT32_MARGIN = 2.0**-18
+"""Largest relative error of white in float32, a quarter DN at 16 bits; light above white by less is not clipped."""
+
+# ----------------------------------------------------------------------------------------------------------- parameters
 
 
-class PairParameters(NamedTuple):
-    """Hold the parameters of a plan's clean frame, as kernels take them."""
+class Scene(NamedTuple):
+    """Hold the parameters of a clean frame in float64."""
 
     products: Float  # [3, 3, codes]: matrix entry (c, j) times the curve at code k
     code_count: int
-    site_channels: NDArray[np.int64]  # [2, 2]: channel of each CFA site
+    site_channels: NDArray[np.int64]  # [2, VECTOR_WIDTH + 2]: channel of each CFA site
     inverse_gains: Float  # [3]
-    headroom: Float  # [3]: factor of the per-channel highlight term, or 0
     gray_mean: bool
     highlight_threshold: float
     linear_limit: float  # signals up to it are neither highlights nor clipped nor saturated
     exposure: float
     brightest: float
-    levels_dn: tuple[float, float, float]  # black, white - black, white
-    pinned_dn: float  # noisy DN of saturated sites; infinity if they keep their noise
-    variance_line: tuple[float, float]
-    site_gains: Float  # [2, LONG_SEGMENT]: of the sites of even and of odd rows, so that loops over them vectorise
-    site_headroom: Float  # [2, LONG_SEGMENT]
+    black_dn: float
+    span_dn: float
+    gains: Float  # [2, VECTOR_WIDTH + 2]: of the sites of even and of odd rows; 1 with gray_mean
+    headroom: Float  # [2, VECTOR_WIDTH + 2]: factor of the per-channel highlight term, or 0
+    response: Float32  # [H * P], relative gain of each pixel; ones if the clean frame has no fixed pattern
+    response_steps: tuple[int, int]  # of a row and of a column; 0 if it has no fixed pattern
 
 
-def pair_parameters(plan: Plan, curve: Float, shape: tuple[int, ...], origin: tuple[int, int]) -> PairParameters:
-    """Return the parameters of a plan; ``curve`` (float64) holds the linear value of each code of the source."""
-    gains, channels = np.array(plan.inverse_gains), np.array(tile(plan.pattern, origin))
-    ccm = np.array(plan.rgb2cam).reshape(3, 3)
+class Scene32(NamedTuple):
+    """Hold the parameters of a clean frame in float32; DN count from the black level."""
+
+    products: Float32  # [3, 3, codes], scaled to DN; not scaled with gray_mean, which compares channels
+    code_count: int
+    site_channels: NDArray[np.int64]
+    inverse_gains: Float32
+    gray_mean: bool
+    highlight_threshold: np.float32
+    steepness: np.float32  # of the highlight term: 1 / (1 - threshold)
+    exposure: np.float32
+    brightest: np.float32
+    clipped: np.float32  # light above it counts as clipped; includes FLOAT32_MARGIN
+    black_dn: np.uint32
+    span_dn: np.float32
+    dn_per_signal: np.float32  # without gains
+    limits_dn: Float32  # [2, VECTOR_WIDTH + 2]: `Scene.linear_limit` by site
+    signal_per_dn: Float32  # [2, VECTOR_WIDTH + 2]
+    gains: Float32
+    headroom: Float32
+
+
+ONES = np.ones(SIZE, dtype=np.float32)
+"""`Scene.response` without fixed patterns."""
+
+
+def scene_of(plan: Plan, codes: int, origin: tuple[int, int], response: Float32 | None = None, pitch: int = 0) -> Scene:
+    """Return the parameters of a plan for sources of ``codes`` codes; ``response`` and its ``pitch`` as in
+    `Scene`."""
+    gains, channels = np.array(plan.inverse_gains), _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
     headroom = np.maximum(1 - gains, 0) if plan.highlight == "per_channel" else np.zeros(3)
     gray_mean = plan.highlight == "gray_mean"
-    black_dn, white_dn = float(plan.black_level_dn), float(plan.white_level_dn)
-    return PairParameters(
-        products=ccm[:, :, None] * curve,
-        code_count=len(curve),
+    return Scene(
+        products=_products(plan.rgb2cam, plan.tone, plan.gamma, codes),
+        code_count=codes,
         site_channels=channels,
         inverse_gains=gains,
-        headroom=headroom,
         gray_mean=gray_mean,
         highlight_threshold=plan.highlight_threshold,
-        linear_limit=_linear_limit(plan, 1.0 if gray_mean else float(gains.max()), bool(headroom.any())),
+        # with fixed patterns, the second pass computes every block, because only it applies the response
+        linear_limit=-np.inf if response is not None else _linear_limit(plan, gains, headroom),
         exposure=plan.exposure,
         brightest=plan.brightest,
-        levels_dn=(black_dn, float(plan.white_level_dn - plan.black_level_dn), white_dn),
-        pinned_dn=pinned_level_dn(plan),
-        variance_line=plan.variance_line,
+        black_dn=float(plan.black_level_dn),
+        span_dn=float(plan.white_level_dn - plan.black_level_dn),
         # `_fill_gray_mean_signal` has inverted the gains already
-        site_gains=_per_site(np.ones(3) if gray_mean else gains, channels),
-        site_headroom=_per_site(headroom, channels),
+        gains=(np.ones(3) if gray_mean else gains)[channels],
+        headroom=headroom[channels],
+        response=ONES if response is None else response,
+        response_steps=(pitch, int(pitch > 0)),
     )
 
 
-def pinned_level_dn(plan: Plan) -> float:
-    """Return the noisy DN of saturated sites; infinity if they keep their noise."""
-    return plan.brightest_dn if plan.saturated == "pinned" else np.inf
+@functools.lru_cache(maxsize=4)
+def _products(rgb2cam: tuple[float, ...], tone: str, gamma: float | str, codes: int) -> Float:
+    products = np.array(rgb2cam).reshape(3, 3, 1) * linear_table(tone, gamma, codes)
+    products.flags.writeable = False
+    return products
 
 
-def _linear_limit(plan: Plan, highest_gain: float, has_highlights: bool) -> float:
+def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:
+    """Return the parameters of a plan in float32, for sources of ``codes`` codes."""
+    scene, f = scene_of(plan, codes, origin), np.float32
+    channels = _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
+    gains = np.ones(3) if scene.gray_mean else scene.inverse_gains
+    dn_per_signal = gains * scene.exposure * scene.span_dn
+    scale = np.ones(3) if scene.gray_mean else dn_per_signal
+    return Scene32(
+        products=(scene.products * scale[:, None, None]).astype(f),
+        code_count=codes,
+        site_channels=scene.site_channels,
+        inverse_gains=scene.inverse_gains.astype(f),
+        gray_mean=scene.gray_mean,
+        highlight_threshold=f(scene.highlight_threshold),
+        steepness=f(1 / (1 - scene.highlight_threshold)),
+        exposure=f(scene.exposure),
+        brightest=f(scene.brightest),
+        clipped=f(scene.brightest * (1 + FLOAT32_MARGIN)),
+        black_dn=np.uint32(scene.black_dn),
+        span_dn=f(scene.span_dn),
+        dn_per_signal=f(scene.exposure * scene.span_dn),
+        limits_dn=(scene.linear_limit * dn_per_signal)[channels].astype(f),
+        signal_per_dn=(1 / dn_per_signal)[channels].astype(f),
+        gains=scene.gains.astype(f),
+        headroom=scene.headroom.astype(f),
+    )
+
+
+def _linear_limit(plan: Plan, gains: Float, headroom: Float) -> float:
     """Return a signal up to which no site is a highlight, clipped or saturated, with a margin for rounding errors."""
     span_dn = plan.white_level_dn - plan.black_level_dn
     light = min(plan.brightest * 0.999, 1 - 1 / span_dn)
+    highest_gain = 1.0 if plan.highlight == "gray_mean" else float(gains.max())
     unclipped = min(1.0, light / plan.exposure) / highest_gain * 0.999
-    return min(unclipped, plan.highlight_threshold) if has_highlights else unclipped
+    return min(unclipped, plan.highlight_threshold) if headroom.any() else unclipped
 
 
-def _per_site(channels: Float, site_channels: NDArray[np.int64]) -> Float:
-    return np.tile(channels[site_channels], (1, LONG_SEGMENT // 2))
-
-
-@inner
-def parameter_pointers(parameters: PairParameters) -> PairParameters:
-    """Return the parameters with raw pointers instead of arrays."""
-    return PairParameters(
-        pointer_to(parameters.products, _0),
-        parameters.code_count,
-        pointer_to(parameters.site_channels, _0),
-        pointer_to(parameters.inverse_gains, _0),
-        pointer_to(parameters.headroom, _0),
-        parameters.gray_mean,
-        parameters.highlight_threshold,
-        parameters.linear_limit,
-        parameters.exposure,
-        parameters.brightest,
-        parameters.levels_dn,
-        parameters.pinned_dn,
-        parameters.variance_line,
-        pointer_to(parameters.site_gains, _0),
-        pointer_to(parameters.site_headroom, _0),
-    )
-
-
-def make_clean(
-    srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)
-) -> tuple[Float, Raw, NDArray[np.int64]]:
-    """Simulate the clean frame alone, to derive several noisy frames from it.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    plan : Plan
-        All parameters of the pair.
-    curve : ndarray of float64, [codes]
-        Linear value of each code.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    unrounded_dn : ndarray of float64, [H, W]
-        Clean frame before rounding, DN.
-    clean : ndarray of uint16, [H, W]
-        Clean frame, DN.
-    counts : ndarray of int64, [6]
-        Numbers of `Counts` in their order; 0 for those of the noisy frame.
-    """
-    unrounded_dn = np.empty(srgb.shape[:2])
-    clean = np.empty(srgb.shape[:2], dtype=np.uint16)
-    counts = np.zeros(6, dtype=np.int64)
-    parameters = pair_parameters(plan, curve, srgb.shape, origin)
-    _fill_clean_frame(np.ascontiguousarray(srgb), parameters, allocate_buffers(), unrounded_dn, clean, counts)
-    return unrounded_dn, clean, counts
-
-
-@kernel
-def _fill_clean_frame(
-    srgb: Srgb,
-    parameters: PairParameters,
-    buffers: SegmentBuffers,
-    unrounded_dn: Float,
-    clean: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Fill the clean frame, before and after rounding, and its counts."""
-    height, width = clean.shape
-    segment, pointers = buffer_pointers(buffers), parameter_pointers(parameters)
-    for y in range(height):
-        for start in range(0, width, SEGMENT):
-            length, at = min(SEGMENT, width - start), y * width + start
-            codes, target = pointer_to(srgb, 3 * at), pointer_to(clean, at)
-            fill_clean(codes, srgb.itemsize == 1, y, 0, length, pointers, segment, target, pointer_to(counts, 0))
-            copy_values(length, segment.unrounded_dn, pointer_to(unrounded_dn, at))
+@functools.lru_cache(maxsize=16)
+def _site_channels(pattern: str, top: int, left: int) -> NDArray[np.int64]:
+    """Return the channel of the sites of an even and an odd row, ``[2, VECTOR_WIDTH + 2]``."""
+    return np.tile(np.array(tile(pattern, (top, left))), (1, VECTOR_WIDTH // 2 + 1))
 
 
 @inner
-def fill_clean(
-    codes: Pointer,
-    is_uint8: bool,
-    y: int,
-    first: int,
-    length: int,
-    parameters: PairParameters,
-    segment: SegmentBuffers,
-    clean: Pointer,
-    counts: Pointer,
-) -> None:
-    """Fill one segment of the clean frame's row ``y``, before and after rounding, and update its counts.
+def _load_sites(values: Pointer, strip: Strip) -> Vector:
+    """Load the values of eight sites from column ``first`` of the strip's row on (`_site_channels`)."""
+    return load(values, np.uint64((strip.y & 1) * _ROW_SITES + (strip.first & 1)))
 
-    The buffers hold it from index ``first`` on; ``clean`` receives the ``length`` rounded values.
-    """
-    after, blocks = first + length, (first + length + BLOCK - 1) // BLOCK
-    fill_signal(codes, is_uint8, y, length, parameters, pointer_to(segment.signal, first))
-    of_row = (y & 1) * LONG_SEGMENT + (first & 1)
-    gains = load(pointer_to(parameters.site_gains, of_row), _0)
-    fills_blocks = length == blocks * BLOCK
-    target = clean if fills_blocks else segment.clean
-    has_negative, has_bright = fill_linear(blocks, gains, parameters, segment, target)
-    if has_negative:
-        counts[0] += count_negative(first, after, segment.signal)
-    if has_bright:
-        headroom = load(pointer_to(parameters.site_headroom, of_row), _0)
-        recompute_bright(blocks, gains, headroom, parameters, segment, target)
-        _count_bright((first, after), parameters, segment, counts)
-    if not fills_blocks:
-        copy_values(length, pointer_to(segment.clean, first), clean)
+
+# --------------------------------------------------------------------------------------------------------------- signal
 
 
 @inner
-def fill_signal(codes: Pointer, is_uint8: bool, y: int, length: int, parameters: PairParameters, out: Pointer) -> None:
-    """Linearise codes of row ``y`` and apply the matrix, for the channel of each site.
-
-    With ``gray_mean``, also invert the gains. ``parameters`` come from `parameter_pointers`.
-    """
-    if parameters.gray_mean:
-        _fill_gray_mean_signal(codes, y, length, parameters, out)
-    else:
-        even, odd = row_products(parameters.products, parameters.code_count, parameters.site_channels, y)
-        sum_products(codes, even, odd, parameters.code_count, length, is_uint8, out)
-
-
-@inner
-def row_products(products: Pointer, code_count: int, site_channels: Pointer, y: int) -> tuple[Pointer, Pointer]:
-    """Return pointers to the products of the even and of the odd sites of row ``y``, in any precision."""
-    even, odd = site_channels[2 * (y & 1)], site_channels[2 * (y & 1) + 1]
+def _row_products(products: Pointer, code_count: int, site_channels: Pointer, y: int) -> tuple[Pointer, Pointer]:
+    """Return pointers to the products of the even and of the odd columns of row ``y``."""
+    even, odd = site_channels[_ROW_SITES * (y & 1)], site_channels[_ROW_SITES * (y & 1) + 1]
     return pointer_to(products, 3 * code_count * even), pointer_to(products, 3 * code_count * odd)
 
 
 @inner
-def sum_products(
+def _sum_products(
     codes: Pointer, even: Pointer, odd: Pointer, code_count: int, length: int, is_uint8: bool, signal: Pointer
 ) -> None:
     """Sum the three products of each pixel of a row: ``even`` for even columns, ``odd`` for odd ones."""
@@ -278,131 +229,199 @@ def _sum_products_uint8(codes: Pointer, even: Pointer, odd: Pointer, fours: int,
 
 
 @inner
-def _fill_gray_mean_signal(codes: Pointer, y: int, length: int, parameters: PairParameters, out: Pointer) -> None:
+def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Scene, out: Pointer) -> None:
     """Linearise, apply the matrix, and invert the gains with highlights preserved by the mean of the channels."""
-    products, gains, threshold = parameters.products, parameters.inverse_gains, parameters.highlight_threshold
-    channel = 3 * parameters.code_count
-    for x in range(length):
+    products, gains, threshold = scene.products, scene.inverse_gains, scene.highlight_threshold
+    channel = 3 * scene.code_count
+    for x in range(strip.length):
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
-        g, b = parameters.code_count + g, 2 * parameters.code_count + b
+        g, b = scene.code_count + g, 2 * scene.code_count + b
         red = (products[r] + products[g]) + products[b]
         green = (products[channel + r] + products[channel + g]) + products[channel + b]
         blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
         m = max(((red + green) + blue) / 3.0 - threshold, 0.0) / (1.0 - threshold)
         mask = m * m
-        c = parameters.site_channels[2 * (y & 1) + (x & 1)]
+        c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
         i = red if c == 0 else green if c == 1 else blue
         out[x] = i * max(mask + (1.0 - mask) * gains[c], gains[c])
 
 
 @inner
-def fill_linear(
-    blocks: int, gains: Vector, parameters: PairParameters, segment: SegmentBuffers, clean: Pointer
-) -> tuple[bool, bool]:
-    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
-    black, span, _ = parameters.levels_dn
-    exposure = parameters.exposure
-    lowest = highest = load(segment.signal, _0)
-    for n in range(blocks * (BLOCK // VECTOR_WIDTH)):
-        x = np.uint64(n) * _8
-        i = load(segment.signal, x)
-        lowest, highest = minimum(lowest, i), maximum(highest, i)
-        _store_clean(maximum(i * gains * exposure, 0.0) * span + black, x, segment, clean)
-    return movemask(less_than(lowest, 0.0)) != 0, movemask(less_than(parameters.linear_limit, highest)) != 0
+def _fill_gray_mean_dn(codes: Pointer, strip: Strip, scene: Scene32, out: Pointer) -> None:
+    """Compute the signal as `_fill_gray_mean_signal` in float32, in DN."""
+    products, gains, threshold = scene.products, scene.inverse_gains, scene.highlight_threshold
+    channel = 3 * scene.code_count
+    for x in range(strip.length):
+        r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
+        g, b = scene.code_count + g, 2 * scene.code_count + b
+        red = (products[r] + products[g]) + products[b]
+        green = (products[channel + r] + products[channel + g]) + products[channel + b]
+        blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
+        m = max(((red + green) + blue) / np.float32(3) - threshold, _ZERO32) * scene.steepness
+        mask = m * m
+        c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
+        i = red if c == 0 else green if c == 1 else blue
+        out[x] = i * max(mask + (_ONE32 - mask) * gains[c], gains[c]) * scene.dn_per_signal
 
 
 @inner
-def recompute_bright(
-    blocks: int,
-    gains: Vector,
-    headroom: Vector,
-    parameters: PairParameters,
-    segment: SegmentBuffers,
-    clean: Pointer,
-) -> None:
-    """Recompute blocks that contain a bright signal as `fill_scene_light` and `fill_clean_from_light` do.
+def _fill_codes(codes: Pointer, is_uint8: bool, strip: Strip, scene: Scene, out: Pointer) -> None:
+    """Linearise codes and apply the matrix, for the channel of each site, in either precision."""
+    even, odd = _row_products(scene.products, scene.code_count, scene.site_channels, strip.y)
+    _sum_products(codes, even, odd, scene.code_count, strip.length, is_uint8, out)
 
-    ``segment.bright_light`` receives their light, and 0 in other blocks.
+
+# ---------------------------------------------------------------------------------------------------------- clean frame
+
+
+@inner
+def _fill_clean_exact(
+    scene: Scene, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer
+) -> Any:
+    signal = pointer_to(workspace.signal, strip.first)
+    if scene.gray_mean:
+        _fill_gray_mean_signal(codes, strip, scene, signal)
+    else:
+        _fill_codes(codes, is_uint8, strip, scene, signal)
+    has_negative, has_bright = _fill_linear(strip, scene, workspace)
+    if has_bright:
+        _recompute_bright(strip, scene, workspace)
+        counts[1] += _count_above(strip, workspace.bright_light, scene.brightest)
+    if has_negative:
+        counts[0] += _count_negative(strip, workspace.bright_light if scene.response_steps[1] else workspace.signal)
+    return has_bright
+
+
+@inner
+def _fill_linear(strip: Strip, scene: Scene, workspace: Workspace) -> tuple[bool, bool]:
+    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
+    gains, exposure, black, span = _load_sites(scene.gains, strip), scene.exposure, scene.black_dn, scene.span_dn
+    lowest = highest = load(workspace.signal, _0)
+    for n in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        i = load(workspace.signal, x)
+        lowest, highest = minimum(lowest, i), maximum(highest, i)
+        _store_clean(maximum(i * gains * exposure, 0.0) * span + black, x, workspace)
+    return movemask(less_than(lowest, 0.0)) != 0, movemask(less_than(scene.linear_limit, highest)) != 0
+
+
+@inner
+def _recompute_bright(strip: Strip, scene: Scene, workspace: Workspace) -> None:
+    """Recompute blocks that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
+
+    ``bright_light`` receives their light, and 0 in other blocks.
     """
-    black, span, _ = parameters.levels_dn
-    threshold, exposure, brightest = parameters.highlight_threshold, parameters.exposure, parameters.brightest
-    limit = np.inf if exposure == 1.0 else 1.0
-    for block in range(blocks):
-        highest = load(segment.signal, np.uint64(block * BLOCK))
+    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
+    threshold, exposure, brightest = scene.highlight_threshold, scene.exposure, scene.brightest
+    limit = np.inf if exposure == 1.0 else 1.0  # clip at white first; otherwise light above white would reappear
+    row, column = scene.response_steps
+    response = pointer_to(scene.response, strip.y * row + strip.x * column)
+    for block in range(strip.total // BLOCK):
+        highest = load(workspace.signal, np.uint64(block * BLOCK))
         for n in range(block * (BLOCK // VECTOR_WIDTH), (block + 1) * (BLOCK // VECTOR_WIDTH)):
-            highest = maximum(highest, load(segment.signal, np.uint64(n) * _8))
-        is_bright = movemask(less_than(parameters.linear_limit, highest)) != 0
+            highest = maximum(highest, load(workspace.signal, np.uint64(n) * _8))
+        is_bright = movemask(less_than(scene.linear_limit, highest)) != 0
         for n in range(block * (BLOCK // VECTOR_WIDTH), (block + 1) * (BLOCK // VECTOR_WIDTH)):
             x = np.uint64(n) * _8
-            i = load(segment.signal, x)
+            i = load(workspace.signal, x)
             if is_bright:
                 m = maximum(i - threshold, 0.0) / (1.0 - threshold)
-                light = minimum(i * gains + i * (m * m) * headroom, limit) * exposure
-                store(segment.bright_light, x, light)
-                _store_clean(minimum(maximum(light, 0.0), brightest) * span + black, x, segment, clean)
+                light = minimum(i * gains + i * (m * m) * headroom, limit) * exposure * to_float64(load(response, x))
+                store(workspace.bright_light, x, light)
+                _store_clean(minimum(maximum(light, 0.0), brightest) * scene.span_dn + scene.black_dn, x, workspace)
             else:
-                store(segment.bright_light, x, i * 0.0)
+                store(workspace.bright_light, x, i * 0.0)
 
 
 @inner
-def _store_clean(dn: Vector, x: np.uint64, segment: SegmentBuffers, clean: Pointer) -> None:
+def _store_clean(dn: Vector, x: np.uint64, workspace: Workspace) -> None:
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
     rounded = (dn + ROUND) - ROUND
     rounded_dn = to_float32(rounded)
-    store(segment.unrounded_dn, x, dn)
-    store(segment.rounded_dn, x, rounded_dn)
-    store(segment.residual_dn, x, to_float32(dn - rounded))
-    store(clean, x, to_uint32(rounded_dn))
+    store(workspace.unrounded_dn, x, dn)
+    store(workspace.rounded_dn, x, rounded_dn)
+    store(workspace.residual_dn, x, to_float32(dn - rounded))
+    store(workspace.clean, x, to_uint32(rounded_dn))
 
 
 @inner
-def count_negative(first: int, after: int, signal: Pointer) -> int:
-    """Count signals below black at indices ``first`` to ``after - 1``."""
+def _count_negative(strip: Strip, values: Pointer) -> int:
     count = 0
-    for x in range(first, after):
-        count += signal[x] < 0.0
+    for x in range(strip.first, strip.after):
+        count += values[x] < 0.0
     return count
 
 
 @inner
-def _count_bright(valid: tuple[int, int], parameters: PairParameters, segment: SegmentBuffers, counts: Pointer) -> None:
-    """Count sites above the brightest light, and saturated ones."""
-    last, brightest = parameters.levels_dn[2] + ROUND, parameters.brightest
-    above = saturated = 0
-    for x in range(valid[0], valid[1]):
-        above += segment.bright_light[x] > brightest
-        saturated += segment.unrounded_dn[x] + ROUND == last
-    counts[1] += above
-    counts[4] += saturated
+def _count_above(strip: Strip, values: Pointer, limit: float) -> int:
+    count = 0
+    for x in range(strip.first, strip.after):
+        count += values[x] > limit
+    return count
+
+
+# ---------------------------------------------------------------------------------------------------- in float32
 
 
 @inner
-def fill_scene_light(signal: Float, gains: Float, headroom: Float, parameters: PairParameters, out: Float) -> None:
-    """Invert the gains with highlights preserved per channel (unless ``headroom`` is 0), and apply the exposure."""
-    threshold, exposure = parameters.highlight_threshold, parameters.exposure
-    limit = np.inf if exposure == 1.0 else 1.0  # clip at white first; otherwise light above white would reappear
-    for x in range(signal.shape[0]):
-        i = signal[x]
-        m = max(i - threshold, 0.0) / (1.0 - threshold)
-        out[x] = min(i * gains[x] + i * (m * m) * headroom[x], limit) * exposure
+def _fill_clean_float32(
+    scene: Scene32, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer
+) -> Any:
+    signal = pointer_to(workspace.signal, strip.first)
+    if scene.gray_mean:
+        _fill_gray_mean_dn(codes, strip, scene, signal)
+    else:
+        _fill_codes(codes, is_uint8, strip, scene, signal)
+    has_negative, has_bright = _fill_linear32(strip, scene, workspace)
+    if has_negative:
+        counts[0] += _count_negative(strip, workspace.signal)
+    if has_bright:
+        _recompute_bright32(strip, scene, workspace)
+        counts[1] += _count_above(strip, workspace.bright_light, scene.clipped)
+    return has_bright
 
 
 @inner
-def fill_clean_from_light(
-    light: Float, parameters: PairParameters, unrounded_dn: Float, clean: Raw, counts: NDArray[np.int64]
-) -> None:
-    """Clip light to [0, brightest], convert it to DN, round, and count; all arrays ``[n]``."""
-    black, span, white = parameters.levels_dn
-    brightest = parameters.brightest
-    below, above, saturated = 0, 0, 0
-    for x in range(light.shape[0]):
-        below += light[x] < 0.0
-        above += light[x] > brightest
-        dn = min(max(light[x], 0.0), brightest) * span + black
-        rounded = (dn + ROUND) - ROUND
-        saturated += rounded == white
-        clean[x] = np.uint16(np.int32(rounded))
-        unrounded_dn[x] = dn
-    counts[0] += below
-    counts[1] += above
-    counts[4] += saturated
+def _fill_linear32(strip: Strip, scene: Scene32, workspace: Workspace) -> tuple[bool, bool]:
+    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
+    lowest = highest = load(workspace.signal, _0)
+    for n in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        signal = load(workspace.signal, x)
+        lowest, highest = minimum(lowest, signal), maximum(highest, signal)
+        _store_clean32(maximum(signal, _ZERO32), x, scene, workspace)
+    is_bright = less_than(_load_sites(scene.limits_dn, strip), highest)
+    return movemask(less_than(lowest, _ZERO32)) != 0, movemask(is_bright) != 0
+
+
+@inner
+def _recompute_bright32(strip: Strip, scene: Scene32, workspace: Workspace) -> None:
+    """Recompute vectors that contain a bright signal; ``bright_light`` receives their light, and 0 elsewhere."""
+    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
+    limits_dn, signal_per_dn = _load_sites(scene.limits_dn, strip), _load_sites(scene.signal_per_dn, strip)
+    limit = np.float32(np.inf) if scene.exposure == _ONE32 else _ONE32
+    for n in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        signal = load(workspace.signal, x)
+        if movemask(less_than(limits_dn, signal)) == 0:
+            store(workspace.bright_light, x, signal * _ZERO32)
+            continue
+        i = signal * signal_per_dn
+        m = maximum(i - scene.highlight_threshold, _ZERO32) * scene.steepness
+        light = minimum(i * gains + i * (m * m) * headroom, limit) * scene.exposure
+        store(workspace.bright_light, x, light)
+        _store_clean32(minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn, x, scene, workspace)
+
+
+@inner
+def _store_clean32(dn: Vector, x: np.uint64, scene: Scene32, workspace: Workspace) -> None:
+    """Store eight clean values: DN above black, and as uint16."""
+    store(workspace.unrounded_dn, x, dn)
+    store(workspace.clean, x, to_bits(dn + ROUND32) + scene.black_dn)
+
+
+fill_clean = by_class({Scene: _fill_clean_exact, Scene32: _fill_clean_float32})
+"""Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
+
+Arguments: scene, codes, whether they are uint8, strip, workspace, counts. Return whether any site can be saturated.
+"""

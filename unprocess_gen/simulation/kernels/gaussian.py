@@ -1,17 +1,9 @@
-"""Simulate clean and noisy frames for two-parameter Gaussian noise: one normal per site.
+"""Sample noise that is one normal deviate per site, with a variance linear in the signal.
 
-Contract: the same DN as `pair.reference_pair` on every CPU. Kernels use Numba without fastmath and only + - × ÷ √,
-comparisons, integers and table look-ups, in the reference's order of operations. Without these kernels a pair takes
-about 70 times as long (300 instead of 4 ns per pixel; AVX2, one thread).
-
-1. Clean frame, float64 (`clean`).
-2. Noise, float32, eight sites at a time (`simd`). Polynomials approximate normal deviates to `FINE_ERROR`; every value
-   has an error bound.
-3. Correction, float64. `_recompute_exact` recomputes sites whose error bound reaches a rounding boundary: about 1 % at
-   a noise standard deviation of 100 DN.
-
-Each stage is a separate loop, because short loops vectorise and overlap better. Segments that consist of complete
-blocks are written to the frames directly, others through the buffers.
+`Gaussian` decides every DN as `reference.noise.heteroscedastic` does. Noise is computed in float32, eight sites at a
+time, with an error bound; the read-out asks for the exact value of sites whose bound reaches a rounding boundary, about
+1 % at a standard deviation of 100 DN. `Gaussian32`, for accuracy budgets that allow errors, has shorter polynomials and
+asks for none; its DN count from the black level.
 
 Timings and rejected alternatives: ``docs/design/kernels.md``.
 """
@@ -24,283 +16,139 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner, kernel
-from unprocess_gen.core.random_streams import BLOCK, purpose
-from unprocess_gen.core.types import Float, Pair, Plan, Raw, Srgb
-from unprocess_gen.simulation.kernels.clean import (
-    PairParameters,
-    fill_clean,
-    pair_parameters,
-    parameter_pointers,
-    pinned_level_dn,
-)
+from unprocess_gen.core.jit import inner
+from unprocess_gen.core.random_streams import purpose
+from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels.normal import (
     FINE_ERROR,
     apply_signs,
+    coarse_normal,
     exact_value,
+    fill_coarse_depths,
     fill_depths,
     fine_normal,
-    normal_quantile_tables,
+    normal_quantiles,
 )
-from unprocess_gen.simulation.kernels.philox import fill_word_blocks, load_key, philox_keys
-from unprocess_gen.simulation.kernels.readout import count_zero_variance
-from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
-from unprocess_gen.simulation.kernels.segments import (
-    SEGMENT,
-    SegmentBuffers,
-    allocate_buffers,
-    allocate_frames,
-    buffer_pointers,
-    copy_values,
-    frames_to_pairs,
-    locate_blocks,
-)
+from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
-    Vector,
     from_bits,
     less_than,
     load,
     maximum,
-    minimum,
-    movemask,
-    pointer_to,
     square_root,
     store,
     to_bits,
-    to_float32,
-    to_uint32,
-    uint32_zeros,
 )
+from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Strip, Workspace
 
 HETEROSCEDASTIC = np.uint64(purpose("heteroscedastic"))
 
 RELATIVE_NOISE_ERROR, RESIDUAL_ERROR_DN = np.float32(FINE_ERROR + 2.0**-16), np.float32(2.0**-22)
-"""Bound of the error of `_fill_noise`: this fraction of the standard deviation, plus this many DN."""
+"""Bound of the error of the noise: this fraction of the standard deviation, plus this many DN."""
 CANCELLATION_FRACTION = 2.0**-4
 """If a or b is negative, sites with a variance below this fraction of abs(b) are recomputed in float64."""
 
-_0, _8, _1_32 = np.uint64(0), np.uint64(8), np.uint32(1)
-_ZERO32, _HALF32 = np.float32(0), np.float32(0.5)
+_8, _ZERO32 = np.uint64(8), np.float32(0)
 _WITHOUT_SIGN, _ONE_BITS32 = np.uint32(0x7FFFFFFF), np.uint32(0x3F800000)
 
 
-def make_pairs(
-    srgb: Srgb,
-    plans: Sequence[Plan],
-    curve: Float,
-    limits_dn: Sequence[tuple[float, float]],
-    origin: tuple[int, int] = (0, 0),
-) -> list[Pair]:
-    """Simulate pairs that share the clean frame and differ in their Gaussian noise, all in one pass.
+class Gaussian(NamedTuple):
+    """Hold the variance lines of N frames."""
 
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    plans : sequence of Plan
-        Plans of two-parameter profiles that differ only in noise, level, draw and frame.
-    curve : ndarray of float64, [codes]
-        Linear value of each code.
-    limits_dn : sequence of (float, float)
-        Lowest and highest DN of each plan's noisy frame.
-    origin : (int, int)
-        Row and column of ``srgb[0, 0]`` in the full frame.
-
-    Returns
-    -------
-    list of Pair
-        One pair per plan, uint16 ``[H, W]``; all share the clean array.
-    """
-    frames = allocate_frames(srgb, len(plans))
-    parameters = pair_parameters(plans[0], curve, srgb.shape, origin)
-    noise = np.array([_noise_numbers(plan, limits) for plan, limits in zip(plans, limits_dn, strict=True)])
-    keys, quadratics = philox_keys(plans), normal_quantile_tables().quadratics
-    _fill_pairs(np.ascontiguousarray(srgb), parameters, noise, keys, origin, quadratics, allocate_buffers(), *frames)
-    return frames_to_pairs(*frames)
+    line: Float  # [N, 2]: a and b
+    black_dn: float
+    quadratics: Float  # of the normal distribution
 
 
-def _noise_numbers(plan: Plan, limits_dn: tuple[float, float]) -> tuple[float, ...]:
-    """Return a and b of the variance line, the pinned level, and the limits of the noisy frame, for one plan."""
-    return *plan.variance_line, pinned_level_dn(plan), *limits_dn
+class Gaussian32(NamedTuple):
+    """Hold the variance lines of N frames in float32."""
+
+    line: Float32  # [N, 2]
+    black_dn: NDArray[np.float32]  # [SIZE] equal values
 
 
-@kernel
-def _fill_pairs(
-    srgb: Srgb,
-    parameters: PairParameters,
-    noise: Float,
-    keys: NDArray[np.uint64],
-    origin: tuple[int, int],
-    quantiles: tuple[Float, Float, Float],
-    buffers: SegmentBuffers,
-    clean: Raw,
-    noisy: Raw,
-    counts: NDArray[np.int64],
-) -> None:
-    """Fill the frames and counts of all pairs, segment by segment."""
-    height, width = clean.shape
-    segment, pointers = buffer_pointers(buffers), parameter_pointers(parameters)
-    quadratics = _quadratic_pointers(quantiles)
-    for y in range(height):
-        for start in range(0, width, SEGMENT):
-            length = min(SEGMENT, width - start)
-            first, after, block, blocks = locate_blocks(origin[1] + start, length)
-            at = y * width + start
-            fills_blocks = length == blocks * BLOCK
-            codes, target = pointer_to(srgb, 3 * at), pointer_to(clean, at)
-            fill_clean(codes, srgb.itemsize == 1, y, first, length, pointers, segment, target, pointer_to(counts, 0))
-            for plan in range(noisy.shape[0]):
-                key, of_plan = load_key(keys, plan), _load_noise_parameters(noise, plan, parameters.levels_dn[0])
-                fill_word_blocks(key, block, blocks, np.uint64(origin[0] + y), HETEROSCEDASTIC, segment.words)
-                to = plan * height * width + at
-                target = pointer_to(noisy, to) if fills_blocks else segment.noisy
-                of_counts = pointer_to(counts, 6 * plan)
-                _fill_noisy(blocks, (first, after), of_plan, quadratics, segment, target, of_counts)
-                if not fills_blocks:
-                    copy_values(length, pointer_to(segment.noisy, first), pointer_to(noisy, to))
+def gaussian_noise(plans: Sequence[Plan]) -> Gaussian:
+    """Return the noise of the plans' frames."""
+    lines = np.array([plan.variance_line for plan in plans])
+    return Gaussian(lines, float(plans[0].black_level_dn), normal_quantiles().quadratics)
 
 
-class _NoiseParameters(NamedTuple):
-    """Hold the variance line and the limits of one noisy frame."""
-
-    exact: tuple[float, float, float]  # a, b, black
-    a: np.float32
-    b: np.float32
-    black: np.float32
-    cancellation: np.float32  # below this variance, float32 may have lost most digits
-    pinned_dn: float
-    low: np.float32
-    high: np.float32
+def gaussian_noise32(plans: Sequence[Plan]) -> Gaussian32:
+    """Return the noise of the plans' frames in float32."""
+    with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
+        lines = np.array([plan.variance_line for plan in plans]).astype(np.float32)
+    return Gaussian32(lines, np.full(SIZE, plans[0].black_level_dn, dtype=np.float32))
 
 
 @inner
-def _load_noise_parameters(noise: Float, plan: int, black: float) -> _NoiseParameters:
-    """Return the noise parameters of row ``plan`` of what `_noise_numbers` gives."""
-    a, b, pinned_dn, low, high = noise[plan, 0], noise[plan, 1], noise[plan, 2], noise[plan, 3], noise[plan, 4]
-    cancellation = abs(b) * CANCELLATION_FRACTION if min(a, b) < 0.0 else 0.0
-    f = np.float32
-    return _NoiseParameters((a, b, black), f(a), f(b), f(black), f(cancellation), pinned_dn, f(low), f(high))
-
-
-@inner
-def _quadratic_pointers(quantiles: tuple[Float, Float, Float]) -> tuple[Pointer, Pointer, Pointer]:
-    return pointer_to(quantiles[0], _0), pointer_to(quantiles[1], _0), pointer_to(quantiles[2], _0)
-
-
-@inner
-def _fill_noisy(
-    blocks: int,
-    valid: tuple[int, int],
-    noise: _NoiseParameters,
-    quadratics: tuple[Pointer, Pointer, Pointer],
-    segment: SegmentBuffers,
-    noisy: Pointer,
-    counts: Pointer,
-) -> None:
-    """Fill one segment of a noisy frame and update its counts: in float32, uncertain sites in float64."""
-    count = blocks * BLOCK
-    fill_depths(count, segment.words, segment.depths)
-    _fill_noise(count, noise, segment)
-    uncertain, has_clipped = _round_and_list(count, noise, segment, noisy)
-    if uncertain:
-        has_clipped = _recompute_exact(uncertain, noise, quadratics, segment, noisy) or has_clipped
-    if noise.pinned_dn < np.inf:
-        _pin_saturated(valid, noise, segment, noisy)
-    if has_clipped:
-        _count_clipped(valid, noise, segment, counts)
-    counts[5] += count_zero_variance(valid, noise.exact, segment.unrounded_dn)
-
-
-@inner
-def _fill_noise(count: int, noise: _NoiseParameters, segment: SegmentBuffers) -> None:
-    """Compute the noise and its error bound in float32."""
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        residual = load(segment.residual_dn, x)
-        variance = ((load(segment.rounded_dn, x) - noise.black) + residual) * noise.a + noise.b
+def add_gaussian(noise: Gaussian, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> Pointer:
+    """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them."""
+    fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
+    fill_depths(strip.total, workspace.words, workspace.depths)
+    a, b = noise.line[2 * n], noise.line[2 * n + 1]
+    cancellation = np.float32(abs(b) * CANCELLATION_FRACTION if min(a, b) < 0.0 else 0.0)
+    a32, b32, black = np.float32(a), np.float32(b), np.float32(noise.black_dn)
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        residual = load(workspace.residual_dn, x)
+        variance = ((load(workspace.rounded_dn, x) - black) + residual) * a32 + b32
         std = square_root(maximum(variance, _ZERO32))
-        normal = fine_normal(load(segment.depths, x))
-        store(segment.noise_dn, x, residual + apply_signs(std * normal, load(segment.words, x)))
-        cancelled = less_than(from_bits(to_bits(variance) & _WITHOUT_SIGN), noise.cancellation) & _ONE_BITS32
-        store(segment.error_dn, x, maximum(std * RELATIVE_NOISE_ERROR + RESIDUAL_ERROR_DN, from_bits(cancelled)))
+        normal = fine_normal(load(workspace.depths, x))
+        store(workspace.noise_dn, x, residual + apply_signs(std * normal, load(workspace.words, x)))
+        cancelled = less_than(from_bits(to_bits(variance) & _WITHOUT_SIGN), cancellation) & _ONE_BITS32
+        store(workspace.error_dn, x, maximum(std * RELATIVE_NOISE_ERROR + RESIDUAL_ERROR_DN, from_bits(cancelled)))
+    return workspace.rounded_dn
 
 
 @inner
-def _round_and_list(count: int, noise: _NoiseParameters, segment: SegmentBuffers, noisy: Pointer) -> tuple[int, bool]:
-    """Round half to even, clip and cast; list sites whose error bound reaches a rounding boundary.
-
-    Return how many sites are uncertain, and whether any was clipped. Every vector writes all its lanes to the list, and
-    the next one overwrites the certain ones: a branch would be mispredicted about every second time.
-    """
-    uncertain, changed = 0, uint32_zeros()
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        noise_dn = load(segment.noise_dn, x)
-        rounded = (noise_dn + ROUND32) - ROUND32
-        dn = load(segment.rounded_dn, x) + rounded
-        clipped = minimum(maximum(dn, noise.low), noise.high)
-        store(segment.noisy_dn, x, dn)
-        store(noisy, x, to_uint32(clipped))
-        changed = changed | (to_bits(clipped) ^ to_bits(dn))
-        to_boundary = _HALF32 - from_bits(to_bits(noise_dn - rounded) & _WITHOUT_SIGN)
-        mask = movemask(less_than(to_boundary, load(segment.error_dn, x)))
-        lanes = load(segment.lanes_by_mask, np.uint64(mask) * _8)
-        store(segment.uncertain, uncertain, lanes + np.uint32(x))
-        uncertain += int(segment.count_by_mask[mask])
-    return uncertain, _any_set(changed)
+def exact_gaussian_dn(noise: Gaussian, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
+    """Return the noisy DN of one site, in the reference's order of operations."""
+    a, b, clean_dn = noise.line[2 * n], noise.line[2 * n + 1], workspace.unrounded_dn[x]
+    std = np.sqrt(max(a * (clean_dn - noise.black_dn) + b, 0.0))
+    return float(clean_dn + std * exact_value(workspace.words[x], noise.quadratics))
 
 
 @inner
-def _any_set(bits: Vector) -> bool:
-    """Return whether any bit of a uint32 vector is set."""
-    return bool(movemask(less_than(_ZERO32, to_float32(bits >> _1_32))) != 0)
+def fill_exact_gaussian(noise: Gaussian, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``exact_dn`` with the noisy DN of all sites."""
+    fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
+    a, b, black, clean, out = (
+        noise.line[2 * n],
+        noise.line[2 * n + 1],
+        noise.black_dn,
+        workspace.unrounded_dn,
+        workspace.exact_dn,
+    )
+    for x in range(strip.total):
+        out[x] = exact_value(workspace.words[x], noise.quadratics)
+    for x in range(strip.total):
+        out[x] = clean[x] + np.sqrt(max(a * (clean[x] - black) + b, 0.0)) * out[x]
 
 
 @inner
-def _recompute_exact(
-    uncertain: int,
-    noise: _NoiseParameters,
-    quadratics: tuple[Pointer, Pointer, Pointer],
-    segment: SegmentBuffers,
-    noisy: Pointer,
-) -> bool:
-    """Recompute the listed sites by the reference's formulas in float64; return whether any was clipped."""
-    clips = 0
-    a, b, black = noise.exact
-    for n in range(uncertain):
-        x = segment.uncertain[n]
-        clean_dn = segment.unrounded_dn[x]
-        std = np.sqrt(max(a * (clean_dn - black) + b, 0.0))
-        dn = (clean_dn + std * exact_value(segment.words[x], quadratics) + ROUND) - ROUND
-        segment.noisy_dn[x] = dn
-        noisy[x] = _clip_to_uint16(dn, noise)
-        clips |= (dn < noise.low) | (dn > noise.high)
-    return bool(clips != 0)
+def gaussian_line(noise: Gaussian, n: int) -> tuple[float, float, float]:
+    """Return a, b and black of frame ``n``."""
+    return noise.line[2 * n], noise.line[2 * n + 1], noise.black_dn
 
 
 @inner
-def _pin_saturated(valid: tuple[int, int], noise: _NoiseParameters, segment: SegmentBuffers, noisy: Pointer) -> None:
-    """Replace the noisy values of saturated sites with the pinned level."""
-    for x in range(valid[0], valid[1]):
-        if segment.unrounded_dn[x] >= noise.pinned_dn:
-            dn = (noise.pinned_dn + ROUND) - ROUND
-            segment.noisy_dn[x] = dn
-            noisy[x] = _clip_to_uint16(dn, noise)
+def add_gaussian32(noise: Gaussian32, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> Pointer:
+    """Fill ``noise_dn`` with clean and noise, in float32; return the base to which the read-out adds it: black."""
+    fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
+    fill_coarse_depths(strip.total, workspace.words, workspace.depths)
+    a, b = noise.line[2 * n], noise.line[2 * n + 1]
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        clean_dn = load(workspace.unrounded_dn, x)
+        std = square_root(maximum(clean_dn * a + b, _ZERO32))
+        normal = coarse_normal(load(workspace.depths, x))
+        store(workspace.noise_dn, x, clean_dn + apply_signs(std * normal, load(workspace.words, x)))
+    return noise.black_dn
 
 
 @inner
-def _clip_to_uint16(dn: float, noise: _NoiseParameters) -> np.uint16:
-    return np.uint16(np.int64(min(max(dn, float(noise.low)), float(noise.high))))
-
-
-@inner
-def _count_clipped(valid: tuple[int, int], noise: _NoiseParameters, segment: SegmentBuffers, counts: Pointer) -> None:
-    """Count noisy values below and above the limits."""
-    low = high = 0
-    for x in range(valid[0], valid[1]):
-        low += segment.noisy_dn[x] < noise.low
-        high += segment.noisy_dn[x] > noise.high
-    counts[2] += low
-    counts[3] += high
+def gaussian_line32(noise: Gaussian32, n: int) -> tuple[np.float32, np.float32, np.float32]:
+    """Return a and b of frame ``n``, and 0: values count from the black level."""
+    return noise.line[2 * n], noise.line[2 * n + 1], _ZERO32

@@ -25,17 +25,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner, kernel
+from unprocess_gen.core.jit import inner
 from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, normal_table
 from unprocess_gen.core.types import Float
-from unprocess_gen.simulation.kernels.segments import Float32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
     Vector,
     from_bits,
     load,
-    pointer_to,
     square_root,
     store,
     to_bits,
@@ -55,43 +53,42 @@ _LINE_SHIFT = np.uint32(23 - _LINE_BITS)
 _FIRST_LINE = np.uint32(126 << _LINE_BITS)
 
 _LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
-_LOW31_64, _SIGN_64, _1 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.uint64(1)
+_LOW31_64, _SIGN_64, _1, _2 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.uint64(1), np.uint64(2)
 _TWO52_BITS, _TWO52, _ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
 _POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
 _POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
 _FIRST_ROW = np.uint64(1023 * SEGMENTS)
 
 
-class QuantileTables(NamedTuple):
+class Quantiles(NamedTuple):
     """Hold the exact and the approximate quantiles of a symmetric distribution.
 
     Attributes
     ----------
     lines : ndarray of uint64, [4097]
-        Value at f = 0 and slope in f, two float32 in the low and high half. The last one is the median, to which f may
-        round.
+        Value at f = 0 and slope in f (`pack_lines`). The last one is the median, to which f may round.
     error : float
         Largest difference between a value by lines and the exact one.
-    quadratics : tuple of three ndarrays of float64
-        Columns of the exact table (`lookup_tables.normal_table`).
+    quadratics : ndarray of float64, [4096]
+        Rows of the exact table (`lookup_tables.normal_table`), each with a fourth number that is not used.
     """
 
     lines: NDArray[np.uint64]
     error: float
-    quadratics: tuple[Float, Float, Float]
+    quadratics: Float
 
 
 @functools.lru_cache(maxsize=1)
-def normal_quantile_tables() -> QuantileTables:
-    """Return the quantile tables of the normal distribution, computed once per process."""
-    return build_quantile_tables(normal_table())
+def normal_quantiles() -> Quantiles:
+    """Return the quantiles of the normal distribution, computed once per process."""
+    return build_quantiles(normal_table())
 
 
-def build_quantile_tables(table: Float) -> QuantileTables:
+def build_quantiles(table: Float) -> Quantiles:
     """Derive the lines and their error from a table of quadratics, float64 ``[OCTAVES * SEGMENTS, 3]``."""
     per_segment = LINES_PER_OCTAVE // SEGMENTS
     rows = np.repeat(table, per_segment, axis=0)
-    t = np.tile(np.arange(per_segment + 1) / LINES_PER_OCTAVE, 1)
+    t = np.arange(per_segment + 1) / LINES_PER_OCTAVE
     at = np.tile(np.arange(per_segment), len(table))
     low, high = t[at], t[at + 1]
     z_low, z_high, z_middle = (rows[:, 0] + x * (rows[:, 1] + x * rows[:, 2]) for x in (low, high, (low + high) / 2))
@@ -100,49 +97,51 @@ def build_quantile_tables(table: Float) -> QuantileTables:
     f_high = f_low + octave / LINES_PER_OCTAVE
     slope = (z_high - z_low) / (f_high - f_low)
     start = z_low - slope * f_low + (z_middle - (z_low + z_high) / 2) / 2
-    lines = np.stack([start, slope], axis=1).astype(np.float32)
-    low_bits, high_bits = lines.view(np.uint32).astype(np.uint64).T
+    start32, slope32 = start.astype(np.float32), slope.astype(np.float32)
     error = max(
-        float(np.abs(z - (lines[:, 0].astype(np.float64) + lines[:, 1].astype(np.float64) * f)).max())
+        float(np.abs(z - (start32.astype(np.float64) + slope32.astype(np.float64) * f)).max())
         for z, f in ((z_low, f_low), (z_middle, (f_low + f_high) / 2), (z_high, f_high))
     )
     farthest = float(np.abs(table[:, 0]).max() + np.abs(slope * f_high).max())
-    median = np.zeros(1, dtype=np.uint64)
-    q0, q1, q2 = (np.ascontiguousarray(column) for column in table.T)
-    packed = np.concatenate([high_bits << _32 | low_bits, median])
-    return QuantileTables(packed, error + FLOAT32_ERROR * farthest, (q0, q1, q2))
+    lines = np.concatenate([pack_lines(start32, slope32), np.zeros(1, dtype=np.uint64)])
+    return Quantiles(lines, error + FLOAT32_ERROR * farthest, np.pad(table, ((0, 0), (0, 1))).ravel())
+
+
+def pack_lines(start: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Store two float32 in the low and high half of a uint64, so that one load gets both; `unpack_line` undoes it."""
+    return start.view(np.uint32).astype(np.uint64) | slope.view(np.uint32).astype(np.uint64) << _32
 
 
 # -------------------------------------------------------------------------------------------------- exact, and by lines
 
 
 @inner
-def exact_value(word: np.uint32, quadratics: tuple[Float, Float, Float]) -> float:
+def exact_value(word: np.uint32, quadratics: Pointer) -> float:
     """Return the quantile of one word, bit for bit as `reference.noise.by_inverse_cdf`."""
     odd = np.uint64(((np.uint64(word) & _LOW31_64) << _1 | _1) | _TWO52_BITS).view(np.float64) - _TWO52
     bits = np.float64(odd).view(np.uint64)
-    row = (bits >> _POSITION_BITS) - _FIRST_ROW
+    row = ((bits >> _POSITION_BITS) - _FIRST_ROW) << _2
     t = np.uint64((bits & _POSITION_MASK) | _ONE_BITS).view(np.float64) - 1.0
-    z: float = quadratics[0][row] + t * (quadratics[1][row] + t * quadratics[2][row])
+    z: float = quadratics[row] + t * (quadratics[row + _1] + t * quadratics[row + _2])
     return np.uint64(np.float64(z).view(np.uint64) ^ (np.uint64(word) & _SIGN_64) << _32).view(np.float64)
 
 
 @inner
-def fill_approximate_values(
-    words: NDArray[np.uint32], lines: NDArray[np.uint64], buffer: NDArray[np.uint64], out: Float32
-) -> None:
-    """Fill ``out`` with the quantiles of ``words`` by lines; ``buffer`` is scratch space of the same length.
+def unpack_line(packed: np.uint64) -> tuple[np.float32, np.float32]:
+    """Return the two float32 that `pack_lines` stored."""
+    return np.uint32(packed & _LOW32).view(np.float32), np.uint32(packed >> _32).view(np.float32)
 
-    Bits are reinterpreted one number at a time: a view of an array takes Numba 0.25 s to compile.
-    """
-    count = out.shape[0]
+
+@inner
+def fill_values_by_lines(count: int, words: Pointer, lines: Pointer, buffer: Pointer, out: Pointer) -> None:
+    """Fill ``out`` (float32) with the quantiles of ``words`` by lines; ``buffer`` (uint64) is scratch space."""
     for n in range(count):
         out[n] = np.float32(np.int32(words[n] & _LOW31)) + _HALF
     for n in range(count):
         buffer[n] = lines[np.uint64((np.float32(out[n]).view(np.uint32) >> _LINE_SHIFT) - _FIRST_LINE)]
     for n in range(count):
-        start, slope = np.uint32(buffer[n] & _LOW32), np.uint32(buffer[n] >> _32)
-        out[n] = start.view(np.float32) + slope.view(np.float32) * out[n]
+        start, slope = unpack_line(buffer[n])
+        out[n] = start + slope * out[n]
     for n in range(count):
         out[n] = np.uint32(np.float32(out[n]).view(np.uint32) ^ (words[n] & _SIGN)).view(np.float32)
 
@@ -176,7 +175,7 @@ _COARSE_QUANTILE = _float32s(
 
 _MANTISSA, _ONE_BITS32 = np.uint32(0x7FFFFF), np.uint32(0x3F800000)
 _BITS_OF_2_32 = np.uint32((32 + 127) << 23)
-_0, _VECTOR_WIDTH = np.uint64(0), np.uint64(VECTOR_WIDTH)
+_VECTOR_WIDTH = np.uint64(VECTOR_WIDTH)
 
 
 @inner
@@ -254,29 +253,3 @@ def coarse_normal(depths: Vector) -> Vector:
 def apply_signs(x: Vector, words: Vector) -> Vector:
     """Negate the float32 lanes whose word has its top bit set."""
     return from_bits(to_bits(x) ^ (words & _SIGN))
-
-
-@kernel
-def fill_fine_normals(words: NDArray[np.uint32], depths: Float32, out: Float32) -> None:
-    """Fill ``out`` with the normal deviates of ``words``, with errors up to `FINE_ERROR`.
-
-    All arrays have the same length, a multiple of `VECTOR_WIDTH`; ``depths`` is scratch space.
-    """
-    source, buffer, target = pointer_to(words, _0), pointer_to(depths, _0), pointer_to(out, _0)
-    fill_depths(words.size, source, buffer)
-    for n in range(words.size // VECTOR_WIDTH):
-        x = np.uint64(n) * _VECTOR_WIDTH
-        store(target, x, apply_signs(fine_normal(load(buffer, x)), load(source, x)))
-
-
-@kernel
-def fill_coarse_normals(words: NDArray[np.uint32], depths: Float32, out: Float32) -> None:
-    """Fill ``out`` with the normal deviates of ``words``, with errors up to `accuracy.POLYNOMIAL_NORMAL`.
-
-    All arrays have the same length, a multiple of `VECTOR_WIDTH`; ``depths`` is scratch space.
-    """
-    source, buffer, target = pointer_to(words, _0), pointer_to(depths, _0), pointer_to(out, _0)
-    fill_coarse_depths(words.size, source, buffer)
-    for n in range(words.size // VECTOR_WIDTH):
-        x = np.uint64(n) * _VECTOR_WIDTH
-        store(target, x, apply_signs(coarse_normal(load(buffer, x)), load(source, x)))

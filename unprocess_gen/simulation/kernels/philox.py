@@ -1,7 +1,7 @@
 """Generate counter-based random words in kernels: Philox4x32-10 in the layout of `core.random_streams`.
 
 The values are those of `core.random_streams.words`; tests compare them with Random123's known answers. Each word
-depends only on its key and counter, so segments, workers and crops cannot change it.
+depends only on its key and counter, so strips, workers and crops cannot change it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from unprocess_gen.core.jit import inner
 from unprocess_gen.core.random_streams import BLOCK, KEY_STEPS, LANES, MULTIPLIERS, ROUNDS
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.kernels.simd import Pointer
+from unprocess_gen.simulation.kernels.strips import Strip
 
-LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
+LOW32, _32, _LANES = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(LANES)
 KEY_STEP0, KEY_STEP1 = (np.uint64(step) for step in KEY_STEPS)
 _M0, _M1 = (np.uint64(multiplier) for multiplier in MULTIPLIERS)
 
@@ -37,9 +38,9 @@ def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
 
 
 @inner
-def load_key(keys: NDArray[np.uint64], plan: int) -> PhiloxKey:
+def load_key(keys: Pointer, plan: int) -> PhiloxKey:
     """Return row ``plan`` of the array that `philox_keys` made."""
-    return keys[plan, 0], keys[plan, 1], keys[plan, 2], keys[plan, 3]
+    return keys[4 * plan], keys[4 * plan + 1], keys[4 * plan + 2], keys[4 * plan + 3]
 
 
 @inner
@@ -57,15 +58,24 @@ def philox_round(
 
 
 @inner
-def fill_word_blocks(
-    key: PhiloxKey, first_block: int, blocks: int, y: np.uint64, purpose_word: np.uint64, out: Pointer
-) -> None:
-    """Fill ``out`` (uint32) with one word per pixel, for ``blocks`` complete blocks of row ``y``."""
-    for block in range(blocks):
-        counter = np.uint64((first_block + block) * LANES)
+def first_word(key: PhiloxKey, row: np.uint64, purpose_word: np.uint64) -> np.uint32:
+    """Return the word of column 0 of a row of the full frame."""
+    c0, c1, c2, c3 = np.uint64(0), row, purpose_word | key[2], key[3]
+    k0, k1 = key[0], key[1]
+    for _ in range(ROUNDS):
+        c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
+        k0, k1 = (k0 + KEY_STEP0) & LOW32, (k1 + KEY_STEP1) & LOW32
+    return np.uint32(c0 & LOW32)
+
+
+@inner
+def fill_word_blocks(key: PhiloxKey, strip: Strip, purpose_word: np.uint64, out: Pointer) -> None:
+    """Fill ``out`` (uint32) with one word per pixel, for the complete blocks of a strip."""
+    for block in range(strip.total // BLOCK):
+        counter = (strip.block + np.uint64(block)) * _LANES
         at = block * BLOCK
         for lane in range(LANES):
-            c0, c1, c2, c3 = counter + np.uint64(lane), y, purpose_word | key[2], key[3]
+            c0, c1, c2, c3 = counter + np.uint64(lane), strip.row, purpose_word | key[2], key[3]
             k0, k1 = key[0], key[1]
             for _ in range(ROUNDS):
                 c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
@@ -74,21 +84,3 @@ def fill_word_blocks(
             out[at + LANES + lane] = np.uint32(c1 & LOW32)
             out[at + 2 * LANES + lane] = np.uint32(c2 & LOW32)
             out[at + 3 * LANES + lane] = np.uint32(c3 & LOW32)
-
-
-@inner
-def fill_segment_words(
-    key: PhiloxKey,
-    position: tuple[int, int],
-    purpose_word: np.uint64,
-    length: int,
-    words: NDArray[np.uint32],
-) -> int:
-    """Fill ``words`` with complete blocks that cover ``length`` pixels from ``position`` (row, column).
-
-    Return the index in ``words`` of the first pixel's word.
-    """
-    offset = position[1] % BLOCK
-    blocks = (offset + length + BLOCK - 1) // BLOCK
-    fill_word_blocks(key, position[1] // BLOCK, blocks, np.uint64(position[0]), purpose_word, words)
-    return int(offset)

@@ -1,60 +1,352 @@
-"""Convert noisy DN in float64 to the sensor's integers, and count clipped sites and sites without variance."""
+"""Read out the frames of a strip: round to the sensor's integers or normalise, clip, count, and write.
+
+`Integers` rounds approximate DN and asks the noise for the exact value of sites whose error bound reaches a rounding
+boundary. `Normalised` needs the exact value of every site, because float32 frames are not rounded to DN.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.jit import inner
-from unprocess_gen.core.types import Float, Raw
-from unprocess_gen.simulation.kernels.clean import PairParameters
-from unprocess_gen.simulation.kernels.rounding import ROUND, low_16_bits
-from unprocess_gen.simulation.kernels.simd import Pointer
+from unprocess_gen.core.jit import by_class, inner
+from unprocess_gen.core.types import PACKED, Float, Plan
+from unprocess_gen.simulation.kernels.clean import FLOAT32_MARGIN
+from unprocess_gen.simulation.kernels.electrons import (
+    Electrons,
+    add_electrons,
+    average_electrons,
+    clear_defects,
+    electrons_line,
+    exact_electrons_dn,
+    fill_exact_electrons,
+    list_defects,
+)
+from unprocess_gen.simulation.kernels.gaussian import (
+    Gaussian,
+    Gaussian32,
+    add_gaussian,
+    add_gaussian32,
+    exact_gaussian_dn,
+    fill_exact_gaussian,
+    gaussian_line,
+    gaussian_line32,
+)
+from unprocess_gen.simulation.kernels.philox import PhiloxKey
+from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
+from unprocess_gen.simulation.kernels.simd import (
+    VECTOR_WIDTH,
+    Pointer,
+    from_bits,
+    less_than,
+    load,
+    maximum,
+    minimum,
+    movemask,
+    pointer_to,
+    store,
+    to_bits,
+    to_float32,
+    to_uint32,
+    uint32_zeros,
+)
+from unprocess_gen.simulation.kernels.strips import Strip, Workspace, copy_values, list_lanes
+from unprocess_gen.simulation.reference.cfa import plane_sites
+from unprocess_gen.simulation.reference.sensor import noisy_limits
+
+_8, _1_32, _WITHOUT_SIGN = np.uint64(8), np.uint32(1), np.uint32(0x7FFFFFFF)
+_ZERO32, _HALF32 = np.float32(0), np.float32(0.5)
+
+
+class Integers(NamedTuple):
+    """Hold what the read-out of N frames of uint16 needs."""
+
+    limits_dn: Float  # [N, 4]: lowest and highest DN, pinned level, and clean value from which sites are pinned
+    averaged: bool  # whether the clean frame contains the fixed patterns
+    black_dn: float
+    span_dn: float
+    white: float  # clean value of saturated sites
+    packed: bool
+    planes: NDArray[np.int64]  # [4]: first element of the plane of each site of the tile
+
+
+class Normalised(NamedTuple):
+    """Hold what the read-out of N frames of float32 needs; members as in `Integers`."""
+
+    limits_dn: Float
+    averaged: bool
+    black_dn: float
+    span_dn: float
+    white: float
+    packed: bool
+    planes: NDArray[np.int64]
+
+
+def readout_of(
+    plans: Sequence[Plan], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
+) -> Integers | Normalised:
+    """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
+    first = plans[0]
+    black_dn = float(first.black_level_dn)
+    kind: Any = Normalised if first.normalised else Integers
+    readout: Integers | Normalised = kind(
+        limits_dn=np.array([(*_limits_dn(plan), *_pinned_dn(plan, counts_from_black)) for plan in plans]),
+        averaged=first.averaged,
+        black_dn=black_dn,
+        span_dn=float(first.white_level_dn) - black_dn,
+        white=1.0 if first.normalised else float(first.white_level_dn),
+        packed=first.layout == PACKED,
+        planes=_planes(first.pattern, origin[0] % 2, origin[1] % 2) * ((shape[0] // 2) * (shape[1] // 2)),
+    )
+    return readout
+
+
+@functools.lru_cache(maxsize=16)
+def _planes(pattern: str, top: int, left: int) -> NDArray[np.int64]:
+    """Return the number of the plane of each site of a tile, [4]."""
+    sites = [2 * y + x for y, x in plane_sites(pattern, (top, left))]
+    return np.argsort(sites)
+
+
+def _limits_dn(plan: Plan) -> tuple[float, float]:
+    return noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+
+
+def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:
+    """Return the noisy DN of saturated sites, and the clean value from which they are; infinity if they keep noise."""
+    if plan.saturated != "pinned":
+        return np.inf, np.inf
+    if counts_from_black:
+        above_black = np.float32((plan.brightest_dn - plan.black_level_dn) * (1 - FLOAT32_MARGIN))
+        return plan.brightest_dn, float(above_black)
+    return plan.brightest_dn, plan.brightest_dn
+
+
+# ------------------------------------------------------------------------------------------------------- noise by class
 
 
 @inner
-def read_out(
-    unrounded_dn: Float,
-    noisy_dn: Float,
-    parameters: PairParameters,
-    limits_dn: tuple[float, float],
-    noisy: Raw,
-    counts: NDArray[np.int64],
+def _do_nothing(noise: Any, strip: Strip, workspace: Workspace) -> None:
+    """Do nothing: the noise has no defects and no fixed patterns."""
+
+
+@inner
+def _keep_list(noise: Any, strip: Strip, found: int, workspace: Workspace) -> int:
+    return found
+
+
+@inner
+def _is_approximate(noise: Any) -> bool:
+    return True
+
+
+@inner
+def _is_final(noise: Any) -> bool:
+    return False
+
+
+@inner
+def _exact_gaussian32_dn(noise: Gaussian32, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
+    """Return 0: this noise lists no site as uncertain."""
+    return 0.0
+
+
+_add_noise = by_class({Gaussian: add_gaussian, Gaussian32: add_gaussian32, Electrons: add_electrons})
+_needs_exact_sites = by_class({Gaussian: _is_approximate, Gaussian32: _is_final, Electrons: _is_approximate})
+_exact_dn = by_class({Gaussian: exact_gaussian_dn, Gaussian32: _exact_gaussian32_dn, Electrons: exact_electrons_dn})
+_fill_exact_dn = by_class({Gaussian: fill_exact_gaussian, Electrons: fill_exact_electrons})  # never for Gaussian32
+_line = by_class({Gaussian: gaussian_line, Gaussian32: gaussian_line32, Electrons: electrons_line})
+_list_defects = by_class({Gaussian: _keep_list, Gaussian32: _keep_list, Electrons: list_defects})
+clear_defects_of = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Electrons: clear_defects})
+average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Electrons: average_electrons})
+"""Replace the unrounded clean frame of a strip with the average of many frames; arguments: noise, strip, workspace."""
+
+
+# ------------------------------------------------------------------------------------------------------------- integers
+
+
+@inner
+def _read_integers(
+    readout: Integers,
+    noise: Any,
+    n: int,
+    key: PhiloxKey,
+    strip: Strip,
+    workspace: Workspace,
+    out: Pointer,
+    counts: Pointer,
 ) -> None:
-    """Pin saturated sites if the plan asks for it, then round, clip and count; all arrays ``[n]``.
-
-    Overwrites pinned values of ``noisy_dn``.
-    """
-    if parameters.pinned_dn < np.inf:
-        for x in range(unrounded_dn.shape[0]):
-            noisy_dn[x] = parameters.pinned_dn if unrounded_dn[x] >= parameters.pinned_dn else noisy_dn[x]
-    round_and_clip(noisy_dn, limits_dn, noisy, counts)
-    line = parameters.variance_line[0], parameters.variance_line[1], parameters.levels_dn[0]
-    counts[5] += count_zero_variance((0, unrounded_dn.shape[0]), line, unrounded_dn)
+    base = _add_noise(noise, n, key, strip, workspace)
+    limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * n))
+    low, high = np.float32(limits_dn[0]), np.float32(limits_dn[1])
+    found, has_clipped = _round_and_list(noise, base, low, high, strip, workspace)
+    found = _list_defects(noise, strip, found, workspace)
+    for m in range(found):
+        x = workspace.uncertain[m]
+        dn = np.float32((_exact_dn(noise, n, x, strip, workspace) + ROUND) - ROUND)
+        has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
+    clear_defects_of(noise, strip, workspace)
+    if limits_dn[3] < np.inf:
+        dn = np.float32((limits_dn[2] + ROUND) - ROUND)
+        for x in range(strip.first, strip.after):
+            if workspace.unrounded_dn[x] >= limits_dn[3]:
+                has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
+    if has_clipped:
+        _count_clipped(strip, workspace.noisy_dn, low, high, counts)
+    _write(readout, strip, workspace.noisy, out)
 
 
 @inner
-def round_and_clip(noisy_dn: Float, limits_dn: tuple[float, float], noisy: Raw, counts: NDArray[np.int64]) -> None:
-    """Round half to even, clip to ``limits_dn``, cast to uint16, and count the clipped sites."""
-    low, high = limits_dn[0] + ROUND, limits_dn[1] + ROUND
-    below, above = 0, 0
-    for x in range(noisy.shape[0]):
-        rounded = noisy_dn[x] + ROUND
-        below += rounded < low
-        above += rounded > high
-        noisy[x] = low_16_bits(min(max(rounded, low), high))
+def _round_and_list(
+    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
+) -> tuple[int, bool]:
+    """Round half to even, clip and cast; list sites whose error bound reaches a rounding boundary.
+
+    Return how many sites are uncertain, and whether any was clipped.
+    """
+    found, changed = 0, uint32_zeros()
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        noise_dn = load(workspace.noise_dn, x)
+        rounded = (noise_dn + ROUND32) - ROUND32
+        dn = load(base, x) + rounded
+        clipped = minimum(maximum(dn, low), high)
+        store(workspace.noisy_dn, x, dn)
+        store(workspace.noisy, x, to_uint32(clipped))
+        changed = changed | (to_bits(clipped) ^ to_bits(dn))
+        if _needs_exact_sites(noise):
+            to_boundary = _HALF32 - from_bits(to_bits(noise_dn - rounded) & _WITHOUT_SIGN)
+            found = list_lanes(less_than(to_boundary, load(workspace.error_dn, x)), x, found, workspace)
+    # to_float32 needs values below 2**31; integers that differ also differ above the lowest bit
+    return found, bool(movemask(less_than(_ZERO32, to_float32(changed >> _1_32))) != 0)
+
+
+@inner
+def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace) -> bool:
+    """Replace a noisy value with a rounded DN; return whether it is clipped."""
+    workspace.noisy_dn[x] = dn
+    workspace.noisy[x] = np.uint16(np.int64(min(max(dn, low), high)))
+    return bool(dn < low or dn > high)
+
+
+@inner
+def _count_clipped(strip: Strip, values: Pointer, low: float, high: float, counts: Pointer) -> None:
+    """Count values below and above the limits."""
+    below = above = 0
+    for x in range(strip.first, strip.after):
+        below += values[x] < low
+        above += values[x] > high
     counts[2] += below
     counts[3] += above
 
 
 @inner
-def count_zero_variance(valid: tuple[int, int], line: tuple[Any, Any, Any], clean_dn: Pointer) -> int:
-    """Count sites ``valid[0]`` to ``valid[1]`` with a·(clean - black) + b <= 0; ``line`` is a, b and black."""
-    a, b, black = line
+def _write_integers(
+    readout: Integers, may_saturate: bool, strip: Strip, workspace: Workspace, out: Pointer, counts: Pointer
+) -> None:
+    if readout.averaged:
+        low, high = readout.limits_dn[0], readout.limits_dn[1]
+        for x in range(strip.total):
+            dn = (workspace.unrounded_dn[x] + ROUND) - ROUND
+            workspace.clean[x] = np.uint16(np.int32(min(max(dn, low), high)))
+    if may_saturate:
+        counts[4] += _count_equal(strip, workspace.clean, np.uint16(readout.white))
+    _write(readout, strip, workspace.clean, out)
+
+
+@inner
+def _count_equal(strip: Strip, values: Pointer, value: Any) -> int:
     count = 0
-    if min(a, b) <= 0.0:
-        for x in range(valid[0], valid[1]):
-            count += a * (clean_dn[x] - black) + b <= 0.0
+    for x in range(strip.first, strip.after):
+        count += values[x] == value
     return count
+
+
+# ----------------------------------------------------------------------------------------------------------- normalised
+
+
+@inner
+def _read_normalised(
+    readout: Normalised,
+    noise: Any,
+    n: int,
+    key: PhiloxKey,
+    strip: Strip,
+    workspace: Workspace,
+    out: Pointer,
+    counts: Pointer,
+) -> None:
+    _fill_exact_dn(noise, n, key, strip, workspace)
+    clear_defects_of(noise, strip, workspace)
+    limits_dn, noisy_dn = pointer_to(readout.limits_dn, np.uint64(4 * n)), workspace.exact_dn
+    if limits_dn[3] < np.inf:
+        for x in range(strip.total):
+            noisy_dn[x] = limits_dn[2] if workspace.unrounded_dn[x] >= limits_dn[3] else noisy_dn[x]
+    _count_clipped(strip, noisy_dn, limits_dn[0], limits_dn[1], counts)
+    _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, workspace)
+    _write(readout, strip, workspace.normalised, out)
+
+
+@inner
+def _normalise(
+    readout: Normalised, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace
+) -> None:
+    """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`."""
+    for x in range(strip.total):
+        clipped = min(max(values_dn[x], low), high)
+        workspace.normalised[x] = np.float32((clipped - readout.black_dn) / readout.span_dn)
+
+
+@inner
+def _write_normalised(
+    readout: Normalised, may_saturate: bool, strip: Strip, workspace: Workspace, out: Pointer, counts: Pointer
+) -> None:
+    low, high = readout.black_dn, readout.black_dn + readout.span_dn
+    if readout.averaged:
+        low, high = readout.limits_dn[0], readout.limits_dn[1]
+    _normalise(readout, workspace.unrounded_dn, low, high, strip, workspace)
+    if may_saturate:
+        counts[4] += _count_equal(strip, workspace.normalised, np.float32(readout.white))
+    _write(readout, strip, workspace.normalised, out)
+
+
+# --------------------------------------------------------------------------------------------------------------- frames
+
+
+@inner
+def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
+    """Write a strip to a frame: in place in a mosaic, or to the planes of its sites."""
+    if not readout.packed:
+        copy_values(strip.length, pointer_to(values, strip.first), out)
+        return
+    for site in range(2):
+        target = pointer_to(out, readout.planes[2 * (strip.y & 1) + site])
+        for x in range(strip.length // 2):
+            target[x] = values[strip.first + 2 * x + site]
+
+
+@inner
+def count_zero_variance(noise: Any, n: int, strip: Strip, workspace: Workspace, counts: Pointer) -> None:
+    """Count sites with a·(clean - black) + b <= 0."""
+    a, b, black = _line(noise, n)
+    if min(a, b) <= 0.0:
+        count = 0
+        for x in range(strip.first, strip.after):
+            count += a * (workspace.unrounded_dn[x] - black) + b <= 0.0
+        counts[5] += count
+
+
+read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised})
+"""Sample the noise of frame n in a strip, read it out, and count its clipped sites.
+
+Arguments: read-out, noise, n, key, strip, workspace, pointer to the strip in the frame, counts.
+"""
+write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised})
+"""Read out the clean frame of a strip.
+
+Arguments: read-out, whether sites can be saturated, strip, workspace, pointer to the strip in the frame, counts.
+"""

@@ -9,14 +9,4 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.jit import inner
-
 ROUND, ROUND32 = 1.5 * 2.0**52, np.float32(1.5 * 2.0**23)
-
-_LOW16 = np.uint64(0xFFFF)
-
-
-@inner
-def low_16_bits(shifted: float) -> np.uint16:
-    """Return the integer below 2**16 that a float64 holds after the addition of `ROUND`."""
-    return np.uint16(np.float64(shifted).view(np.uint64) & _LOW16)

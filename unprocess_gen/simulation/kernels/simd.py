@@ -42,6 +42,17 @@ def pointer_to(array: NDArray[Any], at: Index) -> Pointer:
     return array.reshape(-1)[at:]
 
 
+def pointers_of(record: Any) -> Any:
+    """Return a named tuple with a pointer to the data of each array, also in nested named tuples."""
+    return type(record)(*map(_flatten, record))
+
+
+def _flatten(member: Any) -> Any:
+    if isinstance(member, np.ndarray):
+        return member.reshape(-1)
+    return pointers_of(member) if hasattr(member, "_fields") else member
+
+
 def load(pointer: Pointer, at: Index) -> Vector:
     """Load the vector of elements ``at`` to ``at + 7``."""
     return pointer[at : at + VECTOR_WIDTH].copy()
@@ -89,9 +100,24 @@ def from_bits(bits: Vector) -> Vector:
     return bits.view(np.float32)
 
 
+def absolute(x: Vector) -> Vector:
+    """Return the absolute value of each float32 lane."""
+    return np.asarray(np.abs(x))
+
+
+def low_half(x: Vector) -> Vector:
+    """Return the low 32 bits of each uint64 lane."""
+    return x.astype(np.uint32)
+
+
 def to_float32(x: Vector) -> Vector:
     """Convert float64, or uint32 below 2**31, to the nearest float32."""
     return x.astype(np.float32)
+
+
+def to_float64(x: Vector) -> Vector:
+    """Convert float32 lanes to float64."""
+    return x.astype(np.float64)
 
 
 def to_uint32(x: Vector) -> Vector:
@@ -102,6 +128,11 @@ def to_uint32(x: Vector) -> Vector:
 def uint32_zeros() -> Vector:
     """Return a uint32 vector of zeros."""
     return np.zeros(VECTOR_WIDTH, dtype=np.uint32)
+
+
+def select(mask: Vector, x: Vector, y: Vector) -> Vector:
+    """Return ``x`` in lanes whose mask (`less_than`) is set, else ``y``."""
+    return np.asarray(np.where(mask != 0, x, y))
 
 
 def movemask(x: Vector) -> np.uint32:
@@ -232,6 +263,25 @@ def _build_to_uint32(context: Any, builder: Any, signature: Any, arguments: Any)
     return builder.fptosi(arguments[0], _llvm_vector(signature.return_type))
 
 
+def _build_to_float64(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.fpext(arguments[0], _llvm_vector(signature.return_type))
+
+
+def _build_absolute(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    bits = ir.VectorType(ir.IntType(32), VECTOR_WIDTH)
+    positive = builder.and_(builder.bitcast(arguments[0], bits), ir.Constant(bits, [0x7FFFFFFF] * VECTOR_WIDTH))
+    return builder.bitcast(positive, _llvm_vector(signature.return_type))
+
+
+def _build_low_half(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.trunc(arguments[0], _llvm_vector(signature.return_type))
+
+
+def _build_lane_select(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    mask, x, y = arguments
+    return builder.select(builder.icmp_signed("<", mask, ir.Constant(_llvm_vector(signature.args[0]), None)), x, y)
+
+
 def _build_zeros(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return ir.Constant(_llvm_vector(signature.return_type), None)
 
@@ -260,6 +310,28 @@ def _build_pointer(context: Any, builder: Any, signature: Any, arguments: Any) -
     is_array = isinstance(signature.args[0], types.Array)
     pointer = context.make_array(signature.args[0])(context, builder, array).data if is_array else array
     return builder.gep(pointer, [at])
+
+
+def _type_of_pointers(member: Any) -> Any:
+    if isinstance(member, types.Array):
+        return PointerType(member.dtype)
+    if isinstance(member, types.NamedTuple | types.NamedUniTuple):
+        return types.NamedTuple([_type_of_pointers(each) for each in member.types], member.instance_class)
+    return member
+
+
+def _build_pointers(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return _pointers(context, builder, signature.args[0], arguments[0])
+
+
+def _pointers(context: Any, builder: Any, of_type: Any, member: Any) -> Any:
+    if isinstance(of_type, types.Array):
+        return context.make_array(of_type)(context, builder, member).data
+    if isinstance(of_type, types.NamedTuple | types.NamedUniTuple):
+        members = zip(of_type.types, cgutils.unpack_tuple(builder, member), strict=True)
+        converted = [_pointers(context, builder, each, value) for each, value in members]
+        return context.make_tuple(builder, _type_of_pointers(of_type), converted)
+    return member
 
 
 def _address(builder: Any, pointer: Any, at: Any, pointee: ir.Type) -> Any:
@@ -324,12 +396,17 @@ _register(square_root, lambda x: x, _build_square_root)
 _register(to_bits, lambda x: VectorType(_UNSIGNED[x.element]), _build_bitcast)
 _register(from_bits, lambda bits: VectorType(types.float32), _build_bitcast)
 _register(to_float32, lambda x: VectorType(types.float32), _build_to_float32)
+_register(to_float64, lambda x: VectorType(types.float64), _build_to_float64)
+_register(absolute, lambda x: x, _build_absolute)
+_register(low_half, lambda x: VectorType(types.uint32), _build_low_half)
+_register(select, lambda mask, x, y: x, _build_lane_select)
 _register(to_uint32, lambda x: VectorType(types.uint32), _build_to_uint32)
 _register(uint32_zeros, lambda: VectorType(types.uint32), _build_zeros)
 _register(movemask, lambda x: types.uint32, _build_movemask)
 _register(
     pointer_to, lambda array, at: PointerType(array.dtype) if isinstance(array, types.Array) else array, _build_pointer
 )
+_register(pointers_of, _type_of_pointers, _build_pointers)
 _register(load, lambda pointer, at: VectorType(pointer.element), _build_load)
 _register(store, lambda pointer, at, lanes: types.none, _build_store)
 _register(load_four_bytes, lambda pointer, at: types.uint32, _build_load_four_bytes)

@@ -11,9 +11,6 @@ or the tiles. Fixed patterns are keyed by the camera body and are constant over 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import numpy as np
 
 from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, tukey_table
@@ -59,37 +56,23 @@ def by_inverse_cdf(uniforms: Words, table: Float) -> Float:
     return np.asarray(np.where(uniforms >> np.uint32(31), -z, z))
 
 
-class Draws(NamedTuple):
-    """Functions that draw random words and convert them to deviates; arguments as in `REFERENCE_DRAWS`."""
-
-    words: Callable[..., Words]
-    by_inverse_cdf: Callable[[Words, Float], Float]
-    poisson: Callable[[Words, Float], Float]
-
-
-REFERENCE_DRAWS = Draws(words, by_inverse_cdf, poisson)
-"""Draws in NumPy. The compiled draws (`kernels.float_draws`) return identical bits."""
-
-
-def normals(uniforms: Words, draws: Draws = REFERENCE_DRAWS) -> Float:
+def normals(uniforms: Words) -> Float:
     """Convert random words to standard normal deviates by inverse CDF.
 
     Parameters
     ----------
     uniforms : ndarray of uint32
         Random words, any shape.
-    draws : Draws
-        Functions to use.
 
     Returns
     -------
     ndarray of float64
         Deviates, same shape; at most 6.34 in magnitude, error below 1.5e-7.
     """
-    return draws.by_inverse_cdf(uniforms, normal_table())
+    return by_inverse_cdf(uniforms, normal_table())
 
 
-def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """Add the plan's effects to the unrounded clean frame.
 
     Parameters
@@ -100,8 +83,6 @@ def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = R
         Parameters of the pair.
     origin : (int, int)
         Row and column of ``clean_dn[0, 0]`` in the full frame.
-    draws : Draws
-        Functions to use.
 
     Returns
     -------
@@ -109,8 +90,8 @@ def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = R
         Noisy frame, DN, not clipped.
     """
     if plan.physics is not None:
-        return physical(clean_dn, plan, origin, draws)
-    return heteroscedastic(clean_dn, plan, origin, draws) if "heteroscedastic" in plan.effects else clean_dn
+        return physical(clean_dn, plan, origin)
+    return heteroscedastic(clean_dn, plan, origin) if "heteroscedastic" in plan.effects else clean_dn
 
 
 def noise_variance(clean_dn: Float, plan: Plan) -> Float:
@@ -132,7 +113,7 @@ def noise_variance(clean_dn: Float, plan: Plan) -> Float:
     return np.asarray(np.maximum(a_dn * (clean_dn - plan.black_level_dn) + b_dn2, 0))
 
 
-def heteroscedastic(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def heteroscedastic(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """Add shot and read noise of a two-parameter profile.
 
     For ``noise_law="gaussian"``, the noise is one normal deviate of variance `noise_variance`. For ``"poisson"``, it is
@@ -146,70 +127,64 @@ def heteroscedastic(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws:
         Parameters of the pair.
     origin : (int, int)
         Row and column of ``clean_dn[0, 0]`` in the full frame.
-    draws : Draws
-        Functions to use.
 
     Returns
     -------
     ndarray of float64, [H, W]
         Noisy frame, DN, not clipped.
     """
-    n = normals(_words(plan, "heteroscedastic", clean_dn, origin, draws), draws)
+    n = normals(_words(plan, "heteroscedastic", clean_dn, origin))
     if plan.noise_law == "gaussian" or plan.a_dn == 0:  # a = 0: no shot noise
         return clean_dn + np.sqrt(noise_variance(clean_dn, plan)) * n
     electrons = (clean_dn - plan.black_level_dn) / plan.a_dn
-    count = draws.poisson(_words(plan, "shot", clean_dn, origin, draws), electrons)
+    count = poisson(_words(plan, "shot", clean_dn, origin), electrons)
     return np.asarray((count * plan.a_dn + plan.black_level_dn) + np.sqrt(plan.b_dn2) * n)
 
 
-def _image_words(
-    plan: Plan, stream: str, shape: tuple[int, int], origin: Origin, draws: Draws = REFERENCE_DRAWS
-) -> Words:
+def _image_words(plan: Plan, stream: str, shape: tuple[int, int], origin: Origin) -> Words:
     """Return the random words of the plan's frame, level and draw, [H, W]."""
     at = {"frame": plan.frame, "level": plan.level, "draw": plan.draw}
-    return draws.words(plan.stream_key, stream, shape, origin=origin, **at)
+    return words(plan.stream_key, stream, shape, origin=origin, **at)
 
 
-def _words(plan: Plan, stream: str, like: Float, origin: Origin, draws: Draws) -> Words:
+def _words(plan: Plan, stream: str, like: Float, origin: Origin) -> Words:
     """Return random words as `_image_words` in the shape of ``like``."""
-    return _image_words(plan, stream, (like.shape[0], like.shape[1]), origin, draws)
+    return _image_words(plan, stream, (like.shape[0], like.shape[1]), origin)
 
 
-def _body_words(
-    physics: Physics, stream: str, shape: Shape, origin: Origin, draws: Draws = REFERENCE_DRAWS, draw: int = 0
-) -> Words:
+def _body_words(physics: Physics, stream: str, shape: Shape, origin: Origin, draw: int = 0) -> Words:
     """Return the random words of a fixed pattern of the camera body, [H, W]."""
-    return draws.words(physics.body_key, stream, (shape[0], shape[1]), origin=origin, draw=draw)
+    return words(physics.body_key, stream, (shape[0], shape[1]), origin=origin, draw=draw)
 
 
 # --------------------------------------------------------------------------------------------- physical effects
 
 
-def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """Add the effects of a physical profile, in order, to the unrounded clean frame; [H, W] DN, not clipped."""
     physics = plan.physics
     assert physics is not None
     electrons = (clean_dn - plan.black_level_dn) / physics.dn_per_e
     if "prnu" in plan.effects and not physics.fixed_pattern_in_clean:  # otherwise the clean frame contains it
-        electrons = electrons * response(physics, electrons.shape, origin, draws)
+        electrons = electrons * response(physics, electrons.shape, origin)
     if "shot" in plan.effects:
-        electrons = draws.poisson(_words(plan, "shot", electrons, origin, draws), electrons)
+        electrons = poisson(_words(plan, "shot", electrons, origin), electrons)
     if "dark_current" in plan.effects:
-        electrons = electrons + dark_current(plan, electrons, origin, draws)
+        electrons = electrons + dark_current(plan, electrons, origin)
     if "hot_pixels" in plan.effects:
-        electrons = electrons + hot_pixels(plan, electrons, origin, draws)
+        electrons = electrons + hot_pixels(plan, electrons, origin)
     if "full_well" in plan.effects:
         electrons = np.minimum(electrons, physics.full_well_e)
     noisy_dn = electrons * physics.dn_per_e + plan.black_level_dn
     if "read" in plan.effects:
-        noisy_dn = noisy_dn + read(plan, noisy_dn, origin, draws)
+        noisy_dn = noisy_dn + read(plan, noisy_dn, origin)
     noisy_dn = noisy_dn + offsets(plan, noisy_dn.shape, origin)
     if "dead_pixels" in plan.effects:
-        noisy_dn = np.where(dead(physics, noisy_dn.shape, origin, draws), 0.0, noisy_dn)
+        noisy_dn = np.where(dead(physics, noisy_dn.shape, origin), 0.0, noisy_dn)
     return noisy_dn
 
 
-def response(physics: Physics, shape: Shape, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def response(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> Float:
     """Return the relative gain of each pixel (PRNU, EMVA 1288), a fixed pattern.
 
     Parameters
@@ -220,8 +195,6 @@ def response(physics: Physics, shape: Shape, origin: Origin = (0, 0), draws: Dra
         Height and width.
     origin : (int, int)
         Row and column of the first pixel in the full frame.
-    draws : Draws
-        Functions to use.
 
     Returns
     -------
@@ -229,36 +202,36 @@ def response(physics: Physics, shape: Shape, origin: Origin = (0, 0), draws: Dra
         Gain with mean 1 and standard deviation ``prnu_std``, not negative; rounded to float32, the dtype in which
         kernels store the pattern for many frames.
     """
-    n = normals(_body_words(physics, "prnu", shape, origin, draws), draws)
+    n = normals(_body_words(physics, "prnu", shape, origin))
     return np.maximum(1 + physics.prnu_std * n, 0).astype(np.float32).astype(np.float64)
 
 
-def dark_current(plan: Plan, like: Float, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def dark_current(plan: Plan, like: Float, origin: Origin = (0, 0)) -> Float:
     """Draw the dark signal: Poisson counts of mean ``physics.dark_e``, [H, W] electrons in the shape of ``like``.
 
     The mean is subtracted, as cameras do with optical-black pixels, unless ``dark_offset="kept"``.
     """
     physics = plan.physics
     assert physics is not None
-    count = draws.poisson(_words(plan, "dark_current", like, origin, draws), np.full(like.shape, physics.dark_e))
+    count = poisson(_words(plan, "dark_current", like, origin), np.full(like.shape, physics.dark_e))
     return count - (physics.dark_e if physics.dark_offset == "removed" else 0.0)
 
 
-def hot_pixels(plan: Plan, like: Float, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def hot_pixels(plan: Plan, like: Float, origin: Origin = (0, 0)) -> Float:
     """Draw the excess of hot pixels, [H, W] electrons: Poisson counts of each hot pixel's mean, 0 elsewhere."""
     physics = plan.physics
     assert physics is not None
-    mean_e = hot_pixel_means(physics, like.shape, origin, draws)
-    return draws.poisson(_words(plan, "hot_pixels", like, origin, draws), mean_e)
+    mean_e = hot_pixel_means(physics, like.shape, origin)
+    return poisson(_words(plan, "hot_pixels", like, origin), mean_e)
 
 
-def hot_pixel_means(physics: Physics, shape: Shape, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def hot_pixel_means(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> Float:
     """Return the mean excess of each pixel, [H, W] electrons, a fixed pattern; 0 except for hot pixels.
 
     The excess of hot pixels is exponentially distributed with mean ``hot_pixel_e``, in 1024 equally likely steps.
     """
-    hot = is_among(_body_words(physics, "hot_pixels", shape, origin, draws), physics.hot_pixel_share)
-    step = _body_words(physics, "hot_pixels", shape, origin, draws, draw=1) >> np.uint32(22)
+    hot = is_among(_body_words(physics, "hot_pixels", shape, origin), physics.hot_pixel_share)
+    step = _body_words(physics, "hot_pixels", shape, origin, draw=1) >> np.uint32(22)
     return np.where(hot, physics.hot_pixel_e * exponential_levels()[step], 0.0)
 
 
@@ -267,11 +240,11 @@ def is_among(uniforms: Words, fraction: float) -> np.ndarray:
     return np.asarray(uniforms < np.uint64(int(fraction * 2**32)))
 
 
-def read(plan: Plan, like: Float, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def read(plan: Plan, like: Float, origin: Origin = (0, 0)) -> Float:
     """Draw the read noise, [H, W] DN: Gaussian or Tukey's lambda distribution, standard deviation ``read_std_dn``."""
     physics = plan.physics
     assert physics is not None
-    return physics.read_std_dn * draws.by_inverse_cdf(_words(plan, "read", like, origin, draws), read_table(physics))
+    return physics.read_std_dn * by_inverse_cdf(_words(plan, "read", like, origin), read_table(physics))
 
 
 def read_table(physics: Physics) -> Float:
@@ -321,21 +294,21 @@ def black_error(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> Floa
     return np.asarray(errors[y[:, None], x[None, :]])
 
 
-def dead(physics: Physics, shape: Shape, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> np.ndarray:
+def dead(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> np.ndarray:
     """Return the mask of dead pixels, which read 0, [H, W] bool: a fixed pattern."""
-    return is_among(_body_words(physics, "dead_pixels", shape, origin, draws), physics.dead_pixel_share)
+    return is_among(_body_words(physics, "dead_pixels", shape, origin), physics.dead_pixel_share)
 
 
 # ----------------------------------------------------------------- fixed patterns in the average of many frames
 
 
-def respond(light: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def respond(light: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """Multiply light [H, W] by the relative gain of the pixels if ``prnu`` is simulated."""
     assert plan.physics is not None
-    return light * response(plan.physics, light.shape, origin, draws) if "prnu" in plan.effects else light
+    return light * response(plan.physics, light.shape, origin) if "prnu" in plan.effects else light
 
 
-def average(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws = REFERENCE_DRAWS) -> Float:
+def average(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """Add fixed patterns except PRNU, and a kept dark offset, to the unrounded clean frame; [H, W] DN, not clipped.
 
     The sum of light, dark signal and hot pixels is limited by the full well, as in each frame of a real average.
@@ -343,12 +316,12 @@ def average(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), draws: Draws =
     physics = plan.physics
     assert physics is not None
     if "hot_pixels" in plan.effects:
-        clean_dn = clean_dn + hot_pixel_means(physics, clean_dn.shape, origin, draws) * physics.dn_per_e
+        clean_dn = clean_dn + hot_pixel_means(physics, clean_dn.shape, origin) * physics.dn_per_e
     if "dark_current" in plan.effects and physics.dark_offset == "kept":
         clean_dn = clean_dn + physics.dark_e * physics.dn_per_e
     if "full_well" in plan.effects:
         clean_dn = np.minimum(clean_dn, physics.full_well_e * physics.dn_per_e + plan.black_level_dn)
     clean_dn = clean_dn + offsets(plan, clean_dn.shape, origin, fixed_only=True)
     if "dead_pixels" in plan.effects:
-        clean_dn = np.where(dead(physics, clean_dn.shape, origin, draws), 0.0, clean_dn)
+        clean_dn = np.where(dead(physics, clean_dn.shape, origin), 0.0, clean_dn)
     return clean_dn

@@ -319,7 +319,7 @@ def gaussian_distance(rate_e: float, read_std_e: float) -> float:
 
     The first Edgeworth term gives 0.0665 · rate / (rate + read_std²)^1.5: skewness / 6 times the maximum of
     |(z² - 1) φ(z)|, which is at 0. It ignores that electrons are integers; read noise below half an electron shows the
-    steps, and `kernels.physical` always draws counts there.
+    steps, and `kernels.electrons` always draws counts there.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Kernels of the physical effects equal the reference, for complete pairs and for the noisy frame alone."""
+"""Pairs with counts of electrons equal the reference, and are regenerated from their rows."""
 
 from __future__ import annotations
 
@@ -35,14 +35,11 @@ from hypothesis import strategies as st
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Patch, Physics, Plan, Source, Srgb
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row, read_rows, write_rows
-from unprocess_gen.simulation.kernels.physical import make_noisy
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import noise as effects
 from unprocess_gen.simulation.reference.cfa import PATTERNS
 from unprocess_gen.simulation.reference.noise import EFFECTS
 from unprocess_gen.simulation.reference.poisson import gaussian_from
-from unprocess_gen.simulation.reference.sensor import noisy_limits, to_dn
-from unprocess_gen.simulation.reference.unprocess import unprocess
 
 PATCH = Patch(number=0, y=0, x=0, height=33, width=61)
 
@@ -125,7 +122,7 @@ def test_kernels_equal_reference_on_sixteen_bits(everything: Plan, fixed: bool) 
 
 
 PLAIN = ("shot", "read", "row", "black_error", "quantise")
-"""Effects that `_fill_shot_read_pair` simulates."""
+"""Effects without fixed patterns of single pixels, which need no body."""
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 1), (1, 511), (3, 512), (2, 577), (2, 1100), (97, 1)])
@@ -147,7 +144,7 @@ def test_shot_and_read_noise_alone_equal_reference(
         one = with_physics(plan, dn_per_e=dn_per_e, read_law=distribution, read_shape=-0.1, read_std_dn=1.3)
         one = replace(one, exposure_ratio=ratio, a_dn=dn_per_e, b_dn2=1.69)
         assert_same(srgb, one, (1001, 1007))
-        assert_noisy_alone(srgb, one, (0, 63))
+        assert_same(srgb, one, (0, 63))
 
 
 def test_tile_of_shot_and_read_noise_is_crop_of_frame(everything: Plan) -> None:
@@ -202,56 +199,22 @@ def test_tile_is_crop_of_frame(everything: Plan, top: int, left: int, height: in
     np.testing.assert_array_equal(tile.noisy, frame.noisy[cut])
 
 
-# Noisy frame alone ----------------------------------------------------------------------------------------------------
+# Each effect ----------------------------------------------------------------------------------------------------------
 
 
-def assert_noisy_alone(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> None:
-    """Check `make_noisy` on the unrounded clean frame of the reference, including its counts."""
-    light = unprocess(srgb, plan, origin)
-    light = light if plan.exposure == 1 else np.minimum(light, 1) * plan.exposure
-    clean_dn = to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest)
-    limits_dn = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-    noisy, counts = make_noisy(clean_dn, plan, limits_dn, origin)
-    pair = make_pair(srgb, plan, origin)
-    np.testing.assert_array_equal(noisy, pair.noisy)
-    assert noisy.dtype == pair.noisy.dtype
-    of_pair = pair.counts.noisy_clipped_low, pair.counts.noisy_clipped_high, pair.counts.zero_variance
-    assert tuple(counts) == (0, 0, *of_pair[:2], 0, of_pair[2])
-
-
-WITHOUT_WELL = tuple(effect for effect in EFFECTS if effect != "full_well")
-
-
-@pytest.mark.parametrize("effect", [None, *WITHOUT_WELL])
-def test_make_noisy_equals_pair_with_and_without_every_effect(everything: Plan, effect: str | None) -> None:
+@pytest.mark.parametrize("effect", [None, *EFFECTS])
+def test_pairs_equal_reference_with_and_without_every_effect(everything: Plan, effect: str | None) -> None:
     plan = replace(everything, level=3, draw=2, frame=1)
-    for on in ([one for one in WITHOUT_WELL if one != effect], [effect] if effect else []):
+    for on in ([one for one in EFFECTS if one != effect], [effect] if effect else []):
         for saturated, clip in itertools.product(["noisy", "pinned"], ["sensor", "black"]):
             one = replace(plan, effects=tuple(on), saturated=saturated, sensor_clip=clip)
-            assert_noisy_alone(picture(), one, (3, 7))
+            assert_same(picture(), one, (3, 7))
 
 
 @pytest.mark.parametrize("noise", TWO_NUMBERS)
-def test_make_noisy_equals_pair_for_poisson_form(settings: Settings, noise: str) -> None:
+def test_poisson_form_equals_reference_on_wide_images(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", *TWO_NUMBERS[noise], "noise.law=poisson")
-    assert_noisy_alone(picture(), plan)
-    assert_noisy_alone(np.random.default_rng(6).integers(0, 256, (3, 2049, 3)).astype(np.uint8), plan, (5, 9))
-
-
-def test_crop_of_clean_frame_gets_noise_of_its_sites(everything: Plan) -> None:
-    clean_dn = np.random.default_rng(7).uniform(100, 4000, (60, 200))
-    for some in (WITHOUT_WELL, ("shot", "read", "row", "quantise")):
-        plan = replace(everything, effects=some)
-
-        cut_out = make_noisy(clean_dn[8:40, 64:128], plan, (0.0, 4095.0), (8, 64))[0]
-
-        np.testing.assert_array_equal(cut_out, make_noisy(clean_dn, plan, (0.0, 4095.0))[0][8:40, 64:128])
-
-
-def test_make_noisy_refuses_clean_frame_that_depends_on_level(everything: Plan) -> None:
-    for plan in (everything, replace(averaged(everything), effects=WITHOUT_WELL)):
-        with pytest.raises(ValueError, match="clean frame depends on the noise level"):
-            make_noisy(np.zeros((2, 2)), plan, (0.0, 4095.0))
+    assert_same(np.random.default_rng(6).integers(0, 256, (3, 2049, 3)).astype(np.uint8), plan, (5, 9))
 
 
 # Normal approximation of counts ---------------------------------------------------------------------------------------
@@ -317,15 +280,15 @@ def test_counts_are_used_if_read_noise_shows_electron_steps() -> None:
 
 @pytest.mark.parametrize("law_distance", [1e-3, 5e-3, 0.5])
 def test_other_effects_do_not_change_normal_for_counts(everything: Plan, law_distance: float) -> None:
-    """Nor does the choice of kernel: a PRNU of 1 everywhere selects `_fill_physical_pair`."""
+    """Nor does a response of 1 everywhere, whether it is stored for each pixel or not."""
     plan = near_normal(replace(everything, effects=PLAIN), law_distance)
-    other = with_physics(replace(plan, effects=("prnu", *PLAIN)), prnu_std=0.0)
+    others = [with_physics(replace(plan, effects=("prnu", *PLAIN)), prnu_std=std) for std in (0.0, 1e-30)]
     srgb = np.random.Generator(np.random.Philox(key=5)).integers(0, 256, (9, 1200, 3)).astype(np.uint8)
     frame = make_pair(srgb, plan)
-    np.testing.assert_array_equal(frame.noisy, make_pair(srgb, other).noisy)
-    np.testing.assert_array_equal(make_pair(srgb[3:, 70:], plan, (3, 70)).noisy, frame.noisy[3:, 70:])
-    for one in (plan, other):
-        assert_noisy_alone(srgb, one, (3, 7))
+    for other in others:
+        np.testing.assert_array_equal(frame.noisy, make_pair(srgb, other).noisy)
+    for one in (plan, *others):
+        np.testing.assert_array_equal(make_pair(srgb[3:, 70:], one, (3, 70)).noisy, frame.noisy[3:, 70:])
 
 
 # Replay ---------------------------------------------------------------------------------------------------------------

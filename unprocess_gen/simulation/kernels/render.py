@@ -1,0 +1,150 @@
+"""Render clean and noisy frames strip by strip: the one compiled entry of all pairs.
+
+Per strip: the clean frame (`clean`), then for each noisy frame a sampler and a read-out. Numba chooses the sampler by
+the class of ``noise``, the precision by that of ``scene``, and the read-out by that of ``readout``; so compiled code
+contains only what a pair needs. Every form gives the same DN as `pair.reference_pair` on every processor, except
+`clean.Scene32` with `gaussian.Gaussian32`, whose errors are stated in `config.accuracy`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.jit import kernel
+from unprocess_gen.core.types import PACKED, Counts, Frame, Pair, Plan, Srgb
+from unprocess_gen.simulation.kernels.body import body_of, fixed_patterns
+from unprocess_gen.simulation.kernels.clean import ONES, Scene, Scene32, fill_clean, scene32_of, scene_of
+from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
+from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
+from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
+from unprocess_gen.simulation.kernels.readout import (
+    average_patterns,
+    clear_defects_of,
+    count_zero_variance,
+    read_noisy,
+    readout_of,
+    write_clean,
+)
+from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
+from unprocess_gen.simulation.kernels.strips import STRIP, Workspace, allocate_workspace, locate, workspace_of_thread
+
+CLEAN_COUNTS = [0, 1, 4]
+"""Columns of the counts that belong to the clean frame, in the order of `Counts`."""
+
+
+def render_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> list[Pair]:
+    """Simulate pairs that share the clean frame, in one pass.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes.
+    plans : sequence of Plan
+        Plans that differ only in noise, level, draw and frame.
+    origin : (int, int)
+        Row and column of ``srgb[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    list of Pair
+        One pair per plan; all share the clean array.
+    """
+    clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin)
+    counts[1:, CLEAN_COUNTS] = counts[0, CLEAN_COUNTS]
+    return [Pair(clean, frame, Counts(*numbers)) for frame, numbers in zip(noisy, counts.tolist(), strict=True)]
+
+
+def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
+    """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
+    return _fill_frames(srgb, [plan], 0, origin)[0]
+
+
+def _fill_frames(
+    srgb: Srgb, plans: Sequence[Plan], count: int, origin: tuple[int, int]
+) -> tuple[Frame, Frame, NDArray[np.int64]]:
+    """Return the clean frame, the first ``count`` noisy frames, and the numbers of `Counts` of each."""
+    first, shape = plans[0], (srgb.shape[0], srgb.shape[1])
+    frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.layout == PACKED else shape
+    dtype = np.float32 if first.normalised else np.uint16
+    clean, noisy = np.empty(frame_shape, dtype=dtype), np.empty((count, *frame_shape), dtype=dtype)
+    counts = np.zeros((max(count, 1), 6), dtype=np.int64)
+    scene, noise, workspace = _records(plans, shape, 256 if srgb.dtype == np.uint8 else 65536, origin)
+    codes = np.require(
+        srgb, requirements=["C", "A", "W", "E"]
+    )  # a read-only array would be another type, compiled again
+    keys, readout = philox_keys(plans)[:count], readout_of(plans, shape, origin, uses_scene32(first))
+    frames = clean.reshape(-1), noisy.reshape(count, clean.size)
+    _render(codes, scene, noise, keys, origin, readout, workspace, *frames, counts)
+    return clean, noisy, counts
+
+
+def _records(
+    plans: Sequence[Plan], shape: tuple[int, int], codes: int, origin: tuple[int, int]
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Workspace]:
+    """Return the scene, the noise and the scratch memory, whose classes select the compiled code."""
+    first = plans[0]
+    if first.counts_electrons:
+        body = body_of(first, shape, origin)
+        response, pitch = (body.response, body.response_steps[0]) if first.averaged else (None, 0)
+        if first.averaged:  # the clean frame contains the response, so the noise does not
+            body = body._replace(response=ONES, response_steps=(0, 0))
+        noise = electron_noise(plans, body, shape, origin, counts_all=first.normalised)
+        return scene_of(first, codes, origin, response, pitch), noise, workspace_of_thread()
+    if uses_scene32(first):
+        return scene32_of(first, codes, origin), gaussian_noise32(plans), allocate_workspace(np.float32)
+    return scene_of(first, codes, origin), gaussian_noise(plans), workspace_of_thread()
+
+
+def pass_key(plan: Plan) -> tuple[object, ...]:
+    """Return what the plans of one pass have in common: the kernels, and the fixed patterns of the body."""
+    return plan.uses_reference, plan.uses_float32, plan.averaged, plan.counts_electrons, fixed_patterns(plan)
+
+
+def uses_scene32(plan: Plan) -> bool:
+    """Return whether a plan is rendered in float32: only integer frames with one normal per site are."""
+    return plan.uses_float32 and not plan.normalised and not plan.counts_electrons
+
+
+@kernel
+def _render(
+    srgb: Srgb,
+    scene: Any,
+    noise: Any,
+    keys: NDArray[np.uint64],
+    origin: tuple[int, int],
+    readout: Any,
+    workspace: Workspace,
+    clean: Frame,
+    noisy: Frame,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill the frames and counts of all pairs, strip by strip."""
+    height, width = srgb.shape[:2]
+    light, sampler, frames, buffers = (
+        pointers_of(scene),
+        pointers_of(noise),
+        pointers_of(readout),
+        pointers_of(workspace),
+    )
+    codes, clean_sites, noisy_sites = pointer_to(srgb, 0), pointer_to(clean, 0), pointer_to(noisy, 0)
+    is_uint8, key_words, all_counts, sites = srgb.itemsize == 1, pointer_to(keys, 0), pointer_to(counts, 0), clean.size
+    for y in range(height):
+        for x in range(0, width, STRIP):
+            strip = locate(origin, y, x, min(STRIP, width - x))
+            at = (y // 2) * (width // 2) + x // 2 if readout.packed else y * width + x
+            source = pointer_to(codes, 3 * (y * width + x))
+            may_saturate = fill_clean(light, source, is_uint8, strip, buffers, all_counts)
+            for n in range(noisy.shape[0]):
+                target, of_frame = pointer_to(noisy_sites, n * sites + at), pointer_to(all_counts, 6 * n)
+                read_noisy(frames, sampler, n, load_key(key_words, n), strip, buffers, target, of_frame)
+                count_zero_variance(sampler, n, strip, buffers, of_frame)
+            if readout.averaged:
+                average_patterns(sampler, strip, buffers)
+            target = pointer_to(clean_sites, at)
+            write_clean(frames, may_saturate or readout.averaged, strip, buffers, target, all_counts)
+            if readout.averaged:
+                clear_defects_of(sampler, strip, buffers)
