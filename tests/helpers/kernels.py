@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from unprocess_gen.core.jit import kernel
+from unprocess_gen.core.jit import inner, kernel
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.electrons import _store_rate
@@ -130,6 +130,15 @@ def approximate_counts(words: Words, rates: Float, tables: CountTables | None = 
     return out, is_listed
 
 
+@inner
+def _load_rates(words: Words, rates: Float, start: int, length: int, total: int, buffers: Workspace) -> None:
+    """Load ``length`` words and rates from index ``start``, and repeat the last ones up to ``total``."""
+    for n in range(total):
+        at = start + min(n, length - 1)
+        buffers.words[n] = words[at]
+        _store_rate(n, rates[at], buffers)
+
+
 @kernel
 def _fill_counts(words: Words, rates: Float, tables: CountTables, workspace: Workspace, out: Float) -> None:
     """Draw as `electrons` does: counts of rates beyond float32's integers are computed exactly."""
@@ -138,10 +147,7 @@ def _fill_counts(words: Words, rates: Float, tables: CountTables, workspace: Wor
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         total = -(-length // VECTOR_WIDTH) * VECTOR_WIDTH
-        for n in range(total):
-            at = start + min(n, length - 1)
-            buffers.words[n] = words[at]
-            _store_rate(n, rates[at], buffers)
+        _load_rates(words, rates, start, length, total, buffers)
         fill_counts(total, buffers.words, given, every, of, buffers, buffers.electrons)
         for n in range(length):
             out[start + n] = np.float64(buffers.electrons[n])
@@ -165,10 +171,7 @@ def _fill_approximate(
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         total = -(-length // VECTOR_WIDTH) * VECTOR_WIDTH
-        for n in range(total):
-            at = start + min(n, length - 1)
-            buffers.words[n] = words[at]
-            _store_rate(n, rates[at], buffers)
+        _load_rates(words, rates, start, length, total, buffers)
         fill_values_by_lines(total, buffers.words, of.lines, buffers.lines, buffers.normals)
         found = 0
         has_low, has_high, _ = _survey(total, buffers.root, every)

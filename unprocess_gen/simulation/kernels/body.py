@@ -22,6 +22,7 @@ from unprocess_gen.simulation.kernels.strips import (
     Workspace,
     allocate_workspace,
     locate,
+    padded_width,
 )
 
 PRNU, HOT, DEAD = (np.uint64(purpose(stream)) for stream in ("prnu", "hot_pixels", "dead_pixels"))
@@ -40,6 +41,8 @@ class Body(NamedTuple):
         Relative gain of each pixel; the columns are those of complete blocks. ``[SIZE]`` ones without PRNU.
     response_steps : (int, int)
         Elements of ``response`` from row to row and from column to column; 0 without PRNU.
+    strips : int
+        S.
     starts : ndarray of int64, [H * S + 1]
         First defect of each strip.
     positions : ndarray of int64
@@ -50,6 +53,7 @@ class Body(NamedTuple):
 
     response: Float32
     response_steps: tuple[int, int]
+    strips: int
     starts: NDArray[np.int64]
     positions: NDArray[np.int64]
     means_e: Float
@@ -64,8 +68,10 @@ _Patterns = tuple[int, float, float, float, float]
 
 
 def fixed_patterns(plan: Plan) -> _Patterns:
-    """Return the key of the body, the standard deviation of PRNU, the share and mean of hot pixels, and the share of
-    dead ones; 0 for effects that the plan does not simulate."""
+    """Return the key of the body and the numbers of its patterns, 0 for effects that the plan does not simulate.
+
+    The numbers are the standard deviation of PRNU, the share and mean of hot pixels, and the share of dead ones.
+    """
     physics, on = plan.physics, plan.effects
     if physics is None:
         return 0, 0.0, 0.0, 0.0, 0.0
@@ -89,16 +95,17 @@ def _body(patterns: _Patterns, shape: tuple[int, int], origin: tuple[int, int]) 
     first = origin[1] % BLOCK
     response, pitch = np.ones(SIZE, dtype=np.float32), 0
     if prnu_std != 0:
-        columns = -(-(first + shape[1]) // BLOCK) * BLOCK
-        response = np.empty((shape[0], columns), dtype=np.float32)
+        pitch = padded_width(origin[1], shape[1])
+        response = np.empty((shape[0], pitch), dtype=np.float32)
         _fill_response(
             philox_key(key), prnu_std, origin, shape[1], normal_quantiles().quadratics, allocate_workspace(), response
         )
-        pitch = columns
     strips = max(-(-shape[1] // STRIP), 1)
     y, x, means_e = _defects(key, hot_share, hot_e, dead_share, shape, origin)
     starts = np.searchsorted(y * strips + x // STRIP, np.arange(shape[0] * strips + 1))
-    return Body(response.reshape(-1), (pitch, int(pitch > 0)), starts.astype(np.int64), x % STRIP + first, means_e)
+    return Body(
+        response.reshape(-1), (pitch, int(pitch > 0)), strips, starts.astype(np.int64), x % STRIP + first, means_e
+    )
 
 
 def _defects(

@@ -57,7 +57,7 @@ from unprocess_gen.simulation.kernels.simd import (
     store,
     to_bits,
 )
-from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace
+from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, padded_width
 from unprocess_gen.simulation.reference import noise as reference_noise
 from unprocess_gen.simulation.reference.poisson import gaussian_from
 
@@ -89,28 +89,27 @@ class Electrons(NamedTuple):
     errors_dn: Float  # [N, 2, 2]: black-level errors of the sites of a tile
     base_dn: Float32  # [N, 2, P]: black level, column and black-level error
     padded_width: int  # P
-    strips: int  # per row
     black_dn: float
     body: Body
     tables: CountTables
 
 
 class _Numbers(NamedTuple):
-    """Hold the numbers of one frame; comments give the values that switch an effect off."""
+    """Hold the numbers of one frame; comments and defaults give the values that switch an effect off."""
 
     dn_per_e: float
     shot: float  # 0
-    dark_e: float  # 0
-    removed_e: float  # mean dark signal that the camera subtracts
-    kept_dark_dn: float  # in a clean frame with fixed patterns
-    full_well_e: float  # infinity
     read_std_dn: float  # 0
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
-    row_std_dn: float  # 0
     lowest_root: float  # roots of the mean electrons between which shot noise is counted
     highest_root: float
     a_dn: float  # variance line
     b_dn2: float
+    dark_e: float = 0.0
+    removed_e: float = 0.0  # mean dark signal that the camera subtracts
+    kept_dark_dn: float = 0.0  # in a clean frame with fixed patterns
+    full_well_e: float = np.inf
+    row_std_dn: float = 0.0
 
 
 NUMBERS = len(_Numbers._fields)
@@ -123,8 +122,7 @@ def electron_noise(
     plans: Sequence[Plan], body: Body, shape: tuple[int, int], origin: tuple[int, int], counts_all: bool
 ) -> Electrons:
     """Return the noise of frames of one body; ``counts_all`` forbids normals in place of counts."""
-    first = origin[1] % BLOCK
-    columns = -(-(first + shape[1]) // BLOCK) * BLOCK
+    first, columns = origin[1] % BLOCK, padded_width(origin[1], shape[1])
     frames = [_frame(plan, (origin[0], origin[1] - first), columns, counts_all) for plan in plans]
     numbers, purposes, quantiles, columns_dn, errors_dn = ([*members] for members in zip(*frames, strict=True))
     black_dn, base_dn = float(plans[0].black_level_dn), np.empty((len(plans), 2, columns), dtype=np.float32)
@@ -141,7 +139,6 @@ def electron_noise(
         errors_dn=_stack(errors_dn),
         base_dn=base_dn,
         padded_width=columns,
-        strips=-(-shape[1] // STRIP),
         black_dn=black_dn,
         body=body,
         tables=count_tables(),
@@ -211,13 +208,8 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
     numbers = _Numbers(
         dn_per_e=a_dn,
         shot=1.0,
-        dark_e=0.0,
-        removed_e=0.0,
-        kept_dark_dn=0.0,
-        full_well_e=np.inf,
         read_std_dn=read_std_dn,
         error_dn=_error_dn(read_std_dn, quantiles, float(plan.black_level_dn), 0.0),
-        row_std_dn=0.0,
         lowest_root=lowest_root,
         highest_root=highest_root,
         a_dn=a_dn,
@@ -302,7 +294,7 @@ def _count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, wor
         removed_e = np.float32(of.removed_e)
         for x in range(strip.total):
             workspace.total_e[x] = workspace.electrons[x] + (workspace.dark[x] - removed_e)
-    first, after = _defects_of(noise.body, noise.strips, strip)
+    first, after = _defects_of(noise.body, strip)
     if first < after:
         _draw_defects(noise, key, first, after, strip, workspace)
 
@@ -365,9 +357,9 @@ def _fill_equal_rates(rate: float, count: int, rates: Rates) -> None:
 
 
 @inner
-def _defects_of(body: Body, strips: int, strip: Strip) -> tuple[int, int]:
+def _defects_of(body: Body, strip: Strip) -> tuple[int, int]:
     """Return the range of a strip's defects in the lists of the body."""
-    at = strip.y * strips + strip.x // STRIP
+    at = strip.y * body.strips + strip.x // STRIP
     return body.starts[at], body.starts[at + 1]
 
 
@@ -383,7 +375,7 @@ def _draw_defects(noise: Electrons, key: PhiloxKey, first: int, after: int, stri
 @inner
 def list_defects(noise: Electrons, strip: Strip, found: int, workspace: Workspace) -> int:
     """Append the strip's defects to ``uncertain``; return the length."""
-    first, after = _defects_of(noise.body, noise.strips, strip)
+    first, after = _defects_of(noise.body, strip)
     for d in range(first, after):
         workspace.uncertain[found + d - first] = np.uint32(noise.body.positions[d])
     return int(found + after - first)
@@ -392,7 +384,7 @@ def list_defects(noise: Electrons, strip: Strip, found: int, workspace: Workspac
 @inner
 def clear_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
     """Set ``defects`` to 0 again."""
-    first, after = _defects_of(noise.body, noise.strips, strip)
+    first, after = _defects_of(noise.body, strip)
     for d in range(first, after):
         workspace.defects[noise.body.positions[d]] = 0.0
 
@@ -450,7 +442,7 @@ def electrons_line(noise: Electrons, n: int) -> tuple[float, float, float]:
 def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
     """Add the fixed patterns to the unrounded clean frame, as `reference.noise.average`."""
     of, clean_dn, body = _load_numbers(noise, 0), workspace.unrounded_dn, noise.body
-    first, after = _defects_of(body, noise.strips, strip)
+    first, after = _defects_of(body, strip)
     for d in range(first, after):
         workspace.defects[body.positions[d]] = body.means_e[d]
     for x in range(strip.total):

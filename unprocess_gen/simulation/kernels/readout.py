@@ -92,9 +92,11 @@ def readout_of(
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
     black_dn = float(first.black_level_dn)
+    clipped = [noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip) for plan in plans]
+    pinned = [_pinned_dn(plan, counts_from_black) for plan in plans]
     kind: Any = Normalised if first.normalised else Integers
     readout: Integers | Normalised = kind(
-        limits_dn=np.array([(*_limits_dn(plan), *_pinned_dn(plan, counts_from_black)) for plan in plans]),
+        limits_dn=np.hstack([clipped, pinned]),
         averaged=first.averaged,
         black_dn=black_dn,
         span_dn=float(first.white_level_dn) - black_dn,
@@ -110,10 +112,6 @@ def _planes(pattern: str, top: int, left: int) -> NDArray[np.int64]:
     """Return the number of the plane of each site of a tile, [4]."""
     sites = [2 * y + x for y, x in plane_sites(pattern, (top, left))]
     return np.argsort(sites)
-
-
-def _limits_dn(plan: Plan) -> tuple[float, float]:
-    return noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
 
 
 def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:

@@ -39,6 +39,11 @@ _LANES_BY_MASK = np.argsort(1 - _MASK_BITS, axis=1, kind="stable").astype(np.uin
 _COUNT_BY_MASK = _MASK_BITS.sum(axis=1).astype(np.uint32)
 
 
+def padded_width(left: int, width: int) -> int:
+    """Return how many columns the complete blocks around ``width`` pixels from column ``left`` have."""
+    return -(-(left % BLOCK + width) // BLOCK) * BLOCK
+
+
 class Strip(NamedTuple):
     """Locate a strip in the crop, in the full frame, and in the buffers."""
 
