@@ -156,20 +156,20 @@ def kernels() -> dict[str, Any]:
 def doubles() -> str:
     """Return the digest of the kernels' values before rounding to DN, which shows a change of one bit.
 
-    Frames would show such a change once in 10^12 sites. After the kernel has run, the workspace holds the values of all
-    stages for the last strip, including counts and deviates.
+    Frames would show such a change once in 10^12 sites. After the kernel has run, the scratch memory holds the values
+    of all stages for the last strip, including counts and deviates.
     """
     n = np.arange(2 * STRIP)
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8).reshape(2, STRIP, 3)
     found = []
     for plan in plans():
         shape, origin, dtype = codes.shape[:2], (5, 7), np.float32 if plan.normalised else np.uint16
-        scene, noise, workspace = render._records([plan], shape, 256, origin)
+        scene, noise, scratch = render._records([plan], shape, 256, origin)
         clean, noisy = np.empty(codes[..., 0].size, dtype=dtype), np.empty((1, codes[..., 0].size), dtype=dtype)
         counts = np.zeros((1, 6), dtype=np.int64)
         readout = readout_of([plan], shape, origin, uses_scene32(plan))
-        render._render(codes, scene, noise, philox_keys([plan]), origin, readout, workspace, clean, noisy, counts)
-        found += [clean, noisy, counts, *workspace]
+        render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
+        found += [clean, noisy, counts, *scratch]
         if isinstance(noise, Electrons):
             found += members(noise.body)
     return digest(*map(np.ascontiguousarray, found))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
 from unprocess_gen.core.jit import inner, kernel
@@ -32,12 +30,10 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts,
 )
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, pointers_of, store
-from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Workspace, allocate_workspace
+from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Scratch, Workspace, scratch_of_thread, workspace_in
 
 _ZERO, _INFINITY = np.float32(0), np.float32(np.inf)
 _WIDTH = np.uint64(VECTOR_WIDTH)
-
-workspace = functools.lru_cache(maxsize=1)(allocate_workspace)
 
 
 # Deviates -------------------------------------------------------------------------------------------------------------
@@ -112,7 +108,7 @@ def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
 def counts(words: Words, rates: Float) -> Float:
     """Return the Poisson counts of words, with the arguments of `reference.poisson.poisson`."""
     out = np.full(words.shape, np.nan)
-    _fill_counts(words.astype(np.uint32), rates.astype(np.float64), count_tables(), workspace(), out)
+    _fill_counts(words.astype(np.uint32), rates.astype(np.float64), count_tables(), scratch_of_thread(), out)
     return out
 
 
@@ -126,7 +122,7 @@ def exact_counts(words: Words, rates: Float) -> Float:
 def approximate_counts(words: Words, rates: Float, tables: CountTables | None = None) -> tuple[Float32, np.ndarray]:
     """Return counts before uncertain ones are replaced, and the mask of uncertain ones."""
     out, is_listed = np.full(words.shape, np.nan, dtype=np.float32), np.zeros(words.shape, dtype=np.bool_)
-    _fill_approximate(words.astype(np.uint32), rates, tables or count_tables(), workspace(), out, is_listed)
+    _fill_approximate(words.astype(np.uint32), rates, tables or count_tables(), scratch_of_thread(), out, is_listed)
     return out, is_listed
 
 
@@ -140,9 +136,9 @@ def _load_rates(words: Words, rates: Float, start: int, length: int, total: int,
 
 
 @kernel
-def _fill_counts(words: Words, rates: Float, tables: CountTables, workspace: Workspace, out: Float) -> None:
+def _fill_counts(words: Words, rates: Float, tables: CountTables, scratch: Scratch, out: Float) -> None:
     """Draw as `electrons` does: counts of rates beyond float32's integers are computed exactly."""
-    buffers, of, every = pointers_of(workspace), pointers_of(tables), (_ZERO, _INFINITY)
+    buffers, of, every = workspace_in(scratch, 0), pointers_of(tables), (_ZERO, _INFINITY)
     given = Rates(buffers.rates, buffers.rounded_e, buffers.residual_e, buffers.root, buffers.inverse)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
@@ -164,9 +160,9 @@ def _fill_exact_counts(words: Words, rates: Float, tables: CountTables, out: Flo
 
 @kernel
 def _fill_approximate(
-    words: Words, rates: Float, tables: CountTables, workspace: Workspace, out: Float32, is_listed: np.ndarray
+    words: Words, rates: Float, tables: CountTables, scratch: Scratch, out: Float32, is_listed: np.ndarray
 ) -> None:
-    buffers, of, every = pointers_of(workspace), pointers_of(tables), (_ZERO, _INFINITY)
+    buffers, of, every = workspace_in(scratch, 0), pointers_of(tables), (_ZERO, _INFINITY)
     given = Rates(buffers.rates, buffers.rounded_e, buffers.residual_e, buffers.root, buffers.inverse)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)

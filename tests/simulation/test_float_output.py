@@ -36,7 +36,7 @@ from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import body
 from unprocess_gen.simulation.kernels.normal import build_quantiles
 from unprocess_gen.simulation.kernels.philox import philox_key
-from unprocess_gen.simulation.kernels.strips import allocate_workspace
+from unprocess_gen.simulation.kernels.strips import scratch_of_thread
 from unprocess_gen.simulation.pair import make_pair, make_pairs
 from unprocess_gen.simulation.reference import cfa as bayer
 from unprocess_gen.simulation.reference import noise as effects
@@ -76,7 +76,7 @@ def dn(frame: Frame, plan: Plan) -> np.ndarray:
 def test_compiled_words_equal_the_streams(shape: tuple[int, int], origin: tuple[int, int]) -> None:
     key = 0xFEDCBA9876543210
     found, purpose = np.empty(shape, dtype=np.uint32), np.uint64(streams.purpose("read"))
-    body._fill_words(philox_key(key, level=2, draw=1, frame=3), purpose, origin, allocate_workspace(), found)
+    body._fill_words(philox_key(key, level=2, draw=1, frame=3), purpose, origin, scratch_of_thread(), found)
     assert np.array_equal(found, streams.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1))
 
 

@@ -224,7 +224,7 @@ def nudged(kernel: Callable[..., object], member: str) -> Callable[..., object]:
             return found + 0.5
         output = getattr(given[-1], member) if member else given[-1]
         assert isinstance(output, np.ndarray)
-        output += {"uint32": 2**28, "uint16": 1, "float32": 0.5, "float64": 0.5}[output.dtype.name]
+        output[: strips.STRIP] += {"uint32": 2**28, "uint16": 1, "float32": 0.5, "float64": 0.5}[output.dtype.name]
         return found
 
     return other

@@ -13,6 +13,7 @@ from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.types import Physics, Plan
 from unprocess_gen.simulation.kernels import body
 from unprocess_gen.simulation.kernels.body import Body, body_of, forget_bodies
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
 from unprocess_gen.simulation.kernels.strips import STRIP
 from unprocess_gen.simulation.reference import noise
 
@@ -68,7 +69,7 @@ def test_defects_of_a_crop_equal_the_reference(shape: tuple[int, int], origin: t
     for on in (("hot_pixels", "dead_pixels"), ("hot_pixels",), ("dead_pixels",)):
         for hot_share, dead_share in ((0.05, 0.03), (1.0, 0.3), (0.3, 1.0)):
             plan = plan_with(*on, **NUMBERS | {"hot_pixel_share": hot_share, "dead_pixel_share": dead_share})
-            found = means_of(body_of(plan, shape, origin), shape, origin[1] % BLOCK)
+            found = means_of(body_of(plan, shape, origin), shape, origin[1] % VECTOR_WIDTH)
             np.testing.assert_array_equal(found, expected_means(plan, shape, origin))
 
 
@@ -92,7 +93,7 @@ def test_response_of_a_crop_equals_the_reference(
 def test_bands_of_rows_do_not_change_defects(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     shape, origin = (40, 200), (301, 77)
     monkeypatch.setattr(body, "BAND_SITES", rows * shape[1])
-    found = means_of(body_of(PLAN, shape, origin), shape, origin[1] % BLOCK)
+    found = means_of(body_of(PLAN, shape, origin), shape, origin[1] % VECTOR_WIDTH)
     np.testing.assert_array_equal(found, expected_means(PLAN, shape, origin))
 
 

@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import exponential_levels
-from unprocess_gen.core.random_streams import BLOCK, Words, purpose
+from unprocess_gen.core.random_streams import Words, purpose
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels.normal import exact_value, normal_quantiles
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, philox_key
-from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, pointer_to
 from unprocess_gen.simulation.kernels.strips import (
     SIZE,
     STRIP,
     Float32,
-    Workspace,
-    allocate_workspace,
+    Scratch,
+    lead_of,
     locate,
     padded_width,
+    scratch_of_thread,
+    workspace_in,
 )
 
 PRNU, HOT, DEAD = (np.uint64(purpose(stream)) for stream in ("prnu", "hot_pixels", "dead_pixels"))
@@ -92,17 +94,17 @@ def forget_bodies() -> None:
 @functools.lru_cache(maxsize=2)
 def _body(patterns: _Patterns, shape: tuple[int, int], origin: tuple[int, int]) -> Body:
     key, prnu_std, hot_share, hot_e, dead_share = patterns
-    first = origin[1] % BLOCK
     response, pitch = np.ones(SIZE, dtype=np.float32), 0
     if prnu_std != 0:
         pitch = padded_width(origin[1], shape[1])
-        response = np.empty((shape[0], pitch), dtype=np.float32)
+        response = np.zeros((shape[0], pitch), dtype=np.float32)
         _fill_response(
-            philox_key(key), prnu_std, origin, shape[1], normal_quantiles().quadratics, allocate_workspace(), response
+            philox_key(key), prnu_std, origin, shape[1], normal_quantiles().quadratics, scratch_of_thread(), response
         )
     strips = max(-(-shape[1] // STRIP), 1)
     y, x, means_e = _defects(key, hot_share, hot_e, dead_share, shape, origin)
     starts = np.searchsorted(y * strips + x // STRIP, np.arange(shape[0] * strips + 1))
+    first = origin[1] % VECTOR_WIDTH
     return Body(
         response.reshape(-1), (pitch, int(pitch > 0)), strips, starts.astype(np.int64), x % STRIP + first, means_e
     )
@@ -136,17 +138,15 @@ def word_threshold(fraction: float) -> np.uint64:
 
 def _words(key: int, purpose_word: np.uint64, origin: tuple[int, int], shape: tuple[int, int]) -> Words:
     out = np.empty(shape, dtype=np.uint32)
-    _fill_words(philox_key(key), purpose_word, origin, allocate_workspace(), out)
+    _fill_words(philox_key(key), purpose_word, origin, scratch_of_thread(), out)
     return out
 
 
 @kernel
-def _fill_words(
-    key: PhiloxKey, purpose_word: np.uint64, origin: tuple[int, int], workspace: Workspace, out: Words
-) -> None:
+def _fill_words(key: PhiloxKey, purpose_word: np.uint64, origin: tuple[int, int], scratch: Scratch, out: Words) -> None:
     """Fill ``out`` with the words of a stream."""
     height, width = out.shape
-    buffers, target = pointers_of(workspace), pointer_to(out, 0)
+    buffers, target = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0)
     for y in range(height):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
@@ -162,16 +162,16 @@ def _fill_response(
     origin: tuple[int, int],
     width: int,
     quadratics: Float,
-    workspace: Workspace,
+    scratch: Scratch,
     out: Float32,
 ) -> None:
     """Fill ``out`` with 1 plus normal deviates of standard deviation ``prnu_std``, but at least 0."""
-    buffers, target, normal = pointers_of(workspace), pointer_to(out, 0), pointer_to(quadratics, 0)
+    buffers, target, normal = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0), pointer_to(quadratics, 0)
     for y in range(out.shape[0]):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
             fill_word_blocks(key, strip, PRNU, buffers.words)
-            row = pointer_to(target, y * out.shape[1] + x)
+            row = pointer_to(target, y * out.shape[1] + x + strip.lead)
             for n in range(strip.total):
                 buffers.exact_dn[n] = exact_value(buffers.words[n], normal)
             for n in range(strip.total):

@@ -315,13 +315,15 @@ def _recompute_bright(strip: Strip, scene: Scene, workspace: Workspace) -> None:
     threshold, exposure, brightest = scene.highlight_threshold, scene.exposure, scene.brightest
     limit = np.inf if exposure == 1.0 else 1.0  # clip at white first; otherwise light above white would reappear
     row, column = scene.response_steps
-    response = pointer_to(scene.response, strip.y * row + strip.x * column)
-    for block in range(strip.total // BLOCK):
-        highest = load(workspace.signal, np.uint64(block * BLOCK))
-        for n in range(block * (BLOCK // VECTOR_WIDTH), (block + 1) * (BLOCK // VECTOR_WIDTH)):
+    response = pointer_to(scene.response, strip.y * row + strip.x * column + strip.lead)
+    vectors = strip.total // VECTOR_WIDTH
+    for start in range(0, vectors, BLOCK // VECTOR_WIDTH):
+        end = min(start + BLOCK // VECTOR_WIDTH, vectors)
+        highest = load(workspace.signal, np.uint64(start) * _8)
+        for n in range(start, end):
             highest = maximum(highest, load(workspace.signal, np.uint64(n) * _8))
         is_bright = movemask(less_than(scene.linear_limit, highest)) != 0
-        for n in range(block * (BLOCK // VECTOR_WIDTH), (block + 1) * (BLOCK // VECTOR_WIDTH)):
+        for n in range(start, end):
             x = np.uint64(n) * _8
             i = load(workspace.signal, x)
             if is_bright:

@@ -260,7 +260,7 @@ def add_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, worksp
     f = np.float32
     per_e, std, full_well_e, margin = f(of.dn_per_e), f(of.read_std_dn), f(of.full_well_e), f(of.error_dn)
     row_dn = f(workspace.row_dn[0])
-    base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x)
+    base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
     electrons = workspace.total_e if of.dark_e > 0.0 else workspace.electrons
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
@@ -311,11 +311,11 @@ def _fill_words_and_rates(
     black, clean_dn = noise.black_dn, workspace.unrounded_dn
     shot, read = workspace.words, workspace.read_words
     row, column = noise.body.response_steps
-    response = pointer_to(noise.body.response, strip.y * row + strip.x * column)
-    for block in range(strip.total // BLOCK):
+    response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
+    for block in range(strip.blocks):
         counter = (strip.block + np.uint64(block)) * _LANES
         for lane in range(LANES):
-            x0 = block * BLOCK + lane
+            x0 = block * BLOCK - strip.lead + lane
             x1, x2, x3 = x0 + LANES, x0 + 2 * LANES, x0 + 3 * LANES
             rate0 = (clean_dn[x0] - black) / dn_per_e * np.float64(response[x0])
             rate1 = (clean_dn[x1] - black) / dn_per_e * np.float64(response[x1])
@@ -415,7 +415,7 @@ def _dn(noise: Electrons, of: _Numbers, n: int, x: int, read: float, strip: Stri
     electrons = electrons + workspace.defects[x]
     dn = min(electrons, of.full_well_e) * of.dn_per_e + noise.black_dn
     dn = dn + of.read_std_dn * read
-    offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + x]
+    offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
     dn = dn + (offset_dn + noise.errors_dn[4 * n + 2 * (strip.y & 1) + (x & 1)])
     return dn if workspace.defects[x] >= 0.0 else 0.0
 
@@ -448,6 +448,6 @@ def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> N
     for x in range(strip.total):
         dn = (clean_dn[x] + workspace.defects[x] * of.dn_per_e) + of.kept_dark_dn
         dn = min(dn, of.full_well_e * of.dn_per_e + noise.black_dn)
-        offset_dn = 0.0 + noise.columns_dn[strip.x + x]
+        offset_dn = 0.0 + noise.columns_dn[strip.x + strip.lead + x]
         dn = dn + (offset_dn + noise.errors_dn[2 * (strip.y & 1) + (x & 1)])
         clean_dn[x] = dn if workspace.defects[x] >= 0.0 else 0.0

@@ -70,10 +70,10 @@ def first_word(key: PhiloxKey, row: np.uint64, purpose_word: np.uint64) -> np.ui
 
 @inner
 def fill_word_blocks(key: PhiloxKey, strip: Strip, purpose_word: np.uint64, out: Pointer) -> None:
-    """Fill ``out`` (uint32) with one word per pixel, for the complete blocks of a strip."""
-    for block in range(strip.total // BLOCK):
+    """Fill ``out`` (uint32) with one word per pixel, for the complete blocks of a strip, from index -`lead` on."""
+    for block in range(strip.blocks):
         counter = (strip.block + np.uint64(block)) * _LANES
-        at = block * BLOCK
+        at = block * BLOCK - strip.lead
         for lane in range(LANES):
             c0, c1, c2, c3 = counter + np.uint64(lane), strip.row, purpose_word | key[2], key[3]
             k0, k1 = key[0], key[1]

@@ -30,7 +30,7 @@ from unprocess_gen.simulation.kernels.readout import (
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
-from unprocess_gen.simulation.kernels.strips import STRIP, Workspace, allocate_workspace, locate, workspace_of_thread
+from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, lead_of, locate, scratch_of_thread, workspace_in
 
 CLEAN_COUNTS = [0, 1, 4]
 """Columns of the counts that belong to the clean frame, in the order of `Counts`."""
@@ -72,19 +72,19 @@ def _fill_frames(
     dtype = np.float32 if first.normalised else np.uint16
     clean, noisy = np.empty(frame_shape, dtype=dtype), np.empty((count, *frame_shape), dtype=dtype)
     counts = np.zeros((max(count, 1), 6), dtype=np.int64)
-    scene, noise, workspace = _records(plans, shape, 256 if srgb.dtype == np.uint8 else 65536, origin)
+    scene, noise, scratch = _records(plans, shape, 256 if srgb.dtype == np.uint8 else 65536, origin)
     codes = np.require(
         srgb, requirements=["C", "A", "W", "E"]
     )  # a read-only array would be another type, compiled again
     keys, readout = philox_keys(plans)[:count], readout_of(plans, shape, origin, uses_scene32(first))
     frames = clean.reshape(-1), noisy.reshape(count, clean.size)
-    _render(codes, scene, noise, keys, origin, readout, workspace, *frames, counts)
+    _render(codes, scene, noise, keys, origin, readout, scratch, *frames, counts)
     return clean, noisy, counts
 
 
 def _records(
     plans: Sequence[Plan], shape: tuple[int, int], codes: int, origin: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Workspace]:
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Scratch]:
     """Return the scene, the noise and the scratch memory, whose classes select the compiled code."""
     first = plans[0]
     if first.counts_electrons:
@@ -93,10 +93,10 @@ def _records(
         if first.averaged:  # the clean frame contains the response, so the noise does not
             body = body._replace(response=ONES, response_steps=(0, 0))
         noise = electron_noise(plans, body, shape, origin, counts_all=first.normalised)
-        return scene_of(first, codes, origin, response, pitch), noise, workspace_of_thread()
+        return scene_of(first, codes, origin, response, pitch), noise, scratch_of_thread()
     if uses_scene32(first):
-        return scene32_of(first, codes, origin), gaussian_noise32(plans), allocate_workspace(np.float32)
-    return scene_of(first, codes, origin), gaussian_noise(plans), workspace_of_thread()
+        return scene32_of(first, codes, origin), gaussian_noise32(plans), scratch_of_thread(np.float32)
+    return scene_of(first, codes, origin), gaussian_noise(plans), scratch_of_thread()
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
@@ -117,7 +117,7 @@ def _render(
     keys: NDArray[np.uint64],
     origin: tuple[int, int],
     readout: Any,
-    workspace: Workspace,
+    scratch: Scratch,
     clean: Frame,
     noisy: Frame,
     counts: NDArray[np.int64],
@@ -128,7 +128,7 @@ def _render(
         pointers_of(scene),
         pointers_of(noise),
         pointers_of(readout),
-        pointers_of(workspace),
+        workspace_in(scratch, lead_of(origin)),
     )
     codes, clean_sites, noisy_sites = pointer_to(srgb, 0), pointer_to(clean, 0), pointer_to(noisy, 0)
     is_uint8, key_words, all_counts, sites = srgb.itemsize == 1, pointer_to(keys, 0), pointer_to(counts, 0), clean.size

@@ -1,8 +1,8 @@
 """Divide rows into strips, and hold the scratch memory that the stages of a strip share.
 
 Kernels process a row in strips short enough that their buffers stay in the L1 cache. Random words come in blocks of 64
-pixels (`core.random_streams.BLOCK`), so buffers hold complete blocks; a strip begins ``first`` pixels into them. All
-strips of a frame have the same ``first``, because `STRIP` is a multiple of a block.
+pixels (`core.random_streams.BLOCK`); the other stages compute complete vectors. All strips of a frame begin at the same
+place in a block and in a vector, because `STRIP` is a multiple of a block.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from unprocess_gen.simulation.kernels.simd import (
     Vector,
     load,
     movemask,
+    pointer_to,
     store,
 )
 
@@ -35,8 +36,9 @@ Indices = NDArray[np.uint32]
 
 _8 = np.uint64(8)
 _MASK_BITS = np.arange(2**VECTOR_WIDTH)[:, None] >> np.arange(VECTOR_WIDTH) & 1
-_LANES_BY_MASK = np.argsort(1 - _MASK_BITS, axis=1, kind="stable").astype(np.uint32).ravel()
-_COUNT_BY_MASK = _MASK_BITS.sum(axis=1).astype(np.uint32)
+_LANES_BY_MASK = np.argsort(1 - _MASK_BITS, axis=1, kind="stable").ravel()
+_COUNT_BY_MASK = _MASK_BITS.sum(axis=1)
+_LANES_SIZE, _TABLES_SIZE = _LANES_BY_MASK.size, _LANES_BY_MASK.size + _COUNT_BY_MASK.size
 
 
 def padded_width(left: int, width: int) -> int:
@@ -50,9 +52,11 @@ class Strip(NamedTuple):
     y: int  # row of the crop
     x: int  # first column in the crop
     length: int
-    first: int  # index in the buffers of the first pixel
+    first: int  # index in the buffers of the first pixel, below VECTOR_WIDTH
     after: int  # index after the last pixel
-    total: int  # buffer elements in use: complete blocks
+    total: int  # buffer elements in use: complete vectors
+    lead: int  # elements of the first block before the buffers
+    blocks: int  # complete blocks that contain the strip
     block: np.uint64  # number of the first block in the row of the full frame
     row: np.uint64  # row of the full frame
 
@@ -60,90 +64,160 @@ class Strip(NamedTuple):
 @inner
 def locate(origin: tuple[int, int], y: int, x: int, length: int) -> Strip:
     """Locate the strip of ``length`` pixels from (y, x) of a crop at ``origin`` of the full frame."""
-    first = (origin[1] + x) % BLOCK
-    count = (first + length + BLOCK - 1) // BLOCK * BLOCK
+    lead, first = lead_of(origin), origin[1] % VECTOR_WIDTH
+    total = (first + length + VECTOR_WIDTH - 1) // VECTOR_WIDTH * VECTOR_WIDTH
+    blocks = (lead + total + BLOCK - 1) // BLOCK
     block, row = np.uint64((origin[1] + x) // BLOCK), np.uint64(origin[0] + y)
-    return Strip(y, x, length, first, first + length, count, block, row)
+    return Strip(y, x, length, first, first + length, total, lead, blocks, block, row)
+
+
+@inner
+def lead_of(origin: tuple[int, int]) -> int:
+    """Return `Strip.lead` of a crop at ``origin``."""
+    return origin[1] % BLOCK // VECTOR_WIDTH * VECTOR_WIDTH
 
 
 class Workspace(NamedTuple):
-    """Hold the scratch arrays of one strip. The first three are float64, or float32 for the tier ``fast``.
-
-    Python allocates them, since compiling the allocation takes half a second.
-    """
+    """Point to the scratch memory of one strip. The first three are float64, or float32 for the tier ``fast``."""
 
     signal: Any  # before white balance and highlights
     bright_light: Any  # normalised light in bright blocks, 0 elsewhere
     unrounded_dn: Any  # clean frame
     exact_dn: Float  # noisy frame before rounding
+    rates: Float  # mean electrons, and what the counts need of them: see `poisson.Rates`
+    dark_rates: Float
+    defects: Float  # electrons of hot pixels; negative at dead pixels, 0 at others
+    row_dn: Float  # [1]: offset of the row
     rounded_dn: Float32  # clean frame, rounded
     residual_dn: Float32  # unrounded_dn - rounded_dn
     noise_dn: Float32  # approximate DN to add to the base of the read-out
     error_dn: Float32  # bound of the error of noise_dn
     noisy_dn: Float32  # rounded, not clipped
-    clean: Raw
-    noisy: Raw
     normalised: Float32
-    words: Indices
-    read_words: Indices
-    dark_words: Indices
     depths: Float32  # see `normal.fill_depths`
     normals: Float32
-    lines: NDArray[np.uint64]  # scratch of look-ups
-    more_lines: NDArray[np.uint64]
-    scratch: Indices
     errors: Float32
-    rates: Float  # mean electrons, and what the counts need of them: see `poisson.Rates`
     rounded_e: Float32
     residual_e: Float32
     root: Float32
     inverse: Float32
     electrons: Float32  # shot noise
-    dark_rates: Float
     dark: Float32  # counts of the dark signal
     total_e: Float32
-    defects: Float  # electrons of hot pixels; negative at dead pixels, 0 at others
     zeros: Float32
-    row_dn: Float  # [1]: offset of the row
-    uncertain: Indices  # sites to recompute exactly
+    words: Indices
+    read_words: Indices
+    dark_words: Indices
+    scratch: Indices
+    uncertain: Indices  # [2 SIZE]: sites to recompute exactly
     lanes_by_mask: Indices  # for each mask of eight lanes: its set lanes first
     count_by_mask: Indices  # for each mask: number of set lanes
+    lines: NDArray[np.uint64]  # scratch of look-ups
+    more_lines: NDArray[np.uint64]
+    clean: Raw
+    noisy: Raw
+
+
+class Scratch(NamedTuple):
+    """Hold the scratch memory of a `Workspace`: few arrays, because Numba takes 0.2 µs to read each.
+
+    Python allocates it, since compiling the allocation takes half a second. Each array ends with a spare buffer:
+    negative indices reach it in uncompiled kernels.
+    """
+
+    stages: Any  # [3 + 1, SIZE]
+    doubles: Float  # [5 + 1, SIZE]
+    singles: Float32  # [17 + 1, SIZE]
+    indices: Indices  # [6 + 1, SIZE], flat, and the tables by mask
+    lines: NDArray[np.uint64]  # [2 + 1, SIZE]
+    frames: Raw  # [2 + 1, SIZE]
 
 
 _threads = threading.local()
 
 
-def workspace_of_thread() -> Workspace:
-    """Return the scratch memory of this thread for frames in float64; allocating it takes 30 µs.
+def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
+    """Return the scratch memory of this thread for frames in float64 or float32; allocating it takes 20 µs.
 
-    No result depends on its content. In float32 some do: a bright number in the padding changes the rounding of the
-    sites in its vector. So frames in float32 always begin with zeros, from `allocate_workspace`.
+    Its signal is zero: a bright number in the padding would slow down its block, and in float32 change the rounding of
+    the sites in its vector. No result depends on its other content.
     """
-    if not hasattr(_threads, "workspace"):
-        _threads.workspace = allocate_workspace()
-    workspace: Workspace = _threads.workspace
-    workspace.signal.fill(0)  # a bright number left in the padding would slow down its block
-    return workspace
+    name = np.dtype(dtype).name
+    if not hasattr(_threads, name):
+        setattr(_threads, name, allocate_scratch(dtype))
+    scratch: Scratch = getattr(_threads, name)
+    scratch.stages.fill(0)
+    return scratch
 
 
-def allocate_workspace(dtype: Any = np.float64) -> Workspace:
-    """Allocate zeroed buffers: kernels also compute the padding of blocks, which must hold finite numbers."""
-    signal, bright_light, unrounded_dn = np.zeros((3, SIZE), dtype=dtype)
-    exact_dn, rates, dark_rates, defects = np.zeros((4, SIZE))
-    singles = np.zeros((17, SIZE), dtype=np.float32)
-    rounded_dn, residual_dn, noise_dn, error_dn, noisy_dn, normalised, depths, normals = singles[:8]
-    rounded_e, residual_e, root, inverse, electrons, dark, total_e, zeros, errors = singles[8:]
-    clean, noisy = np.zeros((2, SIZE), dtype=np.uint16)
-    row_dn = np.zeros(1)
-    words, read_words, dark_words, scratch = np.zeros((4, SIZE), dtype=np.uint32)
-    lines, more_lines = np.zeros((2, SIZE), dtype=np.uint64)
-    uncertain = np.zeros(2 * SIZE + VECTOR_WIDTH, dtype=np.uint32)
+def allocate_scratch(dtype: Any = np.float64) -> Scratch:
+    """Allocate zeroed buffers: kernels also compute the padding of vectors, which must hold finite numbers."""
+    return Scratch(
+        stages=np.zeros((4, SIZE), dtype=dtype),
+        doubles=np.zeros((6, SIZE)),
+        singles=np.zeros((18, SIZE), dtype=np.float32),
+        indices=np.concatenate([_LANES_BY_MASK, _COUNT_BY_MASK, np.zeros(7 * SIZE, dtype=int)]).astype(np.uint32),
+        lines=np.zeros((3, SIZE), dtype=np.uint64),
+        frames=np.zeros((3, SIZE), dtype=np.uint16),
+    )
+
+
+@inner
+def workspace_in(scratch: Scratch, lead: int) -> Workspace:
+    """Return pointers to the buffers of strips with this ``lead``.
+
+    Random words fill complete blocks, from index -``lead`` on. All other stages begin at index 0, the first vector with
+    pixels of the strip: in patches, a fifth of the elements of blocks lie outside.
+    """
+    stages, doubles, singles = (
+        pointer_to(scratch.stages, lead),
+        pointer_to(scratch.doubles, lead),
+        pointer_to(scratch.singles, lead),
+    )
+    tables, lines, frames = (
+        pointer_to(scratch.indices, 0),
+        pointer_to(scratch.lines, lead),
+        pointer_to(scratch.frames, lead),
+    )
+    indices = pointer_to(tables, _TABLES_SIZE + lead)
     return Workspace(
-        signal, bright_light, unrounded_dn, exact_dn, rounded_dn, residual_dn, noise_dn, error_dn, noisy_dn, clean,
-        noisy, normalised, words, read_words, dark_words, depths, normals, lines, more_lines, scratch, errors, rates,
-        rounded_e, residual_e, root, inverse, electrons, dark_rates, dark, total_e, defects, zeros, row_dn, uncertain,
-        _LANES_BY_MASK, _COUNT_BY_MASK,
-    )  # fmt: skip
+        signal=pointer_to(stages, 0 * SIZE),
+        bright_light=pointer_to(stages, 1 * SIZE),
+        unrounded_dn=pointer_to(stages, 2 * SIZE),
+        exact_dn=pointer_to(doubles, 0 * SIZE),
+        rates=pointer_to(doubles, 1 * SIZE),
+        dark_rates=pointer_to(doubles, 2 * SIZE),
+        defects=pointer_to(doubles, 3 * SIZE),
+        row_dn=pointer_to(doubles, 4 * SIZE),
+        rounded_dn=pointer_to(singles, 0 * SIZE),
+        residual_dn=pointer_to(singles, 1 * SIZE),
+        noise_dn=pointer_to(singles, 2 * SIZE),
+        error_dn=pointer_to(singles, 3 * SIZE),
+        noisy_dn=pointer_to(singles, 4 * SIZE),
+        normalised=pointer_to(singles, 5 * SIZE),
+        depths=pointer_to(singles, 6 * SIZE),
+        normals=pointer_to(singles, 7 * SIZE),
+        errors=pointer_to(singles, 8 * SIZE),
+        rounded_e=pointer_to(singles, 9 * SIZE),
+        residual_e=pointer_to(singles, 10 * SIZE),
+        root=pointer_to(singles, 11 * SIZE),
+        inverse=pointer_to(singles, 12 * SIZE),
+        electrons=pointer_to(singles, 13 * SIZE),
+        dark=pointer_to(singles, 14 * SIZE),
+        total_e=pointer_to(singles, 15 * SIZE),
+        zeros=pointer_to(singles, 16 * SIZE),
+        words=pointer_to(indices, 0 * SIZE),
+        read_words=pointer_to(indices, 1 * SIZE),
+        dark_words=pointer_to(indices, 2 * SIZE),
+        scratch=pointer_to(indices, 3 * SIZE),
+        uncertain=pointer_to(indices, 4 * SIZE),
+        lanes_by_mask=tables,
+        count_by_mask=pointer_to(tables, _LANES_SIZE),
+        lines=lines,
+        more_lines=pointer_to(lines, SIZE),
+        clean=frames,
+        noisy=pointer_to(frames, SIZE),
+    )
 
 
 @inner
