@@ -117,7 +117,7 @@ def _options(group: str, options: Iterable[str], default: str) -> str:
 def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
     """Return the table of a group's keys; ``None`` stands for the branches, which have no defaults."""
     values = {} if group is None else default_values(group)
-    head = ["key", "meaning", "default", "unit", "allowed"]
+    head = ["key", "meaning", "default", "unit", "allowed", "since"]
     rows = [
         [
             code(name),
@@ -125,6 +125,7 @@ def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
             code(default_text(values[name])) if name in values else "",
             setting.unit,
             str(setting.limit),
+            setting.since,
         ]
         for name, setting in settings.items()
     ]
@@ -162,7 +163,8 @@ COLUMNS_INTRODUCTION = """\
 # Manifest columns
 
 `manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order; later
-versions append columns. `KEY.json` in the shards holds the same values, typed, without `detail`.
+versions append columns. `KEY.json` in the shards holds the same values, typed, without `detail` and without empty
+values of columns that were added after version 0.1.
 
 An empty cell means that the value does not exist. Numbers are written so that they read back exactly. The columns of
 physical profiles, marked with an asterisk, are 0 or `none` in rows of other profiles."""

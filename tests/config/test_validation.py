@@ -457,13 +457,35 @@ def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> N
 
 
 def test_config_yaml_contains_every_other_key(settings: Settings) -> None:
+    """Keys of later versions are left out, because these settings do what version 0.1 did."""
     loaded = yaml.safe_load(dataset_yaml(settings()))
+    later = {(group, name) for group, name, setting in all_settings() if setting.since}
     for field in dataclasses.fields(Config):
         if dataclasses.is_dataclass(group := getattr(Config(), field.name)):
             names = {key.name for key in dataclasses.fields(group)} - set(NOT_DATA.get(field.name, ()))
+            names -= {name for name in names if (field.name, name) in later}
             assert set(loaded[field.name]) - {"kind"} == names
         else:
             assert field.name in loaded or field.name in NOT_DATA[""]
+
+
+def test_recorded_config_without_a_later_key_does_what_0_1_did(settings: Settings) -> None:
+    text = dataset_yaml(settings("noise=nikon_d850"))
+    assert yaml.safe_load(text)["effects"]["assumed"] == "use"
+    recorded = text.replace("  assumed: use\n", "")
+    config, _ = parse_dataset_yaml(recorded)
+    assert config.effects.assumed == "off"
+    assert dataset_yaml(config) == recorded
+
+
+def test_config_yaml_omits_a_later_key_at_the_value_of_0_1(settings: Settings) -> None:
+    text = dataset_yaml(settings("noise=nikon_d850", "effects.assumed=off"))
+    assert "assumed" not in yaml.safe_load(text)["effects"]
+
+
+@pytest.mark.parametrize("profile", [("noise=imx385_iso3200",), ("noise=nikon_d850", "noise.assumed=[]")])
+def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Settings, profile: tuple[str, ...]) -> None:
+    assert dataset_yaml(settings(*profile)) == dataset_yaml(settings(*profile, "effects.assumed=off"))
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import STAGES, methods_of_stage
-from unprocess_gen.config.schema import PHYSICAL_NUMBERS
+from unprocess_gen.config.schema import ASSUMABLE, PHYSICAL_NUMBERS
 from unprocess_gen.core.errors import REASONS, DamageError
 from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source
 from unprocess_gen.dataset import columns
-from unprocess_gen.dataset.columns import COLUMNS, NAMES, NO_VIDEO, Range
+from unprocess_gen.dataset.columns import COLUMNS, FIRST, NAMES, NO_VIDEO, Range
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import (
     JSON_BYTES,
@@ -33,6 +33,7 @@ from unprocess_gen.dataset.manifest import (
     plan_from_row,
     read_rows,
     row_json,
+    rows_of_json,
     write_rows,
 )
 from unprocess_gen.planning.effect_contributions import STATISTICS
@@ -215,11 +216,13 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     conditions = {column.empty_if for column in COLUMNS} - {""}
     failed = {condition for condition in conditions if "the source failed" in condition}
     passed = {"the source did not fail"}
+    absent = {"no effect uses one, or effects.assumed is off"}
     holding = {
-        "pair": (row_of(PHYSICAL), passed),
-        "without effects": (row_of(bare), passed | {one for one in failed if one.startswith("no effect")}),
-        "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed),
-        "failed frame": (failed_row(video, SHA256, 0, 7, "corrupt", "why"), failed - {NO_VIDEO}),
+        "pair": (row_of(PHYSICAL), passed | absent),
+        "assumed": (row_of(dataclasses.replace(PHYSICAL, assumed=("prnu_std",))), passed),
+        "without effects": (row_of(bare), passed | absent | {one for one in failed if one.startswith("no effect")}),
+        "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed | absent),
+        "failed frame": (failed_row(video, SHA256, 0, 7, "corrupt", "why"), (failed | absent) - {NO_VIDEO}),
         "unread": (failed_row(unread, None, 0, 7, "unreadable", "why"), conditions - passed),
     }
     for name, (row, held) in holding.items():
@@ -428,8 +431,18 @@ def test_json_size_depends_on_the_source_name_only(plan: Plan, name: str) -> Non
 def test_json_is_typed() -> None:
     loaded = json.loads(row_json([row_of()]))
     row = row_of()
-    assert loaded == {column.name: row[column.name] for column in COLUMNS if column.in_json}
+    assert loaded == {column.name: row[column.name] for column in COLUMNS if column.in_json and column.since == FIRST}
     assert_typed(row | loaded)
+
+
+def test_json_contains_a_later_column_unless_it_is_empty() -> None:
+    plan = dataclasses.replace(PHYSICAL, assumed=("prnu_std", "dark_e_per_s"))
+    content = row_json([row_of(plan)])
+    assert json.loads(content)["assumed"] == "prnu_std;dark_e_per_s"
+    (row,) = rows_of_json(content)
+    assert plan_from_row(row) == plan
+    (older,) = rows_of_json(row_json([row_of(PHYSICAL)]))
+    assert plan_from_row(older) == PHYSICAL
 
 
 def test_json_is_ascii_and_one_line() -> None:
@@ -464,7 +477,7 @@ def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
     lacking.noise.name = half.noise.name = LONGEST_NAME
     all_given = settings("noise=nikon_d850", "noise.full_well_e=1e5", "noise.assumed=[]")
     all_given.noise.branches[0].column_std_dn = 1.0
-    assumed = settings("noise=nikon_d850")
+    assumed = settings("noise=nikon_d850", "effects.assumed=off")
     assumed.noise.assumed = list(PHYSICAL_NUMBERS)
     for config in (lacking, half, all_given, assumed):
         config.noise.iso = 3200
@@ -496,7 +509,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         sensor_unit="f" * 16, body_key=2**64 - 1,
     )  # fmt: skip
     skipped = tuple(f"{effect}: {reason}" for effect, reason in longest_reasons(settings).items())
-    physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics)
+    physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics, assumed=ASSUMABLE)
     pair = Pair(PAIR.clean, PAIR.noisy, Counts(*[2**40] * 6))
     for one in (plan, physical):
         source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)

@@ -626,15 +626,45 @@ def test_all_off_keeps_rounding(settings: Settings) -> None:
 
 def test_auto_by_name_lets_the_image_decide(settings: Settings) -> None:
     assert predictions_of(settings, "effects.all=off", "effects.shot=auto")["shot"].simulated
-    assert not predictions_of(settings, "effects.all=on", "effects.prnu=auto")["prnu"].simulated
+    assert predictions_of(settings, "effects.all=on", "effects.prnu=auto", "effects.tolerance=1e-3")["prnu"].simulated
+    assert not predictions_of(settings, "effects.all=on", "effects.prnu=auto", "effects.tolerance=9")["prnu"].simulated
 
 
-def test_assumed_numbers_are_off_under_auto_with_reason(settings: Settings) -> None:
-    predictions = predictions_of(settings)
+def test_assumed_numbers_are_off_as_in_0_1_with_reason(settings: Settings) -> None:
+    predictions = predictions_of(settings, "effects.assumed=off")
     for effect in ASSUMED:
         assert not predictions[effect].simulated
         assert "is assumed, no source gives it" in predictions[effect].reason
         assert predictions_of(settings, f"effects.{effect}=on")[effect].simulated
+
+
+def planned(settings: Settings, scene: str, *overrides: str) -> Plan:
+    config = configured(settings, "noise=nikon_d850", "sensor=generic_14bit", f"scene={scene}", *overrides)
+    return plan_image(config, "0" * 64, 0, facts_of(cut("highlights-0", 256, 384)))
+
+
+def test_assumed_numbers_are_used_where_the_scene_calls_for_them(settings: Settings) -> None:
+    """Heat is left out of an exposure of a millisecond, and PRNU where little light falls on the sensor."""
+    daylight, night, long = (planned(settings, scene) for scene in ("daylight", "night", "long_exposure"))
+    assert {"prnu"} == {"prnu", "dark_current", "hot_pixels"} & set(daylight.effects)
+    assert "prnu" not in night.effects
+    assert {"prnu", "dark_current", "hot_pixels"} <= set(long.effects)
+    assert "prnu_std" in daylight.assumed
+    assert {"dark_e_per_s", "hot_pixel_share"}.isdisjoint(daylight.assumed)
+    assert {"prnu_std", "dark_e_per_s", "hot_pixel_share"} <= set(long.assumed)
+
+
+def test_column_assumed_is_empty_if_assumed_numbers_are_off(settings: Settings) -> None:
+    """Rows then have the JSON of version 0.1, even if an effect with an assumed number is switched on by name."""
+    plan = planned(settings, "daylight", "effects.assumed=off", "effects.prnu=on")
+    assert "prnu" in plan.effects
+    assert plan.assumed == ()
+
+
+def test_frame_planned_with_assumed_off_is_that_of_0_1(settings: Settings) -> None:
+    plan = planned(settings, "long_exposure", "effects.assumed=off")
+    assert {"prnu", "dark_current", "hot_pixels", "dead_pixels"}.isdisjoint(plan.effects)
+    assert sum("is assumed, no source gives it: on only where switched on" in one for one in plan.skipped) == 4
 
 
 def test_all_on_simulates_known_numbers_and_lists_missing_ones(settings: Settings) -> None:
@@ -743,7 +773,14 @@ def test_masking_noise_is_the_noise_of_the_plan(base: tuple[Config, Physics]) ->
 
 def test_plan_prints_a_table_of_all_effects(run_main: RunMain, tmp_path: Path) -> None:
     fill(tmp_path / "photos", 3)
-    done = run_main("plan", "source.root=photos", "noise=nikon_d850", "scene=video_night", "noise.assumed=[prnu_std]")
+    done = run_main(
+        "plan",
+        "source.root=photos",
+        "noise=nikon_d850",
+        "scene=video_night",
+        "noise.assumed=[prnu_std]",
+        "effects.assumed=off",
+    )
     assert (done.code, messages(done.err)) == (0, [])
     lines = done.out.splitlines()
     assert max(map(len, lines)) <= 160

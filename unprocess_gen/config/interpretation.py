@@ -148,6 +148,9 @@ BRANCH_NUMBERS = {
 }
 """Keys of each branch of a profile that must have a value for an effect to be simulated."""
 
+HEAT = ("dark_reference_c", "dark_doubling_c")
+"""Keys that dark current and hot pixels depend on too."""
+
 
 def is_physical(noise: NoiseConfig) -> bool:
     """Return whether a noise profile is physical: in electrons, with separate effects.
@@ -218,6 +221,42 @@ def missing_number(noise: NoiseConfig, effect: str) -> str | None:
         if any(getattr(branch, key) is None for branch in noise.branches):
             return key
     return next((key for key in EFFECT_NUMBERS.get(effect, ()) if getattr(noise, key) is None), None)
+
+
+def uses_assumed(config: Config) -> bool:
+    """Return whether effects with assumed numbers are simulated like others.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+
+    Returns
+    -------
+    bool
+        True with ``effects.assumed=use`` and a physical profile that marks numbers as assumed.
+    """
+    return config.effects.assumed == "use" and is_physical(config.noise) and bool(config.noise.assumed)
+
+
+def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:
+    """Return the assumed numbers of a physical profile that an effect depends on.
+
+    Parameters
+    ----------
+    noise : NoiseConfig
+        A physical profile.
+    effect : str
+        One of `noise.EFFECTS`.
+
+    Returns
+    -------
+    tuple of str
+        Keys of ``noise``, in the order of the tables of effects.
+    """
+    heat = HEAT if effect in ("dark_current", "hot_pixels") else ()
+    keys = (*EFFECT_NUMBERS.get(effect, ()), *BRANCH_NUMBERS.get(effect, ()), *heat)
+    return tuple(key for key in keys if key in noise.assumed)
 
 
 # ------------------------------------------------------------------------------------------------------------ source

@@ -24,7 +24,7 @@ from unprocess_gen.config.limits import (
     WHITE_LEVEL,
     IsoForm,
 )
-from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, NoiseConfig, SceneConfig
+from unprocess_gen.config.schema import ASSUMABLE, BranchConfig, NoiseConfig, SceneConfig
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import is_number, one_of, value_text
 from unprocess_gen.core.errors import ConfigError
@@ -126,7 +126,7 @@ def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
     for number, branch in enumerate(noise.branches):
         _check_branch(f"noise.branches[{number}]", noise, branch)
     for name in noise.assumed:
-        one_of("noise.assumed", name, PHYSICAL_NUMBERS)
+        one_of("noise.assumed", name, ASSUMABLE)
     _check_iso(noise, scene)
     _check_electrons(noise, scene)
 

@@ -363,8 +363,8 @@ class NoiseConfig:
     )
     assumed: list[str] = key(
         [],
-        "keys of this section whose numbers no source gives; their effects are simulated only if switched on by name",
-        Described("a list of keys of this section"),
+        "keys whose numbers no source gives for this camera; effects.assumed decides about their effects",
+        Described("a list of keys of this section or of a branch"),
         section=PHYSICAL,
     )
 
@@ -375,6 +375,9 @@ PHYSICAL_NUMBERS = tuple(
     if setting.section == PHYSICAL and isinstance(setting.limit, Numbers)
 )
 """Keys of the numbers of a physical profile that do not depend on ISO."""
+
+ASSUMABLE = (*PHYSICAL_NUMBERS, "row_std_dn", "column_std_dn", "black_error_dn")
+"""Keys that ``noise.assumed`` may name: numbers of a physical profile, and those of a branch that may be unknown."""
 
 
 @documented
@@ -412,6 +415,13 @@ class EffectsConfig:
         0.1,
         "largest ratio of the omitted effects to the masking noise, in each statistic",
         Numbers(0, 10, open_low=True),
+    )
+    assumed: str = key(
+        "off",
+        "effects with an assumed number of a physical profile (noise.assumed): use decides about them like about other "
+        "effects, off simulates them only if they are switched on by name",
+        Choice(("use", "off")),
+        since="0.2",
     )
     heteroscedastic: Optional[str] = key(
         None, "noise of a two-parameter profile, its only effect", limits.SWITCH, null=AS_ALL

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +13,10 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import yaml
 
-from unprocess_gen.config.interpretation import canonical_patch
+from unprocess_gen.config.interpretation import canonical_patch, uses_assumed
 from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
 from unprocess_gen.config.schema import Config, all_settings
-from unprocess_gen.config.settings import Setting
+from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
 from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_text
@@ -77,15 +78,35 @@ def dataset_yaml(config: Config) -> str:
     str
         YAML. Equal data have equal texts.
     """
-    groups = dataclasses.asdict(config)
-    settings = {key: value for key, value in groups.items() if key not in NOT_DATA[""]}
-    settings["source"] = {"kind": source_kind(config)} | {
-        key: value for key, value in groups["source"].items() if key not in NOT_DATA["source"]
-    }
+    settings = _recorded(config)
+    settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["source"]["patch"] = canonical_patch(config.source)
+    if not uses_assumed(config):
+        settings["effects"].pop("assumed", None)  # decides nothing
     for group, keys in NUMBER_KEYS.items():
-        settings[group] = {key: _canonical(value) if key in keys else value for key, value in groups[group].items()}
+        settings[group] = {key: _canonical(value) if key in keys else value for key, value in settings[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)
+
+
+def _recorded(group: Any) -> Any:
+    """Return a dataclass of the schema as mappings, without keys that ``config.yaml`` omits."""
+    if isinstance(group, list):
+        return [_recorded(item) for item in group]
+    if not dataclasses.is_dataclass(group) or isinstance(group, type):
+        return copy.deepcopy(group)
+    settings = settings_of(group)
+    recorded: dict[str, Any] = {}
+    for one in dataclasses.fields(group):
+        setting, value = settings.get(one.name), getattr(group, one.name)
+        omitted = setting is not None and (not setting.decides_data or (setting.since and value == _default(one)))
+        if not omitted:
+            recorded[one.name] = _recorded(value)
+    return recorded
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    """Return the value of a key that a recorded config does not have."""
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
 def _canonical(value: Any) -> Any:
@@ -133,7 +154,8 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
     Parameters
     ----------
     text : str
-        All keys of `Config` except those of `NOT_DATA`, and ``source.kind``.
+        All keys of `Config` except those of `NOT_DATA`, and ``source.kind``. Keys that later versions added may be
+        missing; they have their defaults (`Setting.since`).
 
     Returns
     -------
@@ -165,7 +187,9 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
     omitted = NOT_DATA.get(prefix[:-1], ())
     fields = {one.name: one for one in dataclasses.fields(group) if one.name not in omitted}
-    for problem, keys in (("missing", fields.keys() - loaded.keys()), ("unknown", loaded.keys() - fields.keys())):
+    later = {name for name, setting in settings_of(group).items() if setting.since}
+    missing, unknown = fields.keys() - loaded.keys() - later, loaded.keys() - fields.keys()
+    for problem, keys in (("missing", missing), ("unknown", unknown)):
         if keys:
             raise ConfigError(f"{problem} key {', '.join(prefix + key for key in sorted(keys))[:200]}")
     types = get_type_hints(group)

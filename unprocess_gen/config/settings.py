@@ -39,6 +39,9 @@ class Setting:
         Whether the bytes of a dataset depend on the value. ``config.yaml`` omits other keys.
     section : str
         Title of the part of the group that the key belongs to; empty in groups without parts.
+    since : str
+        First version that records the key; empty for keys of all versions. A ``config.yaml`` without a later key has
+        its default in the dataclass, which is what versions before did; ``config.yaml`` omits the key at that value.
     """
 
     meaning: str
@@ -47,6 +50,7 @@ class Setting:
     null: str = ""
     decides_data: bool = True
     section: str = ""
+    since: str = ""
 
     @property
     def allowed(self) -> str:
@@ -82,6 +86,7 @@ def key(
     null: str = "",
     decides_data: bool = True,
     section: str = "",
+    since: str = "",
 ) -> Any:
     """Return a field of the schema with its description; the parameters are those of `Setting`.
 
@@ -99,13 +104,15 @@ def key(
         Whether the bytes of a dataset depend on the value.
     section : str
         Title of the part of the group that the key belongs to.
+    since : str
+        First version that records the key; empty for keys of all versions.
 
     Returns
     -------
     dataclasses.Field
         For the body of a dataclass.
     """
-    metadata = {METADATA: Setting(meaning, limit, unit, null, decides_data, section)}
+    metadata = {METADATA: Setting(meaning, limit, unit, null, decides_data, section, since)}
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)

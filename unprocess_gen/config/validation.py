@@ -6,7 +6,6 @@ profiles: `noise_validation`.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,9 +23,9 @@ from unprocess_gen.config.interpretation import (
     patch_rule,
     uses_physics,
 )
-from unprocess_gen.config.limits import CAMERA_LAWS, Drawn, LevelRange
+from unprocess_gen.config.limits import CAMERA_LAWS, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise
-from unprocess_gen.config.schema import PHYSICAL, CameraConfig, Config, SourceConfig, all_settings
+from unprocess_gen.config.schema import PHYSICAL, CameraConfig, Config, EffectsConfig, SourceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.config.values import one_of, value_text
@@ -38,6 +37,11 @@ CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bit
 
 Recorded configs may contain any other value of them, and their datasets must stay usable.
 """
+
+SWITCHES = tuple(
+    name for name, setting in settings_of(EffectsConfig).items() if setting.limit is SWITCH and name != "all"
+)
+"""Effects that have a switch of their own."""
 
 SEED = settings_of(Config)["seed"].limit
 
@@ -184,7 +188,7 @@ def _check_levels(config: Config) -> None:
 
 def _check_effects(config: Config) -> None:
     effects = config.effects
-    for effect in (field.name for field in dataclasses.fields(effects) if field.name not in ("all", "tolerance")):
+    for effect in SWITCHES:
         if getattr(effects, effect) and effect_switch(effects, effect) == "on" and effect != "quantise":
             _check_switched_on(config, effect)
 

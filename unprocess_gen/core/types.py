@@ -270,6 +270,8 @@ class Plan:
         values.
     dtype, layout : str
         Dtype and layout of both frames.
+    assumed : tuple of str
+        Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
     """
 
     seed: int
@@ -309,6 +311,7 @@ class Plan:
     frame: int = 0
     dtype: str = UINT16
     layout: str = MOSAIC
+    assumed: tuple[str, ...] = ()
 
     @property
     def normalised(self) -> bool:

@@ -404,6 +404,10 @@ COLUMNS = (
         "detail", str, "explanation of the failure, one line", ANY_TEXT, since="0.2", in_json=False,
         empty_if="the source did not fail",
     ),
+    Column(
+        "assumed", str, "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT, Plan,
+        spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off",
+    ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

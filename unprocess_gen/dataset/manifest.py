@@ -555,7 +555,8 @@ def row_json(rows: Sequence[Row]) -> bytes:
     Parameters
     ----------
     rows : sequence of Row
-        Rows of one clean frame, in order; columns that are not in JSON are left out.
+        Rows of one clean frame, in order. Columns that are not in JSON are left out, and so are empty ones that later
+        versions added: such rows have the JSON that version 0.1 wrote.
 
     Returns
     -------
@@ -567,7 +568,14 @@ def row_json(rows: Sequence[Row]) -> bytes:
     ValueError
         If the text is longer than that.
     """
-    first, *others = ({column.name: row[column.name] for column in _JSON_COLUMNS} for row in rows)
+    first, *others = (
+        {
+            column.name: row[column.name]
+            for column in _JSON_COLUMNS
+            if column.since == FIRST or row[column.name] != column.empty
+        }
+        for row in rows
+    )
     content = {**first, OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
     size = json_size(str(first["source"]), len(rows))
@@ -606,10 +614,12 @@ def rows_of_json(content: bytes) -> list[Row]:
 def _row_of_json(content: Any) -> Row:
     if not isinstance(content, dict):
         raise ValueError("expected an object")
-    missing = [column.name for column in _JSON_COLUMNS if column.name not in content]
+    missing = [column.name for column in _JSON_COLUMNS if column.since == FIRST and column.name not in content]
     if missing:
         raise ValueError(f"row {_key_of(content)}: {missing[0]} is missing")
-    row = {column.name: content[column.name] if column.in_json else column.empty for column in COLUMNS}
+    row = {
+        column.name: content.get(column.name, column.empty) if column.in_json else column.empty for column in COLUMNS
+    }
     try:
         check_row(row)
     except ValueError as error:

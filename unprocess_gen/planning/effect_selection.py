@@ -13,16 +13,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from unprocess_gen.config.interpretation import (
     EFFECT_NUMBERS,
+    assumed_numbers,
     effect_switch,
     is_normalised,
     is_physical,
     missing_number,
+    uses_assumed,
 )
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Facts, Physics, Srgb
@@ -164,7 +166,7 @@ def _forced_decision(config: Config, effect: str) -> ForcedDecision | None:
     if switch == "on":
         return ForcedDecision(True, "switched on")
     assumed = next((key for key in EFFECT_NUMBERS.get(effect, ()) if key in config.noise.assumed), None)
-    if assumed is not None:
+    if assumed is not None and not uses_assumed(config):
         advice = "on only where switched on"  # recorded: decides bytes of datasets
         return ForcedDecision(False, f"{assumed} is assumed, no source gives it: {advice}")
     return None
@@ -182,11 +184,14 @@ class EffectRules:
         Largest ratio of the omitted effects to the masking noise.
     black_level_dn : float
         Black level of the sensor, DN.
+    assumed : mapping of str to tuple of str
+        Assumed numbers that each effect uses; empty with ``effects.assumed=off``.
     """
 
     forced: Mapping[str, ForcedDecision | None]
     tolerance: float
     black_level_dn: float
+    assumed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def effect_rules(config: Config) -> EffectRules:
@@ -203,7 +208,8 @@ def effect_rules(config: Config) -> EffectRules:
         The same for all images.
     """
     forced = {effect: _forced_decision(config, effect) for effect in EFFECTS}
-    return EffectRules(forced, config.effects.tolerance, float(config.sensor.black_level_dn))
+    assumed = {effect: assumed_numbers(config.noise, effect) for effect in EFFECTS} if uses_assumed(config) else {}
+    return EffectRules(forced, config.effects.tolerance, float(config.sensor.black_level_dn), assumed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +234,12 @@ class Selection:
     def effects(self) -> tuple[str, ...]:
         """Return the simulated effects, in the order in which light meets them."""
         return tuple(effect for effect in EFFECTS if effect in self.on)
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Return the assumed numbers that the simulated effects use; none with ``effects.assumed=off``, as in 0.1."""
+        used = (key for effect in self.effects for key in self.rules.assumed.get(effect, ()))
+        return tuple(dict.fromkeys(used))
 
     @property
     def skipped(self) -> tuple[str, ...]:

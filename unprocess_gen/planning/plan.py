@@ -349,6 +349,7 @@ class PhysicalLevel:
             b_dn2=physics.read_std_dn * physics.read_std_dn,
             effects=selection.effects,
             skipped=selection.skipped,
+            assumed=selection.assumed,
         )
         return plan, selection
 

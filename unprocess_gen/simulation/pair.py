@@ -124,7 +124,7 @@ def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
     """Return all parameters of a plan that affect the clean frame."""
     without_noise = replace(
         plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
-        effects=(), skipped=(), physics=None, level=0, draw=0, frame=0,
+        effects=(), skipped=(), assumed=(), physics=None, level=0, draw=0, frame=0,
     )  # fmt: skip
     return without_noise, plan.brightest, plan.averaged and (plan.physics, plan.effects, plan.sensor_clip)
 
