@@ -19,6 +19,7 @@ from unprocess_gen.core.random_streams import (
     STREAMS,
     body_key,
     parameter_uniforms,
+    scatter_uniforms,
     patch_words,
     philox4x32,
     purpose,
@@ -120,7 +121,7 @@ def test_an_empty_tile_has_no_words() -> None:
 def test_stream_numbers_never_change() -> None:
     assert streams.STREAMS == {
         "parameters": 0, "heteroscedastic": 1, "prnu": 2, "shot": 3, "dark_current": 4, "hot_pixels": 5, "read": 6,
-        "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10, "patch": 11,
+        "row": 7, "column": 8, "dead_pixels": 9, "dequantize": 10, "patch": 11, "scatter": 12,
     }  # fmt: skip
     assert len(set(streams.STREAMS.values())) == len(streams.STREAMS)
 
@@ -225,6 +226,14 @@ def test_appending_parameters_changes_none(key: int, count: int) -> None:
 def test_parameter_n_is_the_first_52_bits_of_counter_n(key: int, number: int) -> None:
     high, low, _, _ = philox_by_hand((0, number, 0, 0), key)
     assert parameter_uniforms(key, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
+
+
+@given(keys, st.floats(min_value=1e-3, max_value=1e7), st.integers(0, 20))
+def test_scatter_n_has_the_iso_in_two_words_of_its_counter(key: int, iso: float, number: int) -> None:
+    bits = int(np.float64(iso).view(np.uint64))
+    counter = (bits & 0xFFFFFFFF, number, STREAMS["scatter"] << 24, bits >> 32)
+    high, low, _, _ = philox_by_hand(counter, key)
+    assert scatter_uniforms(key, iso, number + 1)[number] == ((high << 20 | low >> 12) + 0.5) / 2**52
 
 
 @given(keys, st.integers(0, 50))

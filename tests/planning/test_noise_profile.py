@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,14 +10,18 @@ from statistics import NormalDist
 from typing import Any
 
 import mpmath
+import numpy as np
 import pytest
+import yaml
 from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.schema import BranchConfig, Config
+from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.random_streams import parameter_uniforms
 from unprocess_gen.core.types import Facts, Physics
 from unprocess_gen.planning.noise_profile import PhysicalNoise, number
 from unprocess_gen.planning.plan import PARAMETERS, plan_image
@@ -37,8 +42,9 @@ SAME_SENSOR = {
 
 
 def on_its_own_sensor(settings: Settings, noise: str, iso: float, *overrides: str) -> Config:
+    """Return a config on the sensor of the calibration, whose scatter follows the uniforms of an image."""
     bits, black, white = SAME_SENSOR[noise]
-    config = settings(f"noise={noise}", f"noise.iso={iso}", *overrides)
+    config = settings(f"noise={noise}", f"noise.iso={iso}", "noise.scatter=image", *overrides)
     sensor = replace(config.sensor, bits=bits, black_level_dn=black, white_level_dn=white)
     config = replace(config, sensor=sensor)
     validate_config(config)
@@ -132,6 +138,86 @@ def test_table_for_a_single_iso_gives_its_first_row(settings: Settings) -> None:
     branch = replace(config.noise.branches[0], black_error_dn=["by_log_iso", [1.0, 2.0, 3.0, 4.0], [0.0] * 4])
     config = replace(config, noise=replace(config.noise, branches=[branch]))
     assert physics(config).black_error_dn == (1.0, 2.0, 3.0, 4.0)
+
+
+# Scatter --------------------------------------------------------------------------------------------------------------
+
+
+def scattered(physics: Physics) -> tuple[float, ...]:
+    return physics.read_shape, physics.read_std_dn, physics.row_std_dn
+
+
+def scatter_of(settings: Settings, *overrides: str, bodies: int = 1) -> list[tuple[float, ...]]:
+    """Return the numbers of 40 images, of as many bodies as given."""
+    config = settings("noise=canon_70d", *overrides)
+    validate_config(config)
+    numbers = []
+    for image in range(40):
+        uniforms = own_uniforms(image) | {"sensor_unit": (image % bodies + 0.5) / bodies}
+        numbers.append(scattered(PhysicalNoise(config).draw(uniforms, image, config.seed)))
+    return numbers
+
+
+def own_uniforms(image: int) -> dict[str, float]:
+    return dict(zip(PARAMETERS, parameter_uniforms(image, len(PARAMETERS)), strict=True))
+
+
+def test_scatter_by_image_differs_between_images_of_one_body(settings: Settings) -> None:
+    numbers = scatter_of(settings, "noise.iso=3200", "noise.scatter=image", "sensor.units=1")
+    assert len({read for _, read, _ in numbers}) == len({row for _, _, row in numbers}) == 40
+
+
+@pytest.mark.parametrize("units", [1, 4])
+def test_a_body_has_one_value_per_iso(units: int, settings: Settings) -> None:
+    for iso in (400, 3200):
+        chosen = (f"noise.iso={iso}", f"sensor.units={units}")
+        numbers = scatter_of(settings, *chosen, bodies=units)
+        assert len(set(numbers)) == units
+        assert numbers == scatter_of(settings, *chosen, "noise.draws=3", "scene=night", f"noise.iso={iso}", bodies=units)
+
+
+def test_bodies_and_isos_scatter_independently(settings: Settings) -> None:
+    """The logarithms of read noise without its shape, and of row noise, have the spread that the profile states."""
+    line = ("noise.scatter=body", "sensor.units=40")
+    config = settings("noise=canon_70d", *line)
+    read, row = (getattr(config.noise.branches[0], name) for name in ("read_std_dn", "row_std_dn"))
+    deviates = []
+    for iso in (100, 200, 400, 800, 1600, 3200, 6400):
+        middle = physics(settings("noise=canon_70d", "noise.scatter=off", f"noise.iso={iso}"))
+        for shape, read_std_dn, row_std_dn in scatter_of(settings, *line, f"noise.iso={iso}", bodies=40):
+            ratio = read_std_dn / middle.read_std_dn * tukey_std(middle.read_shape) / tukey_std(shape)
+            deviates.append((math.log(ratio) / read[3], math.log(row_std_dn / middle.row_std_dn) / row[3]))
+    of_read, of_row = np.array(deviates).T
+    assert np.abs([of_read.mean(), of_row.mean()]).max() < 4 / math.sqrt(280)
+    assert np.abs([of_read.std() - 1, of_row.std() - 1]).max() < 4 / math.sqrt(560)
+    by_iso = of_read.reshape(7, 40)
+    for one, other in itertools.combinations([*by_iso, *of_row.reshape(7, 40)], 2):
+        assert abs(np.corrcoef(one, other)[0, 1]) < 5 / math.sqrt(40)
+
+
+def test_images_with_patterns_of_their_own_share_the_scatter_of_an_iso(settings: Settings) -> None:
+    assert len(set(scatter_of(settings, "noise.iso=3200"))) == 1
+    assert len(set(scatter_of(settings, "noise.iso=3200", "seed=1"))) == 1
+    assert set(scatter_of(settings, "noise.iso=3200")) != set(scatter_of(settings, "noise.iso=3200", "seed=1"))
+
+
+def test_without_scatter_lines_and_the_median_shape_remain(settings: Settings) -> None:
+    config = settings("noise=canon_70d", "noise.scatter=off", "noise.iso=3200")
+    branch = config.noise.branches[0]
+    gain, shape = branch.dn_per_e[1] * 3200, sorted(branch.read_shape[1:])[len(branch.read_shape[1:]) // 2]
+    scale = (4095 - 240) / (15000 - 2048)
+    expected = line_of(branch.read_std_dn, gain, shape) * scale, line_of(branch.row_std_dn, gain) * scale
+    (numbers,) = set(scatter_of(settings, "noise.scatter=off", "noise.iso=3200"))
+    assert numbers[0] == shape
+    assert all(close(number, one, 1e-14) for number, one in zip(numbers[1:], expected, strict=True))
+
+
+def test_a_config_without_scatter_draws_by_image(settings: Settings) -> None:
+    """A config of 0.1 does not have the key."""
+    text = dataset_yaml(settings("noise=canon_70d", "noise.scatter=image"))
+    assert "scatter" not in yaml.safe_load(text)["noise"]
+    assert parse_dataset_yaml(text)[0].noise.scatter == "image"
+    assert yaml.safe_load(dataset_yaml(settings("noise=canon_70d")))["noise"]["scatter"] == "body"
 
 
 # Profiles in conf/ ----------------------------------------------------------------------------------------------------
@@ -229,7 +315,8 @@ def test_imx385_has_gain_and_read_variance_of_crvd(
 def test_profile_is_converted_by_the_ratio_of_ranges(settings: Settings, noise: str) -> None:
     iso = 1600
     _, black, white = SAME_SENSOR[noise]
-    own, here = physics(on_its_own_sensor(settings, noise, iso)), physics(settings(f"noise={noise}", "noise.iso=1600"))
+    own = physics(on_its_own_sensor(settings, noise, iso))
+    here = physics(settings(f"noise={noise}", "noise.iso=1600", "noise.scatter=image"))
     scale = (4095 - 240) / (white - black)
     for name in ("dn_per_e", "read_std_dn", "row_std_dn"):
         assert getattr(here, name) == getattr(own, name) * scale

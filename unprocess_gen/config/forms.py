@@ -50,7 +50,7 @@ ISO_FORMS: Mapping[str, Form] = {
     "line": Form(
         ("slope", "intercept", "scatter"),
         "the standard deviation σ with ln σ = slope · ln K + intercept + scatter · n, where K is `dn_per_e` and n a "
-        "standard normal deviate, drawn for each image",
+        "standard normal deviate, drawn as `noise.scatter` says",
     ),
     "scale_line": Form(
         ("slope", "intercept", "scatter"),

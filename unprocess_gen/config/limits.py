@@ -252,6 +252,8 @@ MAX_ISO = 1e7
 SWITCH = Switch(("auto", "on", "off"))
 """Values of each effect."""
 
+SCATTER = Switch(("off", "body", "image"))
+
 DEQUANTIZE = Switch(("off", "dither"))
 
 CAMERA_LAWS = Choice(("fixed", "convex", "choice", "identity", "custom"))

@@ -305,6 +305,15 @@ class NoiseConfig:
         null="the ISO of the scene",
         section=CHOSEN,
     )
+    scatter: str = key(
+        "image",
+        "scatter of a physical profile's lines and choice of its read_shape: body draws them once for each camera body "
+        "and ISO, image anew for each image, off takes the lines without scatter and the median shape; with "
+        "sensor.units=image, body draws them once for all images of an ISO",
+        limits.SCATTER,
+        section=CHOSEN,
+        since="0.2",
+    )
     levels: Any = key(
         None, "noise levels of each clean frame", limits.LEVELS, null="one level, as the profile has it", section=CHOSEN
     )

@@ -15,12 +15,18 @@ from typing import Any
 
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.interpretation import branch_of
-from unprocess_gen.config.limits import EXPOSURE_S, ISO, READ_SHAPE, TEMPERATURE_C
+from unprocess_gen.config.limits import EXPOSURE_S, ISO, READ_SHAPE, SCATTER, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile, tukey_std
-from unprocess_gen.core.random_streams import body_key
-from unprocess_gen.core.types import Physics
+from unprocess_gen.core.random_streams import body_key, scatter_uniforms
+from unprocess_gen.core.types import Distribution, Physics
+
+SCATTER_NAMES = ("read_shape", "read_std", "row_std", "column_std")
+"""Draws of a camera body at an ISO; the position is the counter in the stream. Datasets depend on it: append only."""
+
+MIDDLE = 0.5
+"""Uniform at which a line has no scatter."""
 
 
 class PhysicalNoise:
@@ -41,6 +47,7 @@ class PhysicalNoise:
         self.exposure_s = parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S)
         self.temperature_c = parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C)
         self.read_shapes = [parse_drawn("read_shape", branch.read_shape, READ_SHAPE) for branch in noise.branches]
+        self.scatter = SCATTER.word(noise.scatter)
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
 
     def draw(self, uniforms: Mapping[str, float], stream_key: int, seed: int) -> Physics:
@@ -69,9 +76,10 @@ class PhysicalNoise:
         branch = branch_of(noise, iso)
         assert branch is not None
         gain = number(branch.dn_per_e, iso=iso)
-        shape = draw_parameter(self.read_shapes[noise.branches.index(branch)], uniforms["read_shape"])
         warmth = _doublings(celsius, noise.dark_reference_c, noise.dark_doubling_c)
         unit = f"{stream_key:016x}" if sensor.units == "image" else str(int(uniforms["sensor_unit"] * sensor.units))
+        uniforms = self._scatter(uniforms, iso, seed, unit)
+        shape = self._shape(self.read_shapes[noise.branches.index(branch)], uniforms["read_shape"])
         read_std = number(branch.read_std_dn, iso=iso, gain=gain, uniform=uniforms["read_std"], shape=shape)
         errors = _black_error(branch, iso)
         return Physics(
@@ -96,6 +104,25 @@ class PhysicalNoise:
             body_key=body_key(seed, noise.name, unit),
             fixed_pattern_in_clean=self.fixed_pattern_in_clean,
         )
+
+    def _scatter(self, uniforms: Mapping[str, float], iso: float, seed: int, unit: str) -> Mapping[str, float]:
+        """Return the uniforms at which the numbers of a body are drawn, by the names of `SCATTER_NAMES`.
+
+        With ``sensor.units=image`` every image has its own fixed patterns. Its noise is still that of the calibrated
+        camera: the scatter of a fit does not say how bodies differ.
+        """
+        if self.scatter == "image":
+            return uniforms
+        if self.scatter == "off":
+            return dict.fromkeys(SCATTER_NAMES, MIDDLE)
+        body = body_key(seed, self.noise.name, "" if self.sensor.units == "image" else unit)
+        return dict(zip(SCATTER_NAMES, scatter_uniforms(body, iso, len(SCATTER_NAMES)), strict=True))
+
+    def _shape(self, shapes: Distribution, uniform: float) -> float:
+        """Return the shape of the read noise: the median of the distribution if there is no scatter."""
+        if self.scatter == "off":
+            return sorted(shapes.numbers)[len(shapes.numbers) // 2]
+        return draw_parameter(shapes, uniform)
 
 
 def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:
