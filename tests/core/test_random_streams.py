@@ -19,10 +19,10 @@ from unprocess_gen.core.random_streams import (
     STREAMS,
     body_key,
     parameter_uniforms,
-    scatter_uniforms,
     patch_words,
     philox4x32,
     purpose,
+    scatter_uniforms,
     stream_key,
     words,
 )

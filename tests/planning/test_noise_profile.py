@@ -173,7 +173,9 @@ def test_a_body_has_one_value_per_iso(units: int, settings: Settings) -> None:
         chosen = (f"noise.iso={iso}", f"sensor.units={units}")
         numbers = scatter_of(settings, *chosen, bodies=units)
         assert len(set(numbers)) == units
-        assert numbers == scatter_of(settings, *chosen, "noise.draws=3", "scene=night", f"noise.iso={iso}", bodies=units)
+        assert numbers == scatter_of(
+            settings, *chosen, "noise.draws=3", "scene=night", f"noise.iso={iso}", bodies=units
+        )
 
 
 def test_bodies_and_isos_scatter_independently(settings: Settings) -> None:

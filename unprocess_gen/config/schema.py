@@ -308,7 +308,7 @@ class NoiseConfig:
     scatter: str = key(
         "image",
         "scatter of a physical profile's lines and choice of its read_shape: body draws them once for each camera body "
-        "and ISO, image anew for each image, off takes the lines without scatter and the median shape; with "
+        "and ISO, image for each image, off takes the lines without scatter and the median shape; with "
         "sensor.units=image, body draws them once for all images of an ISO",
         limits.SCATTER,
         section=CHOSEN,
