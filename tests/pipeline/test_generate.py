@@ -9,6 +9,7 @@ import json
 import os
 import re
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -415,6 +416,32 @@ def test_dataset_json_records_source_and_versions(dataset: Path, photos: Path) -
     assert known["source"] == {"kind": "folder", "root": str(photos)}
     assert set(runner.PACKAGES) == set(known["versions"])
     assert known["versions"]["numpy"] == np.__version__
+
+
+def test_dataset_json_records_the_times_of_stages(dataset: Path) -> None:
+    run = facts(dataset)["run"]
+    assert 0 < run["decode_s"] < run["seconds"]
+    assert 0 < run["simulate_s"] < run["seconds"]
+
+
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_times_of_stages_are_those_of_all_shards(n_jobs: int, photos: Path, make: Make, tmp_path: Path) -> None:
+    started = time.process_time()
+    times = make(photos, tmp_path / "ds", "output.pairs_per_shard=2", "noise.draws=2", n_jobs=n_jobs).times
+    own_s = time.process_time() - started
+
+    assert times.decode_s > 0
+    assert times.simulate_s > 0
+    assert n_jobs == 2 or times.decode_s + times.simulate_s < own_s
+
+
+def test_times_include_failed_photographs(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/a.png").write_bytes(b"no image")
+    times = make(tmp_path / "photos", tmp_path / "ds").times
+
+    assert times.decode_s > 0
+    assert times.simulate_s == 0
 
 
 def test_config_yaml_is_the_resolved_config(dataset: Path, settings: Callable[..., Any]) -> None:

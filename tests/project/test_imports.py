@@ -29,7 +29,12 @@ ONLY_IN = {
     "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
         *("sources.image.decode", "reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
-        *("reports.sheets.stages_sheet", "simulation.reference.isp", "pipeline.worker"),
+        *(
+            "reports.sheets.stages_sheet",
+            "reports.benchmark.complete_runs",
+            "simulation.reference.isp",
+            "pipeline.worker",
+        ),
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Settings
+from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill
 from helpers.promise_report import Figure
 from hypothesis import given
@@ -21,12 +22,15 @@ from hypothesis import strategies as st
 from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
 from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import AccuracyConfig, NoiseConfig, SensorConfig
+from unprocess_gen.config.schema import AccuracyConfig, NoiseConfig, SceneConfig, SensorConfig, SourceConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports import formatting, report_files
-from unprocess_gen.reports.benchmark import figure, measure, method_errors, report, session, tables
+from unprocess_gen.reports.benchmark import complete_runs, figure, measure, method_errors, report, session, tables
+from unprocess_gen.reports.benchmark.complete_runs import RunFiles, RunMeasurement, RunTimes
+from unprocess_gen.reports.benchmark.conclusion import RECOMMENDATIONS, conclude
 from unprocess_gen.reports.benchmark.measure import (
     BENCHMARKS_BY_NAME,
     METHOD_BENCHMARKS,
@@ -38,10 +42,19 @@ from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, BenchmarkP
 from unprocess_gen.reports.estimate import estimate_run, format_estimate
 from unprocess_gen.simulation.reference import noise
 from unprocess_gen.simulation.reference.poisson import gaussian_distance
+from unprocess_gen.sources.loader import list_photographs, load_source
 
 LITTLE = SampleSizes(
-    photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32), compiled=(48, 64), flat=128, positions=16
+    photographs=3,
+    rounds=2,
+    sampled=(64, 96),
+    readable=(24, 32),
+    compiled=(48, 64),
+    flat=128,
+    positions=16,
+    run_files=2,
 )
+SMALLEST = SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2, run_files=1)
 TIERS = {
     name: read_option(conf_dir() / "accuracy" / f"{name}.yaml", AccuracyConfig) for name in (REFERENCE, EXACT, "fast")
 }
@@ -54,7 +67,8 @@ def option(group: str, name: str, schema: type) -> Any:
 @pytest.fixture(scope="session")
 def profiles() -> BenchmarkProfiles:
     two_numbers, electrons = (option("noise", name, NoiseConfig) for name in ("imx385_iso3200", "sony_a7s2"))
-    return BenchmarkProfiles(TIERS, two_numbers, electrons, option("sensor", "generic_14bit", SensorConfig))
+    scenes = {name: option("scene", name, SceneConfig) for name in ("daylight", "night")}
+    return BenchmarkProfiles(TIERS, two_numbers, electrons, option("sensor", "generic_14bit", SensorConfig), scenes)
 
 
 @pytest.fixture(scope="session")
@@ -143,6 +157,270 @@ def test_exact_tier_changes_no_dn(found: BenchmarkReport, stage: str) -> None:
     assert (row.error_max, row.error_rms, row.changed_share) == (0, 0, 0)
 
 
+# Complete runs --------------------------------------------------------------------------------------------------------
+
+
+def run(tier: str = "fast", ratio: float | None = 0.9, changed: float = 0.02, **changes: Any) -> RunMeasurement:
+    """Return a row of complete runs with the given settings."""
+    shares = {"decode_share": 0.25, "simulate_share": 0.25, "write_share": 0.5}
+    errors = {"noisy_max_dn": 2.0, "noisy_rms_dn": 0.1, "noisy_max_std": 0.3, "noisy_rms_std": 0.004}
+    times = dict.fromkeys(("ns_per_pixel", "ratio_to_exact", "lowest_ratio", "highest_ratio"), ratio)
+    named = {"setting": "given", "noise": "imx385_iso3200", "tier": tier, "noisy_changed_share": changed}
+    return RunMeasurement(**{**named, **times, **shares, **errors, **changes})
+
+
+def runs_of(found: BenchmarkReport, setting: str) -> dict[str, RunMeasurement]:
+    return {run.tier: run for run in found.runs if run.setting == setting}
+
+
+def test_every_tier_runs_in_every_setting(found: BenchmarkReport) -> None:
+    expected = [(setting, tier) for setting in ("given", "daylight", "night") for tier in TIERS]
+
+    assert [(run.setting, run.tier) for run in found.runs] == expected
+    assert [run.noise for run in found.runs[::3]] == [
+        "imx385_iso3200",
+        "sony_a7s2, scene daylight, ISO 100",
+        "sony_a7s2, scene night, ISO 6400",
+    ]
+
+
+def test_shares_of_a_run_sum_to_one(found: BenchmarkReport) -> None:
+    for run in found.runs:
+        shares = (run.decode_share or 0, run.simulate_share or 0, run.write_share or 0)
+        assert sum(shares) == pytest.approx(1, abs=1e-12)
+        assert all(share > 0 for share in shares)
+
+
+def test_ratios_of_runs_are_to_exact_in_the_same_setting(found: BenchmarkReport) -> None:
+    for setting in ("given", "daylight", "night"):
+        runs = runs_of(found, setting)
+        assert runs["exact"].ratio_to_exact == runs["exact"].lowest_ratio == runs["exact"].highest_ratio == 1
+        for run in runs.values():
+            assert run.ratio_to_exact == pytest.approx((run.ns_per_pixel or 0) / (runs["exact"].ns_per_pixel or 0))
+
+
+def test_exact_runs_have_the_noisy_frames_of_the_reference(found: BenchmarkReport) -> None:
+    for run in found.runs:
+        errors = (run.noisy_changed_share, run.noisy_max_dn, run.noisy_rms_dn, run.noisy_max_std, run.noisy_rms_std)
+        assert (errors == (0, 0, 0, 0, 0)) == (run.tier != "fast")
+
+
+def test_tier_own_has_the_noisy_errors_of_the_given_settings(found: BenchmarkReport) -> None:
+    for name, row in rows_of(found, "tier_own").items():
+        run = runs_of(found, "given")[name.partition(":")[2]]
+        for error in ("changed_share", "max_dn", "rms_dn", "max_std", "rms_std"):
+            assert getattr(row, f"noisy_{error}") == getattr(run, f"noisy_{error}")
+
+
+def test_noisy_errors_of_a_tier_are_those_of_its_frames(settings: Settings, profiles: BenchmarkProfiles) -> None:
+    opened = session.open_session(settings("source.limit=1"), profiles, LITTLE)
+    pair, plan = opened.sampled_pairs("given", TIERS["fast"])[0]
+    reference, _ = opened.sampled_pairs("given", TIERS[REFERENCE])[0]
+    difference = pair.noisy.astype(float) - reference.noisy
+    std = np.sqrt(noise.noise_variance(reference.clean.astype(float), plan) + 1 / 12)
+    error = method_errors.noisy_errors(opened, "given", TIERS["fast"])
+
+    assert error.changed_share == np.mean(difference != 0) > 0
+    assert (error.max_dn, error.max_std) == (np.abs(difference).max(), np.abs(difference / std).max())
+    assert error.rms_dn == pytest.approx(np.sqrt(np.mean(difference**2)), rel=1e-12)
+    assert error.rms_std == pytest.approx(np.sqrt(np.mean((difference / std) ** 2)), rel=1e-12)
+
+
+def test_settings_of_runs_include_both_kinds_of_noise(settings: Settings, profiles: BenchmarkProfiles) -> None:
+    for overrides, names in (
+        ((), ["given", "daylight", "night"]),
+        (("noise=sony_a7s2", "scene=low_light"), ["given", "two_parameter_run", "daylight", "night"]),
+        (("noise=sony_a7s2", "scene=night"), ["given", "two_parameter_run", "daylight"]),
+    ):
+        assert list(session.run_settings(settings(*overrides), profiles)) == names
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder for temporary files of this process."""
+    path = tmp_path / "temporary"
+    path.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(path))
+    return path
+
+
+def test_runs_have_the_bytes_of_generate_and_leave_nothing(
+    folder: Path, photos: Path, settings: Settings, make: Make, tree_hash: TreeHash, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+    true = complete_runs.generate
+
+    def generate(config: Any) -> Any:
+        summary = true(config)
+        made.append(tree_hash(Path(config.out)))
+        return summary
+
+    monkeypatch.setattr(complete_runs, "generate", generate)
+    config = settings(f"source.root={photos}", "noise.levels=2")
+    with complete_runs.run_files(config, LITTLE) as files:
+        for tier in TIERS.values():
+            times = complete_runs.time_run(complete_runs.run_config(config, files, tier))
+            assert min(times) > 0
+    expected = [
+        make(photos, folder.parent / tier, f"accuracy={tier}", "noise.levels=2", f"source.limit={files.source.limit}")
+        for tier in TIERS
+    ]
+
+    assert files.count == 2
+    assert made == [tree_hash(summary.out) for summary in expected]
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MachineError])
+def test_ended_measurement_leaves_nothing(
+    error: type[BaseException],
+    folder: Path,
+    settings: Settings,
+    profiles: BenchmarkProfiles,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    level = complete_runs.LOGGER.level
+    true = complete_runs.generate
+
+    def generate(config: Any) -> Any:
+        true(config)
+        assert any(folder.glob("*/dataset/dataset.json"))
+        raise error
+
+    monkeypatch.setattr(complete_runs, "generate", generate)
+    with pytest.raises(error):
+        measure.measure_accuracy(settings(), profiles, SMALLEST)
+
+    assert list(folder.iterdir()) == []
+    assert complete_runs.LOGGER.level == level
+
+
+def test_temporary_folder_without_space_is_reported(
+    folder: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder.rmdir()
+    with pytest.raises(MachineError, match=r"set TMPDIR to a folder with space"):
+        complete_runs.run_files(settings(), LITTLE).__enter__()
+
+
+def test_built_in_scenes_are_read_from_files(folder: Path, settings: Settings) -> None:
+    with complete_runs.run_files(settings("source.include=['*.png']", "source.downscale=2"), LITTLE) as files:
+        listed = list_photographs(files.source).sources
+
+        assert len(listed) == files.count == 2
+        assert all(source.path.endswith(".jpg") for source in listed)
+        assert load_source(files.source, listed[0])[1].srgb.shape == (256, 384, 3)
+
+
+def test_photographs_of_runs_end_with_enough_pixels(folder: Path, settings: Settings, tmp_path: Path) -> None:
+    root = fill(tmp_path / "photos", 9)
+    (root / "000.png").write_bytes(b"")  # cannot be read
+    many = replace(LITTLE, run_files=99)
+    for sizes, count in ((replace(many, run_pixels=500), 3), (LITTLE, 2), (many, 8)):
+        with complete_runs.run_files(settings(f"source.root={root}"), sizes) as files:
+            assert (files.count, files.source.limit) == (count, count + 1)
+
+
+def test_runs_with_too_many_frames_have_one_level(settings: Settings) -> None:
+    config = settings("noise.levels=5", "noise.draws=2")
+    files = RunFiles(config.source, 1, 1000, Path())
+
+    assert complete_runs.affordable(config, files, replace(LITTLE, run_pixels=5000)) == config
+    one = complete_runs.affordable(config, files, replace(LITTLE, run_pixels=4999))
+    assert (one.noise.levels, one.noise.draws) == (None, 1)
+
+
+def test_reference_is_left_out_of_long_runs(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(complete_runs, "time_run", lambda config: RunTimes(1.0, 2.0, 3.0))
+    config = settings()
+    for pixels, rounds in ((complete_runs.REFERENCE_PIXELS, 1), (complete_runs.REFERENCE_PIXELS + 1, 0)):
+        files = RunFiles(config.source, 1, pixels, Path())
+        with Progress(9) as progress:
+            times = complete_runs.measure_runs({"given": config}, TIERS, files, 3, progress)
+        assert [len(one) for one in times.values()] == [rounds, 3, 3]
+        assert (complete_runs.run_cost(times["given", REFERENCE], times["given", EXACT], 1).ratio_to_exact is None) == (
+            rounds == 0
+        )
+
+
+def test_cost_of_runs_is_that_of_the_fastest_round() -> None:
+    slow, fast, exact = RunTimes(2.0, 3.0, 4.0), RunTimes(1.0, 2.0, 1.0), RunTimes(1.0, 6.0, 1.0)
+    cost = complete_runs.run_cost([slow, fast], [exact, exact], pixels=10**9)
+
+    assert (cost.ns_per_pixel, cost.ratio_to_exact, cost.lowest_ratio, cost.highest_ratio) == (4, 0.5, 0.5, 1.125)
+    assert (cost.decode_share, cost.simulate_share, cost.write_share) == (0.25, 0.5, 0.25)
+
+
+# The conclusion -------------------------------------------------------------------------------------------------------
+
+
+def concluded(*runs: RunMeasurement, given: str = "exact") -> str:
+    return conclude(runs, TIERS[given], TIERS, RunFiles(SourceConfig(), 4, 5_210_000, Path()))
+
+
+def test_conclusion_has_the_numbers_of_the_table(found: BenchmarkReport) -> None:
+    run = runs_of(found, "given")["fast"]
+    table = tables.run_table([run])
+    cells = dict(zip(table.headings, next(iter(table.lines)), strict=True))
+
+    assert found.conclusion.startswith("In a complete run of 2 photographs (0.8 megapixels, imx385_iso3200), `fast` ")
+    ratio = re.search(r"takes (?:about as long as `exact` \(ratio )?([\d.]+)", found.conclusion)
+    assert ratio is not None and ratio[1] == cells["of exact"]
+    assert found.conclusion.endswith(
+        f" and moves {cells['changed']} of the noisy DN, by at most {cells['max DN']} DN or {cells['max σ']} standard "
+        f"deviations of the noise (RMS {cells['RMS DN']} DN, {cells['RMS σ']} standard deviations)."
+    )
+
+
+START = "In a complete run of 4 photographs (5.2 megapixels, imx385_iso3200), "
+MOVES = (
+    "moves 2 % of the noisy DN, by at most 2 DN or 0.3 standard deviations of the noise (RMS 0.1 DN, 0.004 standard "
+    "deviations)."
+)
+
+
+@pytest.mark.parametrize(
+    ("measured", "given", "sentence"),
+    [
+        (run(), "exact", f"{START}`fast` takes 0.9 of the processor time of `exact` and {MOVES}"),
+        (run(), "fast", f"{START}`fast` takes 0.9 of the processor time of `exact` and {MOVES}"),
+        (run(ratio=1.25), "exact", f"{START}`fast` takes 1.25 times the processor time of `exact` and {MOVES}"),
+        (
+            run(ratio=0.96, lowest_ratio=0.9, highest_ratio=1.1),
+            "exact",
+            f"{START}`fast` takes about as long as `exact` (ratio 0.96, no clear difference) and {MOVES}",
+        ),
+        (
+            run(ratio=0.9999),
+            "exact",
+            f"{START}`fast` takes about as long as `exact` (ratio 1, no clear difference) and {MOVES}",
+        ),
+        (
+            run("reference", 12.34, changed=0.0),
+            "reference",
+            f"{START}`reference` takes 12.3 times the processor time of `exact` and changes no noisy DN of the "
+            "reference.",
+        ),
+        (run("reference", None), "reference", f"{START}`reference` was too slow to be timed and {MOVES}"),
+        (run("exact"), "exact", "No tier other than `exact` was measured."),
+    ],
+)
+def test_conclusion_is_true_for_any_result(measured: RunMeasurement, given: str, sentence: str) -> None:
+    assert concluded(measured, given=given) == sentence
+
+
+def test_conclusion_names_a_budget_that_is_no_tier() -> None:
+    own = replace(TIERS[EXACT], normal_error=1e-3)
+    tiers = {**TIERS, "exact_changed": own}
+    sentence = conclude([run("exact_changed")], own, tiers, RunFiles(SourceConfig(), 1, 1, Path()))
+
+    assert "`exact_changed` takes 0.9 of" in sentence
+
+
+def test_each_recommended_tier_exists() -> None:
+    assert {each.tier for each in RECOMMENDATIONS} == set(TIERS)
+
+
 # Errors ---------------------------------------------------------------------------------------------------------------
 
 
@@ -224,7 +502,7 @@ def test_any_config_can_be_measured(
     config = settings(*overrides)
     config.source.root = str(fill(tmp_path / "photos", 2))
     validate_config(config)
-    found = measure.measure_accuracy(config, profiles, SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2))
+    found = measure.measure_accuracy(config, profiles, SMALLEST)
 
     assert all(row.error_max == 0 for row in found.rows if row.stage in TIER_STAGES and row.method == EXACT)
     assert ("mine" in {row.method for row in found.rows}) == ("accuracy.name=mine" in overrides)
@@ -259,10 +537,28 @@ def test_csv_has_the_documented_columns(found: BenchmarkReport) -> None:
 
     assert list(lines[0]) == [
         *("stage", "method", "tier", "error_max", "error_rms", "error_unit", "changed_share"),
-        *("ns_per_pixel", "ratio_to_reference"),
+        *("ns_per_pixel", "ratio_to_reference", "noisy_changed_share", "noisy_max_dn", "noisy_rms_dn"),
+        *("noisy_max_std", "noisy_rms_std"),
     ]
     assert len(lines) == len(found.rows)
     assert {line["stage"] for line in lines} == {*STAGES, *TIER_STAGES}
+
+
+def test_csv_of_runs_has_the_documented_columns(found: BenchmarkReport) -> None:
+    lines = list(csv.DictReader(tables.runs_csv_text(found.runs).splitlines()))
+
+    assert list(lines[0]) == [
+        *("setting", "noise", "tier", "ns_per_pixel", "ratio_to_exact", "lowest_ratio", "highest_ratio"),
+        *("decode_share", "simulate_share", "write_share", "noisy_changed_share", "noisy_max_dn", "noisy_rms_dn"),
+        *("noisy_max_std", "noisy_rms_std"),
+    ]
+    assert len(lines) == len(found.runs)
+
+
+def test_markdown_tables_have_equal_cells(found: BenchmarkReport) -> None:
+    for table in (tables.method_table(found.rows), tables.run_table(found.runs), tables.recommendation_table()):
+        lines = tables.markdown_table(table).splitlines()
+        assert {line.count("|") for line in lines} == {len(table.headings) + 1}
 
 
 @pytest.mark.parametrize(
@@ -281,7 +577,7 @@ def test_front_contains_points_that_no_other_dominates(points: list[tuple[float,
 
 
 def test_figure_has_the_size_of_a_page(found: BenchmarkReport) -> None:
-    content = figure.benchmark_figure(found.rows)
+    content = figure.benchmark_figure(found.rows, found.runs)
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
 
     assert 700 <= picture.shape[0] <= 1200
@@ -296,14 +592,18 @@ def test_figure_can_be_drawn_for_any_errors_and_times() -> None:
         for stage in (*STAGES, *TIER_STAGES)
         for name, tier, error, ns in (("a", "fast", 1e-3, 0.01), ("b", "mine", 2.0, 4000.0), ("c", "", None, None))
     ]
+    runs = [run("fast", ratio) for ratio in (1e-3, 1.0, 400.0, None)]
 
-    assert figure.benchmark_figure(rows)[:4] == b"\x89PNG"
+    assert figure.benchmark_figure(rows, runs)[:4] == figure.benchmark_figure(rows)[:4] == b"\x89PNG"
 
 
 def test_page_has_no_script_and_escapes_names() -> None:
     name = "<script>alert('&\")</script>"
     page = report.benchmark_page(
-        BenchmarkReport((Measurement(name, name, name, 1.0, 1.0, name, 0.5, 1.0, 1.0),), {name: name}), b"png"
+        BenchmarkReport(
+            (Measurement(name, name, name, 1.0, 1.0, name, 0.5, 1.0, 1.0),), (run(name),), name, {name: name}
+        ),
+        b"png",
     )
 
     assert "<script" not in page
@@ -321,7 +621,7 @@ def test_page_lists_the_conditions(found: BenchmarkReport) -> None:
 
 
 def test_lines_of_the_text_table_are_aligned(found: BenchmarkReport) -> None:
-    lines = tables.text_table(found.rows).splitlines()
+    lines = tables.text_table(tables.method_table(found.rows)).splitlines()
 
     assert len(lines) == len(found.rows) + 1
     assert len({line.index(name) for line in lines for name in ("method", "exact_table") if name in line}) == 1
@@ -340,7 +640,7 @@ def test_short_numbers_have_few_digits(value: float | None, expected: str) -> No
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the verb measure little."""
-    little = SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), 4, 2)
+    little = SMALLEST
     true = measure.measure_accuracy
     monkeypatch.setattr(
         measure, "measure_accuracy", lambda config, profiles, command: true(config, profiles, little, command)
@@ -355,7 +655,11 @@ def test_accuracy_writes_three_files_and_reports_them(run_main: RunMain, tmp_pat
         assert done.code == 0
         assert sorted(path.name for path in (tmp_path / "new/report").iterdir()) == sorted(report.FILES)
         assert re.search(r"^tier_electrons +fast ", done.out, re.MULTILINE)
+        assert re.search(r"^night .* fast ", done.out, re.MULTILINE)
+        assert done.out.count("In a complete run of 1 photograph (0.0 megapixels, imx385_iso3200), `fast` ") == 1
+        assert all(each.reason in done.out for each in RECOMMENDATIONS)
         assert "measurements" in done.err
+        assert "image" not in done.err  # of the runs that are measured
     assert "gen-dataset accuracy source.root=" in (tmp_path / "new/report/accuracy.html").read_text()
 
 

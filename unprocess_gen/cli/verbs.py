@@ -121,7 +121,7 @@ def run_accuracy(call: Call) -> int:
 
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
-    from unprocess_gen.config.schema import NoiseConfig, SensorConfig
+    from unprocess_gen.config.schema import NoiseConfig, SceneConfig, SensorConfig
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports import report_files
     from unprocess_gen.reports.benchmark import measure
@@ -135,10 +135,11 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
         read_option(noise / "imx385_iso3200.yaml", NoiseConfig),
         read_option(noise / "sony_a7s2.yaml", NoiseConfig),
         read_option(sensor / "generic_14bit.yaml", SensorConfig),
+        {name: read_option(conf_dir() / "scene" / f"{name}.yaml", SceneConfig) for name in ("daylight", "night")},
     )
     benchmark = measure.measure_accuracy(config, profiles, command=command)
     benchmark_report.write_benchmark(benchmark, out)
-    return 0, None, [benchmark_report.text_table(benchmark.rows), f"{out}: {', '.join(benchmark_report.FILES)}"]
+    return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.FILES)}"]
 
 
 def _tiers() -> dict[str, AccuracyConfig]:

@@ -18,7 +18,7 @@ import os
 import platform
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.sizes import check_free_space
-from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
+from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.listing import ClipSizes, Listing
 from unprocess_gen.sources.loader import list_photographs
@@ -68,6 +68,8 @@ class Summary:
         Time that this run took.
     unmatched : dict of str to int
         Files that no include pattern matches, by suffix.
+    times : StageTimes
+        Processor time of the stages in all workers of this run.
     """
 
     out: Path
@@ -79,6 +81,7 @@ class Summary:
     made: int
     seconds: float
     unmatched: dict[str, int] = field(default_factory=dict)
+    times: StageTimes = field(default_factory=StageTimes)
 
     @property
     def rows(self) -> int:
@@ -134,7 +137,7 @@ def generate(config: Config, label: str = "") -> Summary:
             progress.report_compiling(context.compiling_path)
             for warning in listing.warnings:
                 progress.warn(warning)
-            provisional, rows_made = _run(context, todo, n_jobs, workspace, progress)
+            provisional, rows_made, times = _run(context, todo, n_jobs, workspace, progress)
         seconds = time.monotonic() - started
         try:
             pairs, failed, sites = tally(workspace.all_rows(len(tasks), provisional))
@@ -150,19 +153,25 @@ def generate(config: Config, label: str = "") -> Summary:
                 "not_matched": listing.not_matched,
                 "skipped_links": listing.skipped_links,
                 "source": {"kind": source_kind(config), "root": _absolute(config.source.root)},
-                "run": {"seconds": round(seconds, 3), "n_jobs": n_jobs, "shards_made": len(todo), **machine()},
+                "run": {
+                    "seconds": round(seconds, 3),
+                    **{stage: round(stage_s, 3) for stage, stage_s in asdict(times).items()},
+                    "n_jobs": n_jobs,
+                    "shards_made": len(todo),
+                    **machine(),
+                },
                 "versions": {package: version(package) for package in PACKAGES},
             },
         )
-    return _summary(Path(config.out), facts, listing, made=rows_made, started=started)
+    return replace(_summary(Path(config.out), facts, listing, made=rows_made, started=started), times=times)
 
 
 def _run(
     context: RunContext, tasks: Sequence[ShardTask], n_jobs: int, workspace: Workspace, progress: Progress
-) -> tuple[dict[int, ShardResult], int]:
-    """Make and commit shards; return the provisional results by shard, and the number of rows of all results."""
+) -> tuple[dict[int, ShardResult], int, StageTimes]:
+    """Make and commit shards; return the provisional results by shard, the number of rows, and the times of stages."""
     provisional: dict[int, ShardResult] = {}
-    warned, rows, clip_sizes = False, 0, ClipSizes()
+    warned, rows, clip_sizes, times = False, 0, ClipSizes(), StageTimes()
     for result in run_tasks(context, tasks, n_jobs):
         if result.killer is None:
             workspace.commit(result)
@@ -175,9 +184,10 @@ def _run(
         for warning in clip_sizes.warnings(result.rows):
             progress.warn(warning)
         rows += len(result.rows)
+        times.add(result.times)
         statuses = [rows_of_image[0]["status"] for rows_of_image in group_by_image(result.rows)]
         progress.advance(len(statuses), statuses.count("failed"))
-    return provisional, rows
+    return provisional, rows, times
 
 
 def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[ShardTask]:

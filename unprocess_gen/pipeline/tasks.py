@@ -2,13 +2,66 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.shards import shard_name
+
+Item = TypeVar("Item")
+
+
+@dataclass(slots=True)
+class StageTimes:
+    """Add up the processor time of the thread that makes pairs.
+
+    Attributes
+    ----------
+    decode_s, simulate_s : float
+        Seconds to read and decode sources, and to plan and simulate pairs.
+    """
+
+    decode_s: float = 0.0
+    simulate_s: float = 0.0
+
+    @contextmanager
+    def decoding(self) -> Iterator[None]:
+        """Add the time of the body to ``decode_s``, even if it fails."""
+        started = time.thread_time()
+        try:
+            yield
+        finally:
+            self.decode_s += time.thread_time() - started
+
+    @contextmanager
+    def simulating(self) -> Iterator[None]:
+        """Add the time of the body to ``simulate_s``."""
+        started = time.thread_time()
+        try:
+            yield
+        finally:
+            self.simulate_s += time.thread_time() - started
+
+    def each_simulated(self, pairs: Iterable[Item]) -> Iterator[Item]:
+        """Yield the items, and add the time that each of them takes to ``simulate_s``."""
+        remaining = iter(pairs)
+        while True:
+            with self.simulating():
+                try:
+                    pair = next(remaining)
+                except StopIteration:
+                    return
+            yield pair
+
+    def add(self, other: StageTimes) -> None:
+        """Add the times of another shard."""
+        self.decode_s += other.decode_s
+        self.simulate_s += other.simulate_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +122,8 @@ class ShardResult:
         Source at which two workers died. The rows are then provisional and there is no file.
     self_test : str or None
         Failures of the worker's self-test, if ``self_test=go_on`` accepts them.
+    times : StageTimes
+        Processor time of the worker's stages.
     """
 
     shard: int
@@ -78,6 +133,7 @@ class ShardResult:
     rows: tuple[Row, ...]
     killer: str | None = None
     self_test: str | None = None
+    times: StageTimes = field(default_factory=StageTimes)
 
     def entry(self) -> dict[str, Any]:
         """Return the shard's entry in ``dataset.json``."""

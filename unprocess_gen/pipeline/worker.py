@@ -13,19 +13,20 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import RESUME, array_xxh3, machine_error
-from unprocess_gen.core.types import Pair, Patch, Plan, Row, Source, Srgb
+from unprocess_gen.core.types import Pair, Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
 from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
-from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
+from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask, StageTimes
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.simulation import self_test
@@ -49,20 +50,37 @@ def make_shard(context: RunContext, task: ShardTask) -> ShardResult:
         return _make_shard(context, task)
 
 
+@dataclass(frozen=True, slots=True)
+class ShardLog:
+    """Hold what a worker notes while it makes a shard.
+
+    Attributes
+    ----------
+    failures : dict of str to None
+        Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
+    times : StageTimes
+        Processor time of the stages.
+    """
+
+    failures: dict[str, None] = field(default_factory=dict)
+    times: StageTimes = field(default_factory=StageTimes)
+
+
 def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
-    failures: dict[str, None] = {}
+    log = ShardLog()
     path = Path(context.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     busy = task.busy_path(context)
     try:
         with ShardWriter(path, threaded=context.core_to_spare) as writer:
-            rows = tuple(_make_rows(context, task, writer, failures))
+            rows = tuple(_make_rows(context, task, writer, log))
         busy.unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
+            self_test_failures = "; ".join(log.failures) or None
             return ShardResult(
-                task.shard, str(path), writer.bytes, writer.sha256, rows, self_test="; ".join(failures) or None
+                task.shard, str(path), writer.bytes, writer.sha256, rows, self_test=self_test_failures, times=log.times
             )
         path.unlink()
-        return ShardResult(task.shard, None, 0, None, rows)
+        return ShardResult(task.shard, None, 0, None, rows, times=log.times)
     except MemoryError as error:
         if os.getpid() != context.coordinator_pid:
             os._exit(1)  # same path as an OOM kill: the coordinator retries the shard alone
@@ -75,22 +93,18 @@ def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
         raise machine_error(error, Path(context.tmp), RESUME) from error
 
 
-def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, failures: dict[str, None]) -> Iterator[Row]:
+def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, log: ShardLog) -> Iterator[Row]:
     for source in task.sources:
         task.busy_path(context).write_text(str(source.index))
-        yield from make_image(context, task.shard, source, writer, failures)
+        yield from make_image(context, task.shard, source, writer, log)
 
 
-def make_image(
-    context: RunContext, shard: int, source: Source, writer: ShardWriter, failures: dict[str, None]
-) -> list[Row]:
-    """Append one image, or its patches, to a shard and return the rows.
-
-    Adds failures of the self-test to ``failures``, each once, if ``self_test=go_on`` accepts them.
-    """
+def make_image(context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog) -> list[Row]:
+    """Append one image, or its patches, to a shard and return the rows; add failures and times to ``log``."""
     config = context.config
     try:
-        sha256, photograph = load_source(config.source, source, config.output.layout)
+        with log.times.decoding():
+            sha256, photograph = load_source(config.source, source, config.output.layout)
     except SourceError as error:
         if error.reason == "unreadable" and source.reason is None and not _exists(config, source):
             raise MachineError(
@@ -99,15 +113,18 @@ def make_image(
             ) from error
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text)]
     rule = patch_rule(config.source)
-    facts = facts_for(config, photograph.srgb, source.frames)
-    plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
-    failures |= dict.fromkeys(_self_test(context, plans))
+    with log.times.simulating():
+        facts = facts_for(config, photograph.srgb, source.frames)
+        plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
+    log.failures.update(dict.fromkeys(_self_test(context, plans)))
     rows: list[Row] = []
     height, width = photograph.srgb.shape[:2]
     for patch in list_patches(rule, plans[0].stream_key, height, width, config.output.layout):
         key = patch_key(source.index, patch, several=rule is not None)
         sample: list[Row] = []
-        for plan, pair, digests in _add_frames(writer, key, crop_patch(photograph.srgb, patch), patch, plans):
+        with log.times.simulating():
+            pairs = make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin)
+        for plan, pair, digests in _add_frames(writer, key, plans, log.times.each_simulated(pairs)):
             row_key = pair_key(key, plan, several=len(plans) > 1)
             sample.append(pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch))
         writer.add_rows(key, row_json(sample))
@@ -116,11 +133,11 @@ def make_image(
 
 
 def _add_frames(
-    writer: ShardWriter, key: str, srgb: Srgb, patch: Patch, plans: Sequence[Plan]
+    writer: ShardWriter, key: str, plans: Sequence[Plan], pairs: Iterable[Pair]
 ) -> Iterator[tuple[Plan, Pair, tuple[str, str]]]:
     """Append the clean frame of a patch and all its noisy frames; yield each pair with its digests."""
     clean_xxh3 = ""
-    for plan, pair in zip(plans, make_pairs(srgb, plans, patch.origin), strict=True):
+    for plan, pair in zip(plans, pairs, strict=True):
         if plan is plans[0]:
             clean_xxh3 = array_xxh3(pair.clean)
             writer.add_frame(key, CLEAN, pair.clean)

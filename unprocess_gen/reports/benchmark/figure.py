@@ -1,7 +1,10 @@
-"""Draw the figure of a benchmark: error against time, one panel for complete tiers and one for each stage.
+"""Draw the figure of a benchmark: the time of complete runs, and error against time for tiers and for each stage.
 
-A line joins the methods that no other method beats in both error and time. An error of 0 cannot be shown on a
-logarithmic axis, so it is drawn below a break of the axis. Every point is labelled with its name.
+Bars show the processor time of complete runs relative to the exact tier, divided into stages. Bars of slow tiers end at
+the edge of the panel, with their length as a number.
+
+In the other panels, a line joins the methods that no other method beats in both error and time. An error of 0 cannot be
+shown on a logarithmic axis, so it is drawn below a break of the axis. Every point is labelled with its name.
 """
 
 from __future__ import annotations
@@ -12,8 +15,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from unprocess_gen.config.accuracy import STAGES
+from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
+from unprocess_gen.reports.benchmark.conclusion import RATIO_DIGITS
 from unprocess_gen.reports.benchmark.measure import Measurement
-from unprocess_gen.reports.benchmark.session import REFERENCE
+from unprocess_gen.reports.benchmark.session import GIVEN, REFERENCE
 from unprocess_gen.reports.formatting import short_number
 from unprocess_gen.reports.paper.pictures import BLUE, GREEN, GREY, INK, ORANGE
 
@@ -58,28 +63,78 @@ OTHER_COLOUR = GREEN
 MARKERS = {"tier_noisy": ("o", "two-parameter"), "tier_electrons": ("s", "physical")}
 
 
-def benchmark_figure(rows: Sequence[Measurement]) -> bytes:
+RUN_STAGES = {"decode": GREY, "simulate": BLUE, "hash, write, commit": "#b9b9b9"}
+"""Stages of a complete run and their colours, in the order of the shares in `RunMeasurement`."""
+
+LONGEST_BAR = 1.6
+"""Longest ratio to exact that a bar shows."""
+
+
+def benchmark_figure(rows: Sequence[Measurement], runs: Sequence[RunMeasurement] = ()) -> bytes:
     """Return the figure as the bytes of a PNG."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     style: dict[Any, Any] = {"font.size": 9, "axes.labelsize": 9, "axes.titlesize": 10, "axes.titleweight": "bold"}
     with rc_context({**style, "axes.spines.right": False, "axes.spines.top": False}):
-        figure = Figure(figsize=(9.6, 8.2), layout="constrained")
-        for panel, axes in zip(PANELS, _grid(figure), strict=True):
-            _draw_panel(panel, axes, rows)
+        figure = Figure(figsize=(9.6, 10.6), layout="constrained")
+        grid = figure.add_gridspec(4, 3)
+        _draw_runs(figure.add_subplot(grid[0, :]), runs)
+        for panel, (row, columns) in zip(PANELS, PLACES, strict=True):
+            _draw_panel(panel, figure.add_subplot(grid[row, columns]), rows)
         _legend(figure, rows)
-        figure.supxlabel("time, ns per pixel (one thread)", fontsize=10)
+        figure.supxlabel("time of a pair or stage, ns per pixel (one thread)", fontsize=10)
         content = io.BytesIO()
         figure.savefig(content, format="png", dpi=100)
     return content.getvalue()
 
 
-def _grid(figure: Figure) -> list[Axes]:
-    """Return one axes for each of `PANELS`; the first, of the tiers, is twice as wide."""
-    grid = figure.add_gridspec(3, 3)
-    others = [(0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]
-    return [figure.add_subplot(grid[0, :2]), *(figure.add_subplot(grid[row, column]) for row, column in others)]
+PLACES = (
+    *((1, slice(0, 2)), (1, slice(2, 3))),
+    *((row, slice(column, column + 1)) for row in (2, 3) for column in range(3)),
+)
+"""Row and columns of each of `PANELS`; that of the tiers is twice as wide."""
+
+
+def _draw_runs(axes: Axes, runs: Sequence[RunMeasurement]) -> None:
+    """Draw one bar for each tier of each setting, the first on top."""
+    from matplotlib.patches import Patch
+
+    shown = [run for run in runs if run.ratio_to_exact is not None]
+    axes.set_title("complete runs, from files to committed shards", loc="left")
+    if not shown:
+        axes.set_axis_off()
+        return
+    for at, run in enumerate(shown):
+        left, ratio = 0.0, run.ratio_to_exact or 0.0
+        shares = (run.decode_share, run.simulate_share, run.write_share)
+        for share, colour in zip(shares, RUN_STAGES.values(), strict=True):
+            end = min(left + (share or 0.0) * ratio, LONGEST_BAR)
+            axes.barh(at, end - min(left, LONGEST_BAR), left=min(left, LONGEST_BAR), color=colour, height=0.72)
+            left += (share or 0.0) * ratio
+        text = f"{short_number(ratio, RATIO_DIGITS)}{' (cut off)' if ratio > LONGEST_BAR else ''}"
+        axes.annotate(
+            text,
+            (min(ratio, LONGEST_BAR), at),
+            xytext=(5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+            color=TIER_COLOURS.get(run.tier, OTHER_COLOUR),
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 1},
+        )
+    axes.axvline(1, color=INK, linewidth=0.8, linestyle=":", zorder=3)
+    axes.set_yticks(
+        range(len(shown)), [f"{run.noise if run.setting == GIVEN else run.setting}: {run.tier}" for run in shown]
+    )
+    axes.tick_params(axis="y", labelsize=8, length=0)
+    axes.invert_yaxis()
+    axes.set(xlim=(0, LONGEST_BAR * 1.12), xticks=(0, 0.25, 0.5, 0.75, 1, 1.25, 1.5))
+    axes.set_xlabel("processor time relative to exact")
+    marks = [Patch(color=colour, label=stage) for stage, colour in RUN_STAGES.items()]
+    axes.legend(
+        handles=marks, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False, fontsize=8, handlelength=1
+    )
 
 
 def _draw_panel(panel: FigurePanel, axes: Axes, rows: Sequence[Measurement]) -> None:

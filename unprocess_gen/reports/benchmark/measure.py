@@ -15,8 +15,11 @@ tier, tier_own                            clean frame, DN: with two-parameter no
 tier_noisy, tier_electrons                noisy frame at 14 bits, in σ: two-parameter noise; physical noise
 ========================================  =============================================================================
 
+Rows of tiers also have the errors of the noisy frame in DN and in σ.
+
 Times (`method_times`) are medians over rounds. Each round runs every measurement once on one photograph, and ratios are
 taken within a round. Decoding and compilation are excluded; the first use of new memory is included, as in a run.
+Complete runs are measured by `complete_runs`, and `conclusion` states in words what the tiers save and cost.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -33,17 +36,30 @@ from pathlib import Path
 from typing import NamedTuple
 
 from unprocess_gen.config.accuracy import METHODS, STAGES, Method, methods_of_stage
-from unprocess_gen.config.interpretation import accuracy_budget, is_normalised
+from unprocess_gen.config.interpretation import accuracy_budget, is_normalised, is_physical
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float, Srgb
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.benchmark import method_times as times
+from unprocess_gen.reports.benchmark.complete_runs import (
+    JPEG_QUALITY,
+    RunFiles,
+    RunKey,
+    RunMeasurement,
+    affordable,
+    measure_runs,
+    run_files,
+    run_rows,
+)
+from unprocess_gen.reports.benchmark.conclusion import conclude
 from unprocess_gen.reports.benchmark.method_errors import (
     MethodError,
+    NoisyError,
     clean_error,
     noisy_error,
+    noisy_errors,
     normal_error,
     normal_words,
     polynomial_normals,
@@ -64,6 +80,7 @@ from unprocess_gen.reports.benchmark.session import (
     cut_image,
     open_session,
 )
+from unprocess_gen.reports.formatting import counted
 from unprocess_gen.simulation.reference import noise
 
 __all__ = ["BenchmarkProfiles", "BenchmarkReport", "Measurement", "SampleSizes", "measure_accuracy"]
@@ -71,7 +88,10 @@ __all__ = ["BenchmarkProfiles", "BenchmarkReport", "Measurement", "SampleSizes",
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Error and time of a method or tier: one row of ``accuracy.csv``. None means that a value was not measured."""
+    """Error and time of a method or tier: one row of ``accuracy.csv``. None means that a value was not measured.
+
+    The errors of the noisy frame, in DN and in standard deviations of its noise, belong to rows of tiers.
+    """
 
     stage: str
     method: str
@@ -82,13 +102,32 @@ class Measurement:
     changed_share: float | None
     ns_per_pixel: float | None
     ratio_to_reference: float | None
+    noisy_changed_share: float | None = None
+    noisy_max_dn: float | None = None
+    noisy_rms_dn: float | None = None
+    noisy_max_std: float | None = None
+    noisy_rms_std: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkReport:
-    """All measurements, and the conditions under which they were made, as text by name."""
+    """Hold all measurements.
+
+    Attributes
+    ----------
+    rows : tuple of Measurement
+        Error and time of every method and tier.
+    runs : tuple of RunMeasurement
+        Error and time of complete runs.
+    conclusion : str
+        One sentence about the runs with the given settings.
+    conditions : dict of str to str
+        Conditions of the measurements, as text by name.
+    """
 
     rows: tuple[Measurement, ...]
+    runs: tuple[RunMeasurement, ...]
+    conclusion: str
     conditions: dict[str, str]
 
 
@@ -130,17 +169,28 @@ def measure_accuracy(
             "output.dtype=uint16 (float32 frames are exact and equal in every tier)"
         )
     session = open_session(config, profiles, sizes or SampleSizes())
-    error_steps = len(METHOD_BENCHMARKS) + len(TIER_STAGES) * len(session.tiers)
-    round_steps = len(METHOD_BENCHMARKS) + len(session.configs) * len(session.tiers)
-    with Progress(error_steps + round_steps * (session.sizes.rounds + 1), unit="measurement") as progress:
+    settings, tiers, rounds_wanted = session.run_configs, session.tiers, session.sizes.rounds
+    error_steps = len(METHOD_BENCHMARKS) + (len(TIER_STAGES) + len(session.all_configs)) * len(tiers)
+    round_steps = len(METHOD_BENCHMARKS) + len(session.configs) * len(tiers)
+    run_steps = len(settings) * len(tiers) * rounds_wanted
+    with (
+        run_files(config, session.sizes) as files,
+        Progress(error_steps + round_steps * (rounds_wanted + 1) + run_steps, unit="measurement") as progress,
+    ):
         errors = dict(_measure_errors(session, progress))
+        noisy = dict(_measure_noisy_errors(session, progress))
         _measure_round(session, session.corner(), progress)  # compiles the remaining kernels
         rounds = [
             _measure_round(session, session.images[number % len(session.images)], progress)
-            for number in range(session.sizes.rounds)
+            for number in range(rounds_wanted)
         ]
-    rows = (*_method_rows(session, errors, rounds), *_tier_rows(session, errors, rounds))
-    return BenchmarkReport(rows, _conditions(session, command))
+        run_configs = {name: affordable(one, files, session.sizes) for name, one in settings.items()}
+        run_times = measure_runs(run_configs, tiers, files, rounds_wanted, progress)
+    rows = (*_method_rows(session, errors, rounds), *_tier_rows(session, errors, noisy, rounds))
+    noises = {name: _noise_text(one) for name, one in settings.items()}
+    runs = tuple(run_rows(run_times, files.pixels, noises, noisy))
+    conclusion = conclude(runs, config.accuracy, tiers, files)
+    return BenchmarkReport(rows, runs, conclusion, _conditions(session, command) | _run_conditions(session, files))
 
 
 def measure_tier_times(config: Config, tiers: dict[str, AccuracyConfig], srgb: Srgb) -> dict[str, float]:
@@ -236,6 +286,14 @@ def _measure_errors(session: BenchmarkSession, progress: Progress) -> Iterator[t
             progress.advance()
 
 
+def _measure_noisy_errors(session: BenchmarkSession, progress: Progress) -> Iterator[tuple[RunKey, NoisyError]]:
+    """Yield the error of the noisy frames of every config under every tier."""
+    for config_name in session.all_configs:
+        for name, tier in session.tiers.items():
+            yield (config_name, name), noisy_errors(session, config_name, tier)
+            progress.advance()
+
+
 def _measure_round(session: BenchmarkSession, image: BenchmarkImage, progress: Progress) -> RoundTimes:
     """Run every time measurement once on one image."""
     found: RoundTimes = {}
@@ -264,11 +322,13 @@ def _method_rows(session: BenchmarkSession, errors: Errors, rounds: Sequence[Rou
             yield _measurement(key, tiers, errors[key], _median_times(rounds, key, (stage, reference)))
 
 
-def _tier_rows(session: BenchmarkSession, errors: Errors, rounds: Sequence[RoundTimes]) -> Iterator[Measurement]:
+def _tier_rows(
+    session: BenchmarkSession, errors: Errors, noisy: Mapping[RunKey, NoisyError], rounds: Sequence[RoundTimes]
+) -> Iterator[Measurement]:
     for stage, config_name in TIER_CONFIGS.items():
         for name in session.tiers:
             ns = _median_times(rounds, (config_name, name), (config_name, REFERENCE))
-            yield _measurement((stage, name), name, errors[stage, name], ns)
+            yield _measurement((stage, name), name, errors[stage, name], ns, noisy[config_name, name])
 
 
 def _median_times(
@@ -284,11 +344,15 @@ def _median_times(
 
 
 def _measurement(
-    key: RowKey, tiers: str, error: MethodError | None, ns: tuple[float, float] | tuple[None, None]
+    key: RowKey,
+    tiers: str,
+    error: MethodError | None,
+    ns: tuple[float, float] | tuple[None, None],
+    noisy: NoisyError | tuple[()] = (),
 ) -> Measurement:
     if error is None:
         return Measurement(*key, tiers, None, None, "", None, *ns)
-    return Measurement(*key, tiers, error.max, error.rms, error.unit, error.changed_share, *ns)
+    return Measurement(*key, tiers, error.max, error.rms, error.unit, error.changed_share, *ns, *noisy)
 
 
 # --------------------------------------------------------------------------------------------------------- conditions
@@ -318,6 +382,21 @@ def _conditions(session: BenchmarkSession, command: str) -> dict[str, str]:
         "given settings": f"{given.sensor.bits} bits, black {given.sensor.black_level_dn}, white "
         f"{given.sensor.white_level_dn}; noise {given.noise.name}; accuracy {given.accuracy.name}",
     }
+
+
+def _run_conditions(session: BenchmarkSession, files: RunFiles) -> dict[str, str]:
+    """Return what a reader must know about complete runs."""
+    root = session.configs[GIVEN].source.root
+    place = f"the first of {root}" if root else f"built-in scenes, as JPEG files of quality {JPEG_QUALITY}"
+    return {
+        "complete runs": f"{counted(files.count, 'photograph')}, {files.pixels / 1e6:.1f} megapixels ({place}); one "
+        f"worker; processor time of all threads, without compilation and without waiting for the disk; fastest of "
+        f"{counted(session.sizes.rounds, 'round')}, one round for the reference; ratios of fastest rounds"
+    }
+
+
+def _noise_text(config: Config) -> str:
+    return _physical_noise(config) if is_physical(config.noise) else config.noise.name
 
 
 def _physical_noise(config: Config) -> str:

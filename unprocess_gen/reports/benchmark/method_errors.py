@@ -33,6 +33,23 @@ class MethodError(NamedTuple):
     changed_share: float | None = None
 
 
+class NoisyError(NamedTuple):
+    """The error of noisy frames: fraction of DN that differ, largest and RMS error in DN and in σ of the noise."""
+
+    changed_share: float
+    max_dn: float
+    rms_dn: float
+    max_std: float
+    rms_std: float
+
+
+def noisy_errors(session: BenchmarkSession, config_name: str, accuracy: AccuracyConfig) -> NoisyError:
+    """Return the error of the noisy frames under a budget, both in DN and in σ of shot, read and rounding noise."""
+    in_dn, in_stds = (noisy_error(session, config_name, accuracy, unit=unit) for unit in ("DN", "σ"))
+    assert in_dn.changed_share is not None
+    return NoisyError(in_dn.changed_share, in_dn.max, in_dn.rms, in_stds.max, in_stds.rms)
+
+
 def clean_error(session: BenchmarkSession, config_name: str, accuracy: AccuracyConfig) -> MethodError:
     """Return the error of the clean frames under a budget, in DN."""
     frames, reference = (

@@ -12,7 +12,15 @@ import numpy as np
 
 from unprocess_gen.config.accuracy import METHODS, Budget, Method, choose_methods
 from unprocess_gen.config.interpretation import accuracy_budget, is_physical
-from unprocess_gen.config.schema import AccuracyConfig, CleanConfig, Config, EffectsConfig, NoiseConfig, SensorConfig
+from unprocess_gen.config.schema import (
+    AccuracyConfig,
+    CleanConfig,
+    Config,
+    EffectsConfig,
+    NoiseConfig,
+    SceneConfig,
+    SensorConfig,
+)
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.sequences import evenly_spaced
@@ -31,6 +39,9 @@ REFERENCE, EXACT = "reference", "exact"
 TWO_PARAMETER, PHYSICAL, GIVEN = "two_parameter", "physical", "given"
 """Names of the configs of a session: 14 bits with two-parameter noise, 14 bits with physical noise, the user's own."""
 
+TWO_PARAMETER_RUN = "two_parameter_run"
+"""Name of the setting of complete runs that has the user's sensor with two-parameter noise."""
+
 FALLBACK_ISO = 1600
 """ISO of the physical profile if it is not calibrated at the ISO of the scene."""
 
@@ -47,12 +58,15 @@ class BenchmarkProfiles:
         A noise profile of each kind; replaces the user's profile of the other kind.
     sensor : SensorConfig
         A 14-bit sensor.
+    scenes : dict of str to SceneConfig
+        Scenes in which complete runs with physical noise are measured.
     """
 
     tiers: dict[str, AccuracyConfig]
     two_parameter_noise: NoiseConfig
     physical_noise: NoiseConfig
     sensor: SensorConfig
+    scenes: dict[str, SceneConfig]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +85,8 @@ class SampleSizes:
         Side of a flat field.
     positions : int
         Number of random words in each segment of the table of normal quantiles.
+    run_files, run_pixels : int
+        Number of photographs, or of their pixels, that are enough for a complete run.
     """
 
     photographs: int = 8
@@ -80,6 +96,8 @@ class SampleSizes:
     compiled: tuple[int, int] = (1024, 1536)
     flat: int = 512
     positions: int = 64
+    run_files: int = 16
+    run_pixels: int = 8_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,20 +149,28 @@ class BenchmarkSession:
         The photographs.
     sizes : SampleSizes
         How much is measured.
+    run_configs : dict of str to Config
+        The settings of complete runs; `GIVEN` is the first.
     """
 
     configs: dict[str, Config]
     tiers: dict[str, AccuracyConfig]
     images: tuple[BenchmarkImage, ...]
     sizes: SampleSizes
+    run_configs: dict[str, Config] = field(default_factory=dict)
     _pairs: dict[object, list[tuple[Pair, Plan]]] = field(default_factory=dict)
     _flat_frames: dict[object, list[Frame]] = field(default_factory=dict)
+
+    @property
+    def all_configs(self) -> dict[str, Config]:
+        """Every config by name; that of complete runs with the given settings is replaced by its mosaics."""
+        return self.run_configs | self.configs
 
     def plan(
         self, config_name: str, accuracy: AccuracyConfig, image: BenchmarkImage, srgb: Srgb, edit: str = "unchanged"
     ) -> Plan:
         """Return the plan of some pixels of an image under a budget; ``edit`` is a key of `PLAN_EDITS`."""
-        config = replace(self.configs[config_name], accuracy=accuracy)
+        config = replace(self.all_configs[config_name], accuracy=accuracy)
         return PLAN_EDITS[edit](plan_image(config, *image.identity, facts_for(config, srgb)))
 
     def sampled_pairs(
@@ -260,9 +286,13 @@ def _numbers(accuracy: AccuracyConfig) -> object:
 
 def open_session(config: Config, profiles: BenchmarkProfiles, sizes: SampleSizes) -> BenchmarkSession:
     """Return a session for a config; ConfigError if no photograph can be read or the config cannot be compared."""
-    config = as_mosaics(config)
+    mosaics = as_mosaics(config)
     return BenchmarkSession(
-        compared_configs(config, profiles), compared_tiers(config, profiles), load_images(config, sizes), sizes
+        compared_configs(mosaics, profiles),
+        compared_tiers(config, profiles),
+        load_images(mosaics, sizes),
+        sizes,
+        run_settings(config, profiles),
     )
 
 
@@ -274,16 +304,37 @@ def as_mosaics(config: Config) -> Config:
 def compared_configs(config: Config, profiles: BenchmarkProfiles) -> dict[str, Config]:
     """Return the given config, and two with 14 bits whose noise is two-parameter and physical."""
     at_14_bits = replace(config, sensor=profiles.sensor)
-    # Effects set for one kind of profile do not apply to the other.
-    other_kind = replace(at_14_bits, effects=EffectsConfig(tolerance=config.effects.tolerance), clean=CleanConfig())
     if is_physical(config.noise):
-        two_parameter, physical = replace(other_kind, noise=profiles.two_parameter_noise), at_14_bits
+        two_parameter, physical = _with_other_noise(at_14_bits, profiles.two_parameter_noise), at_14_bits
     else:
         two_parameter = replace(at_14_bits, noise=replace(config.noise, law="gaussian"))
-        physical = _at_calibrated_iso(replace(other_kind, noise=profiles.physical_noise))
+        physical = _at_calibrated_iso(_with_other_noise(at_14_bits, profiles.physical_noise))
     for one in (two_parameter, physical):
         validate_config(one)
     return {TWO_PARAMETER: two_parameter, PHYSICAL: physical, GIVEN: config}
+
+
+def run_settings(config: Config, profiles: BenchmarkProfiles) -> dict[str, Config]:
+    """Return the settings of complete runs: the given config, two-parameter noise, and physical noise in each scene.
+
+    Settings equal to the given config are left out.
+    """
+    two_parameter, physical = config, config
+    if is_physical(config.noise):
+        two_parameter = _with_other_noise(config, profiles.two_parameter_noise)
+    else:
+        physical = _with_other_noise(config, profiles.physical_noise)
+    scenes = {name: _at_calibrated_iso(replace(physical, scene=scene)) for name, scene in profiles.scenes.items()}
+    others = {TWO_PARAMETER_RUN: two_parameter, **scenes}
+    for one in others.values():
+        validate_config(one)
+    return {GIVEN: config, **{name: one for name, one in others.items() if one != config}}
+
+
+def _with_other_noise(config: Config, noise: NoiseConfig) -> Config:
+    """Replace a noise profile by one of the other kind, and drop effects that do not apply to it."""
+    effects = EffectsConfig(tolerance=config.effects.tolerance)
+    return replace(config, noise=noise, effects=effects, clean=CleanConfig())
 
 
 def _at_calibrated_iso(config: Config) -> Config:
