@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Source
-from unprocess_gen.reports.estimate import SAMPLE, estimate_run, format_estimate
+from unprocess_gen.reports.estimate import COMMIT_SECONDS, SAMPLE, estimate_run, format_estimate
 from unprocess_gen.simulation.reference.noise import EFFECTS
 
 
@@ -71,9 +71,100 @@ def test_sampled_estimate_says_about(settings: Settings, tmp_path: Path) -> None
     )
 
 
-def test_time_is_divided_by_the_number_of_workers(settings: Settings, tmp_path: Path) -> None:
+def test_time_of_pairs_is_divided_by_the_number_of_workers(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 3)}", "output.pairs_per_shard=1")
+    estimate = estimate_run(config, 2, read_all=True)
+    assert estimate.pair_seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / 2)
+
+
+def test_no_more_workers_are_estimated_than_shards(settings: Settings, tmp_path: Path) -> None:
     estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', 3)}"), 4, read_all=True)
-    assert estimate.seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / 4)
+    assert (estimate.shards, estimate.n_jobs) == (1, 1)
+    assert estimate.pair_seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates))
+
+
+def test_time_includes_start_up_and_disk(settings: Settings, tmp_path: Path) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 3)}", f"out={tmp_path}/not/yet/there")
+    estimate = estimate_run(config, 1, read_all=True)
+    assert estimate.start_seconds > 0.1  # the imports of this process alone
+    assert estimate.disk_seconds > COMMIT_SECONDS
+    assert estimate.seconds == estimate.start_seconds + estimate.pair_seconds + estimate.disk_seconds
+    line = next(line for line in format_estimate(config, estimate).splitlines() if line.startswith("time"))
+    assert re.fullmatch(r"time      about \S+ \w+ with 1 worker: start-up .*, pairs .*, disk .*", line)
+    assert list(tmp_path.iterdir()) == [tmp_path / "p"]
+
+
+# Sentences ------------------------------------------------------------------------------------------------------------
+
+
+def estimate_text(settings: Settings, folder: Path, *overrides: str) -> str:
+    """Return the estimate of two photographs, each sentence in one line."""
+    config = settings(f"source.root={fill(folder / 'p', 2)}", f"out={folder}/ds", *overrides)
+    text = format_estimate(config, estimate_run(config, 1, True))
+    return re.sub(r"\n {10}(?=[a-z(°])", " ", text)
+
+
+def test_sentences_name_what_is_simulated_and_left_out(settings: Settings, tmp_path: Path) -> None:
+    text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=daylight", "effects.row=off")
+    assert re.search(r"^effects   Simulated: prnu \(assumed 0\.5 %\), shot, .*read, .*\.$", text, re.MULTILINE)
+    assert re.search(r"^ {10}Left out, too small to see: dark_current \(0\.\d+ of the noise\), ", text, re.MULTILINE)
+    assert re.search(
+        r"^ {10}Left out though it would show: row \([\d.]+ of the noise; switched off\)\.$", text, re.MULTILINE
+    )
+
+
+def test_sentences_say_none_if_nothing_visible_is_left_out(settings: Settings, tmp_path: Path) -> None:
+    text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=long_exposure")
+    assert "Left out though it would show: none." in text
+
+
+def test_assumed_numbers_that_are_off_are_named_if_they_would_show(settings: Settings, tmp_path: Path) -> None:
+    text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=long_exposure", "effects.assumed=off")
+    visible = text.split("Left out though it would show: ")[1].split("\n")[0]
+    assert visible.startswith("prnu (")
+    assert "dark_current (" in visible
+    assert "prnu_std is assumed, no source gives it: on only where switched on" in visible
+
+
+def test_scene_names_what_the_profile_uses_and_ignores(settings: Settings, tmp_path: Path) -> None:
+    night = "scene     night: ISO 6400, 0.1 s, 20 °C, light divided by "
+    physical = estimate_text(settings, tmp_path / "a", "noise=sony_a7s2", "scene=night")
+    assert night in physical
+    assert "sony_a7s2 uses light, ISO, time and temperature\n" in physical
+    fixed = estimate_text(settings, tmp_path / "b", "noise=sony_a7s2", "scene=night", "noise.iso=800")
+    assert "uses light, time and temperature, and ignores ISO (noise.iso is used)\n" in fixed
+    two_numbers = estimate_text(settings, tmp_path / "c", "scene=night")
+    assert night in two_numbers
+    assert "imx385_iso3200 uses only the light, and ignores ISO, time and temperature\n" in two_numbers
+
+
+def test_dark_scene_with_a_profile_of_two_numbers_is_warned_about(settings: Settings, tmp_path: Path) -> None:
+    text = estimate_text(settings, tmp_path / "a", "scene=night")
+    warning = text.split("warning   ")[1]
+    assert re.match(
+        r"scene=night: light is divided by \d+ to \d+, which leaves \d+ to \d+ distinct DN in a clean ", warning
+    )
+    for profile in ("imx385", "nikon_d850", "sony_a7s2"):
+        assert profile in warning
+    assert "physical profiles" not in estimate_text(settings, tmp_path / "b", "scene=night", "noise=sony_a7s2")
+    assert "warning" not in estimate_text(settings, tmp_path / "c")
+
+
+@pytest.mark.parametrize(("ratio", "limit_db"), [(100, 54.5), (200, 48.5), (300, 45.0)])
+def test_posterised_clean_frames_are_warned_about(
+    settings: Settings, tmp_path: Path, ratio: int, limit_db: float
+) -> None:
+    text = estimate_text(
+        settings, tmp_path, "sensor=generic_14bit", "noise=nikon_d850", f"scene.exposure_ratio={ratio}"
+    )
+    assert f"no denoiser exceeds a PSNR of {limit_db:g} dB" in text
+    assert "output.clean_dtype=float32" in text
+
+
+def test_bright_scenes_have_no_warning_of_few_levels(settings: Settings, tmp_path: Path) -> None:
+    assert "warning" not in estimate_text(
+        settings, tmp_path, "noise=nikon_d850", "scene=indoor", "sensor=generic_14bit"
+    )
 
 
 def test_failed_source_has_no_bytes_and_a_reason(settings: Settings, tmp_path: Path) -> None:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
+import tempfile
+import textwrap
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -20,12 +23,19 @@ from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import Plan, Source
+from unprocess_gen.core.types import Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.sizes import source_bytes
-from unprocess_gen.planning.effect_selection import COST_NS, Prediction, facts_for
+from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.reports.benchmark.measure import measure_tier_times
+from unprocess_gen.reports.effect_summary import (
+    effect_sentences,
+    effect_table,
+    posterisation_warning,
+    scene_sentence,
+    scene_warning,
+)
 from unprocess_gen.reports.formatting import byte_size, counted, value_range
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
@@ -37,6 +47,12 @@ LOGGER = logging.getLogger("unprocess_gen")
 
 SAMPLE = 16
 """Number of sources read unless all are asked for."""
+
+COMMIT_SECONDS = 0.045
+"""Time to sync and rename a shard (``docs/design/dataset_format.md``)."""
+
+TRIAL_BYTES = 2**24
+"""Bytes written to measure the disk."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +77,8 @@ class SourceEstimate:
         Number of patches and of pairs.
     pixels, unused_pixels : int
         Number of pixels, and of those that are in no patch.
+    clean_levels : int
+        Distinct DN in the clean frame; 0 if it is not rounded. Of several patches, in the first.
     """
 
     source: Source
@@ -73,6 +91,7 @@ class SourceEstimate:
     pairs: int = 0
     pixels: int = 0
     unused_pixels: int = 0
+    clean_levels: int = 0
     detail: str = ""
 
 
@@ -86,10 +105,14 @@ class RunEstimate:
         Number of sources and shards, and bytes of all shards.
     exact : bool
         Whether every source was read.
-    seconds : float
-        Time with ``n_jobs`` workers, without writing to disk.
+    pair_seconds : float
+        Time to make the pairs with ``n_jobs`` workers.
+    start_seconds : float
+        Time until the first pair: imports, settings, workers, and loading the kernels.
+    disk_seconds : float
+        Time to write the shards, at the rate of a trial.
     n_jobs : int
-        Number of workers.
+        Number of workers; there are no more than shards.
     free_bytes : int
         Free bytes on the disk of ``out``.
     source_estimates : tuple of SourceEstimate
@@ -107,13 +130,20 @@ class RunEstimate:
     shards: int
     bytes: int
     exact: bool
-    seconds: float
+    pair_seconds: float
+    start_seconds: float
+    disk_seconds: float
     n_jobs: int
     free_bytes: int
     source_estimates: tuple[SourceEstimate, ...]
     tier_ns: dict[str, float]
     unmatched: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        """Time of a run."""
+        return self.start_seconds + self.pair_seconds + self.disk_seconds
 
     @property
     def pairs(self) -> int:
@@ -151,16 +181,21 @@ def estimate_run(
     listing = list_photographs(config.source)
     sources = listing.sources
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
-    _compile_kernels(config, (tiers or {}).values())
+    shards = -(-len(sources) // config.output.pairs_per_shard)
+    n_jobs = min(n_jobs, shards)
+    start_seconds = time.process_time() * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
+    start_seconds += _compile_kernels(config, (tiers or {}).values())
     estimates = tuple(estimate_source(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
-    seconds = sum(source.seconds for source in estimates) / len(estimates) * len(sources) / n_jobs
+    size = _bytes_of_shards(estimates, len(sources), config.output.pairs_per_shard)
     return RunEstimate(
         sources=len(sources),
-        shards=-(-len(sources) // config.output.pairs_per_shard),
-        bytes=_bytes_of_shards(estimates, len(sources), config.output.pairs_per_shard),
+        shards=shards,
+        bytes=size,
         exact=exact,
-        seconds=seconds,
+        pair_seconds=sum(source.seconds for source in estimates) / len(estimates) * len(sources) / n_jobs,
+        start_seconds=start_seconds,
+        disk_seconds=shards * COMMIT_SECONDS + size * _seconds_per_byte(Path(config.out)),
         n_jobs=n_jobs,
         free_bytes=free_bytes(Path(config.out)),
         source_estimates=estimates,
@@ -168,6 +203,23 @@ def estimate_run(
         unmatched=listing.unmatched,
         warnings=listing.warnings,
     )
+
+
+def _seconds_per_byte(out: Path) -> float:
+    """Return the time to write and sync a byte on the disk of ``out``, measured with a file without a name.
+
+    0 if the folder cannot be written.
+    """
+    folder = next(path for path in (out.absolute(), *out.absolute().parents) if path.is_dir())
+    try:
+        with tempfile.TemporaryFile(dir=folder) as trial:
+            started = time.perf_counter()
+            trial.write(bytes(TRIAL_BYTES))
+            trial.flush()
+            os.fsync(trial.fileno())
+            return (time.perf_counter() - started) / TRIAL_BYTES
+    except OSError:
+        return 0.0
 
 
 def _bytes_of_shards(estimates: tuple[SourceEstimate, ...], sources: int, per_shard: int) -> int:
@@ -193,8 +245,10 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
     height, width = photograph.srgb.shape[:2]
     output = config.output
     cuts = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, output.layout)
+    clean: Frame | None = None
     for patch in cuts:
         for number, pair in enumerate(make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin)):
+            clean = pair.clean if clean is None else clean
             for frame in (pair.clean, pair.noisy) if number == 0 else (pair.noisy,):
                 array_xxh3(frame)
                 hashlib.sha256(frame.data)
@@ -211,7 +265,15 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
         pairs=len(cuts) * len(plans),
         pixels=width * height,
         unused_pixels=pixels_in_none(cuts, height, width),
+        clean_levels=_levels_in(clean),
     )
+
+
+def _levels_in(clean: Frame | None) -> int:
+    """Return the number of distinct DN in a frame; 0 for a frame of floats."""
+    if clean is None or clean.dtype != np.uint16:
+        return 0
+    return int(np.count_nonzero(np.bincount(clean.reshape(-1), minlength=2**16)))
 
 
 def _tier_ns(
@@ -224,10 +286,11 @@ def _tier_ns(
     return {}
 
 
-def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> None:
+def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> float:
     """Make pairs of a tiny image, so that the time of the first source does not include compilation.
 
-    Logs first that kernels will be compiled, those of the tiers included, because it takes up to 20 seconds.
+    Logs first that kernels will be compiled, those of the tiers included, because it takes up to 20 seconds. Return the
+    seconds that a run spends on its kernels: they are compiled now, so it only loads them.
     """
     srgb = np.zeros((2, 2, 3), dtype=np.uint8)
     plans, *of_tiers = (
@@ -235,10 +298,15 @@ def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> None:
         for one in (config, *(replace(config, accuracy=tier) for tier in tiers))
     )
     needed = {self_test.kernels(plan) for some in (plans, *of_tiers) for plan in some}
-    if not all(self_test.are_compiled(kernels) for kernels in needed):
+    compiled = all(self_test.are_compiled(kernels) for kernels in needed)
+    if not compiled:
         LOGGER.info("compiling kernels, once per machine and version")
+    started = time.perf_counter()
     for _ in make_pairs(srgb, plans):
         pass
+    for kernels in {self_test.kernels(plan) for plan in plans}:
+        self_test.failures(kernels)  # a run does so before its first pair
+    return time.perf_counter() - started if compiled else 0.0
 
 
 # ------------------------------------------------------------------------------------------------------------- text
@@ -271,8 +339,9 @@ def format_estimate(config: Config, estimate: RunEstimate) -> str:
         + ("" if estimate.exact else " (--all reads every source: exact)"),
         f"disk      {byte_size(estimate.free_bytes)} free"
         + ("" if estimate.free_bytes > estimate.bytes else ": NOT ENOUGH"),
-        f"time      about {format_duration(estimate.seconds)} with {estimate.n_jobs} "
-        f"worker{'s' if estimate.n_jobs > 1 else ''}, plus the time to write to disk",
+        f"time      about {format_duration(estimate.seconds)} with {counted(estimate.n_jobs, 'worker')}: start-up "
+        f"{format_duration(estimate.start_seconds)}, pairs {format_duration(estimate.pair_seconds)}, disk "
+        f"{format_duration(estimate.disk_seconds)}",
         *_failure_lines(config, estimate.source_estimates),
         *_accuracy_lines(config.accuracy, estimate.tier_ns),
         *_noise_lines(config, estimate.source_estimates),
@@ -330,9 +399,27 @@ def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[
     plans = [plan for source in estimates for plan in source.levels]
     if not plans:
         return []
+    levels = [source.clean_levels for source in estimates if source.clean_levels]
+    warnings = scene_warning(config, plans, levels), posterisation_warning(plans, levels)
+    lines = _labelled("scene", [scene_sentence(config, plans)])
     if is_physical(config.noise):
         predictions = [of_level for source in estimates for of_level in source.predictions]
-        return [*_physical_lines(config, plans), *_effect_table(predictions)]
+        lines += _physical_lines(config, plans)
+        lines += _labelled("effects", effect_sentences(config, predictions))
+    else:
+        lines += _two_number_lines(config, plans)
+    lines += _labelled("warning", [warning for warning in warnings if warning])
+    return [*lines, *effect_table(config, predictions)] if is_physical(config.noise) else lines
+
+
+def _labelled(label: str, sentences: Iterable[str]) -> list[str]:
+    """Return sentences in lines of at most 120 characters, the first one with a label."""
+    lines = [line for one in sentences for line in textwrap.wrap(one, 110, break_on_hyphens=False)]
+    return [f"{label if number == 0 else '':10}{line}" for number, line in enumerate(lines)]
+
+
+def _two_number_lines(config: Config, plans: list[Plan]) -> list[str]:
+    """Return the numbers and the effects of a profile with two numbers."""
     sensor, noise, first = config.sensor, config.noise, plans[0]
     profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
     numbers = "; ".join(dict.fromkeys(f"a={level.a}, b={level.b}" for level in noise_levels(noise)))
@@ -367,10 +454,6 @@ def _physical_lines(config: Config, plans: list[Plan]) -> list[str]:
     distributions = sorted({"Gaussian" if one.read_law == "gaussian" else "Tukey lambda" for one in physics})
     scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
     lines = [
-        f"scene     {plans[0].scene}: ISO {value_range([one.iso for one in physics])}, "
-        f"{value_range([one.exposure_s for one in physics])} s, "
-        f"{value_range([one.temperature_c for one in physics])} °C, "
-        f"light divided by {value_range([plan.exposure_ratio for plan in plans], 4)}",
         f"noise     {noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
         f"on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}) times {scale:.6g}",
         f"          system gain {value_range([one.dn_per_e for one in physics], 4)} DN per electron, read noise "
@@ -378,18 +461,4 @@ def _physical_lines(config: Config, plans: list[Plan]) -> list[str]:
     ]
     if noise.assumed:
         lines.append(f"          assumed, without a source: {', '.join(noise.assumed)}")
-    return lines
-
-
-def _effect_table(predictions: list[tuple[Prediction, ...]]) -> list[str]:
-    """Return one line per effect: the source in which it is strongest, and how often it is simulated."""
-    lines = ["effect         predicted DN  statistic      masking DN    simulated  ns/pixel  why"]
-    for of_effect in zip(*predictions, strict=True):
-        best = max(of_effect, key=lambda one: (one.simulated, one.ratio, one.outliers))
-        simulated = f"{sum(one.simulated for one in of_effect)} of {len(of_effect)}"
-        cost = f"{COST_NS[best.effect]:.1f}"
-        lines.append(
-            f"{best.effect:13}  {best.predicted_dn:12.3g}  {best.statistic:13}  {best.masking_dn:10.3g}    "
-            f"{simulated:9}  {cost:>8}  {best.why}"
-        )
     return lines

@@ -1,0 +1,353 @@
+"""Describe in sentences and a table which effects a run simulates and which it leaves out, for the verb ``plan``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from unprocess_gen.config.interpretation import is_physical, missing_number
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.schema import Config, NoiseConfig
+from unprocess_gen.config.yaml_files import read_yaml_mapping
+from unprocess_gen.core.types import Plan
+from unprocess_gen.planning.effect_contributions import OUTLIERS
+from unprocess_gen.planning.effect_selection import COST_NS, MIN_OUTLIERS, Prediction
+from unprocess_gen.reports.formatting import short_number, value_range
+
+Predictions = Sequence[Sequence[Prediction]]
+"""For each noise level of each image, the prediction of every effect."""
+
+
+# ---------------------------------------------------------------------------------------------------------- sentences
+
+
+def effect_sentences(config: Config, predictions: Predictions) -> list[str]:
+    """Return sentences on what is simulated, what is too small to see, and what is left out though it would show.
+
+    Parameters
+    ----------
+    config : Config
+        Config with a physical noise profile.
+    predictions : sequence of sequence of Prediction
+        Predictions of all effects, in the same order, for each noise level of each image.
+
+    Returns
+    -------
+    list of str
+        One sentence per item. Rounding is not named: it is the last step of every integer frame.
+    """
+    effects = [
+        EffectOverview(config, of_effect)
+        for of_effect in zip(*predictions, strict=True)
+        if of_effect[0].effect != "quantise"
+    ]
+    simulated = [one.simulated_text for one in effects if one.count]
+    left_out = [one for one in effects if not one.count and not one.missing]
+    small = [f"{one.name} ({one.size_text})" for one in left_out if not one.shows]
+    visible = [f"{one.name} ({one.size_text}; {one.strongest.reason})" for one in left_out if one.shows]
+    missing = [f"{one.name} ({one.missing})" for one in effects if one.missing]
+    sentences = [
+        f"Simulated: {_listed(simulated)}.",
+        f"Left out, too small to see: {_listed(small)}.",
+        f"Left out though it would show: {_listed(visible)}.",
+    ]
+    return [*sentences, f"Left out, as the profile gives no number: {_listed(missing)}."] if missing else sentences
+
+
+def _listed(texts: Iterable[str]) -> str:
+    return ", ".join(texts) or "none"
+
+
+@dataclass(frozen=True)
+class EffectOverview:
+    """Summarize the predictions of one effect over all images and noise levels."""
+
+    config: Config
+    predictions: Sequence[Prediction]
+
+    @property
+    def name(self) -> str:
+        """Return the name of the effect."""
+        return self.predictions[0].effect
+
+    @property
+    def strongest(self) -> Prediction:
+        """Return the prediction of the image in which the effect is strongest; simulated ones first."""
+        return max(self.predictions, key=lambda one: (one.simulated, one.outliers >= MIN_OUTLIERS, one.ratio))
+
+    @property
+    def count(self) -> int:
+        """Return for how many images and levels the effect is simulated."""
+        return sum(one.simulated for one in self.predictions)
+
+    @property
+    def missing(self) -> str | None:
+        """Return the number that the profile lacks; None if the effect could be simulated."""
+        return missing_number(self.config.noise, self.name)
+
+    @property
+    def shows(self) -> bool:
+        """Return whether the effect exceeds the tolerance or has visible outliers."""
+        one = self.strongest
+        return one.ratio > self.config.effects.tolerance or one.outliers >= MIN_OUTLIERS
+
+    @property
+    def size_text(self) -> str:
+        """Return how strong the effect is: outliers, or its ratio to the noise."""
+        one = self.strongest
+        if self.name in OUTLIERS:
+            return _pixels(one.outliers)
+        return f"{short_number(one.ratio)} of the noise" if math.isfinite(one.ratio) else "no other noise"
+
+    @property
+    def simulated_text(self) -> str:
+        """Return the name, its assumed number, and the number of images unless it is simulated in all of them."""
+        notes = assumed_text(self.config.noise, self.name)
+        images = len(self.predictions)
+        if self.count < images:
+            notes += f"{'; ' if notes else ''}in {self.count} of {images} images"
+        return f"{self.name} ({notes})" if notes else self.name
+
+
+def _pixels(outliers: float) -> str:
+    if outliers < MIN_OUTLIERS:
+        return "no visible pixel" if outliers < 1e-6 else f"{short_number(outliers)} visible pixels per frame"
+    return f"{short_number(outliers, 3)} visible pixels per frame"
+
+
+ASSUMED_TEXTS: dict[str, Callable[[NoiseConfig], str]] = {
+    "prnu_std": lambda noise: f"{100 * (noise.prnu_std or 0):g} %",
+    "dark_e_per_s": lambda noise: f"{noise.dark_e_per_s:g} e⁻/s at {noise.dark_reference_c:g} °C",
+    "dark_reference_c": lambda noise: f"measured at {noise.dark_reference_c:g} °C",
+    "dark_doubling_c": lambda noise: f"doubled every {noise.dark_doubling_c:g} °C",
+    "hot_pixel_share": lambda noise: f"{1e6 * (noise.hot_pixel_share or 0):g} in a million",
+    "hot_pixel_e_per_s": lambda noise: f"{noise.hot_pixel_e_per_s:g} e⁻/s at {noise.dark_reference_c:g} °C",
+    "dead_pixel_share": lambda noise: f"{1e6 * (noise.dead_pixel_share or 0):g} in a million",
+    "full_well_e": lambda noise: f"{noise.full_well_e:,.0f} e⁻",
+    "row_std_dn": lambda noise: f"{noise.branches[0].row_std_dn} DN",
+    "column_std_dn": lambda noise: f"{noise.branches[0].column_std_dn} DN",
+    "black_error_dn": lambda noise: "offsets of the black level",
+}
+"""Value of each number that a profile may mark as assumed."""
+
+ASSUMED_OF_EFFECT = {
+    "prnu": ("prnu_std",),
+    "dark_current": ("dark_e_per_s", "dark_reference_c", "dark_doubling_c"),
+    "hot_pixels": ("hot_pixel_share", "hot_pixel_e_per_s"),
+    "full_well": ("full_well_e",),
+    "row": ("row_std_dn",),
+    "column": ("column_std_dn",),
+    "black_error": ("black_error_dn",),
+    "dead_pixels": ("dead_pixel_share",),
+}
+"""Numbers named behind each effect. Hot pixels share temperature and doubling with the dark current."""
+
+
+def assumed_text(noise: NoiseConfig, effect: str) -> str:
+    """Return the assumed numbers of an effect, such as ``assumed 0.5 %``; empty if all are published.
+
+    Parameters
+    ----------
+    noise : NoiseConfig
+        Physical profile.
+    effect : str
+        One of `noise.EFFECTS`.
+
+    Returns
+    -------
+    str
+        Words for a bracket.
+    """
+    values = [ASSUMED_TEXTS[key](noise) for key in ASSUMED_OF_EFFECT.get(effect, ()) if key in noise.assumed]
+    return f"assumed {', '.join(values)}" if values else ""
+
+
+# --------------------------------------------------------------------------------------------------------------- table
+
+
+def effect_table(config: Config, predictions: Predictions) -> list[str]:
+    """Return one line per effect: the image in which it is strongest, and how often it is simulated.
+
+    Hot and dead pixels are judged by the number of pixels that stand out of the noise, other effects by their ratio to
+    the noise that hides them.
+
+    Parameters
+    ----------
+    config : Config
+        Config with a physical noise profile.
+    predictions : sequence of sequence of Prediction
+        As for `effect_sentences`.
+
+    Returns
+    -------
+    list of str
+        Lines of at most 160 characters, the head first.
+    """
+    lines = [_TABLE_LINE.format("effect", "adds", "seen in", "noise there", "ratio", "images", "ns/pixel", "decision")]
+    for of_effect in zip(*predictions, strict=True):
+        overview = EffectOverview(config, of_effect)
+        one = overview.strongest
+        adds, seen, noise, ratio = f"{one.predicted_dn:.3g} DN", one.statistic, f"{one.masking_dn:.3g} DN", one.ratio
+        if overview.name in OUTLIERS:
+            pixels = one.outliers if one.outliers >= 1e-6 else 0
+            adds, seen, noise, shown = f"{pixels:.3g} pixels", "outliers", "", ""
+        else:
+            shown = f"{ratio:.3g}" if math.isfinite(ratio) else "no noise"
+        images, cost = f"{overview.count} of {len(of_effect)}", f"{COST_NS[overview.name]:.1f}"
+        line = _TABLE_LINE.format(overview.name, adds, seen, noise, shown, images, cost, _decision(overview))
+        lines.append(line.rstrip())
+    return lines
+
+
+_TABLE_LINE = "{:13}{:>13}  {:14}{:>11}{:>10}  {:9}{:>9}  {}"
+
+
+def _decision(overview: EffectOverview) -> str:
+    one, tolerance = overview.strongest, overview.config.effects.tolerance
+    if one.forced:
+        return one.why
+    if not one.simulated:
+        return "too small to see"
+    if one.outliers >= MIN_OUTLIERS:
+        return "visible pixels"
+    return "visible" if one.ratio > tolerance else "too much together with the omitted effects"
+
+
+# ------------------------------------------------------------------------------------------------- scene and warnings
+
+
+def scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
+    """Return the scene, and what of it the noise profile uses.
+
+    Parameters
+    ----------
+    config : Config
+        Config of the run.
+    plans : sequence of Plan
+        At least one plan.
+
+    Returns
+    -------
+    str
+        Name, ISO, exposure, temperature and division of the light; then what is used and what is ignored.
+    """
+    physics = [plan.physics for plan in plans if plan.physics is not None]
+    scene, noise = config.scene, config.noise
+    if physics:
+        iso, seconds = value_range([one.iso for one in physics]), value_range([one.exposure_s for one in physics])
+        celsius = value_range([one.temperature_c for one in physics])
+    else:
+        iso, seconds, celsius = (_written(value) for value in (scene.iso, scene.exposure_s, scene.temperature_c))
+    ratio = value_range([plan.exposure_ratio for plan in plans], 4)
+    text = f"{plans[0].scene}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}"
+    if not physics:
+        return f"{text}; {noise.name} uses only the light, and ignores ISO, time and temperature"
+    used, ignored = ["light"], []
+    (ignored if noise.iso is not None else used).append("ISO")
+    heated = [name for name in ("dark_current", "hot_pixels") if missing_number(noise, name) is None]
+    (used if heated else ignored).extend(("time", "temperature"))
+    uses = f"{', '.join(used[:-1])} and {used[-1]}" if len(used) > 1 else used[0]
+    rest = f", and ignores {' and '.join(ignored)}" if ignored else ""
+    rest += " (noise.iso is used)" if noise.iso is not None else ""
+    return f"{text}; {noise.name} uses {uses}{rest}"
+
+
+def _written(value: object) -> str:
+    """Return a number of the config, or the numbers of a distribution."""
+    if isinstance(value, list):
+        numbers = [f"{one:g}" for one in value if isinstance(one, int | float)]
+        return " to ".join(numbers) if value and value[0] == "uniform" else ", ".join(numbers)
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def scene_warning(config: Config, plans: Sequence[Plan], levels: Sequence[int]) -> str | None:
+    """Return a warning if a dark scene meets a profile with two numbers, which ignores its ISO.
+
+    Parameters
+    ----------
+    config : Config
+        Config of the run.
+    plans : sequence of Plan
+        Plans of the images that were read.
+    levels : sequence of int
+        Distinct DN in their clean frames; empty for float32.
+
+    Returns
+    -------
+    str or None
+        One sentence that names the physical profiles.
+    """
+    ratios = [plan.exposure_ratio for plan in plans]
+    if is_physical(config.noise) or max(ratios) <= 1:
+        return None
+    left = f", which leaves {value_range(levels)} distinct DN in a clean frame" if levels else ""
+    return (
+        f"scene={config.scene.name}: light is divided by {value_range(ratios, 3)}{left}, but noise={config.noise.name} "
+        f"is the noise of one ISO, not of ISO {_written(config.scene.iso)}; physical profiles follow the scene: "
+        f"{', '.join(physical_profiles())}"
+    )
+
+
+def physical_profiles() -> list[str]:
+    """Return the names of the built-in physical noise profiles.
+
+    Returns
+    -------
+    list of str
+        Options of the group ``noise``.
+    """
+    folder = conf_dir() / "noise"
+    return [name for name in group_options("noise") if "branches" in read_yaml_mapping(folder / f"{name}.yaml")]
+
+
+POSTERISED_BELOW = 256
+"""Levels between black and the white of a darkened scene below which ``plan`` warns: fewer than 8-bit codes."""
+
+
+def rounding_psnr_db(span_dn: float, exposure_ratio: float) -> float:
+    """Return the PSNR at which the rounding of clean frames ends every comparison with them.
+
+    The rounding error is uniform in ±½ DN, so its mean square is 1/12 DN². White of the darkened scene is
+    ``span_dn / exposure_ratio`` above black. A denoiser that returned the unrounded mean would have
+    20 log10(√12 · span / ratio).
+
+    Parameters
+    ----------
+    span_dn : float
+        White level minus black level, DN.
+    exposure_ratio : float
+        Divisor of the light.
+
+    Returns
+    -------
+    float
+        Decibels, with the white of the darkened scene as the peak.
+    """
+    return 20 * math.log10(math.sqrt(12) * span_dn / exposure_ratio)
+
+
+def posterisation_warning(plans: Sequence[Plan], levels: Sequence[int]) -> str | None:
+    """Return a warning if rounded clean frames have few levels.
+
+    Parameters
+    ----------
+    plans : sequence of Plan
+        Plans of the images that were read.
+    levels : sequence of int
+        Distinct DN in their clean frames; empty for float32.
+
+    Returns
+    -------
+    str or None
+        One sentence with the levels, the limit of the PSNR and the remedy.
+    """
+    spans = [(plan.white_level_dn - plan.black_level_dn, plan.exposure_ratio) for plan in plans]
+    if not levels or min(span / ratio for span, ratio in spans) >= POSTERISED_BELOW:
+        return None
+    limits = [rounding_psnr_db(span, ratio) for span, ratio in spans]
+    bound = value_range([round(limit, 1) for limit in limits])
+    return (
+        f"clean frames are rounded to {value_range(levels)} levels; compared with them no denoiser exceeds a PSNR of "
+        f"{bound} dB (peak: white of the darkened scene); output.clean_dtype=float32 keeps the unrounded mean"
+    )
