@@ -169,7 +169,7 @@ def assumed_text(noise: NoiseConfig, effect: str) -> str:
 def effect_table(config: Config, predictions: Predictions) -> list[str]:
     """Return one line per effect: the image in which it is strongest, and how often it is simulated.
 
-    Hot and dead pixels are judged by the number of pixels that stand out of the noise, other effects by their ratio to
+    Hot and dead pixels are judged by the number of pixels that exceed the noise, other effects by their ratio to
     the noise that hides them.
 
     Parameters

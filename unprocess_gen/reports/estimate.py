@@ -51,6 +51,9 @@ SAMPLE = 16
 COMMIT_SECONDS = 0.045
 """Time to sync and rename a shard (``docs/design/dataset_format.md``)."""
 
+IMPORT_SECONDS = min(time.process_time(), 3.0)
+"""Time that a process needs for its imports and settings: what this one took so far, unless it did something else."""
+
 TRIAL_BYTES = 2**24
 """Bytes written to measure the disk."""
 
@@ -183,7 +186,7 @@ def estimate_run(
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
     shards = -(-len(sources) // config.output.pairs_per_shard)
     n_jobs = min(n_jobs, shards)
-    start_seconds = time.process_time() * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
+    start_seconds = IMPORT_SECONDS * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
     start_seconds += _compile_kernels(config, (tiers or {}).values())
     estimates = tuple(estimate_source(config, source) for source in chosen)
     exact = len(chosen) == len(sources)
