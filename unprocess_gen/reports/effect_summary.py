@@ -243,7 +243,8 @@ def scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
     text = f"{plans[0].scene}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}"
     if not physics:
         return f"{text}; {noise.name} uses only the light, and ignores ISO, time and temperature"
-    used, ignored = ["light"], []
+    used: list[str] = ["light"]
+    ignored: list[str] = []
     (ignored if noise.iso is not None else used).append("ISO")
     heated = [name for name in ("dark_current", "hot_pixels") if missing_number(noise, name) is None]
     (used if heated else ignored).extend(("time", "temperature"))
