@@ -7,7 +7,6 @@ import numpy as np
 from unprocess_gen.core.jit import inner, kernel
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
-from unprocess_gen.simulation.kernels.electrons import _store_rate
 from unprocess_gen.simulation.kernels.normal import (
     Quantiles,
     apply_signs,
@@ -19,20 +18,17 @@ from unprocess_gen.simulation.kernels.normal import (
     fine_normal,
 )
 from unprocess_gen.simulation.kernels.poisson import (
-    MAX_FLOAT32_RATE,
+    LOW_RATE,
     CountTables,
-    Rates,
-    _count_by_expansion,
-    _count_by_thresholds,
-    _survey,
     count_tables,
+    count_thresholds,
     exact_count,
     fill_counts,
+    fill_counts_of_one_rate,
 )
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, pointers_of, store
 from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Scratch, Workspace, scratch_of_thread, workspace_in
 
-_ZERO, _INFINITY = np.float32(0), np.float32(np.inf)
 _WIDTH = np.uint64(VECTOR_WIDTH)
 
 
@@ -106,10 +102,13 @@ def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
 
 
 def counts(words: Words, rates: Float) -> Float:
-    """Return the Poisson counts of words, with the arguments of `reference.poisson.poisson`."""
-    out = np.full(words.shape, np.nan)
-    _fill_counts(words.astype(np.uint32), rates.astype(np.float64), count_tables(), scratch_of_thread(), out)
-    return out
+    """Return the Poisson counts of words, with the arguments of `reference.poisson.poisson`.
+
+    Draw as `electrons` does: counts that are not certain are computed exactly.
+    """
+    found, error = approximate_counts(words, rates)
+    exact = exact_counts(words, rates)
+    return np.where(error > 0, exact, found.astype(np.float64))
 
 
 def exact_counts(words: Words, rates: Float) -> Float:
@@ -119,36 +118,25 @@ def exact_counts(words: Words, rates: Float) -> Float:
     return out
 
 
-def approximate_counts(words: Words, rates: Float, tables: CountTables | None = None) -> tuple[Float32, np.ndarray]:
-    """Return counts before uncertain ones are replaced, and the mask of uncertain ones."""
-    out, is_listed = np.full(words.shape, np.nan, dtype=np.float32), np.zeros(words.shape, dtype=np.bool_)
-    _fill_approximate(words.astype(np.uint32), rates, tables or count_tables(), scratch_of_thread(), out, is_listed)
-    return out, is_listed
+def approximate_counts(
+    words: Words, rates: Float, tables: CountTables | None = None, rate_error: float = 0.0
+) -> tuple[Float32, Float32]:
+    """Return counts before uncertain ones are replaced, and bounds of their errors, 0 where they are certain.
+
+    ``rate_error`` is the relative error of the rates in float32, in addition to rounding.
+    """
+    out, error = np.full((2, words.size), np.nan, dtype=np.float32)
+    with np.errstate(under="ignore"):
+        near = (rates.astype(np.float64) * (1 + rate_error)).astype(np.float32)
+    _fill_approximate(words.astype(np.uint32), near, tables or count_tables(), scratch_of_thread(), out, error)
+    return out, error
 
 
-@inner
-def _load_rates(words: Words, rates: Float, start: int, length: int, total: int, buffers: Workspace) -> None:
-    """Load ``length`` words and rates from index ``start``, and repeat the last ones up to ``total``."""
-    for n in range(total):
-        at = start + min(n, length - 1)
-        buffers.words[n] = words[at]
-        _store_rate(n, rates[at], buffers)
-
-
-@kernel
-def _fill_counts(words: Words, rates: Float, tables: CountTables, scratch: Scratch, out: Float) -> None:
-    """Draw as `electrons` does: counts of rates beyond float32's integers are computed exactly."""
-    buffers, of, every = workspace_in(scratch, 0), pointers_of(tables), (_ZERO, _INFINITY)
-    given = Rates(buffers.rates, buffers.rounded_e, buffers.residual_e, buffers.root, buffers.inverse)
-    for start in range(0, words.size, SIZE):
-        length = min(SIZE, words.size - start)
-        total = -(-length // VECTOR_WIDTH) * VECTOR_WIDTH
-        _load_rates(words, rates, start, length, total, buffers)
-        fill_counts(total, buffers.words, given, every, of, buffers, buffers.electrons)
-        for n in range(length):
-            out[start + n] = np.float64(buffers.electrons[n])
-            if rates[start + n] > MAX_FLOAT32_RATE:
-                out[start + n] = exact_count(words[start + n], rates[start + n], of)
+def counts_of_one_rate(words: Words, rate: float) -> Float32:
+    """Return the Poisson counts of words by the thresholds of one rate."""
+    out = np.full(words.shape, np.nan, dtype=np.float32)
+    _fill_of_one_rate(words.astype(np.uint32), *count_thresholds(rate), scratch_of_thread(), out)
+    return out
 
 
 @kernel
@@ -158,25 +146,37 @@ def _fill_exact_counts(words: Words, rates: Float, tables: CountTables, out: Flo
         out[n] = exact_count(words[n], rates[n], of)
 
 
+@inner
+def _load_words(words: Words, start: int, length: int, buffers: Workspace) -> None:
+    """Load ``length`` words from index ``start``, and repeat the last one to fill complete blocks."""
+    for n in range(SIZE):
+        buffers.words[n] = words[start + min(n, length - 1)]
+
+
 @kernel
 def _fill_approximate(
-    words: Words, rates: Float, tables: CountTables, scratch: Scratch, out: Float32, is_listed: np.ndarray
+    words: Words, rates: Float32, tables: CountTables, scratch: Scratch, out: Float32, error: Float32
 ) -> None:
-    buffers, of, every = workspace_in(scratch, 0), pointers_of(tables), (_ZERO, _INFINITY)
-    given = Rates(buffers.rates, buffers.rounded_e, buffers.residual_e, buffers.root, buffers.inverse)
+    buffers, of = workspace_in(scratch, 0), pointers_of(tables)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
-        total = -(-length // VECTOR_WIDTH) * VECTOR_WIDTH
-        _load_rates(words, rates, start, length, total, buffers)
-        fill_values_by_lines(total, buffers.words, of.lines, buffers.lines, buffers.normals)
-        found = 0
-        has_low, has_high, _ = _survey(total, buffers.root, every)
-        if has_low:
-            found = _count_by_thresholds(total, given, every, of, buffers, buffers.electrons)
-        if has_high:
-            found = _count_by_expansion(total, given, every, found, buffers, buffers.electrons)
+        _load_words(words, start, length, buffers)
+        highest = np.float32(0)
+        for n in range(SIZE):
+            buffers.rates[n] = rates[start + min(n, length - 1)]
+            highest = max(highest, buffers.rates[n])
+        has_high = highest >= LOW_RATE
+        fill_counts(SIZE, buffers.words, buffers.rates, has_high, of, buffers, buffers.electrons, buffers.error_e)
         for n in range(length):
-            out[start + n] = buffers.electrons[n]
-        for n in range(found):
-            if buffers.uncertain[n] < length:
-                is_listed[start + buffers.uncertain[n]] = True
+            out[start + n], error[start + n] = buffers.electrons[n], buffers.error_e[n]
+
+
+@kernel
+def _fill_of_one_rate(words: Words, smallest: int, ranks: np.ndarray, scratch: Scratch, out: Float32) -> None:
+    buffers, of = workspace_in(scratch, 0), pointer_to(ranks, 0)
+    for start in range(0, words.size, SIZE):
+        length = min(SIZE, words.size - start)
+        _load_words(words, start, length, buffers)
+        fill_counts_of_one_rate(SIZE, buffers.words, smallest, of, ranks.size, buffers.dark)
+        for n in range(length):
+            out[start + n] = buffers.dark[n]

@@ -11,7 +11,7 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
-from helpers.kernels import approximate_counts, exact_counts, values_by_lines
+from helpers.kernels import approximate_counts, counts_of_one_rate, exact_counts, values_by_lines
 from helpers.kernels import counts as fast
 from helpers.moments import bernstein
 from helpers.promise_report import Figure
@@ -21,7 +21,14 @@ from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.simulation.kernels import poisson as kernels
 from unprocess_gen.simulation.kernels.normal import normal_quantiles
-from unprocess_gen.simulation.kernels.poisson import LOW_ROOT, MAX_FLOAT32_RATE, count_tables
+from unprocess_gen.simulation.kernels.poisson import (
+    EXPANSION_ERRORS,
+    FLOAT32_RATE,
+    LOW_RATE,
+    MAX_THRESHOLD_RATE,
+    NORMAL_REACH,
+    count_thresholds,
+)
 from unprocess_gen.simulation.reference import poisson as poissons
 from unprocess_gen.simulation.reference.noise import normals
 from unprocess_gen.simulation.reference.poisson import LIMIT, poisson, poisson_tables
@@ -259,18 +266,16 @@ def test_the_guess_leaves_two_counts_in_every_cell() -> None:
     assert (fast(*every) == poisson(*every)).all()
 
 
-def short(words: np.ndarray, rate: float) -> np.ndarray:
-    """Return x by the short form as compiled: approximate normals, float32, without the integer part of the rate."""
-    quick = values_by_lines(words, normal_quantiles())
-    a, b = (np.array(one, dtype=np.float32) for one in (poissons.A, poissons.B))
-    root = np.sqrt(np.float32(rate))
-    s = quick * (np.float32(1) / root)
+def first_terms(words: np.ndarray, rate: float) -> np.ndarray:
+    """Return x by the first terms as compiled: approximate normals, float32, without the integer part of the rate."""
+    z, near, f = values_by_lines(words, normal_quantiles()), np.float32(rate), np.float32
+    c, reciprocal = kernels._FIRST_TERMS, f(1) / near
+    s = z * (np.sqrt(near) * reciprocal)
     s2 = s * s
-    powers_a = (a[0] + s * a[1]) + s2 * ((a[2] + s * a[3]) + s2 * a[4])
-    powers_b = (b[0] + s * b[1]) + s2 * (b[2] + s * b[3])
-    x = (np.float32(rate - np.rint(rate)) + root * quick) + (quick * quick * powers_a + powers_b)
-    assert x.dtype == np.float32
-    return np.asarray(np.rint(rate) + x.astype(np.float64))
+    terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
+    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * kernels._FIRST_OF_RATE)
+    assert rest.dtype == np.float32
+    return np.asarray(np.float64(near) + rest.astype(np.float64))
 
 
 def real_quantile(rate: float, w: float) -> float:
@@ -286,18 +291,18 @@ def real_quantile(rate: float, w: float) -> float:
 
 
 @pytest.mark.parametrize(
-    "rate", [6.0, 6.7, 8.3, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
+    "rate", [LOW_RATE, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
 )
-def test_the_short_form_is_within_its_error(rate: float) -> None:
-    """The margin is a factor of 1.5, for the words between those that are tested."""
-    w = np.linspace(-poissons.SHORT_REACH, poissons.SHORT_REACH, 37 if rate < LIMIT else 4001)
+def test_the_first_terms_are_within_their_error(rate: float) -> None:
+    """What remains of the bound is for the words between those that are tested."""
+    w = np.linspace(-NORMAL_REACH, NORMAL_REACH, 201 if rate < LIMIT else 4001)
     index = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in w]
     words = np.array([min(int(i), SIGN - 1) | SIGN * (v < 0) for i, v in zip(index, w, strict=True)], dtype=np.uint32)
     z = normals(words)  # to 1.5e-7
     exact = [real_quantile(rate, v) for v in z] if rate < LIMIT else poissons.expansion(np.full(z.shape, rate), z)
-    claimed = poissons.NORMAL_ERROR * (8 + math.sqrt(rate)) + poissons.SHORT_ERROR / rate
-    claimed += poissons.LOW_ERROR / rate**3
-    assert np.abs(short(words, rate) - exact).max() <= claimed / 1.5
+    constant, of_rate, of_reciprocal = EXPANSION_ERRORS
+    claimed = constant + of_rate * rate + of_reciprocal / rate
+    assert np.abs(first_terms(words, rate) - exact).max() <= claimed - FLOAT32_RATE * rate
 
 
 # Approximate counts ---------------------------------------------------------------------------------------------------
@@ -316,71 +321,98 @@ def words_near_changes(rate: float, dense: int) -> np.ndarray:
     return word(np.unique(np.clip(ranks, 0, WORDS - 1)))
 
 
-def wrong_and_not_listed(rate: float, dense: int) -> int:
+def wrong(rate: float, dense: int, rate_error: float = 0.0) -> int:
+    """Return how many counts are farther from the exact ones than their bounds."""
     words = words_near_changes(rate, dense)
     rates = np.full(words.shape, rate)
-    approximate, is_listed = approximate_counts(words, rates)
-    return int(((approximate != poisson(words, rates)) & ~is_listed).sum())
+    approximate, error = approximate_counts(words, rates, rate_error=rate_error)
+    return int((np.abs(approximate - poisson(words, rates)) > error).sum())
 
 
-CELLS = 16 * LOW_ROOT
-"""Cells of the threshold tables, in the square root of the rate."""
+CELLS = 64
+"""Cells of √rate below rate 16 in which counts are tested."""
 
 
+@pytest.mark.parametrize("rate_error", [-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE])
 @pytest.mark.parametrize(
     ("inside", "dense"),
     [
-        pytest.param((1e-7, 0.13, 0.5, 0.87, 1 - 1e-7), 400, id="five rates"),
+        pytest.param((1e-7, 0.5, 1 - 1e-7), 400, id="three rates"),
         pytest.param(np.linspace(1e-9, 1 - 1e-9, 17), 5000, id="many rates", marks=pytest.mark.slow),
     ],
 )
-def test_counts_by_thresholds_are_right_or_listed(inside: tuple[float, ...], dense: int) -> None:
+def test_counts_of_low_rates_are_within_their_bounds(inside: tuple[float, ...], dense: int, rate_error: float) -> None:
     """Rates are in every cell and next to its ends, words where counts change and everywhere between."""
-    wrong = {}
+    found = {}
     for cell, part in itertools.product(range(CELLS), inside):
         rate = ((cell + part) / 16) ** 2
-        if number := wrong_and_not_listed(rate, dense):
-            wrong[rate] = number
-    assert wrong == {}
+        if number := wrong(rate, dense, rate_error):
+            found[rate] = number
+    assert found == {}
 
 
-@pytest.mark.parametrize("rate", [16.0, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, MAX_FLOAT32_RATE])
-def test_counts_by_expansion_are_right_or_listed(rate: float) -> None:
-    assert wrong_and_not_listed(rate, 20_000) == 0
+@pytest.mark.parametrize("rate_error", [-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE])
+@pytest.mark.parametrize("rate", [8.0, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21])
+def test_counts_by_expansion_are_within_their_bounds(rate: float, rate_error: float) -> None:
+    assert wrong(rate, 20_000, rate_error) == 0
 
 
-def test_a_wrong_threshold_is_found() -> None:
-    """A threshold is moved by twice its error bound, which shows that the tests above would find it."""
-    rate, right = ((40 + 0.5) / 16) ** 2, count_tables()
-    row = 40 * 64 + math.floor(rate)
-    start = right.thresholds[row : row + 1].view(np.float32)[0] + np.float32(2 * right.errors[40])
-    wrong = right.thresholds.copy()
-    wrong[row : row + 1].view(np.float32)[0] = start
-    words = words_near_changes(rate, 400)
-    rates = np.full(words.shape, rate)
-    approximate, is_listed = approximate_counts(words, rates, right._replace(thresholds=wrong))
-    assert ((approximate != poisson(words, rates)) & ~is_listed).any()
+@pytest.mark.parametrize("rate", [1.0, 5.0, 8.5, 25.0, 1e4])
+def test_a_rate_beyond_its_error_is_found(rate: float) -> None:
+    """The tests above would find counts that are outside their bounds."""
+    assert wrong(rate, 400, rate_error=4000 * FLOAT32_RATE) > 0
 
 
 @pytest.mark.parametrize(
     ("rate", "share"),
-    [(0.1, 0.004), (1.0, 0.004), (4.0, 0.004), (15.9, 0.004), (16.1, 0.02), (64.0, 0.004), (1e4, 0.004)],
+    [
+        (0.01, 0.004),
+        (0.1, 0.004),
+        (0.3, 0.004),
+        (1.0, 0.004),
+        (4.0, 0.004),
+        (7.9, 0.004),
+        (8.1, 0.01),
+        (16.1, 0.007),
+        (64.0, 0.004),
+        (1e4, 0.014),
+    ],
 )
 def test_few_counts_are_uncertain(rate: float, share: float, figure: Figure) -> None:
-    """Each costs as much as a hundred approximate ones."""
+    """Each costs as much as tens of approximate ones."""
     words = np.random.default_rng(13).integers(0, WORDS, 2**18, dtype=np.uint32)
-    listed = approximate_counts(words, np.full(words.shape, rate))[1].mean()
+    listed = (approximate_counts(words, np.full(words.shape, rate))[1] > 0).mean()
     assert listed <= share
     figure("poisson", f"{listed:.2%} of counts are computed twice at rate {rate:g}")
 
 
-def test_approximate_counts_of_huge_rates_are_near() -> None:
+def test_bounds_hold_for_huge_rates() -> None:
     """Counts beyond float32's integers are rounded to float32; the read-out allows for that error."""
-    rates = np.geomspace(MAX_FLOAT32_RATE, 1e9, 20_000)
+    rates = np.geomspace(2.0**20, 1e9, 20_000)
     words = np.random.default_rng(14).integers(0, WORDS, rates.size, dtype=np.uint32)
-    approximate, is_listed = approximate_counts(words, rates)
-    off = np.abs(approximate.astype(np.float64) - poisson(words, rates))[~is_listed]
-    assert (off <= rates[~is_listed] * 2.0**-23 + 1).all()
+    approximate, error = approximate_counts(words, rates)
+    off = np.abs(approximate.astype(np.float64) - poisson(words, rates))
+    assert (off <= error + rates * 2.0**-23).all()
+    assert (error[rates > 2.0**22] > 0).all()
+
+
+# One rate everywhere --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "rate", [0.0, 1e-12, 1e-6, 0.01, 0.0400001, 0.06, 0.3, 1.0, 3.7, 7.99, 12.5, MAX_THRESHOLD_RATE]
+)
+def test_counts_by_thresholds_equal_the_reference_for_every_word(rate: float) -> None:
+    """Counts change only at the thresholds, so the words next to them decide for all."""
+    smallest, ranks = count_thresholds(rate)
+    edges = (ranks.astype(np.int64)[:, None] + np.arange(-2, 4)).ravel()
+    dense = np.random.default_rng(15).integers(0, WORDS, 20_000)
+    words = word(np.unique(np.clip(np.concatenate([edges, dense, [0, SIGN - 1, SIGN, WORDS - 1]]), 0, WORDS - 1)))
+    expected = poisson(words, np.full(words.shape, rate))
+    assert (counts_of_one_rate(words, rate) == expected).all()
+    assert smallest == expected[0]
+    assert smallest + len(ranks) == expected[-1]
+    assert (np.diff(ranks.astype(np.int64)) > 0).all() or rate < 1e-9
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 7])

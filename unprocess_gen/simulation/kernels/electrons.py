@@ -28,6 +28,7 @@ from unprocess_gen.simulation.kernels.normal import (
     exact_value,
     fill_values_by_lines,
     normal_quantiles,
+    value_by_line,
 )
 from unprocess_gen.simulation.kernels.philox import (
     KEY_STEP0,
@@ -39,23 +40,30 @@ from unprocess_gen.simulation.kernels.philox import (
     philox_round,
 )
 from unprocess_gen.simulation.kernels.poisson import (
-    MAX_FLOAT32_RATE,
+    FLOAT32_RATE,
+    LOW_RATE,
+    MAX_THRESHOLD_RATE,
     CountTables,
-    Rates,
     count_tables,
+    count_thresholds,
     exact_count,
     fill_counts,
+    fill_counts_of_one_rate,
 )
 from unprocess_gen.simulation.kernels.rounding import ROUND
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
+    absolute,
     from_bits,
+    less_than,
     load,
+    maximum,
     minimum,
     pointer_to,
+    select,
+    square_root,
     store,
-    to_bits,
 )
 from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, padded_width
 from unprocess_gen.simulation.reference import noise as reference_noise
@@ -73,8 +81,12 @@ Below it the steps of single electrons show, which no normal has: the Kolmogorov
 noise and 0.001/√rate at this value, in addition to the 0.07/√rate of `accuracy.gaussian_distance` (skewness).
 """
 
-_8, _WITHOUT_SIGN = np.uint64(8), np.uint32(0x7FFFFFFF)
-_ONE32, _FLOAT32_ERROR32 = np.float32(1), np.float32(FLOAT32_ERROR_DN)
+MAX_STEPS = 64
+"""Most thresholds of `poisson.count_thresholds`."""
+
+_0, _8, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint32(0x7F800000)
+_ZERO32, _FLOAT32_ERROR32 = np.float32(0), np.float32(FLOAT32_ERROR_DN)
+_RATE_ERROR32, _NORMAL_ERROR32 = np.float32(FLOAT32_RATE), np.float32(2.0**-19)
 _LANES = np.uint64(LANES)
 
 
@@ -88,6 +100,7 @@ class Electrons(NamedTuple):
     columns_dn: Float  # [N, P]
     errors_dn: Float  # [N, 2, 2]: black-level errors of the sites of a tile
     base_dn: Float32  # [N, 2, P]: black level, column and black-level error
+    dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
     body: Body
@@ -106,6 +119,8 @@ class _Numbers(NamedTuple):
     a_dn: float  # variance line
     b_dn2: float
     dark_e: float = 0.0
+    dark_steps: float = 0.0  # thresholds of the dark signal; below 0 if it has too many
+    fewest_dark: float = 0.0  # smallest count of the dark signal
     removed_e: float = 0.0  # mean dark signal that the camera subtracts
     kept_dark_dn: float = 0.0  # in a clean frame with fixed patterns
     full_well_e: float = np.inf
@@ -124,7 +139,7 @@ def electron_noise(
     """Return the noise of frames of one body; ``counts_all`` forbids normals in place of counts."""
     first, columns = origin[1] % BLOCK, padded_width(origin[1], shape[1])
     frames = [_frame(plan, (origin[0], origin[1] - first), columns, counts_all) for plan in plans]
-    numbers, purposes, quantiles, columns_dn, errors_dn = ([*members] for members in zip(*frames, strict=True))
+    numbers, purposes, quantiles, columns_dn, errors_dn, ranks = ([*members] for members in zip(*frames, strict=True))
     black_dn, base_dn = float(plans[0].black_level_dn), np.empty((len(plans), 2, columns), dtype=np.float32)
     for base, column_dn, error_dn in zip(base_dn, columns_dn, errors_dn, strict=True):
         for y in range(2):
@@ -138,6 +153,7 @@ def electron_noise(
         columns_dn=_stack(columns_dn),
         errors_dn=_stack(errors_dn),
         base_dn=base_dn,
+        dark_ranks=_stack(ranks),
         padded_width=columns,
         black_dn=black_dn,
         body=body,
@@ -150,7 +166,8 @@ def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-_Frame = tuple[_Numbers, np.uint64, Quantiles, Float, Float]
+_Frame = tuple[_Numbers, np.uint64, Quantiles, Float, Float, NDArray[np.uint32]]
+_NO_RANKS = np.zeros(MAX_STEPS, dtype=np.uint32)
 
 
 def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) -> _Frame:
@@ -174,11 +191,14 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     )
     most_dark_dn = physics.dn_per_e * (dark_e + 8 * float(np.sqrt(dark_e)) + 40) if dark_e else 0.0
     lowest_root, highest_root = _count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
+    fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
     a_dn, b_dn2 = plan.variance_line
     numbers = _Numbers(
         dn_per_e=physics.dn_per_e,
         shot=float("shot" in on),
         dark_e=dark_e,
+        dark_steps=-1.0 if ranks is None else len(ranks),
+        fewest_dark=fewest_dark,
         removed_e=removed_e,
         kept_dark_dn=0.0 if removed_e else dark_e * physics.dn_per_e,
         full_well_e=physics.full_well_e if "full_well" in on else np.inf,
@@ -190,7 +210,8 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         a_dn=a_dn,
         b_dn2=b_dn2,
     )
-    return numbers, READ, quantiles, columns_dn, errors_dn
+    dark_ranks = _NO_RANKS if ranks is None else np.resize(ranks, MAX_STEPS)
+    return numbers, READ, quantiles, columns_dn, errors_dn, dark_ranks
 
 
 @functools.lru_cache(maxsize=8)
@@ -215,7 +236,7 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
         a_dn=a_dn,
         b_dn2=b_dn2,
     )
-    return numbers, HETEROSCEDASTIC, quantiles, np.zeros(columns), np.zeros((2, 2))
+    return numbers, HETEROSCEDASTIC, quantiles, np.zeros(columns), np.zeros((2, 2)), _NO_RANKS
 
 
 def _error_dn(read_std_dn: float, quantiles: Quantiles, offset_dn: float, most_dark_dn: float) -> float:
@@ -246,7 +267,7 @@ def _read_quantiles(law: str, shape: float) -> Quantiles:
 @inner
 def _load_numbers(noise: Electrons, n: int) -> _Numbers:
     v = pointer_to(noise.numbers, np.uint64(n * NUMBERS))
-    return _Numbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12])
+    return _Numbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14])
 
 
 @inner
@@ -261,70 +282,69 @@ def add_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, worksp
     per_e, std, full_well_e, margin = f(of.dn_per_e), f(of.read_std_dn), f(of.full_well_e), f(of.error_dn)
     row_dn = f(workspace.row_dn[0])
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
-    electrons = workspace.total_e if of.dark_e > 0.0 else workspace.electrons
+    has_dark = of.dark_e > 0.0
+    electrons = workspace.total_e if has_dark else workspace.electrons
+    error_e = workspace.total_error_e if has_dark else workspace.error_e
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         dn = minimum(load(electrons, x), full_well_e) * per_e + (
             load(workspace.normals, x) * std + (load(base, x) + row_dn)
         )
         store(workspace.noise_dn, x, dn)
-        store(workspace.error_dn, x, from_bits(to_bits(dn) & _WITHOUT_SIGN) * _FLOAT32_ERROR32 + margin)
+        store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (load(error_e, x) * per_e + margin))
     return workspace.zeros
 
 
 @inner
 def _count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``electrons``, ``dark`` and ``defects``, and the words of the read noise."""
+    """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, and all words."""
     of, tables = _load_numbers(noise, n), noise.tables
-    rates = Rates(workspace.rates, workspace.rounded_e, workspace.residual_e, workspace.root, workspace.inverse)
-    _fill_words_and_rates(noise, key, noise.read_purposes[n] | key[2], of.dn_per_e, strip, workspace)
-    roots = np.float32(of.lowest_root), np.float32(of.highest_root)
+    _fill_words(key, noise.read_purposes[n] | key[2], strip, workspace.words, workspace.read_words)
     workspace.row_dn[0] = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
-    if of.shot > 0.0:
-        fill_counts(strip.total, workspace.words, rates, roots, tables, workspace, workspace.electrons)
-    else:
-        for x in range(strip.total):
-            workspace.electrons[x] = np.float32(workspace.rates[x])
     if of.dark_e > 0.0:
         fill_word_blocks(key, strip, DARK, workspace.dark_words)
-        dark = Rates(workspace.dark_rates, workspace.rounded_e, workspace.residual_e, workspace.root, workspace.inverse)
-        _fill_equal_rates(of.dark_e, strip.total, dark)
-        every = np.float32(0), np.float32(np.inf)
-        fill_counts(strip.total, workspace.dark_words, dark, every, tables, workspace, workspace.dark)
+    counted = 2 if of.dark_steps < 0.0 else 1
+    for stream in range(counted):  # a loop, so that machine code contains `fill_counts` once
+        is_shot = stream == 0
+        if is_shot:
+            highest = _fill_rates(noise, of.dn_per_e, strip, workspace)
+        else:
+            highest = np.float32(of.dark_e)
+            for x in range(strip.total):
+                workspace.rates[x] = highest
+        words, out, error = workspace.words, workspace.electrons, workspace.error_e
+        if not is_shot:
+            words, out, error = workspace.dark_words, workspace.dark, workspace.dark_error_e
+        fill_counts(strip.total, words, workspace.rates, highest >= LOW_RATE, tables, workspace, out, error)
+        if is_shot:
+            if of.shot == 0.0:
+                _keep_means(strip.total, workspace)
+            elif of.lowest_root > 0.0 or of.highest_root < np.inf:
+                _replace_by_normals(strip.total, of, tables, workspace)
+    if of.dark_e > 0.0:
+        if of.dark_steps >= 0.0:
+            ranks = pointer_to(noise.dark_ranks, n * MAX_STEPS)
+            words, steps = workspace.dark_words, int(of.dark_steps)
+            fill_counts_of_one_rate(strip.total, words, int(of.fewest_dark), ranks, steps, workspace.dark)
+            for x in range(strip.total):
+                workspace.dark_error_e[x] = 0.0
         removed_e = np.float32(of.removed_e)
         for x in range(strip.total):
             workspace.total_e[x] = workspace.electrons[x] + (workspace.dark[x] - removed_e)
+            workspace.total_error_e[x] = workspace.error_e[x] + workspace.dark_error_e[x]
     first, after = _defects_of(noise.body, strip)
     if first < after:
         _draw_defects(noise, key, first, after, strip, workspace)
 
 
 @inner
-def _fill_words_and_rates(
-    noise: Electrons, key: PhiloxKey, read_purpose: np.uint64, dn_per_e: float, strip: Strip, workspace: Workspace
-) -> None:
-    """Fill the words of shot and read noise, and the mean electrons with their roots and reciprocals.
-
-    One loop: divisions and roots keep the divider busy, Philox the other units. It is written out for the four words of
-    a counter, as in `philox.fill_word_blocks`.
-    """
-    black, clean_dn = noise.black_dn, workspace.unrounded_dn
-    shot, read = workspace.words, workspace.read_words
-    row, column = noise.body.response_steps
-    response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
+def _fill_words(key: PhiloxKey, read_purpose: np.uint64, strip: Strip, shot: Pointer, read: Pointer) -> None:
+    """Fill the words of shot and read noise; written out for the words of a counter as `philox.fill_word_blocks`."""
     for block in range(strip.blocks):
         counter = (strip.block + np.uint64(block)) * _LANES
         for lane in range(LANES):
             x0 = block * BLOCK - strip.lead + lane
             x1, x2, x3 = x0 + LANES, x0 + 2 * LANES, x0 + 3 * LANES
-            rate0 = (clean_dn[x0] - black) / dn_per_e * np.float64(response[x0])
-            rate1 = (clean_dn[x1] - black) / dn_per_e * np.float64(response[x1])
-            rate2 = (clean_dn[x2] - black) / dn_per_e * np.float64(response[x2])
-            rate3 = (clean_dn[x3] - black) / dn_per_e * np.float64(response[x3])
-            _store_rate(x0, rate0, workspace)
-            _store_rate(x1, rate1, workspace)
-            _store_rate(x2, rate2, workspace)
-            _store_rate(x3, rate3, workspace)
             c0, c1, c2, c3 = counter + np.uint64(lane), strip.row, SHOT | key[2], key[3]
             d0, d1, d2, d3 = counter + np.uint64(lane), strip.row, read_purpose, key[3]
             k0, k1 = key[0], key[1]
@@ -339,21 +359,55 @@ def _fill_words_and_rates(
 
 
 @inner
-def _store_rate(x: int, rate: float, workspace: Workspace) -> None:
-    """Store a mean and what `poisson.fill_counts` needs of it."""
-    rounded = (rate + ROUND) - ROUND
-    root = np.sqrt(np.float32(rate))
-    workspace.rates[x], workspace.rounded_e[x] = rate, np.float32(rounded)
-    workspace.residual_e[x], workspace.root[x], workspace.inverse[x] = np.float32(rate - rounded), root, _ONE32 / root
+def _fill_rates(noise: Electrons, dn_per_e: float, strip: Strip, workspace: Workspace) -> np.float32:
+    """Fill ``rates`` (float32) with the mean electrons of shot noise; return the highest.
+
+    At most five roundings, as `poisson.FLOAT32_RATE` allows.
+    """
+    black, e_per_dn = np.float32(noise.black_dn), np.float32(1.0 / dn_per_e)
+    row, column = noise.body.response_steps
+    response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
+    highest = load(workspace.rounded_dn, _0) - load(workspace.rounded_dn, _0)
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        light_dn = (load(workspace.rounded_dn, x) - black) + load(workspace.residual_dn, x)
+        rate = light_dn * e_per_dn * load(response, x)
+        highest = maximum(rate, highest)
+        store(workspace.rates, x, rate)
+    store(workspace.errors, 0, highest)
+    most = workspace.errors[0]
+    for v in range(1, VECTOR_WIDTH):
+        most = max(most, workspace.errors[v])
+    return most
 
 
 @inner
-def _fill_equal_rates(rate: float, count: int, rates: Rates) -> None:
-    """Fill the buffers of `poisson.fill_counts` for one mean."""
-    rounded, root = (rate + ROUND) - ROUND, np.sqrt(np.float32(rate))
+def _keep_means(count: int, workspace: Workspace) -> None:
+    """Replace counts by their means."""
     for x in range(count):
-        rates.rates[x], rates.rounded[x] = rate, np.float32(rounded)
-        rates.residual[x], rates.root[x], rates.inverse[x] = np.float32(rate - rounded), root, np.float32(1) / root
+        workspace.electrons[x] = workspace.rates[x]
+        workspace.error_e[x] = workspace.rates[x] * _RATE_ERROR32
+
+
+@inner
+def _replace_by_normals(count: int, of: _Numbers, tables: CountTables, workspace: Workspace) -> None:
+    """Replace counts where a normal is near enough; sites so near the limits that float32 cannot tell are uncertain."""
+    low, high = of.lowest_root * of.lowest_root, of.highest_root * of.highest_root
+    f, more, less = np.float32, 1 + 4 * FLOAT32_RATE, 1 - 4 * FLOAT32_RATE
+    low_less, low_more, high_less, high_more = f(low * less), f(low * more), f(high * less), f(high * more)
+    fill_values_by_lines(count, workspace.words, tables.lines, workspace.lines, workspace.normals)
+    for v in range(count // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        rate = load(workspace.rates, x)
+        root = square_root(rate)
+        is_counted = less_than(low_more, rate) & less_than(rate, high_less)
+        is_open = (less_than(low_less, rate) & less_than(rate, low_more)) | (
+            less_than(high_less, rate) & less_than(rate, high_more)
+        )
+        normal = rate + root * load(workspace.normals, x)
+        error = maximum((rate + root) * _NORMAL_ERROR32 + _NORMAL_ERROR32, from_bits(is_open & _INFINITE_BITS32))
+        store(workspace.electrons, x, select(is_counted, load(workspace.electrons, x), normal))
+        store(workspace.error_e, x, select(is_counted, load(workspace.error_e, x), error))
 
 
 @inner
@@ -393,42 +447,69 @@ def clear_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
 def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
     """Return the noisy DN of one site, in the reference's order of operations."""
     of = _load_numbers(noise, n)
-    word, quadratics = workspace.read_words[x], pointer_to(noise.read_quadratics, n * 4096)
-    return float(_dn(noise, of, n, x, exact_value(word, quadratics), strip, workspace))
-
-
-@inner
-def _dn(noise: Electrons, of: _Numbers, n: int, x: int, read: float, strip: Strip, workspace: Workspace) -> float:
-    """Return the noisy DN of a site whose read noise is ``read`` standard deviations."""
     electrons = np.float64(workspace.electrons[x])
-    if of.shot == 0.0:
-        electrons = workspace.rates[x]
-    elif workspace.rates[x] > MAX_FLOAT32_RATE:
-        root = np.sqrt(np.float32(workspace.rates[x]))  # as `fill_counts` compares it
-        if root > np.float32(of.lowest_root) and root < np.float32(of.highest_root):
-            electrons = exact_count(workspace.words[x], workspace.rates[x], noise.tables)
+    if workspace.error_e[x] > _ZERO32:
+        electrons = _exact_shot(noise, of, x, strip, workspace)
     if of.dark_e > 0.0:
         dark = np.float64(workspace.dark[x])
-        if of.dark_e > MAX_FLOAT32_RATE:
+        if workspace.dark_error_e[x] > _ZERO32:
             dark = exact_count(workspace.dark_words[x], of.dark_e, noise.tables)
         electrons = electrons + (dark - of.removed_e)
     electrons = electrons + workspace.defects[x]
-    dn = min(electrons, of.full_well_e) * of.dn_per_e + noise.black_dn
-    dn = dn + of.read_std_dn * read
-    offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
-    dn = dn + (offset_dn + noise.errors_dn[4 * n + 2 * (strip.y & 1) + (x & 1)])
+    read = exact_value(workspace.read_words[x], pointer_to(noise.read_quadratics, n * 4096))
+    dn = _dn(noise, of, n, x, electrons, read, strip, workspace)
     return dn if workspace.defects[x] >= 0.0 else 0.0
 
 
 @inner
+def _exact_shot(noise: Electrons, of: _Numbers, x: int, strip: Strip, workspace: Workspace) -> float:
+    """Return the electrons of light: a count, a normal in its place, or the mean."""
+    row, column = noise.body.response_steps
+    response = np.float64(noise.body.response[strip.y * row + (strip.x + strip.lead + x) * column])
+    rate = (workspace.unrounded_dn[x] - noise.black_dn) / of.dn_per_e * response
+    if of.shot == 0.0:
+        return float(rate)
+    root, word = np.sqrt(np.float32(rate)), workspace.words[x]
+    if root > np.float32(of.lowest_root) and root < np.float32(of.highest_root):
+        return float(exact_count(word, rate, noise.tables))
+    rounded = (rate + ROUND) - ROUND
+    return float(np.float32(rounded) + (np.float32(rate - rounded) + root * value_by_line(word, noise.tables.lines)))
+
+
+@inner
+def _dn(
+    noise: Electrons, of: _Numbers, n: int, x: int, electrons: float, read: float, strip: Strip, workspace: Workspace
+) -> float:
+    """Return the DN of ``electrons`` and read noise of ``read`` standard deviations, with the offsets of the site."""
+    dn = min(electrons, of.full_well_e) * of.dn_per_e + noise.black_dn
+    dn = dn + of.read_std_dn * read
+    offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
+    return float(dn + (offset_dn + noise.errors_dn[4 * n + 2 * (strip.y & 1) + (x & 1)]))
+
+
+@inner
 def fill_exact_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``exact_dn`` with the noisy DN of all sites."""
+    """Fill ``exact_dn`` with the noisy DN of all sites: of certain counts in loops, then of the other sites."""
     _count_electrons(noise, n, key, strip, workspace)
     of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
     for x in range(strip.total):
         out[x] = exact_value(workspace.read_words[x], quadratics)
+    has_dark = of.dark_e > 0.0
+    dark, error_e = workspace.dark, workspace.error_e
+    if has_dark:
+        error_e = workspace.total_error_e
+    else:
+        dark = workspace.zeros  # adding 0 - 0 changes no bit
     for x in range(strip.total):
-        out[x] = _dn(noise, of, n, x, out[x], strip, workspace)
+        electrons = np.float64(workspace.electrons[x]) + (np.float64(dark[x]) - of.removed_e)
+        out[x] = _dn(noise, of, n, x, electrons, out[x], strip, workspace)
+    for x in range(strip.total):
+        if error_e[x] > _ZERO32:
+            out[x] = exact_electrons_dn(noise, n, x, strip, workspace)
+    first, after = _defects_of(noise.body, strip)
+    for d in range(first, after):
+        x = noise.body.positions[d]
+        out[x] = exact_electrons_dn(noise, n, x, strip, workspace)
 
 
 @inner

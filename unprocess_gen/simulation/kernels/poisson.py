@@ -2,33 +2,32 @@
 
 Counts are those of `reference.poisson`, for rates up to 1e9. They are computed in two steps.
 
-1. Approximation, float32. From rate 16 up: the terms A and B of the expansion with an approximate normal, eight sites
-   at a time. Below 16: comparison of the normal with two tabulated thresholds, the normals at which the count changes.
-   Either decides the count unless the value is within its error bound of a change.
-2. The remaining sites exactly, float64, in the reference's order of operations: the complete expansion from rate 64 up,
-   otherwise a guess from a table that is at most one too low, and one comparison with the distribution function.
+1. Approximately, float32, eight sites at a time, with a bound of the error that is 0 where the count is certain. Below
+   rate 8: comparison of the word's rank with the distribution function, summed term by term. From rate 8 up: the first
+   terms of the expansion, with an approximate normal.
+2. Exactly, float64, in the reference's order of operations, for sites of which the caller needs more: the complete
+   expansion from rate 64 up, otherwise a guess from a table that is at most one too low, and one comparison with the
+   distribution function.
 
-The tables take 92 kB, of which a scene uses a small part. Timings and rejected alternatives:
-``docs/design/kernels.md``.
+Timings and rejected alternatives: ``docs/design/kernels.md``.
 """
 
 from __future__ import annotations
 
 import functools
-from decimal import Decimal
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
+from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.normal import (
+    apply_signs,
     exact_value,
     fill_values_by_lines,
     normal_quantiles,
-    pack_lines,
 )
 from unprocess_gen.simulation.kernels.rounding import ROUND32
 from unprocess_gen.simulation.kernels.simd import (
@@ -39,27 +38,24 @@ from unprocess_gen.simulation.kernels.simd import (
     from_bits,
     less_than,
     load,
-    low_half,
     maximum,
     minimum,
     movemask,
     select,
+    square_root,
     store,
+    to_bits,
     to_float32,
-    to_uint32,
+    uint32_zeros,
 )
-from unprocess_gen.simulation.kernels.strips import Float32, Workspace, list_lanes
+from unprocess_gen.simulation.kernels.strips import Workspace
 from unprocess_gen.simulation.reference.poisson import (
     GUESS_UNIT,
     LEAST_NORMAL,
     LIMIT,
-    LOW_ERROR,
     NORMAL_CELLS,
-    NORMAL_ERROR,
     ORDER,
     RATE_CELLS,
-    SHORT_ERROR,
-    SHORT_REACH,
     TAIL_CELLS,
     A,
     B,
@@ -69,36 +65,20 @@ from unprocess_gen.simulation.reference.poisson import (
     poisson_tables,
 )
 
-MAX_FLOAT32_RATE = 2.0**22
-"""Largest rate whose counts are exact integers in float32; counts of higher rates are rounded to float32."""
+LOW_RATE = 8.0
+"""Rate below which counts are found by comparison with the distribution function."""
+
+MAX_THRESHOLD_RATE = 16.0
+"""Largest rate for `count_thresholds`; a comparison per threshold takes longer above it."""
+
+FLOAT32_RATE = 5 * 2.0**-24
+"""Largest relative error of a rate in float32 for which the bounds of `fill_counts` hold."""
 
 _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
-_1, _6, _8, _31, _32 = (np.uint64(number) for number in (1, 6, 8, 31, 32))
-_0F, _1F, _8F = np.float32(0.0), np.float32(1.0), np.float32(8.0)
-_A0, _A1, _A2, _A3, _A4 = (np.float32(a) for a in A[:5])
-_B0, _B1, _B2, _B3 = (np.float32(b) for b in B[:4])
-_REACH = np.float32(SHORT_REACH)
-_ERROR, _NORMAL_ERROR, _LOW_ERROR = (np.float32(e) for e in (SHORT_ERROR, NORMAL_ERROR, LOW_ERROR))
-_ONE_BITS32 = np.uint32(0x3F800000)
+_1, _8, _31, _32 = (np.uint64(number) for number in (1, 8, 31, 32))
 _POWERS = len(A)
 _COEFFICIENTS = np.array([(*series, *(0.0,) * (_POWERS - len(series))) for series in (A, B, C, D, E)])
 _GUESSES = 13 * NORMAL_CELLS
-
-
-# --------------------------------------------------------------------------------------------------------------- tables
-
-LOW_ROOT = 4
-"""Square root of the rate below which thresholds decide counts."""
-
-_PER_ROOT, _PER_NORMAL, _ROW = 16, 16, 64
-"""Cells per unit of the root and of the normal, and thresholds per cell: enough for counts at rate 16."""
-
-_BUCKETS = 13 * _PER_NORMAL
-_FARTHEST, _NEVER = 12.0, 63
-"""Most that a threshold needs to be, and the row of thresholds that makes every site uncertain."""
-
-_LAST_ROOT32, _K_BITS, _EVERY_BIT = np.float32(LOW_ROOT - 2.0**-20), np.uint32(_ROW - 1), np.uint32(2**32 - 1)
-_LOW_ROOT32, _CELLS32, _LEAST32 = np.float32(LOW_ROOT), np.float32(_PER_ROOT), np.float32(-LEAST_NORMAL)
 
 
 class CountTables(NamedTuple):
@@ -110,21 +90,12 @@ class CountTables(NamedTuple):
         Approximate normals (`normal.Quantiles`).
     quadratics : ndarray of float64
         Exact normals.
-    thresholds : ndarray of uint64, [64 * 64 + 1]
-        Normal at which the count rises above k, as a line in √rate, by cell floor(16 √rate) and k.
-    errors : ndarray of float32, [64]
-        Largest error of the thresholds of a cell, and of the approximate normals.
-    rows : ndarray of uint16, [64 * 208]
-        First of the two thresholds to compare, by cell of √rate and cell floor(16 (z + 6.5)) of the normal.
     tails, cdf, first, smallest, largest, middle, guess : ndarray
         Columns of `reference.poisson.Tables`, contiguous.
     """
 
     lines: NDArray[np.uint64]
     quadratics: Float
-    thresholds: NDArray[np.uint64]
-    errors: Float32
-    rows: NDArray[np.uint16]
     tails: Float
     cdf: Float
     first: NDArray[np.int64]
@@ -138,214 +109,196 @@ class CountTables(NamedTuple):
 def count_tables() -> CountTables:
     """Return the tables, computed once per process."""
     normal, exact = normal_quantiles(), poisson_tables()
-    thresholds, errors, rows = _threshold_tables(normal.error)
     return CountTables(
-        normal.lines, normal.quadratics, thresholds, errors, rows, exact.tails.ravel(), exact.cdf.ravel(), exact.first,
-        exact.least, exact.most, exact.middle, exact.guess.ravel(),
+        normal.lines, normal.quadratics, exact.tails.ravel(), exact.cdf.ravel(), exact.first, exact.least, exact.most,
+        exact.middle, exact.guess.ravel(),
     )  # fmt: skip
 
 
-def _threshold_tables(normal_error: float) -> tuple[NDArray[np.uint64], Float32, NDArray[np.uint16]]:
-    """Return `CountTables.thresholds`, ``errors`` and ``rows``.
+# -------------------------------------------------------------------------------------------------- one rate everywhere
 
-    A threshold is a line through its values at both ends of a cell. Its error is estimated at three points between
-    them, times 1.25. In the first cell, where thresholds tend to infinity, every normal above the lowest threshold is
-    uncertain.
+
+@functools.lru_cache(maxsize=8)
+def count_thresholds(rate: float) -> tuple[int, NDArray[np.uint32]]:
+    """Return the smallest count of a rate, and the last rank of each count except the largest.
+
+    The rank of a word is its place among all words, ordered by their normals. A count is the smallest one plus the
+    number of ranks that the word's rank exceeds: exactly that of `reference.poisson`, without any other computation.
+
+    Parameters
+    ----------
+    rate : float
+        Mean count, from 0 to `MAX_THRESHOLD_RATE`.
+
+    Returns
+    -------
+    (int, ndarray of uint32)
+        Smallest count and last ranks, in ascending order.
     """
-    cells = LOW_ROOT * _PER_ROOT
-    roots = np.arange(4 * cells + 1) / (4 * _PER_ROOT)
-    at = np.stack([_thresholds(root) for root in roots])  # [4 * cells + 1, _ROW]
-    points = np.stack([at[step : step + 4 * cells : 4] for step in range(5)])  # [5, cells, _ROW]
-    start, end = points[0], points[4]
-    slope = (end - start) * _PER_ROOT
-    intercept = start - slope * (np.arange(cells) / _PER_ROOT)[:, None]
-    line = np.stack([start + (end - start) * (step / 4) for step in range(5)])
-    needed = np.abs(points).min(axis=0) < -LEAST_NORMAL
-    margin = normal_error + 4e-6  # the second term for the rounding of lines in float32
-    error = 1.25 * np.where(needed, np.abs(points - line).max(axis=0), 0).max(axis=1) + margin
-    error[0] = _FARTHEST + margin
-    intercept[0], slope[0] = end[0] + _FARTHEST, 0
-    lowest, highest = points.min(axis=0) - error[:, None], points.max(axis=0) + error[:, None]
-    lowest[0], highest[0] = end[0] - margin, np.inf
-    edges = np.arange(_BUCKETS) / _PER_NORMAL + LEAST_NORMAL
-    least = (highest[:, None, :] < edges[None, :, None]).sum(axis=2)
-    following = np.minimum(least + 2, _ROW - 1)
-    third = np.take_along_axis(lowest, following, axis=1)
-    least = np.where((third > edges + 1 / _PER_NORMAL) & (least < _NEVER - 1), least, _NEVER)
-    intercept[:, _NEVER] = np.nan
-    intercept = np.pad(intercept.astype(np.float32).ravel(), (0, 1), constant_values=np.nan)
-    return (
-        pack_lines(intercept, np.pad(slope.astype(np.float32).ravel(), (0, 1))),
-        error.astype(np.float32),
-        (least + _ROW * np.arange(cells)[:, None]).astype(np.uint16).ravel(),
-    )
+    tables = poisson_tables()
+    cell = int(np.sqrt(rate) * RATE_CELLS)
+    counts = np.arange(tables.least[cell], tables.most[cell] + 1)
+    offset, rows = rate - tables.middle[cell], tables.cdf[tables.first[cell] + counts]
+    cdf = rows[:, ORDER]
+    for n in range(ORDER - 1, -1, -1):
+        cdf = rows[:, n] + offset * cdf
+    last = np.floor(cdf * 2.0**32 - 0.5) if rate > 0 else np.full(len(counts), 2.0**32)  # (rank + ½) / 2**32 <= cdf
+    smallest = int((last < 0).sum())
+    return int(tables.least[cell]) + smallest, last[smallest:][last[smallest:] < 2**32 - 1].astype(np.uint32)
 
 
-def _thresholds(root: float) -> Float:
-    """Return the normals at which the count rises above k = 0, 1, …, `_ROW` - 1, at most `_FARTHEST` in magnitude."""
-    rate = root * root
-    with np.errstate(under="ignore"):
-        shares = np.cumprod(np.concatenate([[float((-Decimal(rate)).exp())], rate / np.arange(1, 2 * _ROW)]))
-    below, above = np.cumsum(shares), np.cumsum(shares[::-1])[::-1] - shares
-    inverse = NormalDist().inv_cdf
-    thresholds = [
-        (-inverse(max(up, 1e-300)) if up < down else inverse(max(down, 1e-300)))
-        for up, down in zip(above[:_ROW], below[:_ROW], strict=True)
-    ]
-    return np.clip(thresholds, -_FARTHEST, _FARTHEST)
+@inner
+def fill_counts_of_one_rate(
+    count: int, words: Pointer, smallest: int, last_ranks: Pointer, steps: int, out: Pointer
+) -> None:
+    """Fill ``out`` (float32) with the counts of ``words`` by the ``steps`` ranks of `count_thresholds`."""
+    for n in range(count // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        word, above = load(words, x), uint32_zeros()
+        rank = word ^ (((word >> _TOP_BIT) - _ONE_BIT) | _SIGN32)
+        for k in range(steps):
+            above = above - less_than(last_ranks[k], rank)
+        store(out, x, to_float32(above) + np.float32(smallest))
 
 
 # ------------------------------------------------------------------------------------------------------------ all sites
 
-
-class Rates(NamedTuple):
-    """Point to mean counts, and to what approximations need of them."""
-
-    rates: Pointer  # float64
-    rounded: Pointer  # float32
-    residual: Pointer  # rates - rounded, float32
-    root: Pointer
-    inverse: Pointer  # 1 / root
+_TOP_BIT, _ONE_BIT, _SIGN32, _LOW31_32 = (np.uint32(bits) for bits in (31, 1, 0x80000000, 0x7FFFFFFF))
+_ONE_BITS32, _INFINITE_BITS32, _23 = np.uint32(0x3F800000), np.uint32(0x7F800000), np.uint32(23)
+_0F, _HALF, _1F, _LOW = np.float32(0), np.float32(0.5), np.float32(1), np.float32(LOW_RATE)
 
 
 @inner
 def fill_counts(
     count: int,
     words: Pointer,
-    rates: Rates,
-    root_range: tuple[np.float32, np.float32],
+    rates: Pointer,
+    has_high: bool,
     tables: CountTables,
     workspace: Workspace,
     out: Pointer,
+    error: Pointer,
 ) -> None:
-    """Fill ``out`` (float32) with the Poisson counts of ``words``.
+    """Fill ``out`` (float32) with the Poisson counts of ``words``; ``count`` is a multiple of `VECTOR_WIDTH`.
 
-    Sites whose root is outside ``root_range`` get a normal deviate of the same mean and variance, not rounded.
+    ``error`` (float32) receives 0 where the count is certain, else a bound of its error, which may be infinite.
+    ``rates`` (float32) may differ from the true rates by `FLOAT32_RATE`. ``has_high`` states whether any of them is
+    `LOW_RATE` or more.
     """
-    normals, found = workspace.normals, 0
-    fill_values_by_lines(count, words, tables.lines, workspace.lines, normals)
-    has_low, has_high, is_counted = _survey(count, rates.root, root_range)
-    if not is_counted:
-        _fill_normal_counts(count, rates, normals, out)
-        return
-    if has_low:
-        found = _count_by_thresholds(count, rates, root_range, tables, workspace, out)
     if has_high:
-        found = _count_by_expansion(count, rates, root_range, found, workspace, out)
-    for n in range(found):
-        x = workspace.uncertain[n]
-        out[x] = np.float32(exact_count(words[x], rates.rates[x], tables))
+        fill_values_by_lines(count, words, tables.lines, workspace.lines, workspace.normals)
+    for start in range(0, count, BLOCK):
+        first, vectors = np.uint64(start), min(BLOCK, count - start) // VECTOR_WIDTH
+        lowest = highest = load(rates, first)
+        for n in range(1, vectors):
+            r = load(rates, first + np.uint64(n) * _8)
+            lowest, highest = minimum(r, lowest), maximum(r, highest)
+        has_low = movemask(less_than(lowest, _LOW)) != 0
+        if has_low:
+            store(workspace.errors, 0, minimum(highest, _LOW))
+            most = workspace.errors[0]
+            for n in range(1, VECTOR_WIDTH):
+                most = max(most, workspace.errors[n])
+            _count_low_rates(first, vectors, most, words, rates, out, error)
+        if movemask(less_than(highest, _LOW)) != _EVERY_LANE:
+            _count_high_rates(first, vectors, has_low, rates, workspace.normals, out, error)
+
+
+_EVERY_LANE = np.uint32(2**VECTOR_WIDTH - 1)
+
+CDF_ERROR = 2.0**-18
+"""Bound of the error of a distribution function in float32 below rate 8.
+
+The largest terms: rounding of the exponent 5e-7, the 18 terms of the recurrence 1e-6, their sum 5e-7, the error of the
+rate 4e-7, exponential and rank 2e-7.
+"""
+
+_LOG2E, _CDF_ERROR, _WORD = np.float32(np.log2(np.e)), np.float32(CDF_ERROR), np.float32(2.0**-32)
+_RECIPROCALS = np.array([0.0, *(1 / k for k in range(1, 32))], dtype=np.float32)
+_EXP2 = tuple(np.float32(c) for c in (1.00000007, 0.693146967, 0.240221197, 0.0555071329, 9.67554206e-3, 1.32764676e-3))
+"""Minimax polynomial of 2**f for f from -1/2 to 1/2, relative error 7.5e-8."""
 
 
 @inner
-def _survey(count: int, root: Pointer, root_range: tuple[np.float32, np.float32]) -> tuple[bool, bool, bool]:
-    """Return whether any root is below `LOW_ROOT`, whether any is not, and whether any is within ``root_range``."""
-    lowest = highest = load(root, np.uint64(0))
-    within = less_than(lowest, lowest)
-    for n in range(count // VECTOR_WIDTH):
-        r = load(root, np.uint64(n) * _8)
-        lowest, highest = minimum(r, lowest), maximum(r, highest)
-        within = within | (less_than(root_range[0], r) & less_than(r, root_range[1]))
-    is_low, all_low = movemask(less_than(lowest, _LOW_ROOT32)), movemask(less_than(highest, _LOW_ROOT32))
-    return bool(is_low != 0), bool(all_low != np.uint32(255)), bool(movemask(within) != 0)
+def _count_low_rates(
+    first: np.uint64, vectors: int, most: np.float32, words: Pointer, rates: Pointer, out: Pointer, error: Pointer
+) -> None:
+    """Fill up to a block with the counts of rates below `LOW_RATE`, ``most`` or less.
 
-
-@inner
-def _fill_normal_counts(count: int, rates: Rates, normals: Pointer, out: Pointer) -> None:
-    """Fill ``out`` with normals of the same mean and variance."""
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        store(out, x, load(rates.rounded, x) + (load(rates.residual, x) + load(rates.root, x) * load(normals, x)))
-
-
-@inner
-def _count_by_thresholds(
-    count: int,
-    rates: Rates,
-    root_range: tuple[np.float32, np.float32],
-    tables: CountTables,
-    workspace: Workspace,
-    out: Pointer,
-) -> int:
-    """Fill ``out`` with the counts of rates below `LOW_ROOT`² and list uncertain sites; return how many.
-
-    Loads in one loop and arithmetic in others, which vectorise.
+    Terms are summed up to a count that 0.2 % of the words exceed; these get an infinite error.
     """
-    low, high = root_range[0], min(root_range[1], _LOW_ROOT32)
-    normals, rows, first, second = workspace.normals, workspace.scratch, workspace.lines, workspace.more_lines
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        root = minimum(maximum(load(rates.root, x), _0F), _LAST_ROOT32)
-        bucket = to_uint32((load(normals, x) + _LEAST32) * _CELLS32)
-        store(rows, x, to_uint32(root * _CELLS32) * np.uint32(_BUCKETS) + bucket)
-    for at in range(count):
-        row = np.uint64(tables.rows[rows[at]])
-        first[at], second[at] = tables.thresholds[row], tables.thresholds[row + _1]
-        rows[at], workspace.errors[at] = np.uint32(row), tables.errors[row >> _6]
-    found = 0
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        root, z, error = load(rates.root, x), load(normals, x), load(workspace.errors, x)
-        above0, above1 = _above(first, x, root, z), _above(second, x, root, z)
-        one0, one1 = less_than(_0F, above0) & _ONE_BITS32, less_than(_0F, above1) & _ONE_BITS32
-        counted = to_float32(load(rows, x) & _K_BITS) + (from_bits(one0) + from_bits(one1))
-        normal = load(rates.rounded, x) + (load(rates.residual, x) + root * z)
-        is_counted = less_than(low, root) & less_than(root, high)
-        store(out, x, select(is_counted, counted, normal))
-        is_sure = less_than(error, absolute(above0)) & less_than(error, absolute(above1))
-        found = list_lanes(is_counted & (is_sure ^ _EVERY_BIT), x, found, workspace)
-    return found
+    steps = int(most + np.float32(3.1) * np.sqrt(most)) + 2
+    for n in range(vectors):
+        x = first + np.uint64(n) * _8
+        rate, word = load(rates, x), load(words, x)
+        # probability up to the word's rank, minus ½
+        centred = apply_signs(_HALF - (to_float32(word & _LOW31_32) + _HALF) * _WORD, word)
+        low, high = centred - _CDF_ERROR, centred + _CDF_ERROR
+        term = _exp_of_minus(rate)
+        cdf, certain, possible = term - _HALF, uint32_zeros(), uint32_zeros()
+        for k in range(1, steps):
+            certain, possible = certain - less_than(cdf, low), possible - less_than(cdf, high)
+            term = term * (rate * _RECIPROCALS[k])
+            cdf = cdf + term
+        store(out, x, to_float32(certain))
+        beyond = from_bits(less_than(cdf, high) & _INFINITE_BITS32)
+        store(error, x, to_float32(possible - certain) + beyond)
 
 
 @inner
-def _above(lines: Pointer, x: np.uint64, root: Vector, z: Vector) -> Vector:
-    """Return how far normals are above eight packed thresholds (`normal.pack_lines`)."""
-    packed = load(lines, x)
-    start, slope = from_bits(low_half(packed)), from_bits(low_half(packed >> _32))
-    distance: Vector = z - (start + slope * root)
-    return distance
+def _exp_of_minus(x: Vector) -> Vector:
+    """Return exp(-x) for x from 0 to 80 in float32, with a relative error of 2e-7 (1 + x / 3)."""
+    t = x * -_LOG2E
+    shifted = t + ROUND32
+    f = t - (shifted - ROUND32)
+    c, f2 = _EXP2, f * f
+    power = (f * c[1] + c[0]) + f2 * ((f * c[3] + c[2]) + f2 * (f * c[5] + c[4]))
+    return from_bits(to_bits(power) + (to_bits(shifted) << _23))
+
+
+NORMAL_REACH = 3.5
+"""Normals farther out are not covered by `EXPANSION_ERRORS`."""
+
+EXPANSION_ERRORS = 2e-4, 6.5e-7, 0.033
+"""Error of the expansion's first terms: less than the sum of these, times 1, the rate and 1 / rate.
+
+The last term is the truncation, from rate 8 up. The others are those of the approximate normal, 6e-6 (8 + √rate), which
+is at most 6e-6 (8 + 12.5 + rate / 50), of the rate, and of rounding to float32.
+"""
+
+_FIRST_TERMS = tuple(np.float32(c) for c in (1 / 6, -1 / 72, 3.73812511e-3, -1.63447644e-3, 7.86901025e-4))
+_FIRST_OF_RATE = np.float32(-0.025991)
+"""Coefficients of x - rate - √rate·z ≈ (z² + 2)·P(s) + c / rate, s = z / √rate.
+
+The first two are those of the expansion; the others minimise the largest error times the rate.
+"""
+_ERROR, _ERROR_OF_RATE, _ERROR_OF_RECIPROCAL = (np.float32(e) for e in EXPANSION_ERRORS)
+_2F, _1_HALF, _REACH2 = np.float32(2), np.float32(1.5), np.float32(NORMAL_REACH * NORMAL_REACH - 1e-3)
 
 
 @inner
-def _count_by_expansion(
-    count: int,
-    rates: Rates,
-    root_range: tuple[np.float32, np.float32],
-    found: int,
-    workspace: Workspace,
-    out: Pointer,
-) -> int:
-    """Fill ``out`` with the counts of rates from `LOW_ROOT`² up and append uncertain sites; return the length."""
-    low, high = root_range
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        root, inverse, z = load(rates.root, x), load(rates.inverse, x), load(workspace.normals, x)
-        normal = load(rates.residual, x) + root * z
-        value = normal + _short_rest(inverse, z)
-        rounded = (value + ROUND32) - ROUND32
-        one = from_bits(less_than(value, rounded) & _ONE_BITS32)
-        i2 = inverse * inverse
-        error = (root + _8F) * _NORMAL_ERROR + i2 * ((i2 * i2) * _LOW_ERROR + _ERROR)
-        distance = absolute(value - rounded)
-        far = less_than(_REACH, absolute(z))
-        is_counted = less_than(low, root) & less_than(root, high)
-        is_low = less_than(root, _LOW_ROOT32)
-        counted = load(rates.rounded, x) + select(is_counted, rounded - one, normal)
-        store(out, x, select(is_low, load(out, x), counted))
-        open_lanes = (less_than(distance, error) | far) & is_counted
-        found = list_lanes(select(is_low, open_lanes ^ open_lanes, open_lanes), x, found, workspace)
-    return found
-
-
-@inner
-def _short_rest(inverse: Vector, z: Vector) -> Vector:
-    """Return w²·A(s) + B(s) with the first terms of both, in float32."""
-    s = z * inverse
-    s2 = s * s
-    a = (s * _A1 + _A0) + s2 * ((s * _A3 + _A2) + s2 * _A4)
-    b = (s * _B1 + _B0) + s2 * (s * _B3 + _B2)
-    rest: Vector = z * z * a + b
-    return rest
+def _count_high_rates(
+    first: np.uint64, vectors: int, has_low: bool, rates: Pointer, normals: Pointer, out: Pointer, error: Pointer
+) -> None:
+    """Fill up to a block with the counts of rates from `LOW_RATE` up; ``has_low`` keeps those of lower rates."""
+    c = _FIRST_TERMS
+    for n in range(vectors):
+        x = first + np.uint64(n) * _8
+        rate, z = load(rates, x), load(normals, x)
+        reciprocal, root = _1F / rate, square_root(rate)
+        s, z2 = z * (root * reciprocal), z * z
+        s2 = s * s
+        terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
+        value = (rate - _HALF) + (root * z + ((z2 + _2F) * terms + reciprocal * _FIRST_OF_RATE))
+        counted = (value + ROUND32) - ROUND32
+        most = (rate * _ERROR_OF_RATE + reciprocal * _ERROR_OF_RECIPROCAL) + (_1F + _ERROR)
+        is_open, is_far = less_than(_1_HALF - most, absolute(value - counted)), less_than(_REACH2, z2)
+        bound = maximum(from_bits(to_bits(most) & is_open), from_bits(is_far & _INFINITE_BITS32))
+        if has_low:
+            is_low = less_than(rate, _LOW)
+            counted, bound = select(is_low, load(out, x), counted), select(is_low, load(error, x), bound)
+        store(out, x, counted)
+        store(error, x, bound)
 
 
 # ------------------------------------------------------------------------------------------------------ uncertain sites

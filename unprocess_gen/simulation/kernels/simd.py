@@ -234,12 +234,13 @@ def _operation_type(x: Any, y: Any) -> VectorType | None:
 
 def _comparison_type(x: Any, y: Any) -> VectorType | None:
     vector_type = _common_type(x, y)
-    return None if vector_type is None else VectorType(_UNSIGNED[vector_type.element])
+    return None if vector_type is None else VectorType(_UNSIGNED.get(vector_type.element, vector_type.element))
 
 
 def _build_less_than(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    _, (x, y) = _broadcast(context, builder, signature, arguments)
-    return builder.sext(builder.fcmp_ordered("<", x, y), _llvm_vector(signature.return_type))
+    vector_type, (x, y) = _broadcast(context, builder, signature, arguments)
+    compare = builder.fcmp_ordered if vector_type.element in _UNSIGNED else builder.icmp_unsigned
+    return builder.sext(compare("<", x, y), _llvm_vector(signature.return_type))
 
 
 def _build_square_root(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -84,8 +84,6 @@ class Workspace(NamedTuple):
     bright_light: Any  # normalised light in bright blocks, 0 elsewhere
     unrounded_dn: Any  # clean frame
     exact_dn: Float  # noisy frame before rounding
-    rates: Float  # mean electrons, and what the counts need of them: see `poisson.Rates`
-    dark_rates: Float
     defects: Float  # electrons of hot pixels; negative at dead pixels, 0 at others
     row_dn: Float  # [1]: offset of the row
     rounded_dn: Float32  # clean frame, rounded
@@ -97,13 +95,13 @@ class Workspace(NamedTuple):
     depths: Float32  # see `normal.fill_depths`
     normals: Float32
     errors: Float32
-    rounded_e: Float32
-    residual_e: Float32
-    root: Float32
-    inverse: Float32
+    rates: Float32  # mean electrons
     electrons: Float32  # shot noise
+    error_e: Float32  # bound of the error of electrons; 0 where the count is certain
     dark: Float32  # counts of the dark signal
+    dark_error_e: Float32
     total_e: Float32
+    total_error_e: Float32
     zeros: Float32
     words: Indices
     read_words: Indices
@@ -113,7 +111,6 @@ class Workspace(NamedTuple):
     lanes_by_mask: Indices  # for each mask of eight lanes: its set lanes first
     count_by_mask: Indices  # for each mask: number of set lanes
     lines: NDArray[np.uint64]  # scratch of look-ups
-    more_lines: NDArray[np.uint64]
     clean: Raw
     noisy: Raw
 
@@ -126,10 +123,10 @@ class Scratch(NamedTuple):
     """
 
     stages: Any  # [3 + 1, SIZE]
-    doubles: Float  # [5 + 1, SIZE]
+    doubles: Float  # [3 + 1, SIZE]
     singles: Float32  # [17 + 1, SIZE]
     indices: Indices  # [6 + 1, SIZE], flat, and the tables by mask
-    lines: NDArray[np.uint64]  # [2 + 1, SIZE]
+    lines: NDArray[np.uint64]  # [1 + 1, SIZE]
     frames: Raw  # [2 + 1, SIZE]
 
 
@@ -154,10 +151,10 @@ def allocate_scratch(dtype: Any = np.float64) -> Scratch:
     """Allocate zeroed buffers: kernels also compute the padding of vectors, which must hold finite numbers."""
     return Scratch(
         stages=np.zeros((4, SIZE), dtype=dtype),
-        doubles=np.zeros((6, SIZE)),
+        doubles=np.zeros((4, SIZE)),
         singles=np.zeros((18, SIZE), dtype=np.float32),
         indices=np.concatenate([_LANES_BY_MASK, _COUNT_BY_MASK, np.zeros(7 * SIZE, dtype=int)]).astype(np.uint32),
-        lines=np.zeros((3, SIZE), dtype=np.uint64),
+        lines=np.zeros((2, SIZE), dtype=np.uint64),
         frames=np.zeros((3, SIZE), dtype=np.uint16),
     )
 
@@ -185,10 +182,8 @@ def workspace_in(scratch: Scratch, lead: int) -> Workspace:
         bright_light=pointer_to(stages, 1 * SIZE),
         unrounded_dn=pointer_to(stages, 2 * SIZE),
         exact_dn=pointer_to(doubles, 0 * SIZE),
-        rates=pointer_to(doubles, 1 * SIZE),
-        dark_rates=pointer_to(doubles, 2 * SIZE),
-        defects=pointer_to(doubles, 3 * SIZE),
-        row_dn=pointer_to(doubles, 4 * SIZE),
+        defects=pointer_to(doubles, 1 * SIZE),
+        row_dn=pointer_to(doubles, 2 * SIZE),
         rounded_dn=pointer_to(singles, 0 * SIZE),
         residual_dn=pointer_to(singles, 1 * SIZE),
         noise_dn=pointer_to(singles, 2 * SIZE),
@@ -198,13 +193,13 @@ def workspace_in(scratch: Scratch, lead: int) -> Workspace:
         depths=pointer_to(singles, 6 * SIZE),
         normals=pointer_to(singles, 7 * SIZE),
         errors=pointer_to(singles, 8 * SIZE),
-        rounded_e=pointer_to(singles, 9 * SIZE),
-        residual_e=pointer_to(singles, 10 * SIZE),
-        root=pointer_to(singles, 11 * SIZE),
-        inverse=pointer_to(singles, 12 * SIZE),
-        electrons=pointer_to(singles, 13 * SIZE),
-        dark=pointer_to(singles, 14 * SIZE),
-        total_e=pointer_to(singles, 15 * SIZE),
+        rates=pointer_to(singles, 9 * SIZE),
+        electrons=pointer_to(singles, 10 * SIZE),
+        error_e=pointer_to(singles, 11 * SIZE),
+        dark=pointer_to(singles, 12 * SIZE),
+        dark_error_e=pointer_to(singles, 13 * SIZE),
+        total_e=pointer_to(singles, 14 * SIZE),
+        total_error_e=pointer_to(singles, 15 * SIZE),
         zeros=pointer_to(singles, 16 * SIZE),
         words=pointer_to(indices, 0 * SIZE),
         read_words=pointer_to(indices, 1 * SIZE),
@@ -214,7 +209,6 @@ def workspace_in(scratch: Scratch, lead: int) -> Workspace:
         lanes_by_mask=tables,
         count_by_mask=pointer_to(tables, _LANES_SIZE),
         lines=lines,
-        more_lines=pointer_to(lines, SIZE),
         clean=frames,
         noisy=pointer_to(frames, SIZE),
     )

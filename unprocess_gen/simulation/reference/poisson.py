@@ -64,12 +64,6 @@ D = (
 
 E = (5408 / 3444525, -18075959 / 4232632320, 27968607743 / 3928411872000, -9969287490329 / 1055957111193600)
 
-SHORT_LEAST, SHORT_REACH = 6.0, 3.5
-
-NORMAL_ERROR, SHORT_ERROR, LOW_ERROR = 6e-6, 0.05, 18.0
-"""Error of the kernels' short form of x (float32, approximate normal deviates), for rates from `SHORT_LEAST` and normal
-deviates within `SHORT_REACH`: less than NORMAL_ERROR·(8 + √rate) + SHORT_ERROR / rate + LOW_ERROR / rate³."""
-
 TAIL_CELLS = 8
 """Cells of the normal tail table per standard deviation."""
 
