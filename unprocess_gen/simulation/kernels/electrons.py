@@ -378,7 +378,7 @@ def _fill_rates(noise: Electrons, dn_per_e: float, strip: Strip, workspace: Work
     most = workspace.errors[0]
     for v in range(1, VECTOR_WIDTH):
         most = max(most, workspace.errors[v])
-    return most
+    return np.float32(most)
 
 
 @inner
@@ -391,7 +391,7 @@ def _keep_means(count: int, workspace: Workspace) -> None:
 
 @inner
 def _replace_by_normals(count: int, of: _Numbers, tables: CountTables, workspace: Workspace) -> None:
-    """Replace counts where a normal is near enough; sites so near the limits that float32 cannot tell are uncertain."""
+    """Replace counts where a normal is near enough; sites at the limits, within the error of float32, are uncertain."""
     low, high = of.lowest_root * of.lowest_root, of.highest_root * of.highest_root
     f, more, less = np.float32, 1 + 4 * FLOAT32_RATE, 1 - 4 * FLOAT32_RATE
     low_less, low_more, high_less, high_more = f(low * less), f(low * more), f(high * less), f(high * more)

@@ -151,7 +151,8 @@ def value_by_line(word: np.uint32, lines: Pointer) -> np.float32:
     """Return the quantile of one word by lines, bit for bit as `fill_values_by_lines`."""
     f = np.float32(np.int32(word & _LOW31)) + _HALF
     start, slope = unpack_line(lines[np.uint64((np.float32(f).view(np.uint32) >> _LINE_SHIFT) - _FIRST_LINE)])
-    return np.uint32(np.float32(start + slope * f).view(np.uint32) ^ (word & _SIGN)).view(np.float32)
+    bits = np.uint32(np.float32(start + slope * f).view(np.uint32) ^ (word & _SIGN))
+    return np.float32(bits.view(np.float32))
 
 
 # ------------------------------------------------------------------------------------------------------- by polynomials
