@@ -1,7 +1,7 @@
 """Measure the cost of accuracy and update docs/accuracy.md: python .readme/draw_accuracy.py [overrides].
 
 Run `gen-dataset accuracy` with the overrides (source.root=photos). Save its figure as accuracy.png in this folder, and
-its table between the two marks in docs/accuracy.md. It takes about a minute; stop other programs meanwhile.
+its conclusion and tables between the marks in docs/accuracy.md. It takes about a minute; stop other programs meanwhile.
 """
 
 from __future__ import annotations
@@ -13,34 +13,55 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
+from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
 from unprocess_gen.reports.benchmark.measure import Measurement
-from unprocess_gen.reports.benchmark.tables import markdown_table
+from unprocess_gen.reports.benchmark.tables import markdown_table, method_table, recommendation_table, run_table
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "accuracy.md"
-TABLE = re.compile(r"(<!-- accuracy: [^>]*-->\n).*?(<!-- end of accuracy -->)", re.DOTALL)
-TEXTS = ("stage", "method", "tier", "error_unit")
+CONCLUSION = re.compile(r"^In a complete run of .*$", re.MULTILINE)
+TEXTS = ("stage", "method", "tier", "error_unit", "setting", "noise")
 
 
-def read_measurement(line: dict[str, str]) -> Measurement:
-    """Return the measurement of a line of accuracy.csv."""
-    return Measurement(
-        **{name: text if name in TEXTS else float(text) if text else None for name, text in line.items()}
-    )
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of a CSV file of the report, with numbers as numbers and empty values as None."""
+    with path.open(newline="", encoding="utf-8") as lines:
+        return [
+            {name: text if name in TEXTS else float(text) if text else None for name, text in line.items()}
+            for line in csv.DictReader(lines)
+        ]
+
+
+def replace_part(page: str, name: str, content: str) -> str:
+    """Return the page with other content between the marks of a part."""
+    part = re.compile(rf"(<!-- accuracy {name}: [^>]*-->\n).*?(<!-- end of accuracy {name} -->)", re.DOTALL)
+    changed, count = part.subn(lambda found: f"{found[1]}{content}\n{found[2]}", page)
+    assert count == 1, f"{PAGE} has no part {name}"
+    return changed
 
 
 def main() -> None:
-    """Measure, then replace table and figure."""
+    """Measure, then replace conclusion, tables and figure."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "unprocess_gen", "accuracy", *sys.argv[1:], f"out={folder}/report"]
-        subprocess.run(command, check=True)
+        printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         report = Path(folder) / "report"
         shutil.copy(report / "accuracy.png", HERE / "accuracy.png")
-        with (report / "accuracy.csv").open(newline="", encoding="utf-8") as lines:
-            table = markdown_table([read_measurement(line) for line in csv.DictReader(lines)])
-    text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(TABLE.sub(lambda found: found[1] + table + "\n" + found[2], text), encoding="utf-8")
+        methods = [Measurement(**row) for row in read_rows(report / "accuracy.csv")]
+        runs = [RunMeasurement(**row) for row in read_rows(report / "accuracy_runs.csv")]
+    conclusion = CONCLUSION.search(printed)
+    assert conclusion is not None
+    page = PAGE.read_text(encoding="utf-8")
+    for name, content in (
+        ("conclusion", conclusion[0]),
+        ("runs", markdown_table(run_table(runs))),
+        ("recommendations", markdown_table(recommendation_table())),
+        ("methods", markdown_table(method_table(methods))),
+    ):
+        page = replace_part(page, name, content)
+    PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

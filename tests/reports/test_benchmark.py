@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from unprocess_gen.config.accuracy import METHODS, STAGES, choose_methods
 from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import AccuracyConfig, NoiseConfig, SceneConfig, SensorConfig, SourceConfig
+from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SceneConfig, SensorConfig, SourceConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, MachineError
@@ -164,7 +164,7 @@ def run(tier: str = "fast", ratio: float | None = 0.9, changed: float = 0.02, **
     """Return a row of complete runs with the given settings."""
     shares = {"decode_share": 0.25, "simulate_share": 0.25, "write_share": 0.5}
     errors = {"noisy_max_dn": 2.0, "noisy_rms_dn": 0.1, "noisy_max_std": 0.3, "noisy_rms_std": 0.004}
-    times = dict.fromkeys(("ns_per_pixel", "ratio_to_exact", "lowest_ratio", "highest_ratio"), ratio)
+    times = dict.fromkeys(("ns_per_pixel", "ratio_to_exact", "lower_quartile_ratio", "upper_quartile_ratio"), ratio)
     named = {"setting": "given", "noise": "imx385_iso3200", "tier": tier, "noisy_changed_share": changed}
     return RunMeasurement(**{**named, **times, **shares, **errors, **changes})
 
@@ -194,7 +194,12 @@ def test_shares_of_a_run_sum_to_one(found: BenchmarkReport) -> None:
 def test_ratios_of_runs_are_to_exact_in_the_same_setting(found: BenchmarkReport) -> None:
     for setting in ("given", "daylight", "night"):
         runs = runs_of(found, setting)
-        assert runs["exact"].ratio_to_exact == runs["exact"].lowest_ratio == runs["exact"].highest_ratio == 1
+        assert (
+            runs["exact"].ratio_to_exact
+            == runs["exact"].lower_quartile_ratio
+            == runs["exact"].upper_quartile_ratio
+            == 1
+        )
         for run in runs.values():
             assert run.ratio_to_exact == pytest.approx((run.ns_per_pixel or 0) / (runs["exact"].ns_per_pixel or 0))
 
@@ -259,7 +264,7 @@ def test_runs_have_the_bytes_of_generate_and_leave_nothing(
     config = settings(f"source.root={photos}", "noise.levels=2")
     with complete_runs.run_files(config, LITTLE) as files:
         for tier in TIERS.values():
-            times = complete_runs.time_run(complete_runs.run_config(config, files, tier))
+            times = complete_runs.time_run(complete_runs.run_config(config, files, tier), files.pixels)
             assert min(times) > 0
     expected = [
         make(photos, folder.parent / tier, f"accuracy={tier}", "noise.levels=2", f"source.limit={files.source.limit}")
@@ -316,38 +321,59 @@ def test_photographs_of_runs_end_with_enough_pixels(folder: Path, settings: Sett
     root = fill(tmp_path / "photos", 9)
     (root / "000.png").write_bytes(b"")  # cannot be read
     many = replace(LITTLE, run_files=99)
-    for sizes, count in ((replace(many, run_pixels=500), 3), (LITTLE, 2), (many, 8)):
+    pixels = (0, 13 * 17, 14 * 18, 15 * 19)
+    for sizes, count in (
+        (replace(many, run_pixels=13 * 17 + 14 * 18), 2),
+        (replace(many, run_pixels=13 * 17 + 14 * 18 - 1), 1),
+        (replace(many, run_pixels=1), 1),
+        (LITTLE, 2),
+        (many, 8),
+    ):
         with complete_runs.run_files(settings(f"source.root={root}"), sizes) as files:
             assert (files.count, files.source.limit) == (count, count + 1)
+            assert files.pixels_of_sources[:4] == pixels[: count + 1]
 
 
 def test_runs_with_too_many_frames_have_one_level(settings: Settings) -> None:
     config = settings("noise.levels=5", "noise.draws=2")
-    files = RunFiles(config.source, 1, 1000, Path())
+    files = RunFiles(config.source, (1000,), Path())
 
     assert complete_runs.affordable(config, files, replace(LITTLE, run_pixels=5000)) == config
     one = complete_runs.affordable(config, files, replace(LITTLE, run_pixels=4999))
     assert (one.noise.levels, one.noise.draws) == (None, 1)
 
 
-def test_reference_is_left_out_of_long_runs(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(complete_runs, "time_run", lambda config: RunTimes(1.0, 2.0, 3.0))
-    config = settings()
-    for pixels, rounds in ((complete_runs.REFERENCE_PIXELS, 1), (complete_runs.REFERENCE_PIXELS + 1, 0)):
-        files = RunFiles(config.source, 1, pixels, Path())
-        with Progress(9) as progress:
-            times = complete_runs.measure_runs({"given": config}, TIERS, files, 3, progress)
-        assert [len(one) for one in times.values()] == [rounds, 3, 3]
-        assert (complete_runs.run_cost(times["given", REFERENCE], times["given", EXACT], 1).ratio_to_exact is None) == (
-            rounds == 0
-        )
+@pytest.mark.parametrize(
+    ("megapixels", "levels", "limits"), [((4, 2, 1), 1, [2]), ((4, 2), 3, [1]), ((24, 1), 1, [1]), ((25,), 1, [])]
+)
+def test_reference_runs_once_on_few_photographs(
+    megapixels: tuple[int, ...], levels: int, limits: list[int], settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[tuple[str, int]] = []
+
+    def time_run(config: Config, pixels: int) -> RunTimes:
+        assert pixels == sum(megapixels[: config.source.limit]) * 1_000_000
+        ran.append((config.accuracy.name, config.source.limit or 0))
+        return RunTimes(1.0, 2.0, 3.0)
+
+    monkeypatch.setattr(complete_runs, "time_run", time_run)
+    config = settings(f"noise.levels={levels}")
+    files = RunFiles(config.source, tuple(number * 1_000_000 for number in megapixels), Path()).at_most(10**9)
+    with Progress(9) as progress:
+        times = complete_runs.measure_runs({"given": config}, TIERS, files, 3, progress)
+
+    assert [limit for name, limit in ran if name == REFERENCE] == limits
+    assert [limit for name, limit in ran if name != REFERENCE] == [1] * 2 + [len(megapixels)] * 6
+    cost = complete_runs.run_cost(times["given", REFERENCE], times["given", EXACT])
+    assert cost.ratio_to_exact == (1 if limits else None)
 
 
 def test_cost_of_runs_is_that_of_the_fastest_round() -> None:
     slow, fast, exact = RunTimes(2.0, 3.0, 4.0), RunTimes(1.0, 2.0, 1.0), RunTimes(1.0, 6.0, 1.0)
-    cost = complete_runs.run_cost([slow, fast], [exact, exact], pixels=10**9)
+    cost = complete_runs.run_cost([slow, fast], [exact, exact])
 
-    assert (cost.ns_per_pixel, cost.ratio_to_exact, cost.lowest_ratio, cost.highest_ratio) == (4, 0.5, 0.5, 1.125)
+    assert (cost.ns_per_pixel, cost.ratio_to_exact) == (4, 0.5)
+    assert (cost.lower_quartile_ratio, cost.upper_quartile_ratio) == (0.5 + 0.625 / 4, 1.125 - 0.625 / 4)
     assert (cost.decode_share, cost.simulate_share, cost.write_share) == (0.25, 0.5, 0.25)
 
 
@@ -355,7 +381,7 @@ def test_cost_of_runs_is_that_of_the_fastest_round() -> None:
 
 
 def concluded(*runs: RunMeasurement, given: str = "exact") -> str:
-    return conclude(runs, TIERS[given], TIERS, RunFiles(SourceConfig(), 4, 5_210_000, Path()))
+    return conclude(runs, TIERS[given], TIERS, RunFiles(SourceConfig(), (5_000_000, 0, 210_000), Path()))
 
 
 def test_conclusion_has_the_numbers_of_the_table(found: BenchmarkReport) -> None:
@@ -372,7 +398,7 @@ def test_conclusion_has_the_numbers_of_the_table(found: BenchmarkReport) -> None
     )
 
 
-START = "In a complete run of 4 photographs (5.2 megapixels, imx385_iso3200), "
+START = "In a complete run of 2 photographs (5.2 megapixels, imx385_iso3200), "
 MOVES = (
     "moves 2 % of the noisy DN, by at most 2 DN or 0.3 standard deviations of the noise (RMS 0.1 DN, 0.004 standard "
     "deviations)."
@@ -386,7 +412,7 @@ MOVES = (
         (run(), "fast", f"{START}`fast` takes 0.9 of the processor time of `exact` and {MOVES}"),
         (run(ratio=1.25), "exact", f"{START}`fast` takes 1.25 times the processor time of `exact` and {MOVES}"),
         (
-            run(ratio=0.96, lowest_ratio=0.9, highest_ratio=1.1),
+            run(ratio=0.96, lower_quartile_ratio=0.9, upper_quartile_ratio=1.1),
             "exact",
             f"{START}`fast` takes about as long as `exact` (ratio 0.96, no clear difference) and {MOVES}",
         ),
@@ -412,9 +438,15 @@ def test_conclusion_is_true_for_any_result(measured: RunMeasurement, given: str,
 def test_conclusion_names_a_budget_that_is_no_tier() -> None:
     own = replace(TIERS[EXACT], normal_error=1e-3)
     tiers = {**TIERS, "exact_changed": own}
-    sentence = conclude([run("exact_changed")], own, tiers, RunFiles(SourceConfig(), 1, 1, Path()))
+    sentence = conclude([run("exact_changed")], own, tiers, RunFiles(SourceConfig(), (1,), Path()))
 
     assert "`exact_changed` takes 0.9 of" in sentence
+
+
+def test_documentation_has_the_recommendations() -> None:
+    page = (Path(__file__).parents[2] / "docs/accuracy.md").read_text(encoding="utf-8")
+
+    assert f"\n{tables.markdown_table(tables.recommendation_table())}\n" in page
 
 
 def test_each_recommended_tier_exists() -> None:
@@ -548,7 +580,7 @@ def test_csv_of_runs_has_the_documented_columns(found: BenchmarkReport) -> None:
     lines = list(csv.DictReader(tables.runs_csv_text(found.runs).splitlines()))
 
     assert list(lines[0]) == [
-        *("setting", "noise", "tier", "ns_per_pixel", "ratio_to_exact", "lowest_ratio", "highest_ratio"),
+        *("setting", "noise", "tier", "ns_per_pixel", "ratio_to_exact", "lower_quartile_ratio", "upper_quartile_ratio"),
         *("decode_share", "simulate_share", "write_share", "noisy_changed_share", "noisy_max_dn", "noisy_rms_dn"),
         *("noisy_max_std", "noisy_rms_std"),
     ]

@@ -5,16 +5,19 @@ directly after each other; the order is reversed in every second round. A run co
 process, so the thread that hashes and writes is included, and waiting for the disk is not. The worker measures decoding
 and simulation (`pipeline.tasks.StageTimes`); the rest is hashing, writing and committing.
 
-The reported time is that of the fastest round. The reference is so slow that it runs in one round only.
+The reported time is that of the fastest round, per pixel. The reference is so slow that it runs in one round only, and
+on fewer photographs.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import shutil
+import statistics
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,19 +42,22 @@ LOGGER = logging.getLogger("unprocess_gen")
 JPEG_QUALITY = 95
 """Quality of the files of built-in scenes."""
 
-REFERENCE_PIXELS = 24_000_000
-"""Pixels of noisy frames above which runs of NumPy tiers are left out; they take about a second per megapixel."""
+REFERENCE_PIXELS, MOST_REFERENCE_PIXELS = 6_000_000, 24_000_000
+"""Pixels of noisy frames that are enough for a run of a NumPy tier, and those above which it is left out.
+
+A megapixel takes 0.2 to 0.9 s, and a run makes at least one photograph.
+"""
 
 
 class RunTimes(NamedTuple):
-    """Processor time of one run, seconds; ``write_s`` is what decoding and simulation leave."""
+    """Processor time of one run, ns per pixel; ``write_ns`` is what decoding and simulation leave."""
 
-    decode_s: float
-    simulate_s: float
-    write_s: float
+    decode_ns: float
+    simulate_ns: float
+    write_ns: float
 
     @property
-    def total_s(self) -> float:
+    def total_ns(self) -> float:
         """Sum of the stages."""
         return sum(self)
 
@@ -68,8 +74,8 @@ class RunMeasurement:
     tier: str
     ns_per_pixel: float | None
     ratio_to_exact: float | None
-    lowest_ratio: float | None
-    highest_ratio: float | None
+    lower_quartile_ratio: float | None
+    upper_quartile_ratio: float | None
     decode_share: float | None
     simulate_share: float | None
     write_share: float | None
@@ -88,16 +94,32 @@ class RunFiles:
     ----------
     source : SourceConfig
         Settings that select these photographs.
-    count, pixels : int
-        Number of photographs that can be read, and of their pixels.
+    pixels_of_sources : tuple of int
+        Number of pixels of each source; 0 if it cannot be read.
     folder : Path
         Temporary folder for datasets.
     """
 
     source: SourceConfig
-    count: int
-    pixels: int
+    pixels_of_sources: tuple[int, ...]
     folder: Path
+
+    @property
+    def count(self) -> int:
+        """Number of photographs that can be read."""
+        return sum(pixels > 0 for pixels in self.pixels_of_sources)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of all photographs."""
+        return sum(self.pixels_of_sources)
+
+    def at_most(self, pixels: int) -> RunFiles:
+        """Return the first photographs that have no more pixels together, but at least one that can be read."""
+        first = next(at for at, number in enumerate(self.pixels_of_sources) if number)
+        totals = list(itertools.accumulate(self.pixels_of_sources))
+        limit = max(first + 1, sum(total <= pixels for total in totals))
+        return RunFiles(replace(self.source, limit=limit), self.pixels_of_sources[:limit], self.folder)
 
 
 RunKey = tuple[str, str]
@@ -111,15 +133,15 @@ RunRounds = dict[RunKey, list[RunTimes]]
 def run_files(config: Config, sizes: SampleSizes) -> Iterator[RunFiles]:
     """Select the photographs of complete runs, and create a temporary folder that is deleted at the end.
 
-    Takes the first photographs of the config's source, until there are enough pixels. Built-in scenes are written as
-    JPEG files first, so that runs decode files.
+    Takes the first photographs of the config's source up to a number of photographs and of pixels, but at least one.
+    Built-in scenes are written as JPEG files first, so that runs decode files.
 
     Parameters
     ----------
     config : Config
         Validated config.
     sizes : SampleSizes
-        How many photographs and pixels are enough.
+        The largest number of photographs and of pixels.
 
     Yields
     ------
@@ -140,22 +162,20 @@ def run_files(config: Config, sizes: SampleSizes) -> Iterator[RunFiles]:
 
 
 def _select(config: Config, sizes: SampleSizes, folder: Path) -> RunFiles:
-    sources = list_photographs(config.source).sources
-    files, count, pixels, listed = folder / "photographs", 0, 0, 0
-    for source in sources:
-        listed += 1
+    files, pixels_of_sources = folder / "photographs", []
+    for source in list_photographs(config.source).sources:
+        pixels_of_sources.append(0)
         with suppress(SourceError):
             _, photograph = load_source(config.source, source, config.output.layout)
-            height, width = photograph.srgb.shape[:2]
-            count, pixels = count + 1, pixels + height * width
+            pixels_of_sources[-1] = photograph.srgb.shape[0] * photograph.srgb.shape[1]
             if config.source.root is None:
                 _write_scene(config, source, files)
-        if count >= sizes.run_files or pixels >= sizes.run_pixels:
+        if sum(map(bool, pixels_of_sources)) >= sizes.run_files or sum(pixels_of_sources) >= sizes.run_pixels:
             break
-    selected = replace(config.source, limit=listed)
-    if config.source.root is None:
-        selected = replace(selected, root=str(files), include=["*.jpg"], clips=False)
-    return RunFiles(selected, count, pixels, folder)
+    source_config = config.source
+    if source_config.root is None:
+        source_config = replace(source_config, root=str(files), include=["*.jpg"], clips=False)
+    return RunFiles(source_config, tuple(pixels_of_sources), folder).at_most(sizes.run_pixels)
 
 
 def _write_scene(config: Config, source: Source, folder: Path) -> None:
@@ -174,18 +194,20 @@ def run_config(config: Config, files: RunFiles, tier: AccuracyConfig) -> Config:
     return replace(config, source=files.source, accuracy=tier, n_jobs=1, out=str(files.folder / "dataset"))
 
 
-def time_run(config: Config) -> RunTimes:
+def time_run(config: Config, pixels: int) -> RunTimes:
     """Generate a dataset, delete it, and return the processor time that generating took.
 
     Parameters
     ----------
     config : Config
         Validated config with ``n_jobs=1``; ``out`` does not exist.
+    pixels : int
+        Number of pixels of its photographs.
 
     Returns
     -------
     RunTimes
-        Seconds.
+        Nanoseconds per pixel.
     """
     forget_bodies()
     try:
@@ -195,7 +217,8 @@ def time_run(config: Config) -> RunTimes:
             total_s = time.process_time() - started
     finally:
         shutil.rmtree(config.out, ignore_errors=True)
-    return RunTimes(times.decode_s, times.simulate_s, max(total_s - times.decode_s - times.simulate_s, 0.0))
+    write_s = max(total_s - times.decode_s - times.simulate_s, 0.0)
+    return RunTimes(*(1e9 * stage_s / pixels for stage_s in (times.decode_s, times.simulate_s, write_s)))
 
 
 @contextmanager
@@ -211,13 +234,14 @@ def _without_messages() -> Iterator[None]:
 
 def affordable(config: Config, files: RunFiles, sizes: SampleSizes) -> Config:
     """Return the config, with one noise level and one draw if it would make too many noisy frames."""
-    if _noisy_pixels(config, files) <= 2 * max(sizes.run_pixels, files.pixels):
+    if files.pixels * _pairs(config) <= 2 * max(sizes.run_pixels, files.pixels):
         return config
     return replace(config, noise=replace(config.noise, levels=None, draws=1))
 
 
-def _noisy_pixels(config: Config, files: RunFiles) -> int:
-    return files.pixels * len(noise_levels(config.noise)) * config.noise.draws
+def _pairs(config: Config) -> int:
+    """Return the number of pairs of a photograph."""
+    return len(noise_levels(config.noise)) * config.noise.draws
 
 
 def measure_runs(
@@ -248,32 +272,32 @@ def measure_runs(
         Times by setting and tier.
     """
     found: RunRounds = {(setting, tier): [] for setting in configs for tier in tiers}
+    one = files.at_most(0)
+    for config in configs.values():
+        for tier in tiers.values():
+            if not tier.readable:
+                time_run(run_config(config, one, tier), one.pixels)  # compiles, tests and fills caches
     for number in range(rounds):
         for setting, config in configs.items():
-            for name, tier in _ordered(tiers.items(), number):
-                if _is_measured(tier, config, files, number):
-                    if number == 0 and not tier.readable:
-                        time_run(_first_photograph(run_config(config, files, tier)))  # fills caches
-                    found[setting, name].append(time_run(run_config(config, files, tier)))
+            for name, tier in list(tiers.items())[:: -1 if number % 2 else 1]:
+                for some in _photographs(tier, config, files, number):
+                    found[setting, name].append(time_run(run_config(config, some, tier), some.pixels))
                 progress.advance()
     return found
 
 
-def _ordered(tiers: Iterable[tuple[str, AccuracyConfig]], number: int) -> list[tuple[str, AccuracyConfig]]:
-    """Return the tiers in the order of a round, so that a drift within rounds cancels."""
-    return list(tiers)[:: -1 if number % 2 else 1]
-
-
-def _is_measured(tier: AccuracyConfig, config: Config, files: RunFiles, number: int) -> bool:
-    return not tier.readable or (number == 0 and _noisy_pixels(config, files) <= REFERENCE_PIXELS)
-
-
-def _first_photograph(config: Config) -> Config:
-    return replace(config, source=replace(config.source, limit=1))
+def _photographs(tier: AccuracyConfig, config: Config, files: RunFiles, number: int) -> Iterator[RunFiles]:
+    """Yield the photographs of a tier's run in a round; none if it does not run."""
+    if not tier.readable:
+        yield files
+    elif number == 0:
+        some = files.at_most(REFERENCE_PIXELS // _pairs(config))
+        if some.pixels * _pairs(config) <= MOST_REFERENCE_PIXELS:
+            yield some
 
 
 def run_rows(
-    rounds: RunRounds, pixels: int, noises: Mapping[str, str], errors: Mapping[RunKey, NoisyError]
+    rounds: RunRounds, noises: Mapping[str, str], errors: Mapping[RunKey, NoisyError]
 ) -> Iterator[RunMeasurement]:
     """Yield time and error of each tier of each setting.
 
@@ -281,8 +305,6 @@ def run_rows(
     ----------
     rounds : dict of (str, str) to list of RunTimes
         Times by setting and tier.
-    pixels : int
-        Number of pixels of all photographs.
     noises : mapping of str to str
         Description of the noise by setting.
     errors : mapping of (str, str) to NoisyError
@@ -294,7 +316,7 @@ def run_rows(
         In the order of ``rounds``.
     """
     for (setting, tier), times in rounds.items():
-        cost = run_cost(times, rounds[setting, EXACT], pixels)
+        cost = run_cost(times, rounds[setting, EXACT])
         yield RunMeasurement(setting, noises[setting], tier, *cost, *errors[setting, tier])
 
 
@@ -303,22 +325,20 @@ class RunCost(NamedTuple):
 
     ns_per_pixel: float | None = None
     ratio_to_exact: float | None = None
-    lowest_ratio: float | None = None
-    highest_ratio: float | None = None
+    lower_quartile_ratio: float | None = None
+    upper_quartile_ratio: float | None = None
     decode_share: float | None = None
     simulate_share: float | None = None
     write_share: float | None = None
 
 
-def run_cost(times: Sequence[RunTimes], exact: Sequence[RunTimes], pixels: int) -> RunCost:
+def run_cost(times: Sequence[RunTimes], exact: Sequence[RunTimes]) -> RunCost:
     """Return the time of a tier's runs: that of the fastest, its shares, and the ratios to exact.
 
     Parameters
     ----------
     times, exact : sequence of RunTimes
         Times of the tier and of ``exact``, by round; the tier can have fewer rounds, or none.
-    pixels : int
-        Number of pixels of all photographs.
 
     Returns
     -------
@@ -327,8 +347,16 @@ def run_cost(times: Sequence[RunTimes], exact: Sequence[RunTimes], pixels: int) 
     """
     if not times:
         return RunCost()
-    least = min(times, key=lambda one: one.total_s)
-    ratios = [one.total_s / other.total_s for one, other in zip(times, exact, strict=False)]
-    ratio = least.total_s / min(one.total_s for one in exact)
-    shares = [stage_s / least.total_s for stage_s in least]
-    return RunCost(least.total_s / pixels * 1e9, ratio, min(ratios), max(ratios), *shares)
+    least = min(times, key=lambda one: one.total_ns)
+    ratios = [one.total_ns / other.total_ns for one, other in zip(times, exact, strict=False)]
+    ratio = least.total_ns / min(one.total_ns for one in exact)
+    shares = [stage_ns / least.total_ns for stage_ns in least]
+    return RunCost(least.total_ns, ratio, *_quartiles(ratios), *shares)
+
+
+def _quartiles(ratios: Sequence[float]) -> tuple[float, float]:
+    """Return the lower and the upper quartile."""
+    if len(ratios) == 1:
+        return ratios[0], ratios[0]
+    lower, _, upper = statistics.quantiles(ratios, method="inclusive")
+    return lower, upper

@@ -123,7 +123,7 @@ def _draw_runs(axes: Axes, runs: Sequence[RunMeasurement]) -> None:
             color=TIER_COLOURS.get(run.tier, OTHER_COLOUR),
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 1},
         )
-    axes.axvline(1, color=INK, linewidth=0.8, linestyle=":", zorder=3)
+    axes.axvline(1, color=INK, linewidth=0.8, linestyle=":", zorder=0.5)
     axes.set_yticks(
         range(len(shown)), [f"{run.noise if run.setting == GIVEN else run.setting}: {run.tier}" for run in shown]
     )

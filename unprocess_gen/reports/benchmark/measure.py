@@ -45,6 +45,7 @@ from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.benchmark import method_times as times
 from unprocess_gen.reports.benchmark.complete_runs import (
     JPEG_QUALITY,
+    REFERENCE_PIXELS,
     RunFiles,
     RunKey,
     RunMeasurement,
@@ -188,7 +189,7 @@ def measure_accuracy(
         run_times = measure_runs(run_configs, tiers, files, rounds_wanted, progress)
     rows = (*_method_rows(session, errors, rounds), *_tier_rows(session, errors, noisy, rounds))
     noises = {name: _noise_text(one) for name, one in settings.items()}
-    runs = tuple(run_rows(run_times, files.pixels, noises, noisy))
+    runs = tuple(run_rows(run_times, noises, noisy))
     conclusion = conclude(runs, config.accuracy, tiers, files)
     return BenchmarkReport(rows, runs, conclusion, _conditions(session, command) | _run_conditions(session, files))
 
@@ -387,11 +388,13 @@ def _conditions(session: BenchmarkSession, command: str) -> dict[str, str]:
 def _run_conditions(session: BenchmarkSession, files: RunFiles) -> dict[str, str]:
     """Return what a reader must know about complete runs."""
     root = session.configs[GIVEN].source.root
+    reference = files.at_most(REFERENCE_PIXELS)
     place = f"the first of {root}" if root else f"built-in scenes, as JPEG files of quality {JPEG_QUALITY}"
     return {
         "complete runs": f"{counted(files.count, 'photograph')}, {files.pixels / 1e6:.1f} megapixels ({place}); one "
         f"worker; processor time of all threads, without compilation and without waiting for the disk; fastest of "
-        f"{counted(session.sizes.rounds, 'round')}, one round for the reference; ratios of fastest rounds"
+        f"{counted(session.sizes.rounds, 'round')}, for the reference one round with {reference.pixels / 1e6:.1f} "
+        "megapixels; ratios of fastest rounds"
     }
 
 

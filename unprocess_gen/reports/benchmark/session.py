@@ -86,7 +86,7 @@ class SampleSizes:
     positions : int
         Number of random words in each segment of the table of normal quantiles.
     run_files, run_pixels : int
-        Number of photographs, or of their pixels, that are enough for a complete run.
+        Largest number of photographs of a complete run, and of their pixels if it has more than one.
     """
 
     photographs: int = 8
@@ -97,7 +97,7 @@ class SampleSizes:
     flat: int = 512
     positions: int = 64
     run_files: int = 16
-    run_pixels: int = 8_000_000
+    run_pixels: int = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
