@@ -17,6 +17,7 @@ from unprocess_gen.simulation.kernels.normal import (
     fill_values_by_lines,
     fine_normal,
 )
+from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.poisson import (
     LOW_RATE,
     CountTables,
@@ -27,9 +28,35 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts_of_one_rate,
 )
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, pointers_of, store
-from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Scratch, Workspace, scratch_of_thread, workspace_in
+from unprocess_gen.simulation.kernels.strips import (
+    SIZE,
+    STRIP,
+    Float32,
+    Scratch,
+    Workspace,
+    lead_of,
+    locate,
+    scratch_of_thread,
+    workspace_in,
+)
 
 _WIDTH = np.uint64(VECTOR_WIDTH)
+
+
+# Words ----------------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def fill_words(key: PhiloxKey, purpose_word: np.uint64, origin: tuple[int, int], scratch: Scratch, out: Words) -> None:
+    """Fill ``out`` with the words of a stream, strip by strip."""
+    height, width = out.shape
+    workspace, target = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0)
+    for y in range(height):
+        for x in range(0, width, STRIP):
+            strip = locate(origin, y, x, min(STRIP, width - x))
+            fill_word_blocks(key, strip, purpose_word, workspace.words)
+            for n in range(strip.length):
+                target[y * width + x + n] = workspace.words[strip.first + n]
 
 
 # Deviates -------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.kernels import counts, exact_values
+from helpers.kernels import counts, exact_values, fill_words
 from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
@@ -33,7 +33,6 @@ from unprocess_gen.planning.plan import plan_image, plan_pairs
 from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.estimate import estimate_run
 from unprocess_gen.simulation import self_test as selftest
-from unprocess_gen.simulation.kernels import body
 from unprocess_gen.simulation.kernels.normal import build_quantiles
 from unprocess_gen.simulation.kernels.philox import philox_key
 from unprocess_gen.simulation.kernels.strips import scratch_of_thread
@@ -76,7 +75,7 @@ def dn(frame: Frame, plan: Plan) -> np.ndarray:
 def test_compiled_words_equal_the_streams(shape: tuple[int, int], origin: tuple[int, int]) -> None:
     key = 0xFEDCBA9876543210
     found, purpose = np.empty(shape, dtype=np.uint32), np.uint64(streams.purpose("read"))
-    body._fill_words(philox_key(key, level=2, draw=1, frame=3), purpose, origin, scratch_of_thread(), found)
+    fill_words(philox_key(key, level=2, draw=1, frame=3), purpose, origin, scratch_of_thread(), found)
     assert np.array_equal(found, streams.words(key, "read", shape, origin=origin, frame=3, level=2, draw=1))
 
 
@@ -165,22 +164,6 @@ def test_unclipped_noise_has_mean_zero_in_black() -> None:
     assert abs(free.mean(dtype=np.float64)) < 5 * std / 512
     assert abs(free.var(dtype=np.float64) / std**2 - 1) < 5 * np.sqrt(2) / 512
     assert abs(clipped.mean(dtype=np.float64) - std / np.sqrt(2 * np.pi)) < 5 * 0.6 * std / 512
-
-
-@pytest.mark.parametrize("name", ["physical", "averaged"])
-def test_the_result_does_not_depend_on_bands(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The words of defects are compared in bands of rows."""
-    picture = selftest.golden_image()
-    for plan in (PLANS[name], normalised(PLANS[name])):
-        whole = make_pair(picture, plan, ORIGIN)
-        with monkeypatch.context() as patched:
-            patched.setattr(body, "BAND_SITES", 5 * picture.shape[1])
-            body.forget_bodies()
-            pieces = make_pair(picture, plan, ORIGIN)
-        body.forget_bodies()
-        assert pieces.clean.tobytes() == whole.clean.tobytes()
-        assert pieces.noisy.tobytes() == whole.noisy.tobytes()
-        assert pieces.counts == whole.counts
 
 
 @pytest.mark.parametrize("name", ["per_channel", "physical"])

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import exponential_levels
-from unprocess_gen.core.random_streams import Words, purpose
+from unprocess_gen.core.random_streams import purpose
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels.normal import exact_value, normal_quantiles
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, philox_key
-from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, pointer_to
+from unprocess_gen.simulation.kernels.simd import pointer_to
 from unprocess_gen.simulation.kernels.strips import (
-    SIZE,
+    ONES,
     STRIP,
     Float32,
     Scratch,
@@ -30,8 +30,8 @@ from unprocess_gen.simulation.kernels.strips import (
 PRNU, HOT, DEAD = (np.uint64(purpose(stream)) for stream in ("prnu", "hot_pixels", "dead_pixels"))
 HOT_STEP = np.uint64(purpose("hot_pixels", draw=1))
 
-BAND_SITES = 2**20
-"""Sites whose words are compared at a time when defects are located."""
+SMALL_SITES, SMALL_CROPS, LARGE_CROPS = 2**16, 128, 2
+"""Patterns are kept for the last crops of up to this many sites (0.4 MB each), and for the last larger ones."""
 
 
 class Body(NamedTuple):
@@ -44,7 +44,7 @@ class Body(NamedTuple):
     response_steps : (int, int)
         Elements of ``response`` from row to row and from column to column; 0 without PRNU.
     strips : int
-        S.
+        S; 0 without defects.
     starts : ndarray of int64, [H * S + 1]
         First defect of each strip.
     positions : ndarray of int64
@@ -61,23 +61,34 @@ class Body(NamedTuple):
     means_e: Float
 
 
+class FixedPatterns(NamedTuple):
+    """Hold the key of a body and the numbers of its patterns, 0 for effects that a plan does not simulate."""
+
+    key: int
+    prnu_std: float
+    hot_share: float
+    hot_e: float
+    dead_share: float
+
+
+WITHOUT_PATTERNS = Body(ONES, (0, 0), 0, np.zeros(2, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+
+
 def body_of(plan: Plan, shape: tuple[int, int], origin: tuple[int, int]) -> Body:
     """Return the fixed patterns that a plan simulates, for a crop of ``shape`` at ``origin``."""
-    return _body(fixed_patterns(plan), shape, origin)
+    patterns = fixed_patterns(plan)
+    if not any(patterns[1:]):
+        return WITHOUT_PATTERNS
+    body = _small_body if shape[0] * shape[1] <= SMALL_SITES else _large_body
+    return body(patterns, shape, origin)
 
 
-_Patterns = tuple[int, float, float, float, float]
-
-
-def fixed_patterns(plan: Plan) -> _Patterns:
-    """Return the key of the body and the numbers of its patterns, 0 for effects that the plan does not simulate.
-
-    The numbers are the standard deviation of PRNU, the share and mean of hot pixels, and the share of dead ones.
-    """
+def fixed_patterns(plan: Plan) -> FixedPatterns:
+    """Return the fixed patterns that a plan simulates."""
     physics, on = plan.physics, plan.effects
     if physics is None:
-        return 0, 0.0, 0.0, 0.0, 0.0
-    return (
+        return FixedPatterns(0, 0.0, 0.0, 0.0, 0.0)
+    return FixedPatterns(
         physics.body_key,
         physics.prnu_std if "prnu" in on else 0.0,
         physics.hot_pixel_share if "hot_pixels" in on else 0.0,
@@ -88,47 +99,40 @@ def fixed_patterns(plan: Plan) -> _Patterns:
 
 def forget_bodies() -> None:
     """Drop the cached patterns, so that the next frame computes them, as the first frame of a body does."""
-    _body.cache_clear()
+    _small_body.cache_clear()
+    _large_body.cache_clear()
 
 
-@functools.lru_cache(maxsize=2)
-def _body(patterns: _Patterns, shape: tuple[int, int], origin: tuple[int, int]) -> Body:
-    key, prnu_std, hot_share, hot_e, dead_share = patterns
-    response, pitch = np.ones(SIZE, dtype=np.float32), 0
-    if prnu_std != 0:
-        pitch = padded_width(origin[1], shape[1])
-        response = np.zeros((shape[0], pitch), dtype=np.float32)
-        _fill_response(
-            philox_key(key), prnu_std, origin, shape[1], normal_quantiles().quadratics, scratch_of_thread(), response
-        )
-    strips = max(-(-shape[1] // STRIP), 1)
-    y, x, means_e = _defects(key, hot_share, hot_e, dead_share, shape, origin)
-    starts = np.searchsorted(y * strips + x // STRIP, np.arange(shape[0] * strips + 1))
-    first = origin[1] % VECTOR_WIDTH
-    return Body(
-        response.reshape(-1), (pitch, int(pitch > 0)), strips, starts.astype(np.int64), x % STRIP + first, means_e
-    )
+def _body(patterns: FixedPatterns, shape: tuple[int, int], origin: tuple[int, int]) -> Body:
+    key, scratch, (height, width) = philox_key(patterns.key), scratch_of_thread(), shape
+    response, pitch = ONES, 0
+    if patterns.prnu_std:
+        pitch = padded_width(origin[1], width)
+        response = np.zeros((height, pitch), dtype=np.float32)
+        _fill_response(key, patterns.prnu_std, origin, width, normal_quantiles().quadratics, scratch, response)
+    body = WITHOUT_PATTERNS._replace(response=response.reshape(-1), response_steps=(pitch, int(pitch > 0)))
+    below = word_threshold(patterns.hot_share), word_threshold(patterns.dead_share)
+    if not any(below):
+        return body
+    strips = max(-(-width // STRIP), 1)
+    starts = np.zeros(height * strips + 1, dtype=np.int64)
+    size, found = 0, _expected_defects(patterns, height * width)
+    while size < found:
+        size, levels = found, exponential_levels()
+        positions, means_e = np.empty(size, dtype=np.int64), np.empty(size)
+        _list_defects(key, below, patterns.hot_e, levels, origin, width, scratch, starts, positions, means_e)
+        found = int(starts[-1])
+    return body._replace(strips=strips, starts=starts, positions=positions[:found], means_e=means_e[:found])
 
 
-def _defects(
-    key: int, hot_share: float, hot_e: float, dead_share: float, shape: tuple[int, int], origin: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
-    """Return the rows, columns and means (`Body.means_e`) of hot and dead pixels, row by row."""
-    hot_below, dead_below = word_threshold(hot_share), word_threshold(dead_share)
-    empty = np.zeros(0, dtype=np.int64)
-    found = [(empty, empty, np.zeros(0))]
-    rows = max(1, BAND_SITES // max(shape[1], 1))
-    for top in range(0, shape[0] if hot_below or dead_below else 0, rows):
-        at, size = (origin[0] + top, origin[1]), (min(rows, shape[0] - top), shape[1])
-        dead = _words(key, DEAD, at, size) < dead_below if dead_below else np.zeros(size, dtype=np.bool_)
-        hot = _words(key, HOT, at, size) < hot_below if hot_below else np.zeros(size, dtype=np.bool_)
-        y, x = np.nonzero(hot | dead)
-        steps = (
-            _words(key, HOT_STEP, at, size)[y, x] >> np.uint32(22) if hot_below else np.zeros(len(y), dtype=np.uint32)
-        )
-        found.append((y + top, x, np.where(dead[y, x], -1.0, hot_e * exponential_levels()[steps])))
-    y, x, means_e = (np.concatenate(column) for column in zip(*found, strict=True))
-    return y, x, means_e
+_small_body = functools.lru_cache(maxsize=SMALL_CROPS)(_body)
+_large_body = functools.lru_cache(maxsize=LARGE_CROPS)(_body)
+
+
+def _expected_defects(patterns: FixedPatterns, sites: int) -> int:
+    """Return a number of defects that is rarely exceeded: six standard deviations above the mean."""
+    mean = (patterns.hot_share + patterns.dead_share) * sites
+    return int(mean + 6 * mean**0.5) + 8
 
 
 def word_threshold(fraction: float) -> np.uint64:
@@ -136,23 +140,42 @@ def word_threshold(fraction: float) -> np.uint64:
     return np.uint64(int(fraction * 2**32))
 
 
-def _words(key: int, purpose_word: np.uint64, origin: tuple[int, int], shape: tuple[int, int]) -> Words:
-    out = np.empty(shape, dtype=np.uint32)
-    _fill_words(philox_key(key), purpose_word, origin, scratch_of_thread(), out)
-    return out
-
-
 @kernel
-def _fill_words(key: PhiloxKey, purpose_word: np.uint64, origin: tuple[int, int], scratch: Scratch, out: Words) -> None:
-    """Fill ``out`` with the words of a stream."""
-    height, width = out.shape
-    buffers, target = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0)
-    for y in range(height):
-        for x in range(0, width, STRIP):
-            strip = locate(origin, y, x, min(STRIP, width - x))
-            fill_word_blocks(key, strip, purpose_word, buffers.words)
-            for n in range(strip.length):
-                target[y * width + x + n] = buffers.words[strip.first + n]
+def _list_defects(
+    key: PhiloxKey,
+    below: tuple[np.uint64, np.uint64],
+    hot_e: float,
+    levels: Float,
+    origin: tuple[int, int],
+    width: int,
+    scratch: Scratch,
+    starts: NDArray[np.int64],
+    positions: NDArray[np.int64],
+    means_e: Float,
+) -> None:
+    """List hot and dead pixels, strip by strip: those whose words are below two thresholds.
+
+    ``starts`` counts all of them, also those for which the lists have no space.
+    """
+    workspace, found, strips = workspace_in(scratch, lead_of(origin)), 0, max(-(-width // STRIP), 1)
+    hot, dead, steps = workspace.words, workspace.read_words, workspace.dark_words
+    for n in range(starts.size - 1):
+        y, x = n // strips, n % strips * STRIP
+        strip, before = locate(origin, y, x, min(STRIP, width - x)), found
+        fill_word_blocks(key, strip, HOT, hot)
+        fill_word_blocks(key, strip, DEAD, dead)
+        for at in range(strip.first, strip.after):
+            if np.uint64(hot[at]) < below[0] or np.uint64(dead[at]) < below[1]:
+                if found < positions.size:
+                    positions[found] = at
+                found += 1
+        if found > before:
+            fill_word_blocks(key, strip, HOT_STEP, steps)
+            for d in range(before, min(found, positions.size)):
+                at = positions[d]
+                is_dead = np.uint64(dead[at]) < below[1]
+                means_e[d] = -1.0 if is_dead else hot_e * levels[steps[at] >> np.uint32(22)]
+        starts[n + 1] = found
 
 
 @kernel
@@ -166,13 +189,13 @@ def _fill_response(
     out: Float32,
 ) -> None:
     """Fill ``out`` with 1 plus normal deviates of standard deviation ``prnu_std``, but at least 0."""
-    buffers, target, normal = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0), pointer_to(quadratics, 0)
+    workspace, target, normal = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0), pointer_to(quadratics, 0)
     for y in range(out.shape[0]):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
-            fill_word_blocks(key, strip, PRNU, buffers.words)
+            fill_word_blocks(key, strip, PRNU, workspace.words)
             row = pointer_to(target, y * out.shape[1] + x + strip.lead)
             for n in range(strip.total):
-                buffers.exact_dn[n] = exact_value(buffers.words[n], normal)
+                workspace.exact_dn[n] = exact_value(workspace.words[n], normal)
             for n in range(strip.total):
-                row[n] = np.float32(max(1 + prnu_std * buffers.exact_dn[n], 0.0))
+                row[n] = np.float32(max(1 + prnu_std * workspace.exact_dn[n], 0.0))

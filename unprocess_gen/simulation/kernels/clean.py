@@ -41,7 +41,7 @@ from unprocess_gen.simulation.kernels.simd import (
     to_float64,
     to_uint32,
 )
-from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Strip, Workspace
+from unprocess_gen.simulation.kernels.strips import ONES, Float32, Strip, Workspace
 from unprocess_gen.simulation.reference.cfa import tile
 
 _0, _1, _2, _3, _4, _8 = (np.uint64(number) for number in (0, 1, 2, 3, 4, 8))
@@ -98,34 +98,59 @@ class Scene32(NamedTuple):
     headroom: Float32
 
 
-ONES = np.ones(SIZE, dtype=np.float32)
-"""`Scene.response` without fixed patterns."""
-
-
 def scene_of(plan: Plan, codes: int, origin: tuple[int, int], response: Float32 | None = None, pitch: int = 0) -> Scene:
     """Return the parameters of a plan for sources of ``codes`` codes; ``response`` and its ``pitch`` as in
     `Scene`."""
-    gains, channels = np.array(plan.inverse_gains), _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
-    headroom = np.maximum(1 - gains, 0) if plan.highlight == "per_channel" else np.zeros(3)
+    channels = _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
     gray_mean = plan.highlight == "gray_mean"
+    sites = np.array((_site_gains(plan), _headroom(plan))).take(channels, axis=1)
     return Scene(
         products=_products(plan.rgb2cam, plan.tone, plan.gamma, codes),
         code_count=codes,
         site_channels=channels,
-        inverse_gains=gains,
+        inverse_gains=np.array(plan.inverse_gains),
         gray_mean=gray_mean,
         highlight_threshold=plan.highlight_threshold,
         # with fixed patterns, the second pass computes every block, because only it applies the response
-        linear_limit=-np.inf if response is not None else _linear_limit(plan, gains, headroom),
+        linear_limit=-np.inf if response is not None else _linear_limit(plan),
         exposure=plan.exposure,
         brightest=plan.brightest,
         black_dn=float(plan.black_level_dn),
         span_dn=float(plan.white_level_dn - plan.black_level_dn),
-        # `_fill_gray_mean_signal` has inverted the gains already
-        gains=(np.ones(3) if gray_mean else gains)[channels],
-        headroom=headroom[channels],
+        gains=sites[0],
+        headroom=sites[1],
         response=ONES if response is None else response,
         response_steps=(pitch, int(pitch > 0)),
+    )
+
+
+def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:
+    """Return the parameters of a plan in float32, for sources of ``codes`` codes."""
+    f, channels = np.float32, _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
+    gray_mean, gains, limit = plan.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
+    exposure, brightest, threshold = plan.exposure, plan.brightest, plan.highlight_threshold
+    span_dn = float(plan.white_level_dn - plan.black_level_dn)
+    scale = [gain * exposure * span_dn for gain in gains]
+    numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
+    limits_dn, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
+    return Scene32(
+        products=_products32(plan.rgb2cam, plan.tone, plan.gamma, codes, (1.0,) * 3 if gray_mean else tuple(scale)),
+        code_count=codes,
+        site_channels=channels,
+        inverse_gains=np.array(plan.inverse_gains, dtype=f),
+        gray_mean=gray_mean,
+        highlight_threshold=f(threshold),
+        steepness=f(1 / (1 - threshold)),
+        exposure=f(exposure),
+        brightest=f(brightest),
+        clipped=f(brightest * (1 + FLOAT32_MARGIN)),
+        black_dn=np.uint32(plan.black_level_dn),
+        span_dn=f(span_dn),
+        dn_per_signal=f(exposure * span_dn),
+        limits_dn=limits_dn,
+        signal_per_dn=signal_per_dn,
+        gains=site_gains,
+        headroom=headroom,
     )
 
 
@@ -136,41 +161,31 @@ def _products(rgb2cam: tuple[float, ...], tone: str, gamma: float | str, codes: 
     return products
 
 
-def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:
-    """Return the parameters of a plan in float32, for sources of ``codes`` codes."""
-    scene, f = scene_of(plan, codes, origin), np.float32
-    channels = _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
-    gains = np.ones(3) if scene.gray_mean else scene.inverse_gains
-    dn_per_signal = gains * scene.exposure * scene.span_dn
-    scale = np.ones(3) if scene.gray_mean else dn_per_signal
-    return Scene32(
-        products=(scene.products * scale[:, None, None]).astype(f),
-        code_count=codes,
-        site_channels=scene.site_channels,
-        inverse_gains=scene.inverse_gains.astype(f),
-        gray_mean=scene.gray_mean,
-        highlight_threshold=f(scene.highlight_threshold),
-        steepness=f(1 / (1 - scene.highlight_threshold)),
-        exposure=f(scene.exposure),
-        brightest=f(scene.brightest),
-        clipped=f(scene.brightest * (1 + FLOAT32_MARGIN)),
-        black_dn=np.uint32(scene.black_dn),
-        span_dn=f(scene.span_dn),
-        dn_per_signal=f(scene.exposure * scene.span_dn),
-        limits_dn=(scene.linear_limit * dn_per_signal)[channels].astype(f),
-        signal_per_dn=(1 / dn_per_signal)[channels].astype(f),
-        gains=scene.gains.astype(f),
-        headroom=scene.headroom.astype(f),
-    )
+@functools.lru_cache(maxsize=4)
+def _products32(
+    rgb2cam: tuple[float, ...], tone: str, gamma: float | str, codes: int, scale: tuple[float, ...]
+) -> Float32:
+    products = np.array(_products(rgb2cam, tone, gamma, codes) * np.array(scale)[:, None, None], dtype=np.float32)
+    products.flags.writeable = False
+    return products
 
 
-def _linear_limit(plan: Plan, gains: Float, headroom: Float) -> float:
+def _site_gains(plan: Plan) -> tuple[float, float, float]:
+    """Return the factors of the channels that remain: `_fill_gray_mean_signal` has inverted the gains already."""
+    return (1.0, 1.0, 1.0) if plan.highlight == "gray_mean" else plan.inverse_gains
+
+
+def _headroom(plan: Plan) -> list[float]:
+    """Return the factor of the per-channel highlight term by channel; 0 without the term."""
+    return [max(1 - gain, 0.0) for gain in plan.inverse_gains] if plan.highlight == "per_channel" else [0.0] * 3
+
+
+def _linear_limit(plan: Plan) -> float:
     """Return a signal up to which no site is a highlight, clipped or saturated, with a margin for rounding errors."""
     span_dn = plan.white_level_dn - plan.black_level_dn
     light = min(plan.brightest * 0.999, 1 - 1 / span_dn)
-    highest_gain = 1.0 if plan.highlight == "gray_mean" else float(gains.max())
-    unclipped = min(1.0, light / plan.exposure) / highest_gain * 0.999
-    return min(unclipped, plan.highlight_threshold) if headroom.any() else unclipped
+    unclipped = min(1.0, light / plan.exposure) / max(_site_gains(plan)) * 0.999
+    return min(unclipped, plan.highlight_threshold) if any(_headroom(plan)) else unclipped
 
 
 @functools.lru_cache(maxsize=16)

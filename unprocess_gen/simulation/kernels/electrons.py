@@ -10,6 +10,7 @@ Timings and rejected alternatives: ``docs/design/kernels.md``.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -142,9 +143,7 @@ def electron_noise(
     numbers, purposes, quantiles, columns_dn, errors_dn, ranks = ([*members] for members in zip(*frames, strict=True))
     black_dn, base_dn = float(plans[0].black_level_dn), np.empty((len(plans), 2, columns), dtype=np.float32)
     for base, column_dn, error_dn in zip(base_dn, columns_dn, errors_dn, strict=True):
-        for y in range(2):
-            for x in range(2):
-                base[y, x::2] = black_dn + (column_dn[x::2] + error_dn[y, x])
+        base.reshape(2, -1, 2)[...] = black_dn + (column_dn.reshape(-1, 2) + error_dn.reshape(2, 1, 2))
     return Electrons(
         numbers=np.array(numbers),
         read_purposes=np.array(purposes),
@@ -176,20 +175,20 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     if physics is None:
         return _two_parameter_frame(plan, columns, counts_all)
     on = frozenset(plan.effects)
-    columns_dn, errors_dn = np.zeros(columns), np.zeros((2, 2))
+    columns_dn, errors_dn, farthest_dn = np.zeros(columns), np.zeros((2, 2)), 0.0
     if "column" in on:
         columns_dn = physics.column_std_dn * _column_normals(physics.body_key, columns, origin[1])
+        farthest_dn += float(np.abs(columns_dn).max(initial=0.0))
     if "black_error" in on:
         errors_dn = reference_noise.black_error(physics, (2, 2), origin)
+        farthest_dn += float(np.abs(errors_dn).max())
     dark_e = physics.dark_e if "dark_current" in on else 0.0
     removed_e = dark_e if physics.dark_offset == "removed" else 0.0
     read_std_dn = physics.read_std_dn if "read" in on else 0.0
     row_std_dn = physics.row_std_dn if "row" in on else 0.0
     quantiles = _read_quantiles(physics.read_law, physics.read_shape)
-    offset_dn = (
-        plan.black_level_dn + 6.4 * row_std_dn + float(np.abs(columns_dn).max(initial=0.0) + np.abs(errors_dn).max())
-    )
-    most_dark_dn = physics.dn_per_e * (dark_e + 8 * float(np.sqrt(dark_e)) + 40) if dark_e else 0.0
+    offset_dn = plan.black_level_dn + 6.4 * row_std_dn + farthest_dn
+    most_dark_dn = physics.dn_per_e * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
     lowest_root, highest_root = _count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
     fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
     a_dn, b_dn2 = plan.variance_line
@@ -224,7 +223,7 @@ def _column_normals(body_key: int, columns: int, left: int) -> Float:
 def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
     """Return shot and read noise whose variance line is that of the plan."""
     a_dn, b_dn2 = plan.variance_line
-    read_std_dn, quantiles = float(np.sqrt(max(b_dn2, 0.0))), normal_quantiles()
+    read_std_dn, quantiles = math.sqrt(max(b_dn2, 0.0)), normal_quantiles()
     lowest_root, highest_root = _count_roots(plan, read_std_dn / a_dn, counts_all)
     numbers = _Numbers(
         dn_per_e=a_dn,
@@ -241,8 +240,7 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
 
 def _error_dn(read_std_dn: float, quantiles: Quantiles, offset_dn: float, most_dark_dn: float) -> float:
     """Return `_Numbers.error_dn`."""
-    farthest_dn = read_std_dn * float(np.abs(quantiles.quadratics[::4]).max())
-    summands_dn = 2 * farthest_dn + 2 * offset_dn + most_dark_dn + 0.5
+    summands_dn = 2 * read_std_dn * quantiles.farthest + 2 * offset_dn + most_dark_dn + 0.5
     return read_std_dn * quantiles.error + FLOAT32_ERROR_DN * summands_dn
 
 
@@ -250,8 +248,8 @@ def _count_roots(plan: Plan, read_std_e: float, counts_all: bool) -> tuple[float
     """Return the square roots of the mean electrons between which a normal is too far from the counts."""
     if "shot:gaussian_where_near" not in plan.methods or read_std_e < MIN_READ_STD_E or counts_all:
         return 0.0, np.inf  # without light no count is needed
-    lowest, highest = np.sqrt(gaussian_from(read_std_e, plan.law_distance))
-    return float(lowest), float(highest)
+    lowest, highest = gaussian_from(read_std_e, plan.law_distance)
+    return math.sqrt(lowest), math.sqrt(highest)
 
 
 @functools.lru_cache(maxsize=8)
@@ -413,6 +411,8 @@ def _replace_by_normals(count: int, of: _Numbers, tables: CountTables, workspace
 @inner
 def _defects_of(body: Body, strip: Strip) -> tuple[int, int]:
     """Return the range of a strip's defects in the lists of the body."""
+    if body.strips == 0:
+        return 0, 0
     at = strip.y * body.strips + strip.x // STRIP
     return body.starts[at], body.starts[at + 1]
 

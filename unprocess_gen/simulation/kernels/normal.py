@@ -69,12 +69,15 @@ class Quantiles(NamedTuple):
         Value at f = 0 and slope in f (`pack_lines`). The last one is the median, to which f may round.
     error : float
         Largest difference between a value by lines and the exact one.
+    farthest : float
+        Largest absolute value.
     quadratics : ndarray of float64, [4096]
         Rows of the exact table (`lookup_tables.normal_table`), each with a fourth number that is not used.
     """
 
     lines: NDArray[np.uint64]
     error: float
+    farthest: float
     quadratics: Float
 
 
@@ -102,9 +105,10 @@ def build_quantiles(table: Float) -> Quantiles:
         float(np.abs(z - (start32.astype(np.float64) + slope32.astype(np.float64) * f)).max())
         for z, f in ((z_low, f_low), (z_middle, (f_low + f_high) / 2), (z_high, f_high))
     )
-    farthest = float(np.abs(table[:, 0]).max() + np.abs(slope * f_high).max())
+    farthest = float(np.abs(table[:, 0]).max())
+    error += FLOAT32_ERROR * (farthest + float(np.abs(slope * f_high).max()))
     lines = np.concatenate([pack_lines(start32, slope32), np.zeros(1, dtype=np.uint64)])
-    return Quantiles(lines, error + FLOAT32_ERROR * farthest, np.pad(table, ((0, 0), (0, 1))).ravel())
+    return Quantiles(lines, error, farthest, np.pad(table, ((0, 0), (0, 1))).ravel())
 
 
 def pack_lines(start: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArray[np.uint64]:

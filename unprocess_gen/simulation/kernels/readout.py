@@ -92,17 +92,21 @@ def readout_of(
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
     black_dn = float(first.black_level_dn)
-    clipped = [noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip) for plan in plans]
-    pinned = [_pinned_dn(plan, counts_from_black) for plan in plans]
+    limits_dn = [
+        noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip) + _pinned_dn(plan, counts_from_black)
+        for plan in plans
+    ]
+    packed = first.layout == PACKED
+    planes = _planes(first.pattern, origin[0] % 2, origin[1] % 2)
     kind: Any = Normalised if first.normalised else Integers
     readout: Integers | Normalised = kind(
-        limits_dn=np.hstack([clipped, pinned]),
+        limits_dn=np.array(limits_dn, dtype=np.float64),
         averaged=first.averaged,
         black_dn=black_dn,
         span_dn=float(first.white_level_dn) - black_dn,
         white=1.0 if first.normalised else float(first.white_level_dn),
-        packed=first.layout == PACKED,
-        planes=_planes(first.pattern, origin[0] % 2, origin[1] % 2) * ((shape[0] // 2) * (shape[1] // 2)),
+        packed=packed,
+        planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
     return readout
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.types import PACKED, Counts, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import body_of, fixed_patterns
-from unprocess_gen.simulation.kernels.clean import ONES, Scene, Scene32, fill_clean, scene32_of, scene_of
+from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene32_of, scene_of
 from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
@@ -30,10 +30,15 @@ from unprocess_gen.simulation.kernels.readout import (
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
-from unprocess_gen.simulation.kernels.strips import STRIP, Scratch, lead_of, locate, scratch_of_thread, workspace_in
-
-CLEAN_COUNTS = [0, 1, 4]
-"""Columns of the counts that belong to the clean frame, in the order of `Counts`."""
+from unprocess_gen.simulation.kernels.strips import (
+    ONES,
+    STRIP,
+    Scratch,
+    lead_of,
+    locate,
+    scratch_of_thread,
+    workspace_in,
+)
 
 
 def render_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> list[Pair]:
@@ -54,8 +59,11 @@ def render_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0
         One pair per plan; all share the clean array.
     """
     clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin)
-    counts[1:, CLEAN_COUNTS] = counts[0, CLEAN_COUNTS]
-    return [Pair(clean, frame, Counts(*numbers)) for frame, numbers in zip(noisy, counts.tolist(), strict=True)]
+    clean_low, clean_high, _, _, saturated, _ = counts[0]
+    return [
+        Pair(clean, frame, Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance))
+        for frame, (_, _, noisy_low, noisy_high, _, zero_variance) in zip(noisy, counts, strict=True)
+    ]
 
 
 def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
@@ -65,21 +73,23 @@ def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Fr
 
 def _fill_frames(
     srgb: Srgb, plans: Sequence[Plan], count: int, origin: tuple[int, int]
-) -> tuple[Frame, Frame, NDArray[np.int64]]:
-    """Return the clean frame, the first ``count`` noisy frames, and the numbers of `Counts` of each."""
+) -> tuple[Frame, Frame, list[list[int]]]:
+    """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
+
+    Only the first numbers include those of the clean frame.
+    """
     first, shape = plans[0], (srgb.shape[0], srgb.shape[1])
     frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.layout == PACKED else shape
     dtype = np.float32 if first.normalised else np.uint16
     clean, noisy = np.empty(frame_shape, dtype=dtype), np.empty((count, *frame_shape), dtype=dtype)
     counts = np.zeros((max(count, 1), 6), dtype=np.int64)
-    scene, noise, scratch = _records(plans, shape, 256 if srgb.dtype == np.uint8 else 65536, origin)
-    codes = np.require(
-        srgb, requirements=["C", "A", "W", "E"]
-    )  # a read-only array would be another type, compiled again
+    scene, noise, scratch = _records(plans, shape, 256 if srgb.itemsize == 1 else 65536, origin)
+    # a view, a read-only array or a subclass would be another type, compiled again
+    codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
     keys, readout = philox_keys(plans)[:count], readout_of(plans, shape, origin, uses_scene32(first))
     frames = clean.reshape(-1), noisy.reshape(count, clean.size)
     _render(codes, scene, noise, keys, origin, readout, scratch, *frames, counts)
-    return clean, noisy, counts
+    return clean, noisy, counts.tolist()
 
 
 def _records(

@@ -34,6 +34,9 @@ SIZE = STRIP + BLOCK
 Float32 = NDArray[np.float32]
 Indices = NDArray[np.uint32]
 
+ONES = np.ones(SIZE, dtype=np.float32)
+"""Relative gain of the pixels without PRNU."""
+
 _8 = np.uint64(8)
 _MASK_BITS = np.arange(2**VECTOR_WIDTH)[:, None] >> np.arange(VECTOR_WIDTH) & 1
 _LANES_BY_MASK = np.argsort(1 - _MASK_BITS, axis=1, kind="stable").ravel()
@@ -130,7 +133,14 @@ class Scratch(NamedTuple):
     frames: Raw  # [2 + 1, SIZE]
 
 
-_threads = threading.local()
+class _Threads(threading.local):
+    """Hold the scratch memory of each thread, by dtype."""
+
+    def __init__(self) -> None:
+        self.scratch: dict[Any, Scratch] = {}
+
+
+_threads = _Threads()
 
 
 def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
@@ -139,10 +149,9 @@ def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
     Its signal is zero: a bright number in the padding would slow down its block, and in float32 change the rounding of
     the sites in its vector. No result depends on its other content.
     """
-    name = np.dtype(dtype).name
-    if not hasattr(_threads, name):
-        setattr(_threads, name, allocate_scratch(dtype))
-    scratch: Scratch = getattr(_threads, name)
+    scratch = _threads.scratch.get(dtype)
+    if scratch is None:
+        scratch = _threads.scratch[dtype] = allocate_scratch(dtype)
     scratch.stages.fill(0)
     return scratch
 
