@@ -21,7 +21,7 @@ from unprocess_gen.reports.benchmark.tables import markdown_table, method_table,
 
 HERE = Path(__file__).parent
 PAGE = HERE.parent / "docs" / "accuracy.md"
-CONCLUSION = re.compile(r"^In a complete run of .*$", re.MULTILINE)
+CONCLUSION = re.compile(r"^In a complete run of .*?(?=\n\n)", re.MULTILINE | re.DOTALL)
 TEXTS = ("stage", "method", "tier", "error_unit", "setting", "noise")
 
 

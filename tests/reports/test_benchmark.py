@@ -179,8 +179,8 @@ def test_every_tier_runs_in_every_setting(found: BenchmarkReport) -> None:
     assert [(run.setting, run.tier) for run in found.runs] == expected
     assert [run.noise for run in found.runs[::3]] == [
         "imx385_iso3200",
-        "sony_a7s2, scene daylight, ISO 100",
-        "sony_a7s2, scene night, ISO 6400",
+        "sony_a7s2, ISO 100",
+        "sony_a7s2, ISO 6400",
     ]
 
 
@@ -234,8 +234,8 @@ def test_noisy_errors_of_a_tier_are_those_of_its_frames(settings: Settings, prof
 def test_settings_of_runs_include_both_kinds_of_noise(settings: Settings, profiles: BenchmarkProfiles) -> None:
     for overrides, names in (
         ((), ["given", "daylight", "night"]),
-        (("noise=sony_a7s2", "scene=low_light"), ["given", "two_parameter_run", "daylight", "night"]),
-        (("noise=sony_a7s2", "scene=night"), ["given", "two_parameter_run", "daylight"]),
+        (("noise=sony_a7s2", "scene=low_light"), ["given", "two_parameter_noise", "daylight", "night"]),
+        (("noise=sony_a7s2", "scene=night"), ["given", "two_parameter_noise", "daylight"]),
     ):
         assert list(session.run_settings(settings(*overrides), profiles)) == names
 
@@ -334,6 +334,14 @@ def test_photographs_of_runs_end_with_enough_pixels(folder: Path, settings: Sett
             assert files.pixels_of_sources[:4] == pixels[: count + 1]
 
 
+def test_photographs_that_cannot_be_packed_are_an_error(folder: Path, settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos/a.png"), np.zeros((1, 9, 3), np.uint8))
+    config = settings(f"source.root={tmp_path / 'photos'}", "output.layout=packed")
+    with pytest.raises(ConfigError, match=r"none of 1 photographs can be read with output.layout=packed"):
+        complete_runs.run_files(config, LITTLE).__enter__()
+
+
 def test_runs_with_too_many_frames_have_one_level(settings: Settings) -> None:
     config = settings("noise.levels=5", "noise.draws=2")
     files = RunFiles(config.source, (1000,), Path())
@@ -389,7 +397,9 @@ def test_conclusion_has_the_numbers_of_the_table(found: BenchmarkReport) -> None
     table = tables.run_table([run])
     cells = dict(zip(table.headings, next(iter(table.lines)), strict=True))
 
-    assert found.conclusion.startswith("In a complete run of 2 photographs (0.8 megapixels, imx385_iso3200), `fast` ")
+    assert found.conclusion.startswith(
+        "In a complete run of 2 photographs (0.8 megapixels, noise=imx385_iso3200), `fast` "
+    )
     ratio = re.search(r"takes (?:about as long as `exact` \(ratio )?([\d.]+)", found.conclusion)
     assert ratio is not None and ratio[1] == cells["of exact"]
     assert found.conclusion.endswith(
@@ -398,7 +408,7 @@ def test_conclusion_has_the_numbers_of_the_table(found: BenchmarkReport) -> None
     )
 
 
-START = "In a complete run of 2 photographs (5.2 megapixels, imx385_iso3200), "
+START = "In a complete run of 2 photographs (5.2 megapixels, noise=imx385_iso3200), "
 MOVES = (
     "moves 2 % of the noisy DN, by at most 2 DN or 0.3 standard deviations of the noise (RMS 0.1 DN, 0.004 standard "
     "deviations)."
@@ -688,8 +698,9 @@ def test_accuracy_writes_three_files_and_reports_them(run_main: RunMain, tmp_pat
         assert sorted(path.name for path in (tmp_path / "new/report").iterdir()) == sorted(report.FILES)
         assert re.search(r"^tier_electrons +fast ", done.out, re.MULTILINE)
         assert re.search(r"^night .* fast ", done.out, re.MULTILINE)
-        assert done.out.count("In a complete run of 1 photograph (0.0 megapixels, imx385_iso3200), `fast` ") == 1
-        assert all(each.reason in done.out for each in RECOMMENDATIONS)
+        printed = " ".join(done.out.split())
+        assert printed.count("In a complete run of 1 photograph (0.0 megapixels, noise=imx385_iso3200), `fast` ") == 1
+        assert all(f"{each.use}: {each.tier}; {each.reason}" in printed for each in RECOMMENDATIONS)
         assert "measurements" in done.err
         assert "image" not in done.err  # of the runs that are measured
     assert "gen-dataset accuracy source.root=" in (tmp_path / "new/report/accuracy.html").read_text()

@@ -27,7 +27,7 @@ import cv2
 
 from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import AccuracyConfig, Config, SourceConfig
-from unprocess_gen.core.errors import SourceError
+from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.generate import generate
@@ -150,6 +150,8 @@ def run_files(config: Config, sizes: SampleSizes) -> Iterator[RunFiles]:
 
     Raises
     ------
+    ConfigError
+        If no photograph can be read.
     MachineError
         If the folder or a file in it cannot be written.
     """
@@ -172,6 +174,11 @@ def _select(config: Config, sizes: SampleSizes, folder: Path) -> RunFiles:
                 _write_scene(config, source, files)
         if sum(map(bool, pixels_of_sources)) >= sizes.run_files or sum(pixels_of_sources) >= sizes.run_pixels:
             break
+    if not any(pixels_of_sources):
+        raise ConfigError(
+            f"source.root={config.source.root}: none of {len(pixels_of_sources)} photographs can be read with "
+            f"output.layout={config.output.layout}; expected at least one"
+        )
     source_config = config.source
     if source_config.root is None:
         source_config = replace(source_config, root=str(files), include=["*.jpg"], clips=False)

@@ -28,8 +28,8 @@ RECOMMENDATIONS = (
     Recommendation(
         "training data",
         EXACT,
-        "fast shortens only the simulation, half of a run or less; it pays if a photograph gives many pairs "
-        "(noise.levels, noise.draws) or if pairs are made from arrays",
+        "fast can shorten only the simulation, so its errors pay only if the simulation is most of a run "
+        "(noise.levels, noise.draws, pairs made from arrays) and the table of runs shows that fast saves time",
     ),
     Recommendation(
         "benchmark whose files are published",
@@ -41,9 +41,7 @@ RECOMMENDATIONS = (
         REFERENCE,
         "NumPy code that can be read and checked; it gives the DN of exact",
     ),
-    Recommendation(
-        "quick look", FAST, "the error is small against the noise, so pictures and statistics look the same"
-    ),
+    Recommendation("quick look", FAST, "its errors cannot be seen in pictures, and it is never much slower"),
 )
 
 
@@ -75,7 +73,7 @@ def conclude(
     run = next((run for run in runs if (run.setting, run.tier) == (GIVEN, compared)), None)
     if run is None:
         return f"No tier other than `{EXACT}` was measured."
-    photographs = f"{counted(files.count, 'photograph')} ({files.pixels / 1e6:.1f} megapixels, {run.noise})"
+    photographs = f"{counted(files.count, 'photograph')} ({files.pixels / 1e6:.1f} megapixels, noise={run.noise})"
     return f"In a complete run of {photographs}, `{run.tier}` {time_clause(run)} and {error_clause(run)}."
 
 

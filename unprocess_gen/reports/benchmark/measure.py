@@ -188,7 +188,7 @@ def measure_accuracy(
         run_configs = {name: affordable(one, files, session.sizes) for name, one in settings.items()}
         run_times = measure_runs(run_configs, tiers, files, rounds_wanted, progress)
     rows = (*_method_rows(session, errors, rounds), *_tier_rows(session, errors, noisy, rounds))
-    noises = {name: _noise_text(one) for name, one in settings.items()}
+    noises = {name: _noise_text(one, with_scene=name == GIVEN) for name, one in settings.items()}
     runs = tuple(run_rows(run_times, noises, noisy))
     conclusion = conclude(runs, config.accuracy, tiers, files)
     return BenchmarkReport(rows, runs, conclusion, _conditions(session, command) | _run_conditions(session, files))
@@ -398,13 +398,13 @@ def _run_conditions(session: BenchmarkSession, files: RunFiles) -> dict[str, str
     }
 
 
-def _noise_text(config: Config) -> str:
-    return _physical_noise(config) if is_physical(config.noise) else config.noise.name
+def _noise_text(config: Config, with_scene: bool) -> str:
+    return _physical_noise(config, with_scene) if is_physical(config.noise) else config.noise.name
 
 
-def _physical_noise(config: Config) -> str:
+def _physical_noise(config: Config, with_scene: bool = True) -> str:
     iso = config.scene.iso if config.noise.iso is None else config.noise.iso
-    return f"{config.noise.name}, scene {config.scene.name}, ISO {iso}"
+    return f"{config.noise.name}{f', scene {config.scene.name}' if with_scene else ''}, ISO {iso}"
 
 
 def processor() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 from unprocess_gen.reports.benchmark.figure import benchmark_figure
@@ -18,6 +19,9 @@ from unprocess_gen.reports.html_pages import data_uri, render_page
 from unprocess_gen.reports.report_files import write_files
 
 __all__ = ["FILES", "benchmark_page", "report_text", "write_benchmark"]
+
+COLUMNS = 120
+"""Width of printed sentences."""
 
 FILES = ("accuracy.csv", "accuracy_runs.csv", "accuracy.png", "accuracy.html")
 
@@ -42,11 +46,17 @@ def report_text(report: BenchmarkReport) -> str:
             "complete runs, from files to committed shards: processor time and its shares; errors of the noisy frames",
             text_table(run_table(report.runs)),
             "",
-            report.conclusion,
+            textwrap.fill(report.conclusion, COLUMNS, break_on_hyphens=False),
             "",
-            text_table(recommendation_table()),
+            "recommended tiers",
+            *(_recommended(*line) for line in recommendation_table().lines),
         ]
     )
+
+
+def _recommended(use: str, tier: str, reason: str) -> str:
+    text = f"{use}: {tier}; {reason}"
+    return textwrap.fill(text, COLUMNS, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
 
 
 def write_benchmark(report: BenchmarkReport, out: Path) -> None:

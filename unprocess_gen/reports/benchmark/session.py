@@ -39,7 +39,7 @@ REFERENCE, EXACT = "reference", "exact"
 TWO_PARAMETER, PHYSICAL, GIVEN = "two_parameter", "physical", "given"
 """Names of the configs of a session: 14 bits with two-parameter noise, 14 bits with physical noise, the user's own."""
 
-TWO_PARAMETER_RUN = "two_parameter_run"
+TWO_PARAMETER_RUN = "two_parameter_noise"
 """Name of the setting of complete runs that has the user's sensor with two-parameter noise."""
 
 FALLBACK_ISO = 1600
