@@ -13,7 +13,7 @@ from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.forms import spelled as spelled_form
 from unprocess_gen.config.interpretation import BRANCH_NUMBERS, EFFECT_NUMBERS
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, BranchConfig, all_settings
+from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.core.types import Physics
@@ -54,6 +54,11 @@ DISTRIBUTIONS_INTRODUCTION = """\
 A setting that is drawn for each image is a number, which is the same for all images, or a distribution, written as a
 list: `gains.red=[uniform,1.9,2.4]`. The column "allowed" names the distributions that a setting accepts."""
 
+PROVENANCE_INTRODUCTION = """\
+### Keys of a statement of provenance
+
+Each item of `noise.provenance` states where numbers come from. `plan` prints the statements for the ISOs that occur."""
+
 FORMS_INTRODUCTION = """\
 ### Numbers that depend on ISO
 
@@ -93,6 +98,8 @@ def settings_page() -> str:
                 _keys(None, settings_of(BranchConfig)),
                 FORMS_INTRODUCTION,
                 _forms(ISO_FORMS),
+                PROVENANCE_INTRODUCTION,
+                _keys(None, settings_of(ProvenanceConfig)),
             ]
         if group == "effects":
             blocks += [EFFECTS_INTRODUCTION, _effect_numbers()]

@@ -41,7 +41,7 @@ CHANGES: dict[str, Callable[[Config], Any]] = {
     "gain": lambda config: setattr(config.gains, "red", 2.0),
     "end of a list": lambda config: config.gains.red.__setitem__(2, 2.3),
     "true in place of 1": lambda config: setattr(config.scene, "exposure_ratio", True),
-    "number of a branch": lambda config: setattr(config.noise.branches[2], "dn_per_e", ["per_iso", 1e-3]),
+    "number of a branch": lambda config: setattr(config.noise.branches[1], "dn_per_e", ["per_iso", 1e-3]),
     "ISO": lambda config: setattr(config.noise, "iso", 3200),
     "switch": lambda config: setattr(config.effects, "prnu", "on"),
     "group": lambda config: setattr(config, "noise", NoiseConfig()),

@@ -57,7 +57,7 @@ NEEDS = {
 }
 NOISE_KEYS = {"name", "units", "black", "bits", "black_level_dn", "white_level_dn"}
 TWO_NUMBERS = {"a", "b", "negative_variance"}
-PHYSICAL = {"branches", "assumed", *PHYSICAL_NUMBERS}
+PHYSICAL = {"branches", "assumed", "provenance", *PHYSICAL_NUMBERS}
 CHOSEN = {"iso", "law", "levels", "draws", "scatter"}
 """Keys that users set; of these, profiles set only ``scatter``."""
 SHA256 = "0" * 64
@@ -451,7 +451,11 @@ def test_source_kind_is_derived_from_root(settings: Settings) -> None:
 
 def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> None:
     loaded = yaml.safe_load(dataset_yaml(settings()))
-    assert NOT_DATA == {"": ("out", "n_jobs", "self_test", "check_disk"), "source": ("root", "max_failed")}
+    assert NOT_DATA == {
+        "": ("out", "n_jobs", "self_test", "check_disk"),
+        "source": ("root", "max_failed"),
+        "noise": ("provenance",),
+    }
     assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)
     assert {"root", "max_failed"}.isdisjoint(loaded["source"])
 
@@ -681,7 +685,7 @@ def test_choices_match_their_implementations() -> None:
 
 def test_forms_match_their_implementations() -> None:
     assert set(DISTRIBUTION_FORMS) == set(distributions.DISTRIBUTIONS)
-    assert set(ISO_FORMS) == {*noise_profile.FORMS, "by_log_iso"}
+    assert set(ISO_FORMS) == {*noise_profile.FORMS, "by_stop", "by_log_iso", "by_colour"}
 
 
 @pytest.mark.parametrize(("group", "name", "setting"), list(all_settings()), ids=lambda value: str(value)[:20])

@@ -17,8 +17,10 @@ from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unprocess_gen.config.schema import BranchConfig, Config
+from unprocess_gen.config.interpretation import provenance_at
+from unprocess_gen.config.schema import PHYSICAL_NUMBERS, BranchConfig, Config, ProvenanceConfig
 from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.random_streams import parameter_uniforms
@@ -31,11 +33,11 @@ FACTS = Facts(64, 48, 256, 0, 255)
 
 SAME_SENSOR = {
     "imx385": (12, 240, 4095),
-    "sony_a7s2": (14, 512, 16383),
-    "nikon_d850": (14, 400, 16383),
+    "sony_a7s2": (14, 512, 16300),
+    "nikon_d850": (14, 400, 16150),
     "canon_5d4": (14, 512, 16383),
-    "canon_70d": (14, 2048, 15000),
-    "canon_700d": (14, 2048, 15000),
+    "canon_70d": (14, 2048, 15303),
+    "canon_700d": (14, 2048, 15303),
     "oppo_reno10x": (10, 64, 1023),
 }
 """Bits, black and white level of each calibration; on this sensor DN need no conversion."""
@@ -140,6 +142,92 @@ def test_table_for_a_single_iso_gives_its_first_row(settings: Settings) -> None:
     assert physics(config).black_error_dn == (1.0, 2.0, 3.0, 4.0)
 
 
+ISOS = [(100.0, 1.0), (200.0, 1.5), (800.0, 4.0), (6400.0, 20.0)]
+
+
+@pytest.mark.parametrize(("iso", "value"), ISOS)
+def test_table_by_iso_gives_its_values(iso: float, value: float) -> None:
+    assert number(["by_iso", *itertools.chain(*ISOS)], iso=iso) == value
+
+
+@given(iso=st.floats(200, 800))
+def test_standard_deviation_between_two_isos_is_interpolated_in_logarithms(iso: float) -> None:
+    with mpmath.workdps(40):
+        share = mpmath.log(mpmath.mpf(iso) / 200) / mpmath.log(4)
+        expected = mpmath.mpf(1.5) * (mpmath.mpf(4) / 1.5) ** share
+        assert close(number(["by_iso", *itertools.chain(*ISOS)], iso=iso), expected)
+
+
+def with_branch(config: Config, **change: Any) -> Config:
+    branch = replace(config.noise.branches[0], **change)
+    config = replace(config, noise=replace(config.noise, branches=[branch]))
+    validate_config(config)
+    return config
+
+
+def test_shapes_between_two_isos_are_interpolated_linearly(settings: Settings) -> None:
+    table = ["by_iso", 100, 0.1, 400, -0.3, 6400, -0.1]
+    config = on_its_own_sensor(settings, "canon_70d", 100)
+    for iso, shape in ((100, 0.1), (200, -0.1), (400, -0.3), (1600, -0.2), (6400, -0.1)):
+        config.noise.iso = iso
+        assert math.isclose(physics(with_branch(config, read_shape=table)).read_shape, shape, abs_tol=1e-16)
+
+
+@pytest.mark.parametrize(
+    ("iso", "row"),
+    [(100, 0), (141.4, 0), (141.5, 1), (160, 1), (200, 2), (399.9, 3), (400, 4), (800, 6), (3200, 10), (6400, 12)],
+)
+def test_table_by_stop_has_two_rows_for_each_full_stop(settings: Settings, iso: float, row: int) -> None:
+    """Row ⌊2·log2(ISO / 100)⌋: at full stops, where the logarithm is an integer, without rounding."""
+    config = on_its_own_sensor(settings, "canon_70d", iso)
+    table = [[float(one), 0.0, -float(one), 0.5] for one in range(16)]
+    shapes = [one / 64 for one in range(16)]
+    made = physics(with_branch(config, black_error_dn=["by_stop", *table], read_shape=["by_stop", *shapes]))
+    assert made.black_error_dn == tuple(table[row])
+    assert made.read_shape == shapes[row]
+
+
+def test_table_by_stop_does_not_depend_on_the_range_of_the_branch(settings: Settings) -> None:
+    config = on_its_own_sensor(settings, "canon_70d", 800)
+    table = [[float(one)] * 4 for one in range(16)]
+    made = physics(with_branch(config, black_error_dn=["by_stop", *table], iso=[400, 1600]))
+    assert made.black_error_dn == (6.0,) * 4
+
+
+COLOURS = {"RGGB": ("R", "G1", "G2", "B"), "BGGR": ("B", "G2", "G1", "R")}
+COLOURS |= {"GRBG": ("G1", "R", "B", "G2"), "GBRG": ("G2", "B", "R", "G1")}
+"""Colours of the sites (0, 0), (0, 1), (1, 0), (1, 1); G1 is the green of the red rows."""
+
+
+@pytest.mark.parametrize("pattern", COLOURS)
+@pytest.mark.parametrize("form", [(), ("by_stop",), ("by_log_iso",)], ids=str)
+def test_black_errors_by_colour_follow_the_pattern(settings: Settings, pattern: str, form: tuple[str, ...]) -> None:
+    errors = {"R": 1.0, "G1": 2.0, "B": 3.0, "G2": 4.0}
+    four = list(errors.values())
+    config = on_its_own_sensor(settings, "canon_70d", 800)
+    config.sensor.pattern = pattern
+    value = ["by_colour", *form, *([four] * 16 if form else four)]
+    assert physics(with_branch(config, black_error_dn=value)).black_error_dn == tuple(
+        errors[colour] for colour in COLOURS[pattern]
+    )
+
+
+@pytest.mark.parametrize("pattern", COLOURS)
+def test_black_errors_by_site_ignore_the_pattern(settings: Settings, pattern: str) -> None:
+    config = on_its_own_sensor(settings, "canon_70d", 800)
+    config.sensor.pattern = pattern
+    assert physics(with_branch(config, black_error_dn=[1, 2, 3, 4])).black_error_dn == (1, 2, 3, 4)
+
+
+def test_black_errors_of_a_profile_follow_the_pattern(settings: Settings) -> None:
+    red = {}
+    for pattern, colours in COLOURS.items():
+        config = on_its_own_sensor(settings, "nikon_d850", 6400)
+        config.sensor.pattern = pattern
+        red[pattern] = dict(zip(colours, physics(config).black_error_dn, strict=True))
+    assert all(errors == {"R": 0.937, "G1": 1.489, "B": 1.129, "G2": 1.691} for errors in red.values())
+
+
 # Scatter --------------------------------------------------------------------------------------------------------------
 
 
@@ -149,13 +237,20 @@ def scattered(physics: Physics) -> tuple[float, ...]:
 
 def scatter_of(settings: Settings, *overrides: str, bodies: int = 1) -> list[tuple[float, ...]]:
     """Return the numbers of 40 images, of as many bodies as given."""
-    config = settings("noise=canon_70d", *overrides)
-    validate_config(config)
+    config = drawn_shapes(settings("noise=canon_70d", *overrides))
     numbers = []
     for image in range(40):
         uniforms = own_uniforms(image) | {"sensor_unit": (image % bodies + 0.5) / bodies}
         numbers.append(scattered(PhysicalNoise(config).draw(uniforms, image, config.seed)))
     return numbers
+
+
+SHAPES = ["choice", 0.1429, 0.1143, 0.0286, -0.1000, -0.0857, -0.1714, -0.1571]
+
+
+def drawn_shapes(config: Config) -> Config:
+    """Return a config whose shapes are drawn, and whose line is that of a Tukey scale."""
+    return with_branch(config, read_shape=SHAPES, read_std_dn=["scale_line", 0.486806, 1.46427, 0.382006])
 
 
 def own_uniforms(image: int) -> dict[str, float]:
@@ -181,11 +276,11 @@ def test_a_body_has_one_value_per_iso(units: int, settings: Settings) -> None:
 def test_bodies_and_isos_scatter_independently(settings: Settings) -> None:
     """The logarithms of read noise without its shape, and of row noise, have the spread that the profile states."""
     line = ("noise.scatter=body", "sensor.units=40")
-    config = settings("noise=canon_70d", *line)
+    config = drawn_shapes(settings("noise=canon_70d", *line))
     read, row = (getattr(config.noise.branches[0], name) for name in ("read_std_dn", "row_std_dn"))
     deviates = []
     for iso in (100, 200, 400, 800, 1600, 3200, 6400):
-        middle = physics(settings("noise=canon_70d", "noise.scatter=off", f"noise.iso={iso}"))
+        middle = physics(drawn_shapes(settings("noise=canon_70d", "noise.scatter=off", f"noise.iso={iso}")))
         for shape, read_std_dn, row_std_dn in scatter_of(settings, *line, f"noise.iso={iso}", bodies=40):
             ratio = read_std_dn / middle.read_std_dn * tukey_std(middle.read_shape) / tukey_std(shape)
             deviates.append((math.log(ratio) / read[3], math.log(row_std_dn / middle.row_std_dn) / row[3]))
@@ -204,11 +299,11 @@ def test_images_with_patterns_of_their_own_share_the_scatter_of_an_iso(settings:
 
 
 def test_without_scatter_lines_and_the_median_shape_remain(settings: Settings) -> None:
-    config = settings("noise=canon_70d", "noise.scatter=off", "noise.iso=3200")
+    config = drawn_shapes(settings("noise=canon_70d", "noise.scatter=off", "noise.iso=3200"))
     branch = config.noise.branches[0]
     gain, shape = branch.dn_per_e[1] * 3200, sorted(branch.read_shape[1:])[len(branch.read_shape[1:]) // 2]
-    scale = (4095 - 240) / (15000 - 2048)
-    expected = line_of(branch.read_std_dn, gain, shape) * scale, line_of(branch.row_std_dn, gain) * scale
+    scale = (4095 - 240) / (15303 - 2048)
+    expected = line_of(branch.read_std_dn, gain) * tukey_std(shape) * scale, line_of(branch.row_std_dn, gain) * scale
     (numbers,) = set(scatter_of(settings, "noise.scatter=off", "noise.iso=3200"))
     assert numbers[0] == shape
     assert all(close(number, one, 1e-14) for number, one in zip(numbers[1:], expected, strict=True))
@@ -225,32 +320,30 @@ def test_a_config_without_scatter_draws_by_image(settings: Settings) -> None:
 # Profiles in conf/ ----------------------------------------------------------------------------------------------------
 
 
-def line_of(form: list[Any], gain: Any, shape: float | None = None) -> Any:
+def line_of(form: list[Any], gain: Any) -> Any:
     """Return the value of a line without scatter."""
     with mpmath.workdps(40):
-        value = mpmath.exp(mpmath.mpf(form[1]) * mpmath.log(gain) + form[2])
-        return value if shape is None else value * tukey_std(shape)
+        return mpmath.exp(mpmath.mpf(form[1]) * mpmath.log(gain) + form[2])
 
 
 @pytest.mark.parametrize(
-    ("iso", "slope", "read", "row"),
+    ("iso", "shape", "read", "row"),
     [
-        (100, 0.000939161, (0.462105, 0.565715), (0.527536, -0.5917)),
-        (1600, 9.563e-4, (0.740, 0.862), (0.788, -0.342)),
-        (2000, 9.563e-4, (0.749, -0.123), (0.629, -1.510)),
-        (12800, 9.563e-4, (0.749, -0.123), (0.629, -1.510)),
+        (100, 0.1488, 1.007, 0.139),
+        (1600, -0.0441, 6.299, 0.989),
+        (2000, -0.0130, 2.654, 0.331),
+        (6400, -0.0752, 7.116, 0.722),
+        (25600, -0.0909, 25.853, 2.276),
     ],
 )
-def test_sony_a7s2_has_published_numbers_for_both_gains(
-    settings: Settings, iso: int, slope: float, read: tuple[float, float], row: tuple[float, float]
+def test_sony_a7s2_has_the_published_table_for_both_gains(
+    settings: Settings, iso: int, shape: float, read: float, row: float
 ) -> None:
+    """PMN, data_process/process.py: K = 9.563e-4·ISO; lambda, Gaussian and row deviation by ISO."""
     made = physics(on_its_own_sensor(settings, "sony_a7s2", iso))
     with mpmath.workdps(40):
-        gain = mpmath.mpf(slope) * iso
-        assert close(made.dn_per_e, gain)
-        assert made.read_shape == -0.0857  # the middle one of 18
-        assert close(made.read_std_dn, line_of(["", *read], gain, -0.0857))
-        assert close(made.row_std_dn, line_of(["", *row], gain))
+        assert close(made.dn_per_e, mpmath.mpf(9.563e-4) * iso)
+    assert (made.read_law, made.read_shape, made.read_std_dn, made.row_std_dn) == ("tukey", shape, read, row)
 
 
 def test_dual_gain_of_sony_a7s2_lowers_the_read_noise(settings: Settings) -> None:
@@ -259,25 +352,88 @@ def test_dual_gain_of_sony_a7s2_lowers_the_read_noise(settings: Settings) -> Non
     assert above.read_std_dn < 0.5 * below.read_std_dn
 
 
-@pytest.mark.parametrize(
-    ("noise", "least_gain"),
-    [("nikon_d850", 0.00415039), ("canon_5d4", 0.0021819), ("canon_70d", 0.00407497), ("canon_700d", 0.00447629)],
-)
-@pytest.mark.parametrize("iso", [100, 400, 1234, 6400])
-def test_profiles_of_eld_have_published_numbers(settings: Settings, noise: str, least_gain: float, iso: int) -> None:
-    """K = Kmin · ISO / 100, here Kmin is in DN per electron at ISO 1; lines have no scatter."""
-    config = on_its_own_sensor(settings, noise, iso)
-    branch, made = config.noise.branches[0], physics(config)
+ELD_LINES = {
+    ("canon_5d4", 0): (0.0021819, (0.677127, 1.51219), (0.47128, -0.807896)),
+    ("canon_70d", 0): (0.00407497, (0.568118, 1.99827), (0.729222, -0.937057)),
+    ("canon_700d", 0): (0.00447629, (0.652459, 2.07986), (0.622059, -0.775647)),
+    ("nikon_d850", 400): (0.00415039, (0.954668, 0.180218), (0.966234, -2.69533)),
+    ("nikon_d850", 0): (0.00415039, (0.563461, 0.79941), (0.448292, -1.79771)),
+}
+"""K at ISO 1, slope and intercept of ln σ of read and row noise, by camera and lowest ISO (camera_params/release)."""
+
+
+@pytest.mark.parametrize("iso", [100, 200, 320, 400, 1234, 6400])
+@pytest.mark.parametrize("noise", ["canon_5d4", "canon_70d", "canon_700d", "nikon_d850"])
+def test_profiles_of_eld_have_published_numbers(settings: Settings, noise: str, iso: int) -> None:
+    least_gain, read, row = next(numbers for (name, low), numbers in ELD_LINES.items() if name == noise and iso >= low)
+    made = physics(on_its_own_sensor(settings, noise, iso))
     with mpmath.workdps(40):
         gain = mpmath.mpf(least_gain) * iso
-        shape = branch.read_shape[1:][(len(branch.read_shape) - 1) // 2]
         assert close(made.dn_per_e, gain)
-        assert made.read_shape == shape
-        assert close(made.read_std_dn, line_of(branch.read_std_dn, gain, shape))
-        assert close(made.row_std_dn, line_of(branch.row_std_dn, gain))
-    table = branch.black_error_dn[1:]
-    row = table[min(int(math.log(iso / 100) / math.log(64) * len(table)), len(table) - 1)]
-    assert made.black_error_dn == tuple(row)
+        assert close(made.read_std_dn, line_of(["", *read], gain))
+        assert close(made.row_std_dn, line_of(["", *row], gain))
+    assert made.read_law == "tukey"
+
+
+@pytest.mark.parametrize(
+    ("noise", "iso", "shape", "by_colour"),
+    [
+        ("nikon_d850", 100, -0.1143, (-0.174, -0.194, -0.164, -0.177)),
+        ("nikon_d850", 800, -0.2286, (-2.757, -1.628, -2.169, -1.078)),
+        ("nikon_d850", 6400, -0.1429, (0.937, 1.489, 1.129, 1.691)),
+        ("canon_5d4", 1600, 0.0571, (0.956, 0.067, 0.898, 0.218)),
+        ("canon_70d", 6400, -0.0857, (3.321, 3.430, 1.207, 0.087)),
+        ("canon_700d", 3200, -0.1286, (0.516, 1.512, 0.152, -0.617)),
+        ("sony_a7s2", 3200, -0.0349, (-1.347, -1.371, -1.349, -1.366)),
+        ("sony_a7s2", 25600, -0.0909, (4.073, 3.857, 4.296, 4.096)),
+    ],
+)
+def test_tables_of_eld_are_used_at_their_full_stops(
+    settings: Settings, noise: str, iso: int, shape: float, by_colour: tuple[float, ...]
+) -> None:
+    """Row 2·log2(ISO / 100) of G_shape and color_bias; 0.1 used the last row at ISO 6400 and others in between."""
+    made = physics(on_its_own_sensor(settings, noise, iso))
+    red, green_1, blue, green_2 = by_colour
+    assert made.read_shape == shape
+    assert made.black_error_dn == (red, green_1, green_2, blue)
+
+
+MEASURED = {
+    800: {"SFRN": 4.50, "PMN": 4.86},
+    1600: {"SFRN": 8.36, "PMN": 9.11},
+    3200: {"SFRN": 15.68, "PMN": 17.07},
+    6400: {"PMN": 31.98},
+}
+"""Read noise of the D850 in DN by ISO, in calibrations that ELD took no part in."""
+
+
+@pytest.mark.parametrize("iso", MEASURED)
+def test_read_noise_of_nikon_d850_agrees_with_other_calibrations(settings: Settings, iso: int) -> None:
+    """Profile-1, which 0.1 used, is 0.33 to 0.5 of them at ISO 6400 and 3200."""
+    made = physics(on_its_own_sensor(settings, "nikon_d850", iso))
+    for measured in MEASURED[iso].values():
+        assert 0.75 < made.read_std_dn / measured < 1.1
+    assert 1.0 < made.read_std_dn / made.dn_per_e < 1.2  # electrons: flat, as in one gain mode
+
+
+@pytest.mark.parametrize("noise", SAME_SENSOR)
+def test_every_number_of_a_profile_has_a_source_and_an_uncertainty(settings: Settings, noise: str) -> None:
+    profile = settings(f"noise={noise}").noise
+    needed = {
+        (name, tuple(branch.iso))
+        for branch in profile.branches
+        for name in settings_of(BranchConfig)
+        if name not in ("iso", "read_law") and getattr(branch, name) not in (None, 0.0)
+    }
+    every = (min(branch.iso[0] for branch in profile.branches), max(branch.iso[1] for branch in profile.branches))
+    needed |= {(name, every) for name in PHYSICAL_NUMBERS if getattr(profile, name) is not None}
+    needed |= {("black_level_dn", every), ("white_level_dn", every)}
+    for name, (low, high) in needed:
+        assert any(
+            name in one.numbers and (not one.iso or one.iso[0] <= low <= high <= one.iso[1])
+            for one in profile.provenance
+        ), (name, low, high)
+    assert all(one.source and one.uncertainty for one in profile.provenance)
 
 
 @pytest.mark.parametrize("iso", [100, 800, 6400])
@@ -340,6 +496,8 @@ def test_profile_is_converted_by_the_ratio_of_ranges(settings: Settings, noise: 
 
 def test_each_number_is_drawn_from_its_own_uniform(settings: Settings) -> None:
     config = on_its_own_sensor(settings, "canon_70d", 800)
+    line = ["scale_line", 0.486806, 1.46427, 0.382006]
+    config = with_branch(config, read_shape=["choice", -0.1, 0.0, 0.1], read_std_dn=line)
     config.scene.exposure_s, config.scene.temperature_c = ["log_uniform", 0.01, 1.0], ["uniform", 10, 30]
     middle = physics(config)
     moves = {
@@ -358,8 +516,8 @@ def test_each_number_is_drawn_from_its_own_uniform(settings: Settings) -> None:
 
 
 def test_shapes_are_chosen_equally_often(settings: Settings) -> None:
-    config = on_its_own_sensor(settings, "sony_a7s2", 800)
-    shapes = config.noise.branches[1].read_shape[1:]
+    shapes = [0.1, 0.0, -0.1, -0.2]
+    config = with_branch(on_its_own_sensor(settings, "canon_70d", 800), read_shape=["choice", *shapes])
     drawn = [physics(config, read_shape=(k + 0.5) / len(shapes)).read_shape for k in range(len(shapes))]
     assert drawn == shapes
 
@@ -442,14 +600,13 @@ def test_body_depends_on_seed_and_camera_but_not_on_iso(settings: Settings) -> N
         ),
         (
             ("noise=sony_a7s2", "noise.iso=1800"),
-            "noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to 12800",
+            "noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to 25600",
         ),
         (
-            ("noise=sony_a7s2", "noise.iso=[uniform,100,1000]"),
-            "noise.iso=[uniform, 100, 1000]: noise=sony_a7s2 is calibrated for ISO 100 to 200, 200 to 1600, 2000 to "
-            "12800; expected a distribution within one of these ranges",
+            ("noise=sony_a7s2", "noise.iso=[uniform,1000,3000]"),
+            "noise.iso=[uniform, 1000, 3000]: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to 25600; "
+            "expected a distribution within one of these ranges",
         ),
-        (("noise=sony_a7s2", "noise.iso=[uniform,1000,3000]"), "noise.iso=[uniform, 1000, 3000]: noise=sony_a7s2 is"),
         (("noise=imx385", "noise.iso=[uniform,1600,3200]"), "noise.iso=[uniform, 1600, 3200]: noise=imx385 is"),
         (("noise=imx385", "noise.iso=[choice,1600,100]"), "noise.iso=[choice, 1600, 100]: noise=imx385 is calibrated"),
         (("noise=nikon_d850", "noise.iso=99"), "noise.iso=99: noise=nikon_d850 is calibrated for ISO 100 to 6400"),
@@ -511,8 +668,31 @@ def test_unknown_effect_is_refused_by_the_command_line(cli: Callable[..., Any]) 
             "expected more than -0.5, where the Tukey-lambda",
         ),
         ({"read_law": "cauchy"}, "branches[0].read_law=cauchy: expected one of gaussian, tukey"),
-        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
-        ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
+        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
+        ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
+        (
+            {"black_error_dn": ["by_colour", ["by_stop", 1, 2, 3, 4]]},
+            "branches[0].black_error_dn=[by_colour, [by_stop, 1, 2, 3, 4]]: expected a number, four",
+        ),
+        ({"black_error_dn": ["by_stop", "by_colour", *[[1, 2, 3, 4]] * 16]}, "black_error_dn=[by_stop, by_colour, [1,"),
+        (
+            {"black_error_dn": ["by_stop", *[[1, 2, 3, 4]] * 12]},
+            "has 12 rows from ISO 100; the branch, ISO 400 to 6400",
+        ),
+        ({"read_shape": ["by_stop", *[0.1] * 12]}, "needs 13; expected two rows for each full stop"),
+        ({"read_shape": ["by_stop", *[-0.6] * 13]}, "expected more than -0.5, where the Tukey-lambda"),
+        ({"read_shape": ["by_iso", 400, 0.1, 6400, "x"]}, "expected pairs of ISO and shape"),
+        ({"read_shape": ["by_iso", 400, 0.1, 6400, 10]}, "expected more than -0.5, where the Tukey-lambda"),
+        ({"read_std_dn": ["by_iso", 400, 1.0, 6400]}, "expected pairs of ISO and value, ISOs in ascending order"),
+        ({"read_std_dn": ["by_iso"]}, "expected pairs of ISO and value, ISOs in ascending order"),
+        ({"read_std_dn": ["by_iso", 6400, 1.0, 400, 2.0]}, "expected pairs of ISO and value, ISOs in ascending order"),
+        ({"read_std_dn": ["by_iso", 400, 1.0, 6400, 0]}, "expected numbers above 0, up to 1e+09"),
+        ({"row_std_dn": ["by_iso", 800, 1.0, 6400, 2.0]}, "has ISO 800 to 6400; expected values for the ISOs of the"),
+        (
+            {"dn_per_e": ["by_iso", 400, 1.0, 6400, 2.0]},
+            "expected a number of 0 or more, up to 1e+09, or a form: per_iso",
+        ),
+        ({"iso": [50, 6400]}, "has 16 rows from ISO 100; the branch, ISO 50 to 6400, needs 13"),
         ({"iso": [800, 100]}, "branches[0].iso=[800, 100]: expected the lowest and the highest ISO"),
     ],
 )
@@ -523,6 +703,63 @@ def test_branch_with_invalid_numbers_is_refused(settings: Settings, change: dict
     with pytest.raises(ConfigError) as refused:
         validate_config(config)
     assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("noise=sony_a7s2", "noise.iso=[uniform,100,1000]"),
+        ("noise=nikon_d850", "noise.iso=[log_uniform,100,6400]"),
+        ("noise=nikon_d850", "noise.iso=[uniform,300,500]"),
+    ],
+)
+def test_distribution_of_isos_may_cross_branches_that_touch(settings: Settings, overrides: tuple[str, ...]) -> None:
+    config = settings(*overrides)
+    validate_config(config)
+    for uniform in (0.01, 0.5, 0.99):
+        assert physics(config, iso=uniform).read_std_dn > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"numbers": []}, "noise.provenance[0].numbers=[]: expected at least one of black_level_dn, "),
+        (
+            {"numbers": ["gain"]},
+            "noise.provenance[0].numbers=gain: expected one of black_level_dn, white_level_dn, dn_per",
+        ),
+        ({"iso": [800]}, "noise.provenance[0].iso=[800]: expected the lowest and the highest ISO, [100, 6400], or []"),
+        ({"iso": [800, 100]}, "noise.provenance[0].iso=[800, 100]: expected the lowest and the highest ISO"),
+        ({"source": ""}, "noise.provenance[0].source='': expected a text"),
+        ({"uncertainty": ""}, "noise.provenance[0].uncertainty='': expected a text"),
+    ],
+)
+def test_incomplete_provenance_is_refused(settings: Settings, change: dict[str, Any], message: str) -> None:
+    config = settings("noise=nikon_d850")
+    statement = ProvenanceConfig(numbers=["dn_per_e"], iso=[100.0, 6400.0], source="a page", uncertainty="1 %")
+    validate_config(replace(config, noise=replace(config.noise, provenance=[statement])))
+    with pytest.raises(ConfigError) as refused:
+        validate_config(replace(config, noise=replace(config.noise, provenance=[replace(statement, **change)])))
+    assert message in str(refused.value)
+
+
+def test_provenance_at_an_iso_is_that_of_its_branch(settings: Settings) -> None:
+    noise = settings("noise=nikon_d850").noise
+
+    def sources(*isos: float) -> list[str]:
+        return [one.source for one in provenance_at(noise, isos) if "read_std_dn" in one.numbers]
+
+    assert sources(100, 200) == ["ELD, Profile-1, Gaussian line"]
+    assert sources(6400) == ["ELD, Profile-2, Gaussian line"]
+    assert sources(100, 6400) == ["ELD, Profile-2, Gaussian line", "ELD, Profile-1, Gaussian line"]
+
+
+def test_provenance_does_not_change_a_dataset(settings: Settings) -> None:
+    config = settings("noise=nikon_d850")
+    text = dataset_yaml(config)
+    assert "provenance" not in text
+    assert dataset_yaml(replace(config, noise=replace(config.noise, provenance=[]))) == text
+    assert parse_dataset_yaml(text)[0].noise.provenance == []
 
 
 def test_branch_without_optional_numbers_lacks_their_effects(settings: Settings) -> None:

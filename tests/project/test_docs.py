@@ -21,7 +21,7 @@ from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, all_settings
+from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.dataset.columns import COLUMNS
@@ -96,8 +96,9 @@ def promised_unit(name: str) -> str:
 
 
 def test_every_setting_is_explained() -> None:
-    branches = [("noise", name, setting) for name, setting in settings_of(BranchConfig).items()]
-    for group, name, setting in [*all_settings(), *branches]:
+    kinds = (BranchConfig, ProvenanceConfig)
+    items = [("noise", name, setting) for kind in kinds for name, setting in settings_of(kind).items()]
+    for group, name, setting in [*all_settings(), *items]:
         key = f"{group}.{name}"
         assert setting.meaning and not setting.meaning.endswith("."), key
         assert str(setting.limit), key
@@ -106,7 +107,7 @@ def test_every_setting_is_explained() -> None:
 
 
 def test_settings_declare_all_keys_of_the_schema() -> None:
-    for kind in (*GROUPS.values(), BranchConfig, Config):
+    for kind in (*GROUPS.values(), BranchConfig, ProvenanceConfig, Config):
         plain = {field.name for field in dataclasses.fields(kind)} - set(settings_of(kind))
         assert plain == (set(GROUPS) if kind is Config else set())
 

@@ -269,3 +269,13 @@ def test_pairs_are_extrapolated_from_the_sample(settings: Settings, tmp_path: Pa
     config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 4)}", "noise.draws=2")
     assert estimate_run(config, 1, False).pairs == 2 * (SAMPLE + 4)
     assert estimate_run(config, 1, True).pairs == 2 * (SAMPLE + 4)
+
+
+def test_plan_states_source_and_uncertainty_of_numbers_at_its_isos(run_main: RunMain) -> None:
+    for iso, profile in ((100, "Profile-1"), (6400, "Profile-2")):
+        done = run_main("plan", "source.limit=1", "noise=nikon_d850", f"noise.iso={iso}", "sensor=generic_14bit")
+        text = " ".join(done.out.split())
+        assert f"read_std_dn: ELD, {profile}, Gaussian line; uncertainty: " in text
+        assert f"row_std_dn: ELD, {profile}, row line; uncertainty: " in text
+        assert "black_error_dn: ELD, color_bias of its dark frames; uncertainty: " in text
+        assert max(map(len, done.out.splitlines())) <= 160

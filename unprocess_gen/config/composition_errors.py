@@ -11,7 +11,7 @@ from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options
-from unprocess_gen.config.schema import BranchConfig, Config, all_settings
+from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.suggestions import did_you_mean
@@ -41,8 +41,8 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
             return f"{link.override}: not a valid override ({error_in_one_line(link)})"
         key = getattr(link, "full_key", None)
         if isinstance(link, OmegaConfBaseException) and key:
-            if link.object_type is BranchConfig:
-                return _in_branch(key)
+            if link.object_type in ITEMS:
+                return _in_item(link.object_type, key)
             if isinstance(link, ConfigAttributeError | ConfigKeyError):
                 return unknown_key(key, overrides)
             message = str(link.msg or link).splitlines()[0]
@@ -136,12 +136,16 @@ def _setting(key: str) -> Setting | None:
     return next((setting for group, name, setting in all_settings() if key == f"{group}.{name}".lstrip(".")), None)
 
 
-def _in_branch(key: str) -> str:
-    """Return the sentence about a key of a branch, whose place in the config OmegaConf does not name."""
-    settings = settings_of(BranchConfig)
+ITEMS = {BranchConfig: ("noise.branches", "a branch"), ProvenanceConfig: ("noise.provenance", "an item")}
+"""Dataclasses of list items: the key of the list, and what an item is called."""
+
+
+def _in_item(kind: type, key: str) -> str:
+    """Return the sentence about a key of a list's item, whose place in the config OmegaConf does not name."""
+    settings, (place, item) = settings_of(kind), ITEMS[kind]
     if key in settings:
-        return f"noise.branches: {key}: expected {settings[key].allowed}"
-    return f"noise.branches: {key}: no such key; a branch has {', '.join(settings)}{did_you_mean(key, list(settings))}"
+        return f"{place}: {key}: expected {settings[key].allowed}"
+    return f"{place}: {key}: no such key; {item} has {', '.join(settings)}{did_you_mean(key, list(settings))}"
 
 
 def _missing_file(error: MissingConfigException) -> str:

@@ -57,9 +57,24 @@ ISO_FORMS: Mapping[str, Form] = {
         "the same line for the scale of Tukey's lambda distribution; the scale is multiplied by the standard deviation "
         "at scale 1",
     ),
+    "by_iso": Form(
+        ("ISO", "value", "…"),
+        "values at these ISOs in ascending order; between them, standard deviations are interpolated in ln σ, shapes "
+        "linearly, both against ln ISO",
+    ),
+    "by_stop": Form(
+        ("row", "…"),
+        "a table with two rows for each full stop from ISO 100: row ⌊2·log₂(ISO / 100)⌋, counted from 0; a row is a "
+        "shape, or four black-level errors",
+    ),
     "by_log_iso": Form(
         ("[four]", "…"),
         "black-level errors of the four sites, for equal parts of the branch's range of ln ISO, lowest ISO first",
+    ),
+    "by_colour": Form(
+        ("R", "G1", "B", "G2"),
+        "black-level errors of the red, the green of the red rows, the blue, and the green of the blue rows, whatever "
+        "the CFA pattern; before `by_stop` or `by_log_iso`, the fours of the table are in this order",
     ),
 }
 """Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Sequence
+from fractions import Fraction
 from typing import Any
 
 from unprocess_gen.config.accuracy import Budget
@@ -28,6 +31,7 @@ from unprocess_gen.config.schema import (
     EffectsConfig,
     GainsConfig,
     NoiseConfig,
+    ProvenanceConfig,
     SourceConfig,
 )
 from unprocess_gen.config.values import is_integer, is_number, value_text
@@ -200,6 +204,68 @@ def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
         The first branch whose range contains the ISO; None if no branch does.
     """
     return next((branch for branch in noise.branches if branch.iso[0] <= iso <= branch.iso[1]), None)
+
+
+@functools.lru_cache(maxsize=256)
+def row_of_stop(iso: float) -> int:
+    """Return the row of a table ``by_stop``: ⌊2·log2(ISO / 100)⌋, in exact arithmetic; 0 below ISO 100.
+
+    Parameters
+    ----------
+    iso : float
+        The ISO.
+
+    Returns
+    -------
+    int
+        Row, from 0. Rows 2k and 2k + 1 are for ISO 100·2^k to 100·2^(k + 1).
+
+    Examples
+    --------
+    >>> [row_of_stop(iso) for iso in (100, 141, 142, 200, 6400, 25600)]
+    [0, 0, 1, 2, 12, 16]
+    """
+    ratio = (Fraction(iso) / 100) ** 2
+    return max((ratio.numerator // ratio.denominator).bit_length() - 1, 0)
+
+
+def table_words(value: Any) -> tuple[list[str], list[Any]]:
+    """Split a number of a branch into its leading words and the rest.
+
+    Parameters
+    ----------
+    value : Any
+        Such as ``["by_colour", "by_stop", [1, 2, 3, 4], …]``.
+
+    Returns
+    -------
+    words : list of str
+        The words before the first value that is none; empty if the value is not a list.
+    rest : list
+        The values after them.
+    """
+    if not isinstance(value, list):
+        return [], [value]
+    count = next((place for place, one in enumerate(value) if not isinstance(one, str)), len(value))
+    return value[:count], value[count:]
+
+
+def provenance_at(noise: NoiseConfig, isos: Sequence[float]) -> list[ProvenanceConfig]:
+    """Return the statements about the source of a physical profile's numbers at some ISOs.
+
+    Parameters
+    ----------
+    noise : NoiseConfig
+        A physical profile.
+    isos : sequence of float
+        ISOs for which it is used.
+
+    Returns
+    -------
+    list of ProvenanceConfig
+        In the order of the profile: statements without a range of ISO, and those whose range contains one of them.
+    """
+    return [one for one in noise.provenance if not one.iso or any(one.iso[0] <= iso <= one.iso[1] for iso in isos)]
 
 
 def missing_number(noise: NoiseConfig, effect: str) -> str | None:

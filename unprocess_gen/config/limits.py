@@ -274,11 +274,23 @@ TEMPERATURE_C = Drawn(SCENE_KINDS, -100.0, 150.0)
 EXPOSURE_RATIO = Drawn(SCENE_KINDS, 1e-3, 1e6)
 """Ranges of the values of a scene. Chosen: far beyond cameras."""
 
-READ_SHAPE = Drawn(
+
+@dataclass(frozen=True)
+class DrawnOrByIso(Drawn):
+    """A number, a distribution, or a table by ISO: one of ``forms``, which `noise_validation` checks."""
+
+    forms: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{super().__str__()}; or by ISO: {', '.join(self.forms)}"
+
+
+READ_SHAPE = DrawnOrByIso(
     ("choice",),
     math.nextafter(-0.5, 0),
     math.nextafter(10.0, 0),
     "more than -0.5, where the Tukey-lambda distribution has a variance, and less than 10",
+    ("by_stop", "by_iso"),
 )
 
 PATCH = Described(
@@ -287,7 +299,10 @@ PATCH = Described(
 )
 LEVELS = Described(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
 ISO_RANGE = Described("the lowest and the highest ISO, [100, 6400]")
-BLACK_ERROR = Described("a number, four (the 2x2 sites), or [by_log_iso, [four], …]")
+BLACK_ERROR = Described(
+    "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "
+    "[four], …], whose fours are in the order R, G1, B, G2 if by_colour precedes it"
+)
 
 BLACK_LEVEL = LevelRange("0 to 2^bits - 2", lambda group: (0, 2**group.bits - 2))
 WHITE_LEVEL = LevelRange(

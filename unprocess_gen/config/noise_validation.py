@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from decimal import Decimal
@@ -9,7 +10,13 @@ from typing import Any
 
 from unprocess_gen.config.distributions import highest, lowest, parse_drawn
 from unprocess_gen.config.forms import ISO_FORMS
-from unprocess_gen.config.interpretation import branch_of, is_physical, noise_distributions
+from unprocess_gen.config.interpretation import (
+    branch_of,
+    is_physical,
+    noise_distributions,
+    row_of_stop,
+    table_words,
+)
 from unprocess_gen.config.limits import (
     BLACK_ERROR,
     BLACK_LEVEL,
@@ -24,7 +31,14 @@ from unprocess_gen.config.limits import (
     WHITE_LEVEL,
     IsoForm,
 )
-from unprocess_gen.config.schema import ASSUMABLE, BranchConfig, NoiseConfig, SceneConfig
+from unprocess_gen.config.schema import (
+    ASSUMABLE,
+    PHYSICAL_NUMBERS,
+    BranchConfig,
+    NoiseConfig,
+    ProvenanceConfig,
+    SceneConfig,
+)
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import is_number, one_of, value_text
 from unprocess_gen.core.errors import ConfigError
@@ -127,6 +141,8 @@ def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
         _check_branch(f"noise.branches[{number}]", noise, branch)
     for name in noise.assumed:
         one_of("noise.assumed", name, ASSUMABLE)
+    for number, statement in enumerate(noise.provenance):
+        _check_provenance(f"noise.provenance[{number}]", statement)
     _check_iso(noise, scene)
     _check_electrons(noise, scene)
 
@@ -139,12 +155,14 @@ def _check_branch(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
         value = getattr(branch, name)
         if isinstance(setting.limit, IsoForm) and not (value is None and setting.null):
             _check_form(f"{key}.{name}", value, setting.limit, gains)
+            if _is_table(value, "by_iso"):
+                _check_isos(f"{key}.{name}", value, branch)
         if name == "dn_per_e":
             gains = _gains_at_ends(branch)
             _check_gain(f"{key}.{name}", noise, branch, gains[0])
         setting.check(f"{key}.{name}", value)
-    parse_drawn(f"{key}.read_shape", branch.read_shape, READ_SHAPE)
-    _check_black_error(f"{key}.black_error_dn", branch.black_error_dn)
+    _check_shape(f"{key}.read_shape", branch)
+    _check_black_error(f"{key}.black_error_dn", branch)
 
 
 def _gains_at_ends(branch: BranchConfig) -> tuple[float, float]:
@@ -173,6 +191,10 @@ def _check_form(key: str, value: Any, limit: IsoForm, gains: tuple[float, ...]) 
     form, numbers = (value[0], value[1:]) if isinstance(value, list) and value else (None, [])
     if form not in limit.forms:
         raise ConfigError(f"{key}={value_text(value)}: expected {limit}")
+    if form == "by_iso":
+        if not all(is_number(number) and 0 < number <= MAX_BRANCH_NUMBER for number in numbers):
+            raise ConfigError(f"{key}={value_text(value)[:60]}: expected numbers above 0, up to {MAX_BRANCH_NUMBER:g}")
+        return
     most = len(ISO_FORMS[form].numbers)
     fewest = most - ISO_FORMS[form].optional
     if not (
@@ -196,17 +218,99 @@ def _check_form(key: str, value: Any, limit: IsoForm, gains: tuple[float, ...]) 
         )
 
 
-def _check_black_error(key: str, value: Any) -> None:
+def _is_table(value: Any, form: str) -> bool:
+    return isinstance(value, list) and bool(value) and value[0] == form
+
+
+def _check_isos(key: str, value: list[Any], branch: BranchConfig) -> None:
+    """Raise ConfigError unless the ISOs of a table ``by_iso`` ascend and contain the range of the branch."""
+    isos = value[1::2]
+    if len(value) % 2 == 0 or not isos or any(low >= high for low, high in itertools.pairwise(isos)):
+        raise ConfigError(f"{key}={value_text(value)[:60]}: expected pairs of ISO and value, ISOs in ascending order")
+    if not isos[0] <= branch.iso[0] <= branch.iso[1] <= isos[-1]:
+        raise ConfigError(
+            f"{key}={value_text(value)[:60]}: has ISO {isos[0]:g} to {isos[-1]:g}; expected values for the ISOs of "
+            f"the branch, {branch.iso[0]:g} to {branch.iso[1]:g}"
+        )
+
+
+def _check_stops(key: str, value: list[Any], rows: int, branch: BranchConfig) -> None:
+    """Raise ConfigError unless a table ``by_stop`` has a row for every ISO of the branch."""
+    needed = row_of_stop(branch.iso[1]) + 1
+    if branch.iso[0] < 100 or rows < needed:
+        raise ConfigError(
+            f"{key}={value_text(value)[:60]}: has {rows} rows from ISO 100; the branch, ISO {branch.iso[0]:g} to "
+            f"{branch.iso[1]:g}, needs {needed}; expected two rows for each full stop"
+        )
+
+
+def _check_shape(key: str, branch: BranchConfig) -> None:
+    value = branch.read_shape
+    if _is_table(value, "by_iso"):
+        if not all(map(is_number, value[1:])):
+            raise ConfigError(f"{key}={value_text(value)[:60]}: expected pairs of ISO and shape")
+        _check_isos(key, value, branch)
+        shapes = value[2::2]
+    elif _is_table(value, "by_stop"):
+        shapes = value[1:]
+        _check_stops(key, value, len(shapes), branch)
+    else:
+        parse_drawn(key, value, READ_SHAPE)
+        return
+    parse_drawn(key, ["choice", *shapes], READ_SHAPE)
+
+
+BLACK_ERROR_WORDS: tuple[list[str], ...] = (
+    [],
+    ["by_log_iso"],
+    ["by_stop"],
+    ["by_colour"],
+    ["by_colour", "by_stop"],
+    ["by_colour", "by_log_iso"],
+)
+"""Words that may precede the black-level errors of a branch."""
+
+
+def _check_black_error(key: str, branch: BranchConfig) -> None:
+    value = branch.black_error_dn
     if value is None or _is_black_error(value):
         return
-    by_iso = isinstance(value, list) and bool(value) and value[0] == "by_log_iso"
-    rows = value[1:] if by_iso else [value]
-    if not rows or not all(isinstance(row, list) and len(row) == 4 and all(map(_is_black_error, row)) for row in rows):
+    words, rest = table_words(value)
+    has_rows = words[-1:] in (["by_log_iso"], ["by_stop"])
+    rows = rest if has_rows else [rest]
+    if (
+        words not in BLACK_ERROR_WORDS
+        or not isinstance(value, list)
+        or not rows
+        or not all(isinstance(row, list) and len(row) == 4 and all(map(_is_black_error, row)) for row in rows)
+    ):
         raise ConfigError(f"{key}={value_text(value)[:60]}: expected {BLACK_ERROR}")
+    if words[-1:] == ["by_stop"]:
+        _check_stops(key, value, len(rows), branch)
 
 
 def _is_black_error(value: Any) -> bool:
     return is_number(value) and abs(value) <= MAX_BRANCH_NUMBER
+
+
+PROVENANCE_NUMBERS = (
+    *("black_level_dn", "white_level_dn"),
+    *(name for name in settings_of(BranchConfig) if name not in ("iso", "read_law")),
+    *PHYSICAL_NUMBERS,
+)
+"""Keys whose source a profile may state."""
+
+
+def _check_provenance(key: str, statement: ProvenanceConfig) -> None:
+    if not statement.numbers:
+        raise ConfigError(f"{key}.numbers=[]: expected at least one of {', '.join(PROVENANCE_NUMBERS)}")
+    for name in statement.numbers:
+        one_of(f"{key}.numbers", name, PROVENANCE_NUMBERS)
+    iso = statement.iso
+    if iso and (len(iso) != 2 or not 0 < iso[0] <= iso[1] <= MAX_ISO):
+        raise ConfigError(f"{key}.iso={value_text(iso)}: expected {ISO_RANGE}, or [] for all ISOs")
+    for name in ("source", "uncertainty"):
+        settings_of(ProvenanceConfig)[name].check(f"{key}.{name}", getattr(statement, name))
 
 
 def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
@@ -215,14 +319,11 @@ def _check_iso(noise: NoiseConfig, scene: SceneConfig) -> None:
     drawn = parse_drawn(key, value, ISO)
     ends = drawn.numbers
     branches = [(branch.iso[0], branch.iso[1]) for branch in noise.branches]
-    if any(branch_of(noise, iso) is None for iso in ends):
-        ranges, expected = _merged(branches), ""
-    elif drawn.kind not in ("constant", "choice") and not any(
-        low <= min(ends) and max(ends) <= high for low, high in branches
-    ):
-        ranges, expected = branches, "; expected a distribution within one of these ranges"
-    else:
-        return
+    ranges, expected = _merged(branches), ""
+    if all(branch_of(noise, iso) is not None for iso in ends):
+        if drawn.kind in ("constant", "choice") or any(low <= min(ends) and max(ends) <= high for low, high in ranges):
+            return
+        expected = "; expected a distribution within one of these ranges"
     texts = ", ".join(f"{low:g}" if low == high else f"{low:g} to {high:g}" for low, high in ranges)
     advice = "" if noise.iso is not None else "; give noise.iso=…"
     raise ConfigError(f"{key}={value_text(value)}: noise={noise.name} is calibrated for ISO {texts}{expected}{advice}")

@@ -195,20 +195,20 @@ class BranchConfig:
     read_std_dn: Any = key(
         None,
         "standard deviation of the read noise",
-        IsoForm(("root", "line", "scale_line")),
+        IsoForm(("root", "line", "scale_line", "by_iso")),
         unit="DN of the profile",
     )
     row_std_dn: Any = key(
         None,
         "standard deviation of row offsets",
-        IsoForm(("root", "line")),
+        IsoForm(("root", "line", "by_iso")),
         unit="DN of the profile",
         null="not known, so the effect row cannot be simulated",
     )
     column_std_dn: Any = key(
         None,
         "standard deviation of column offsets",
-        IsoForm(("root", "line")),
+        IsoForm(("root", "line", "by_iso")),
         unit="DN of the profile",
         null="not known, so the effect column cannot be simulated",
     )
@@ -219,6 +219,19 @@ class BranchConfig:
         unit="DN of the profile",
         null="not known, so the effect black_error cannot be simulated",
     )
+
+
+@documented
+@dataclass
+class ProvenanceConfig:
+    """State the source and the uncertainty of numbers of a physical noise profile."""
+
+    numbers: list[str] = key(
+        [], "keys of a branch or of the profile", Described("a list of keys whose values are numbers")
+    )
+    iso: list[float] = key([], "lowest and highest ISO the statement holds for; empty: all", limits.ISO_RANGE)
+    source: str = key("", "where the numbers come from", Text("a text"))
+    uncertainty: str = key("", "how far the numbers may be off, or how far sources differ", Text("a text"))
 
 
 CHOSEN, PROFILE = "Chosen for a run", "Every profile"
@@ -375,6 +388,14 @@ class NoiseConfig:
         "keys whose numbers no source gives for this camera; effects.assumed decides about their effects",
         Described("a list of keys of this section or of a branch"),
         section=PHYSICAL,
+    )
+    provenance: list[ProvenanceConfig] = key(
+        [],
+        "source and uncertainty of the numbers, which plan prints",
+        Described("a list of mappings with the keys numbers, iso, source and uncertainty"),
+        decides_data=False,
+        section=PHYSICAL,
+        since="0.2",
     )
 
 

@@ -14,13 +14,14 @@ from decimal import Decimal, localcontext
 from typing import Any
 
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
-from unprocess_gen.config.interpretation import branch_of
+from unprocess_gen.config.interpretation import branch_of, row_of_stop, table_words
 from unprocess_gen.config.limits import EXPOSURE_S, ISO, READ_SHAPE, SCATTER, TEMPERATURE_C
 from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile, tukey_std
 from unprocess_gen.core.random_streams import body_key, scatter_uniforms
 from unprocess_gen.core.types import Distribution, Physics
+from unprocess_gen.simulation.reference import cfa
 
 SCATTER_NAMES = ("read_shape", "read_std", "row_std", "column_std")
 """Draws of a camera body at an ISO; the position is the counter in the stream. Datasets depend on it: append only."""
@@ -46,7 +47,7 @@ class PhysicalNoise:
         self.iso = parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO)
         self.exposure_s = parse_drawn("exposure_s", scene.exposure_s, EXPOSURE_S)
         self.temperature_c = parse_drawn("temperature_c", scene.temperature_c, TEMPERATURE_C)
-        self.read_shapes = [parse_drawn("read_shape", branch.read_shape, READ_SHAPE) for branch in noise.branches]
+        self.read_shapes = [_parse_shape(branch.read_shape) for branch in noise.branches]
         self.scatter = SCATTER.word(noise.scatter)
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
 
@@ -79,9 +80,9 @@ class PhysicalNoise:
         warmth = _doublings(celsius, noise.dark_reference_c, noise.dark_doubling_c)
         unit = f"{stream_key:016x}" if sensor.units == "image" else str(int(uniforms["sensor_unit"] * sensor.units))
         uniforms = self._scatter(uniforms, iso, seed, unit)
-        shape = self._shape(self.read_shapes[noise.branches.index(branch)], uniforms["read_shape"])
+        shape = self._shape(branch, iso, uniforms["read_shape"])
         read_std = number(branch.read_std_dn, iso=iso, gain=gain, uniform=uniforms["read_std"], shape=shape)
-        errors = _black_error(branch, iso)
+        errors = _black_error(branch, iso, sensor.pattern)
         return Physics(
             iso=iso,
             exposure_s=seconds,
@@ -118,8 +119,11 @@ class PhysicalNoise:
         body = body_key(seed, self.noise.name, "" if self.sensor.units == "image" else unit)
         return dict(zip(SCATTER_NAMES, scatter_uniforms(body, iso, len(SCATTER_NAMES)), strict=True))
 
-    def _shape(self, shapes: Distribution, uniform: float) -> float:
-        """Return the shape of the read noise: the median of the distribution if there is no scatter."""
+    def _shape(self, branch: BranchConfig, iso: float, uniform: float) -> float:
+        """Return the shape of the read noise; without scatter, the median of a distribution."""
+        shapes = self.read_shapes[self.noise.branches.index(branch)]
+        if shapes is None:
+            return _shape_of_iso(branch.read_shape, iso)
         if self.scatter == "off":
             return sorted(shapes.numbers)[len(shapes.numbers) // 2]
         return draw_parameter(shapes, uniform)
@@ -217,11 +221,28 @@ def _scale_line(iso: Decimal, gain: Decimal, u: float, shape: float, *line: Deci
     return _line(iso, gain, u, shape, *line) * _tukey_std(shape)
 
 
+def _by_iso(iso: Decimal, gain: Decimal, u: float, shape: float, *pairs: Decimal) -> Decimal:
+    """Interpolate standard deviations: ln σ is linear in ln ISO between neighbours of a table of ISO, σ, …."""
+    share, low, high = _neighbours(iso, pairs)
+    return (low.ln() + share * (high.ln() - low.ln())).exp()
+
+
+def _neighbours(iso: Decimal, pairs: Sequence[Decimal]) -> tuple[Decimal, Decimal, Decimal]:
+    """Return the place of an ISO between its neighbours in a table, from 0 to 1 in ln ISO, and their values."""
+    isos, values = pairs[::2], pairs[1::2]
+    above = next((place for place, one in enumerate(isos) if iso <= one), len(isos) - 1)
+    if iso >= isos[above] or not above:
+        return Decimal(0), values[above], values[above]
+    low, high = isos[above - 1], isos[above]
+    return (iso / low).ln() / (high / low).ln(), values[above - 1], values[above]
+
+
 FORMS: dict[str, Callable[..., Decimal]] = {
     "per_iso": _per_iso,
     "root": _root,
     "line": _line,
     "scale_line": _scale_line,
+    "by_iso": _by_iso,
 }
 """Functions that a branch may contain instead of a number, as ``[form, number, …]``."""
 
@@ -231,21 +252,57 @@ ROW_DIGITS = 28
 this product rounds up to the row; datasets depend on it."""
 
 
-def _black_error(branch: BranchConfig, iso: float) -> Sequence[float]:
+def _black_error(branch: BranchConfig, iso: float, pattern: str) -> Sequence[float]:
     """Return the black-level errors of the four sites of the CFA pattern, DN of the profile.
 
-    A branch has one for all sites, four, or a table of rows. Rows divide the branch's range of ln ISO into equal parts.
+    A branch has one for all sites, four, or a table of rows. ``by_log_iso``: rows divide the branch's range of ln ISO
+    into equal parts. ``by_stop``: two rows for each full stop. ``by_colour``: fours are R, G1, B, G2, where G1 is the
+    green of the red rows; otherwise they are sites, row by row.
     """
     value = branch.black_error_dn
     if value is None:
         return (0.0,) * 4
     if not isinstance(value, list):
         return (float(value),) * 4
-    if value[0] != "by_log_iso":
-        return [float(each) for each in value]
-    table, (low, high) = value[1:], branch.iso
+    words, rest = table_words(value)
+    if "by_stop" in words:
+        rest = rest[row_of_stop(iso)]
+    elif "by_log_iso" in words:
+        rest = rest[_row_of_range(iso, branch.iso[0], branch.iso[1], len(rest))]
+    errors = [float(each) for each in rest]
+    return _by_site(errors, pattern) if "by_colour" in words else errors
+
+
+def _row_of_range(iso: float, low: float, high: float, rows: int) -> int:
+    """Return the row of a table ``by_log_iso`` for an ISO in the range of a branch."""
     if low == high:
-        return [float(each) for each in table[0]]
+        return 0
     with localcontext(prec=ROW_DIGITS):
-        row = int(_place(iso, low, high) * len(table))
-    return [float(each) for each in table[min(row, len(table) - 1)]]
+        return min(int(_place(iso, low, high) * rows), rows - 1)
+
+
+def _by_site(by_colour: Sequence[float], pattern: str) -> list[float]:
+    """Return errors in the order of the sites (0, 0), (0, 1), (1, 0), (1, 1) from R, G1, B, G2."""
+    red, green_1, blue, green_2 = by_colour
+    by_plane = dict(zip(cfa.plane_sites(pattern), (red, green_1, green_2, blue), strict=True))
+    return [by_plane[y, x] for y in (0, 1) for x in (0, 1)]
+
+
+def _parse_shape(value: Any) -> Distribution | None:
+    """Return the distribution that shapes are drawn from; None for a table by ISO."""
+    return (
+        None if table_words(value)[0][:1] in (["by_iso"], ["by_stop"]) else parse_drawn("read_shape", value, READ_SHAPE)
+    )
+
+
+def _shape_of_iso(table: Sequence[Any], iso: float) -> float:
+    """Return the shape at an ISO from a table ``by_stop``, or ``by_iso``: linear in ln ISO."""
+    kind, *numbers = table
+    return float(numbers[row_of_stop(iso)]) if kind == "by_stop" else _interpolated(iso, *numbers)
+
+
+@functools.lru_cache(maxsize=256)
+def _interpolated(iso: float, *pairs: float) -> float:
+    with localcontext(prec=DIGITS):
+        share, low, high = _neighbours(Decimal(iso), [Decimal(one) for one in pairs])
+        return float(low + share * (high - low))

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import is_physical, noise_levels, patch_rule
+from unprocess_gen.config.interpretation import is_physical, noise_levels, patch_rule, provenance_at
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
@@ -464,4 +464,16 @@ def _physical_lines(config: Config, plans: list[Plan]) -> list[str]:
     ]
     if noise.assumed:
         lines.append(f"          assumed, without a source: {', '.join(noise.assumed)}")
-    return lines
+    return [*lines, *_provenance_lines(config, [one.iso for one in physics])]
+
+
+def _provenance_lines(config: Config, isos: list[float]) -> list[str]:
+    """Return where the numbers of a physical profile come from, and their uncertainty, at the ISOs that occur."""
+    lines = [
+        line
+        for one in provenance_at(config.noise, isos)
+        for line in textwrap.wrap(
+            f"{', '.join(one.numbers)}: {one.source}; uncertainty: {one.uncertainty}", 108, subsequent_indent="  "
+        )
+    ]
+    return [f"{'' if number else 'numbers':9} {line}" for number, line in enumerate(lines)]
