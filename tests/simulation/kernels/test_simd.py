@@ -15,8 +15,8 @@ from unprocess_gen.simulation.kernels.simd import (
     from_bits,
     less_than,
     load,
+    load_columns,
     load_four_bytes,
-    low_half,
     maximum,
     minimum,
     movemask,
@@ -29,7 +29,7 @@ from unprocess_gen.simulation.kernels.simd import (
     to_float32,
     to_float64,
     to_uint32,
-    uint32_zeros,
+    to_uint64,
 )
 
 SINGLES = np.array([-np.inf, -1.5, -0.0, 0.0, 1e-40, 2.5, 7.25, np.inf], dtype=np.float32)
@@ -61,7 +61,7 @@ def _bits(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     store(target, 16, less_than(a, NUMBER))
     store(target, 24, to_bits(to_float32(b & MASK)))
     store(target, 32, to_uint32(to_float32(b & MASK) * NUMBER))
-    store(target, 40, to_bits(from_bits(b ^ b)) + uint32_zeros() + b)
+    store(target, 40, to_bits(from_bits(b ^ b)) + b)
 
 
 @kernel
@@ -108,10 +108,27 @@ def _wide(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
 @kernel
 def _halves(x: np.ndarray, out: np.ndarray) -> None:
     a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
-    store(target, 0, low_half(a))
-    store(target, 8, low_half(a >> _32))
-    store(target, 16, select(less_than(from_bits(low_half(a)), NUMBER), low_half(a >> _32), low_half(a)))
-    target[24] = movemask(less_than(to_float64(from_bits(low_half(a))), 0.5))
+    store(target, 0, to_uint32(a))
+    store(target, 8, to_uint32(a >> _32))
+    store(target, 16, select(less_than(from_bits(to_uint32(a)), NUMBER), to_uint32(a >> _32), to_uint32(a)))
+    target[24] = movemask(less_than(to_float64(from_bits(to_uint32(a))), 0.5))
+
+
+@kernel
+def _columns(table: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
+    target = pointer_to(out, 0)
+    first, second, third = load_columns(pointer_to(table, 0), pointer_to(starts, 0), 1)
+    store(target, 0, first)
+    store(target, 8, second)
+    store(target, 16, third)
+
+
+@kernel
+def _uint64(x: np.ndarray, out: np.ndarray) -> None:
+    a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
+    store(target, 0, to_uint64(a) << _32 | to_uint64(a >> SHIFT))
+    store(target, 8, to_bits(from_bits(to_uint64(a) << _32) * 0.5))
+    store(target, 16, to_bits(to_float64(a & MASK) + 0.5))
 
 
 class Inside(NamedTuple):
@@ -149,6 +166,7 @@ def record() -> Record:
 LONG_WORDS = np.array(
     [0, 1, 2**32 - 1, 2**32, 2**63, 2**64 - 1, 0x3F800000_BF000000, 0x0123456789ABCDEF], dtype=np.uint64
 )
+STARTS = np.array([7, 999, 0, 3, 3, 512, 40, 998, 1], dtype=np.uint32)
 DOUBLES = np.array([1.1, -2.5e-11, 2.5e-10, 3.5e-10, 1e300, -0.0, 12345.678901234, 0.5e-10])
 CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
     "arithmetic": (_arithmetic, (SINGLES, OTHERS), np.zeros(64, dtype=np.float32)),
@@ -156,6 +174,8 @@ CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
     "float64": (_float64, (DOUBLES,), np.zeros(16, dtype=np.float32)),
     "wide": (_wide, (SINGLES, OTHERS), np.zeros(48)),
     "halves": (_halves, (LONG_WORDS,), np.zeros(25, dtype=np.uint32)),
+    "columns": (_columns, (np.arange(4000) * 0.1, 4 * STARTS), np.zeros(24)),
+    "uint64": (_uint64, (WORDS,), np.zeros(24, dtype=np.uint64)),
     "masks": (_masks, (OTHERS, WORDS), np.zeros(3, dtype=np.uint32)),
     "uint16": (_uint16, (WORDS,), np.zeros(12, dtype=np.uint16)),
     "scalars": (
@@ -219,7 +239,13 @@ def test_absolute_clears_the_sign_of_zero_and_infinity() -> None:
     assert not np.signbit(out[24:32]).any()
 
 
-def test_low_half_drops_the_high_bits() -> None:
+def test_columns_are_those_of_the_rows_that_begin_there() -> None:
+    out = np.zeros(24)
+    _columns(*CASES["columns"][1], out)
+    assert np.array_equal(out.reshape(3, 8), (np.arange(4000) * 0.1).reshape(1000, 4)[STARTS[1:], :3].T)
+
+
+def test_conversion_to_uint32_drops_the_high_bits() -> None:
     out = np.zeros(25, dtype=np.uint32)
     _halves(LONG_WORDS, out)
     assert out[:8].tolist() == [int(word) % 2**32 for word in LONG_WORDS]

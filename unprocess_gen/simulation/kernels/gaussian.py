@@ -24,8 +24,10 @@ from unprocess_gen.simulation.kernels.normal import (
     apply_signs,
     coarse_normal,
     exact_value,
+    exact_values,
     fill_coarse_depths,
     fill_depths,
+    fill_rows,
     fine_normal,
     normal_quantiles,
 )
@@ -114,17 +116,14 @@ def exact_gaussian_dn(noise: Gaussian, n: int, x: int, strip: Strip, workspace: 
 def fill_exact_gaussian(noise: Gaussian, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
     """Fill ``exact_dn`` with the noisy DN of all sites."""
     fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
-    a, b, black, clean, out = (
-        noise.line[2 * n],
-        noise.line[2 * n + 1],
-        noise.black_dn,
-        workspace.unrounded_dn,
-        workspace.exact_dn,
-    )
-    for x in range(strip.total):
-        out[x] = exact_value(workspace.words[x], noise.quadratics)
-    for x in range(strip.total):
-        out[x] = clean[x] + np.sqrt(max(a * (clean[x] - black) + b, 0.0)) * out[x]
+    fill_rows(strip.total, workspace.words, workspace.scratch)
+    a, b = noise.line[2 * n], noise.line[2 * n + 1]
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        clean_dn = load(workspace.unrounded_dn, x)
+        std = square_root(maximum((clean_dn - noise.black_dn) * a + b, 0.0))
+        normal = exact_values(workspace.words, workspace.scratch, x, noise.quadratics)
+        store(workspace.exact_dn, x, clean_dn + std * normal)
 
 
 @inner

@@ -34,10 +34,14 @@ from unprocess_gen.simulation.kernels.simd import (
     Vector,
     from_bits,
     load,
+    load_columns,
     square_root,
     store,
     to_bits,
     to_float32,
+    to_float64,
+    to_uint32,
+    to_uint64,
 )
 
 # --------------------------------------------------------------------------------------------------------------- tables
@@ -49,6 +53,7 @@ FLOAT32_ERROR = 2.0**-21
 """Error that float32 adds, relative to the farthest quantile and to a line's rise over its octave."""
 
 _LOW31, _SIGN, _HALF = np.uint32(0x7FFFFFFF), np.uint32(0x80000000), np.float32(0.5)
+_VECTOR_WIDTH = np.uint64(VECTOR_WIDTH)
 _LINE_SHIFT = np.uint32(23 - _LINE_BITS)
 _FIRST_LINE = np.uint32(126 << _LINE_BITS)
 
@@ -57,7 +62,7 @@ _LOW31_64, _SIGN_64, _1, _2 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.u
 _TWO52_BITS, _TWO52, _ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
 _POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
 _POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
-_FIRST_ROW = np.uint64(1023 * SEGMENTS)
+_FIRST_ROW, _FIRST_ROW_OF_F = np.uint64(1023 * SEGMENTS), np.uint64(1022 * SEGMENTS)
 
 
 class Quantiles(NamedTuple):
@@ -131,6 +136,26 @@ def exact_value(word: np.uint32, quadratics: Pointer) -> float:
 
 
 @inner
+def fill_rows(count: int, words: Pointer, rows: Pointer) -> None:
+    """Fill ``rows`` (uint32) with the index at which the quadratic of each word begins, for `exact_values`."""
+    for n in range(count // VECTOR_WIDTH):
+        x = np.uint64(n) * _VECTOR_WIDTH
+        bits = to_bits(to_float64(load(words, x) & _LOW31) + 0.5)
+        store(rows, x, to_uint32(((bits >> _POSITION_BITS) - _FIRST_ROW_OF_F) << _2))
+
+
+@inner
+def exact_values(words: Pointer, rows: Pointer, x: np.uint64, quadratics: Pointer) -> Vector:
+    """Return the quantiles of eight words, the values of `exact_value`."""
+    of_words = load(words, x)
+    bits = to_bits(to_float64(of_words & _LOW31) + 0.5)
+    t = from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
+    start, slope, curvature = load_columns(quadratics, rows, x)
+    z: Vector = start + t * (slope + t * curvature)
+    return from_bits(to_bits(z) ^ (to_uint64(of_words & _SIGN) << _32))
+
+
+@inner
 def unpack_line(packed: np.uint64) -> tuple[np.float32, np.float32]:
     """Return the two float32 that `pack_lines` stored."""
     return np.uint32(packed & _LOW32).view(np.float32), np.uint32(packed >> _32).view(np.float32)
@@ -188,7 +213,6 @@ _COARSE_QUANTILE = _float32s(
 
 _MANTISSA, _ONE_BITS32 = np.uint32(0x7FFFFF), np.uint32(0x3F800000)
 _BITS_OF_2_32 = np.uint32((32 + 127) << 23)
-_VECTOR_WIDTH = np.uint64(VECTOR_WIDTH)
 
 
 @inner

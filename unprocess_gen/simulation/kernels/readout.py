@@ -41,25 +41,26 @@ from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
-    from_bits,
+    absolute,
+    has_any_bit,
     less_than,
     load,
     maximum,
     minimum,
-    movemask,
     pointer_to,
     store,
     to_bits,
     to_float32,
     to_uint32,
+    to_uint64,
     uint32_zeros,
 )
 from unprocess_gen.simulation.kernels.strips import Strip, Workspace, copy_values, list_lanes
 from unprocess_gen.simulation.reference.cfa import plane_sites
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
-_8, _1_32, _WITHOUT_SIGN = np.uint64(8), np.uint32(1), np.uint32(0x7FFFFFFF)
-_ZERO32, _HALF32 = np.float32(0), np.float32(0.5)
+_8, _HALF32 = np.uint64(8), np.float32(0.5)
+_DECREASED, _INCREASED = 1.0 - 2.0**-50, 1.0 + 2.0**-50
 
 
 class Integers(NamedTuple):
@@ -210,7 +211,8 @@ def _round_and_list(
 
     Return how many sites are uncertain, and whether any was clipped.
     """
-    found, changed = 0, uint32_zeros()
+    found = 0
+    clipped_bits = uint32_zeros()
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         noise_dn = load(workspace.noise_dn, x)
@@ -219,12 +221,11 @@ def _round_and_list(
         clipped = minimum(maximum(dn, low), high)
         store(workspace.noisy_dn, x, dn)
         store(workspace.noisy, x, to_uint32(clipped))
-        changed = changed | (to_bits(clipped) ^ to_bits(dn))
+        clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
         if _needs_exact_sites(noise):
-            to_boundary = _HALF32 - from_bits(to_bits(noise_dn - rounded) & _WITHOUT_SIGN)
+            to_boundary = _HALF32 - absolute(noise_dn - rounded)
             found = list_lanes(less_than(to_boundary, load(workspace.error_dn, x)), x, found, workspace)
-    # to_float32 needs values below 2**31; integers that differ also differ above the lowest bit
-    return found, bool(movemask(less_than(_ZERO32, to_float32(changed >> _1_32))) != 0)
+    return found, has_any_bit(clipped_bits)
 
 
 @inner
@@ -288,19 +289,36 @@ def _read_normalised(
     if limits_dn[3] < np.inf:
         for x in range(strip.total):
             noisy_dn[x] = limits_dn[2] if workspace.unrounded_dn[x] >= limits_dn[3] else noisy_dn[x]
-    _count_clipped(strip, noisy_dn, limits_dn[0], limits_dn[1], counts)
-    _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, workspace)
+    if _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, workspace):
+        _count_clipped(strip, noisy_dn, limits_dn[0], limits_dn[1], counts)
     _write(readout, strip, workspace.normalised, out)
 
 
 @inner
 def _normalise(
     readout: Normalised, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace
-) -> None:
-    """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`."""
-    for x in range(strip.total):
-        clipped = min(max(values_dn[x], low), high)
-        workspace.normalised[x] = np.float32((clipped - readout.black_dn) / readout.span_dn)
+) -> bool:
+    """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`; return whether any DN is clipped.
+
+    The product with 1/span takes a fifth of the time of a quotient. It differs from the quotient by three roundings,
+    at most 3·2**-53 of it. Rounding to float32 preserves order, so if the product rounds alike when it is decreased
+    and increased by 2**-50 of itself, the quotient rounds alike too. Otherwise, about once in 10**8 sites, the quotient
+    is computed.
+    """
+    per_dn = 1.0 / readout.span_dn
+    clipped_bits = to_uint64(uint32_zeros())
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        dn = load(values_dn, x)
+        clipped = minimum(maximum(dn, low), high)
+        clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
+        above_black = clipped - readout.black_dn
+        product = above_black * per_dn
+        nearer, farther = to_float32(product * _DECREASED), to_float32(product * _INCREASED)
+        if has_any_bit(to_bits(nearer) ^ to_bits(farther)):
+            farther = to_float32(above_black / readout.span_dn)
+        store(workspace.normalised, x, farther)
+    return has_any_bit(clipped_bits)
 
 
 @inner
