@@ -14,9 +14,11 @@ from unprocess_gen.simulation.kernels.normal import (
     exact_value,
     fill_coarse_depths,
     fill_depths,
+    fill_rows,
     fill_values_by_lines,
     fine_normal,
 )
+from unprocess_gen.simulation.kernels.normal import exact_values as kernel_exact_values
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.poisson import (
     LOW_RATE,
@@ -27,6 +29,7 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts,
     fill_counts_of_one_rate,
 )
+from unprocess_gen.simulation.kernels.readout import Normalised, _normalise
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, pointer_to, pointers_of, store
 from unprocess_gen.simulation.kernels.strips import (
     SIZE,
@@ -76,6 +79,14 @@ def exact_values(words: Words, law: Quantiles) -> Float:
     return out
 
 
+def exact_values_by_vectors(words: Words, law: Quantiles) -> Float:
+    """Return the exact quantiles of words, computed eight at a time."""
+    padded = _padded(words)
+    out = np.empty(padded.shape)
+    _fill_by_vectors(padded, law.quadratics, np.empty(padded.shape, dtype=np.uint32), out)
+    return out[: words.size]
+
+
 def fine_normals(words: Words) -> Float32:
     """Return the normals of words by the fine polynomials."""
     depths, out = np.empty((2, _padded(words).size), dtype=np.float32)
@@ -108,6 +119,15 @@ def _fill_exact(words: Words, quadratics: Float, out: Float) -> None:
 
 
 @kernel
+def _fill_by_vectors(words: Words, quadratics: Float, buffer: np.ndarray, out: Float) -> None:
+    given, rows, table = pointer_to(words, 0), pointer_to(buffer, 0), pointer_to(quadratics, 0)
+    fill_rows(words.size, given, rows)
+    for n in range(words.size // VECTOR_WIDTH):
+        x = np.uint64(n) * _WIDTH
+        store(pointer_to(out, 0), x, kernel_exact_values(given, rows, x, table))
+
+
+@kernel
 def _fill_fine(words: Words, depths: Float32, out: Float32) -> None:
     given, depth, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
     fill_depths(words.size, given, depth)
@@ -123,6 +143,31 @@ def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
     for n in range(words.size // VECTOR_WIDTH):
         x = np.uint64(n) * _WIDTH
         store(target, x, apply_signs(coarse_normal(load(depth, x)), load(given, x)))
+
+
+# Frames ---------------------------------------------------------------------------------------------------------------
+
+
+def normalised_values(values_dn: Float, black_dn: float, span_dn: float, limits_dn: tuple[float, float]) -> Float32:
+    """Return DN as the read-out of float32 frames clips and normalises them."""
+    out, padded = np.empty(values_dn.size, dtype=np.float32), np.resize(values_dn, -(-values_dn.size // STRIP) * STRIP)
+    readout = Normalised(
+        np.array([[*limits_dn, np.inf, np.inf]]), False, black_dn, span_dn, 1.0, False, np.zeros(4, dtype=np.int64)
+    )
+    _fill_normalised(padded, readout, limits_dn, scratch_of_thread(), out)
+    return out
+
+
+@kernel
+def _fill_normalised(
+    values_dn: Float, readout: Normalised, limits_dn: tuple[float, float], scratch: Scratch, out: Float32
+) -> None:
+    buffers, of, values = workspace_in(scratch, 0), pointers_of(readout), pointer_to(values_dn, 0)
+    strip = locate((0, 0), 0, 0, STRIP)
+    for start in range(0, out.size, STRIP):
+        _normalise(of, pointer_to(values, start), limits_dn[0], limits_dn[1], strip, buffers)
+        for x in range(min(STRIP, out.size - start)):
+            out[start + x] = buffers.normalised[x]
 
 
 # Counts ---------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
-from helpers.kernels import counts, exact_values, fill_words
+from helpers.kernels import counts, exact_values, exact_values_by_vectors, fill_words, normalised_values
 from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
@@ -91,14 +91,37 @@ WORDS = np.concatenate(
 
 @pytest.mark.parametrize("table", [effects.normal_table(), tukey_table(-0.2), tukey_table(0.0)], ids=["n", "t", "l"])
 def test_compiled_quantiles_equal_the_reference_bit_for_bit(table: np.ndarray) -> None:
-    found = exact_values(WORDS.ravel(), build_quantiles(table))
-    assert found.tobytes() == effects.by_inverse_cdf(WORDS, table).tobytes()
+    expected = effects.by_inverse_cdf(WORDS, table).tobytes()
+    assert exact_values(WORDS.ravel(), build_quantiles(table)).tobytes() == expected
+    assert exact_values_by_vectors(WORDS.ravel(), build_quantiles(table)).tobytes() == expected
 
 
 def test_compiled_counts_equal_the_reference() -> None:
     rate = np.geomspace(1e-3, 1e6, WORDS.size).reshape(WORDS.shape)
     rate[:, ::7] = 0.0
     assert np.array_equal(counts(WORDS.ravel(), rate.ravel()), reference_poisson.poisson(WORDS, rate).ravel())
+
+
+@pytest.mark.parametrize("span_dn", [1.0, 959.0, 1024.0, 3840.0, 15871.0, 65535.0])
+@pytest.mark.parametrize("black_dn", [0.0, 64.0])
+@np.errstate(under="ignore")
+def test_normalised_values_are_rounded_quotients_near_midpoints(black_dn: float, span_dn: float) -> None:
+    """Quotients are within four units of float64 of a midpoint of float32, where the product may round apart."""
+    rng = np.random.default_rng(1)
+    low = np.concatenate([rng.uniform(-1, 1, 4000), 2.0 ** rng.uniform(-149, 0, 4000)]).astype(np.float32)
+    midpoints = (low.astype(np.float64) + np.nextafter(low, np.float32(2)).astype(np.float64)) / 2
+    above_black = (midpoints * span_dn)[:, None] * (1 + np.arange(-4, 5) * 2.0**-52)
+    special = np.array([0.0, -0.0, 5e-324, -5e-324, 1e-310, 1e-45, -1e-45, span_dn, -span_dn / 3, 1e9, -1e9])
+    values_dn = np.concatenate([above_black.ravel(), special]) + black_dn
+    product = (values_dn - black_dn) * (1 / span_dn)
+    is_open = (product * (1 - 2.0**-50)).astype(np.float32) != (product * (1 + 2.0**-50)).astype(np.float32)
+    assert is_open.mean() > (0.8 if black_dn == 0 else 0.1)
+    for limits_dn in ((-np.inf, np.inf), (0.0, black_dn + span_dn), (black_dn, black_dn + span_dn)):
+        found = normalised_values(values_dn, black_dn, span_dn, limits_dn)
+        expected = ((np.minimum(np.maximum(values_dn, limits_dn[0]), limits_dn[1]) - black_dn) / span_dn).astype("f4")
+        assert np.array_equal(found, expected)
+        if limits_dn[0] == -np.inf:  # the sign of a zero equal to a limit is undefined
+            assert found.tobytes() == expected.tobytes()
 
 
 # Pairs ----------------------------------------------------------------------------------------------------------------

@@ -27,6 +27,8 @@ from unprocess_gen.simulation.kernels.normal import (
     Quantiles,
     build_quantiles,
     exact_value,
+    exact_values,
+    fill_rows,
     fill_values_by_lines,
     normal_quantiles,
     value_by_line,
@@ -492,8 +494,10 @@ def fill_exact_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip,
     """Fill ``exact_dn`` with the noisy DN of all sites: of certain counts in loops, then of the other sites."""
     _count_electrons(noise, n, key, strip, workspace)
     of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
-    for x in range(strip.total):
-        out[x] = exact_value(workspace.read_words[x], quadratics)
+    fill_rows(strip.total, workspace.read_words, workspace.scratch)
+    for v in range(strip.total // VECTOR_WIDTH):
+        at = np.uint64(v) * _8
+        store(out, at, exact_values(workspace.read_words, workspace.scratch, at, quadratics))
     has_dark = of.dark_e > 0.0
     dark, error_e = workspace.dark, workspace.error_e
     if has_dark:

@@ -35,7 +35,7 @@ Index = int | np.integer[Any]
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-# ---------------------------------------------------------------------------------------------------- types and compiler
+# ------------------------------------------------------------------------------------------------- types and compiler
 
 
 class VectorType(types.Type):
@@ -46,7 +46,8 @@ class VectorType(types.Type):
         super().__init__(name=f"vector({element})")
 
 
-_FLOAT32, _FLOAT64, _UINT32, _UINT64 = map(VectorType, (types.float32, types.float64, types.uint32, types.uint64))
+_FLOAT32, _FLOAT64 = VectorType(types.float32), VectorType(types.float64)
+_UINT32, _UINT64 = VectorType(types.uint32), VectorType(types.uint64)
 _UNSIGNED = {_FLOAT32: _UINT32, _FLOAT64: _UINT64}
 _FLOATS = {unsigned: of_floats for of_floats, unsigned in _UNSIGNED.items()}
 _LLVM_VECTORS = {
@@ -64,7 +65,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _register(function: Any, typer: Callable[..., Any], build: Callable[..., Any], *operands: Any) -> None:
-    """Compile calls of a function as ``build``; ``typer`` returns the type of the result, or None for other operands."""
+    """Compile calls of a function as ``build``; ``typer`` returns the result type, or None for other operands."""
 
     class _Template(AbstractTemplate):
         key = function
@@ -98,7 +99,7 @@ def _lanewise(
 
 
 def _vector_type(operands: tuple[Any, ...]) -> Any:
-    """Return the type of the last vector among operands; None, so that Numba tries other overloads, if there is none."""
+    """Return the type of the last vector among operands, or None: then Numba tries other overloads."""
     return next((each for each in operands[::-1] if isinstance(each, VectorType)), None)
 
 
@@ -120,10 +121,10 @@ def _per_lane(code: Callable[..., Any]) -> Callable[..., Any]:
 
 def _splat(builder: Any, number: Any, vector_type: VectorType) -> Any:
     empty, first = ir.Constant(_LLVM_VECTORS[vector_type], ir.Undefined), ir.Constant(ir.IntType(32), 0)
-    return _shuffle(builder, builder.insert_element(empty, number, first), empty, [0] * VECTOR_WIDTH)
+    return _shuffle(builder, [0] * VECTOR_WIDTH, builder.insert_element(empty, number, first), empty)
 
 
-def _shuffle(builder: Any, x: Any, y: Any, lanes: list[int]) -> Any:
+def _shuffle(builder: Any, lanes: list[int], x: Any, y: Any) -> Any:
     return builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes))
 
 
@@ -201,12 +202,12 @@ def pointer_to(array: NDArray[Any], at: Index) -> Pointer:
     return array.reshape(-1)[at:]
 
 
-def _address(builder: Any, pointer: Any, at: Any, llvm_type: ir.Type) -> Any:
+def _address(builder: Any, llvm_type: ir.Type, pointer: Any, at: Any) -> Any:
     return builder.bitcast(builder.gep(pointer, [at]), llvm_type.as_pointer())
 
 
 def _build_load(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
-    address = _address(builder, *arguments, _LLVM_VECTORS[call.return_type])
+    address = _address(builder, _LLVM_VECTORS[call.return_type], *arguments)
     return builder.load(address, align=call.args[0].dtype.bitwidth // 8)
 
 
@@ -221,7 +222,7 @@ def _build_store(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
     element = call.args[0].dtype
     if element == types.uint16:
         lanes = builder.trunc(lanes, ir.VectorType(ir.IntType(16), VECTOR_WIDTH))
-    builder.store(lanes, _address(builder, pointer, at, lanes.type), align=element.bitwidth // 8)
+    builder.store(lanes, _address(builder, lanes.type, pointer, at), align=element.bitwidth // 8)
     return context.get_dummy_value()
 
 
@@ -233,7 +234,7 @@ def store(pointer: Pointer, at: Index, lanes: Vector) -> None:
 
 @_compiled(
     lambda pointer, at: types.uint32,
-    lambda context, builder, call, arguments: builder.load(_address(builder, *arguments, ir.IntType(32)), align=1),
+    lambda context, builder, call, arguments: builder.load(_address(builder, ir.IntType(32), *arguments), align=1),
 )
 def load_four_bytes(pointer: Pointer, at: Index) -> np.uint32:
     """Load bytes ``at`` to ``at + 3`` as one little-endian number, in a single instruction."""
@@ -247,13 +248,13 @@ def _build_columns(context: Any, builder: Any, call: Any, arguments: Any) -> Any
     for lane in range(VECTOR_WIDTH):
         start = builder.load(builder.gep(starts, [builder.add(at, ir.Constant(at.type, lane))]))
         start = builder.zext(start, ir.IntType(64))
-        rows.append(builder.load(_address(builder, table, start, row_type), align=8))
+        rows.append(builder.load(_address(builder, row_type, table, start), align=8))
     columns = []
     for column in range(3):
-        parts = [_shuffle(builder, *rows[n : n + 2], [column, 4 + column]) for n in range(0, VECTOR_WIDTH, 2)]
+        parts = [_shuffle(builder, [column, 4 + column], *rows[n : n + 2]) for n in range(0, VECTOR_WIDTH, 2)]
         while len(parts) > 1:
             both = [*range(2 * parts[0].type.count)]
-            parts = [_shuffle(builder, *parts[n : n + 2], both) for n in range(0, len(parts), 2)]
+            parts = [_shuffle(builder, both, *parts[n : n + 2]) for n in range(0, len(parts), 2)]
         columns += parts
     return context.make_tuple(builder, call.return_type, columns)
 
@@ -265,7 +266,7 @@ def load_columns(table: Pointer, starts: Pointer, at: Index) -> tuple[Vector, Ve
     return rows[:, 0], rows[:, 1], rows[:, 2]
 
 
-# ------------------------------------------------------------------------------------------------------------- functions
+# ------------------------------------------------------------------------------------------------------------ functions
 
 
 @_lanewise(lambda builder, llvm_type, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
