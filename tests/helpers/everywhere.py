@@ -50,9 +50,8 @@ from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels import body, render
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.philox import philox_keys
-from unprocess_gen.simulation.kernels.readout import readout_of
 from unprocess_gen.simulation.kernels.render import uses_scene32
-from unprocess_gen.simulation.kernels.strips import STRIP
+from unprocess_gen.simulation.kernels.strips import STRIP, scratch_of_thread
 from unprocess_gen.simulation.pair import make_pair
 
 KERNELS = {
@@ -164,10 +163,10 @@ def doubles() -> str:
     found = []
     for plan in plans():
         shape, origin, dtype = codes.shape[:2], (5, 7), np.float32 if plan.normalised else np.uint16
-        scene, noise, scratch = render._records([plan], shape, 256, origin)
+        scene, noise, readout = render._records((plan,), shape, 256, origin)
+        scratch = scratch_of_thread(np.float32 if uses_scene32(plan) else np.float64)
         clean, noisy = np.empty(codes[..., 0].size, dtype=dtype), np.empty((1, codes[..., 0].size), dtype=dtype)
         counts = np.zeros((1, 6), dtype=np.int64)
-        readout = readout_of([plan], shape, origin, uses_scene32(plan))
         render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
         found += [clean, noisy, counts, *scratch]
         if isinstance(noise, Electrons):

@@ -23,6 +23,7 @@ from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.kernels.body import Body
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
@@ -98,9 +99,8 @@ class Scene32(NamedTuple):
     headroom: Float32
 
 
-def scene_of(plan: Plan, codes: int, origin: tuple[int, int], response: Float32 | None = None, pitch: int = 0) -> Scene:
-    """Return the parameters of a plan for sources of ``codes`` codes; ``response`` and its ``pitch`` as in
-    `Scene`."""
+def scene_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene:
+    """Return the parameters of a plan for sources of ``codes`` codes."""
     channels = _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
     gray_mean = plan.highlight == "gray_mean"
     sites = np.array((_site_gains(plan), _headroom(plan))).take(channels, axis=1)
@@ -111,17 +111,23 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int], response: Float32 
         inverse_gains=np.array(plan.inverse_gains),
         gray_mean=gray_mean,
         highlight_threshold=plan.highlight_threshold,
-        # with fixed patterns, the second pass computes every block, because only it applies the response
-        linear_limit=-np.inf if response is not None else _linear_limit(plan),
+        linear_limit=_linear_limit(plan),
         exposure=plan.exposure,
         brightest=plan.brightest,
         black_dn=float(plan.black_level_dn),
         span_dn=float(plan.white_level_dn - plan.black_level_dn),
         gains=sites[0],
         headroom=sites[1],
-        response=ONES if response is None else response,
-        response_steps=(pitch, int(pitch > 0)),
+        response=ONES,
+        response_steps=(0, 0),
     )
+
+
+def with_response(scene: Any, body: Body) -> Scene:
+    """Return the scene of a clean frame that contains the PRNU of a body."""
+    # the second pass computes every block, because only it applies the response
+    of_body: Scene = scene._replace(response=body.response, response_steps=body.response_steps, linear_limit=-np.inf)
+    return of_body
 
 
 def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:

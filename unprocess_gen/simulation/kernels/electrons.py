@@ -21,7 +21,7 @@ from unprocess_gen.core.jit import inner
 from unprocess_gen.core.lookup_tables import tukey_table
 from unprocess_gen.core.random_streams import BLOCK, LANES, ROUNDS, purpose, words
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.kernels.body import HOT, Body
+from unprocess_gen.simulation.kernels.body import HOT, WITHOUT_PATTERNS, Body
 from unprocess_gen.simulation.kernels.gaussian import HETEROSCEDASTIC
 from unprocess_gen.simulation.kernels.normal import (
     Quantiles,
@@ -140,12 +140,21 @@ def electron_noise(
     plans: Sequence[Plan], body: Body, shape: tuple[int, int], origin: tuple[int, int], counts_all: bool
 ) -> Electrons:
     """Return the noise of frames of one body; ``counts_all`` forbids normals in place of counts."""
-    first, columns = origin[1] % BLOCK, padded_width(origin[1], shape[1])
-    frames = [_frame(plan, (origin[0], origin[1] - first), columns, counts_all) for plan in plans]
+    left = origin[1] // BLOCK * BLOCK if any("column" in plan.effects for plan in plans) else 0
+    columns = padded_width(origin[1], shape[1])
+    return _electron_noise(tuple(plans), columns, (origin[0] % 2, left), counts_all)._replace(body=body)
+
+
+@functools.lru_cache(maxsize=8)
+def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, int], counts_all: bool) -> Electrons:
+    """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
+    frames = [_frame(plan, origin, columns, counts_all) for plan in plans]
     numbers, purposes, quantiles, columns_dn, errors_dn, ranks = ([*members] for members in zip(*frames, strict=True))
     black_dn, base_dn = float(plans[0].black_level_dn), np.empty((len(plans), 2, columns), dtype=np.float32)
     for base, column_dn, error_dn in zip(base_dn, columns_dn, errors_dn, strict=True):
-        base.reshape(2, -1, 2)[...] = black_dn + (column_dn.reshape(-1, 2) + error_dn.reshape(2, 1, 2))
+        for y in range(2):
+            for x in range(2):
+                base[y, x::2] = black_dn + (column_dn[x::2] + error_dn[y, x])
     return Electrons(
         numbers=np.array(numbers),
         read_purposes=np.array(purposes),
@@ -157,7 +166,7 @@ def electron_noise(
         dark_ranks=_stack(ranks),
         padded_width=columns,
         black_dn=black_dn,
-        body=body,
+        body=WITHOUT_PATTERNS,
         tables=count_tables(),
     )
 

@@ -8,6 +8,7 @@ contains only what a pair needs. Every form gives the same DN as `pair.reference
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,11 +18,13 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.types import PACKED, Counts, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import body_of, fixed_patterns
-from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene32_of, scene_of
+from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene32_of, scene_of, with_response
 from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
+    Integers,
+    Normalised,
     average_patterns,
     clear_defects_of,
     count_zero_variance,
@@ -83,30 +86,41 @@ def _fill_frames(
     dtype = np.float32 if first.normalised else np.uint16
     clean, noisy = np.empty(frame_shape, dtype=dtype), np.empty((count, *frame_shape), dtype=dtype)
     counts = np.zeros((max(count, 1), 6), dtype=np.int64)
-    scene, noise, scratch = _records(plans, shape, 256 if srgb.itemsize == 1 else 65536, origin)
+    scene, noise, readout = _records(tuple(plans), shape, 256 if srgb.itemsize == 1 else 65536, origin)
+    scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
     # a view, a read-only array or a subclass would be another type, compiled again
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")
-    keys, readout = philox_keys(plans)[:count], readout_of(plans, shape, origin, uses_scene32(first))
-    frames = clean.reshape(-1), noisy.reshape(count, clean.size)
+    keys, frames = philox_keys(plans)[:count], (clean.reshape(-1), noisy.reshape(count, clean.size))
     _render(codes, scene, noise, keys, origin, readout, scratch, *frames, counts)
     return clean, noisy, counts.tolist()
 
 
 def _records(
-    plans: Sequence[Plan], shape: tuple[int, int], codes: int, origin: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Scratch]:
-    """Return the scene, the noise and the scratch memory, whose classes select the compiled code."""
+    plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, origin: tuple[int, int]
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Integers | Normalised]:
+    """Return the scene, the noise and the read-out, whose classes select the compiled code."""
     first = plans[0]
-    if first.counts_electrons:
-        body = body_of(first, shape, origin)
-        response, pitch = (body.response, body.response_steps[0]) if first.averaged else (None, 0)
-        if first.averaged:  # the clean frame contains the response, so the noise does not
-            body = body._replace(response=ONES, response_steps=(0, 0))
-        noise = electron_noise(plans, body, shape, origin, counts_all=first.normalised)
-        return scene_of(first, codes, origin, response, pitch), noise, scratch_of_thread()
-    if uses_scene32(first):
-        return scene32_of(first, codes, origin), gaussian_noise32(plans), scratch_of_thread(np.float32)
-    return scene_of(first, codes, origin), gaussian_noise(plans), scratch_of_thread()
+    scene, noise, readout = _records_of_plans(
+        plans, shape if first.layout == PACKED else (0, 0), codes, (origin[0] % 2, origin[1] % 2)
+    )
+    if noise is not None:
+        return scene, noise, readout
+    body = body_of(first, shape, origin)
+    if first.averaged:  # the clean frame contains the response, so the noise does not
+        scene = with_response(scene, body)
+        body = body._replace(response=ONES, response_steps=(0, 0))
+    return scene, electron_noise(plans, body, shape, origin, counts_all=first.normalised), readout
+
+
+@functools.lru_cache(maxsize=4)
+def _records_of_plans(
+    plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, corner: tuple[int, int]
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | None, Integers | Normalised]:
+    """Return what all patches of an image share; the noise is None if it is counted in electrons."""
+    if uses_scene32(plans[0]):
+        return scene32_of(plans[0], codes, corner), gaussian_noise32(plans), readout_of(plans, shape, corner, True)
+    noise = None if plans[0].counts_electrons else gaussian_noise(plans)
+    return scene_of(plans[0], codes, corner), noise, readout_of(plans, shape, corner, False)
 
 
 def pass_key(plan: Plan) -> tuple[object, ...]:
