@@ -5,8 +5,10 @@
 The benchmark copies the photographs under other names. It alternates between making datasets of them and the lower
 bound: `cv2.imdecode`, one SHA-256, one write and one fdatasync of as many bytes, in one thread. Times last from the
 first pair to the last; ratios are medians over the rounds. It prints a Markdown table: one worker with a core to spare,
-one worker on one core, and two workers and five noise levels compared with that. Below it are the peak memory of a
-worker, and the shortest of several starts: from the start of the process to the first bytes in a shard.
+one worker on one core, and two workers and five noise levels compared with that. The last column is the ratio of
+processor times, which depends less on other programs; it is empty for two workers, which are processes of their own.
+Below the table are the peak memory of a worker, and the shortest of several starts: from the start of the process to
+the first bytes in a shard.
 """
 
 from __future__ import annotations
@@ -36,17 +38,18 @@ committed = []
 commit = workspace.Workspace.commit
 def commit_timed(self, result):
     commit(self, result)
-    committed.append(time.time())
+    committed.append((time.time(), time.process_time()))
 workspace.Workspace.commit = commit_timed
 begin = workspace.Workspace.begin
 def begin_timed(self, sources):
     begin(self, sources)
-    committed.append(time.time())
+    committed.append((time.time(), time.process_time()))
 workspace.Workspace.begin = begin_timed
 sys.argv = ["gen-dataset", *sys.argv[2:]]
 code = cli.main()
 peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-print(json.dumps({"code": code, "seconds": committed[-1] - committed[0], "kib": peak}))
+seconds, processor_s = (last - first for first, last in zip(committed[0], committed[-1]))
+print(json.dumps({"code": code, "seconds": seconds, "processor_s": processor_s, "kib": peak}))
 """
 
 FLOOR = """
@@ -55,7 +58,7 @@ import cv2
 cv2.setNumThreads(1)
 os.sched_setaffinity(0, json.loads(sys.argv[1]))
 out, names = sys.argv[2], json.load(open(sys.argv[3]))
-started = time.time()
+started, started_cpu = time.time(), time.process_time()
 with open(out, "wb", buffering=0) as file:
     for at, name in enumerate(names):
         pixels = cv2.imdecode(__import__("numpy").fromfile(name, dtype="uint8"), cv2.IMREAD_COLOR)
@@ -66,7 +69,7 @@ with open(out, "wb", buffering=0) as file:
         if at % 8 == 7:
             os.fdatasync(file.fileno())
     os.fdatasync(file.fileno())
-print(time.time() - started)
+print(json.dumps({"seconds": time.time() - started, "processor_s": time.process_time() - started_cpu}))
 """
 
 
@@ -101,10 +104,11 @@ def start(cores: Sequence[int], out: Path, *arguments: str) -> float:
     return seconds
 
 
-def floor(names: Path, to: Path) -> float:
+def floor(names: Path, to: Path) -> dict[str, float]:
     """Time the lower bound on one core."""
     command = [sys.executable, "-c", FLOOR, json.dumps(sorted(os.sched_getaffinity(0))[-1:]), str(to), str(names)]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    measured: dict[str, float] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    return measured
 
 
 def main() -> None:
@@ -134,21 +138,26 @@ def main() -> None:
     against = {"core to spare": "", "one core": "", "two workers": "one core", "five levels": "one core"}
     run(all_cores, "source.limit=1", f"out={options.to / 'warm'}", settings[0], "n_jobs=1")
     times: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
-    floors: dict[str, list[float]] = {name: [] for name, other in against.items() if not other}
+    floors: dict[str, list[dict[str, float]]] = {name: [] for name, other in against.items() if not other}
     for _ in range(options.rounds):
         for name, (cores, more) in runs.items():
             around = [] if against[name] else [floor(names, options.to / "floor.bin")]
             times[name].append(run(cores, *settings, *more))
             shutil.rmtree(out)
             if around:
-                floors[name].append(statistics.mean([*around, floor(names, options.to / "floor.bin")]))
-    print("| run | seconds | ratio | to |\n|---|--:|--:|---|")
-    print(f"| floor | {statistics.median(itertools.chain(*floors.values())):.2f} | | |")
+                around.append(floor(names, options.to / "floor.bin"))
+                floors[name].append({what: statistics.mean(one[what] for one in around) for what in around[0]})
+    print("| run | seconds | ratio | to | ratio of processor times |\n|---|--:|--:|---|--:|")
+    print(f"| floor | {statistics.median(one['seconds'] for one in itertools.chain(*floors.values())):.2f} | | | |")
     for name, other in against.items():
-        own = [one["seconds"] for one in times[name]]
-        compared = [one["seconds"] for one in times[other]] if other else floors[name]
-        ratio = statistics.median(a / b for a, b in zip(own, compared, strict=True))
-        print(f"| {name} | {statistics.median(own):.2f} | {ratio:.3f} | {other or 'floor'} |")
+        compared = times[other] if other else floors[name]
+        ratio, processor_ratio = (
+            statistics.median(a[what] / b[what] for a, b in zip(times[name], compared, strict=True))
+            for what in ("seconds", "processor_s")
+        )
+        seconds = statistics.median(one["seconds"] for one in times[name])
+        shown = "" if name == "two workers" else f"{processor_ratio:.3f}"
+        print(f"| {name} | {seconds:.2f} | {ratio:.3f} | {other or 'floor'} | {shown} |")
     peak = max(one["kib"] for one in times["one core"])
     print(f"\npeak of a process {peak:.0f} KiB; from the start to the first pair:")
     small = (settings[0], "source.limit=2", "output.pairs_per_shard=1")

@@ -41,7 +41,9 @@ RECOMMENDATIONS = (
         REFERENCE,
         "NumPy code that can be read and checked; it gives the DN of exact",
     ),
-    Recommendation("quick look", FAST, "its errors cannot be seen in pictures, and it is never much slower"),
+    Recommendation(
+        "quick look", FAST, "its errors cannot be seen in pictures; it saves time mainly with two-parameter noise"
+    ),
 )
 
 
