@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from noise_profile_page import profiles_page
+
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.help import default_text, hydra_flag, spelled, synopsis
@@ -57,7 +59,8 @@ list: `gains.red=[uniform,1.9,2.4]`. The column "allowed" names the distribution
 PROVENANCE_INTRODUCTION = """\
 ### Keys of a statement of provenance
 
-Each item of `noise.provenance` states where numbers come from. `plan` prints the statements for the ISOs that occur."""
+Each item of `noise.provenance` states where numbers come from. `plan` prints the statements for the ISOs that occur.
+[Noise profiles](noise_profiles.md) has those of the built-in profiles."""
 
 FORMS_INTRODUCTION = """\
 ### Numbers that depend on ISO
@@ -260,5 +263,6 @@ PAGES = {
     "docs/reference/settings.md": settings_page,
     "docs/reference/columns.md": columns_page,
     "docs/reference/command_line.md": command_line_page,
+    "docs/reference/noise_profiles.md": lambda: profiles_page(table, page),
 }
 """The pages, and the functions that return their text."""

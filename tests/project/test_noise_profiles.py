@@ -1,0 +1,81 @@
+"""The published numbers in docs/noise_sources.yaml, and the physical profiles beside them."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+import noise_profile_page
+from noise_profile_page import ISOS, ISOS_OF, PublishedSet, number_at, physical_profiles, profile_at, published, sets_of
+
+from unprocess_gen.config.option_files import conf_dir, group_options
+
+PROFILES = list(published()["profiles"])
+
+
+def isos_of(name: str) -> tuple[int, ...]:
+    return ISOS_OF.get(name, ISOS)
+
+
+def test_every_physical_profile_has_published_numbers() -> None:
+    written = {name: yaml.safe_load((conf_dir() / f"noise/{name}.yaml").read_text()) for name in group_options("noise")}
+    assert set(PROFILES) == {name for name, profile in written.items() if "branches" in profile}
+
+
+def test_every_source_is_cited() -> None:
+    sources = published()["sources"]
+    assert all(one["citation"] and one["place"] for one in sources.values())
+    for name in PROFILES:
+        assert {entry["source"] for entry in published()["profiles"][name]} <= set(sources)
+        for statement in physical_profiles()[name].provenance:
+            source = re.match(r"[A-Z][A-Za-z]+\b", statement.source)
+            assert source is None or source[0] in sources, statement.source
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_numbers_of_a_profile_lie_within_those_of_its_sources(name: str) -> None:
+    """Gain, read and row noise at every ISO of the table, to a tenth of a percent of rounding."""
+    for iso in isos_of(name):
+        physics = profile_at(physical_profiles()[name], iso)
+        assert physics is not None
+        for keys, made in (
+            (("gain",), physics.dn_per_e),
+            (("read", "tukey"), physics.read_std_dn),
+            (("row",), physics.row_std_dn),
+        ):
+            values = [one.number(key, iso) for one in sets_of(name) for key in keys if one.has(key)]
+            values = [value for value in values if value is not None]
+            assert (min(values) * 0.999 <= made <= max(values) * 1.001) if values else made == 0, (name, iso, keys)
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_every_profile_is_beside_its_sources_in_the_table(name: str) -> None:
+    rows = noise_profile_page.comparison_rows(name)
+    assert {len(row) for row in rows} == {3 + len(isos_of(name))}
+    origins = {row[1].split(",")[0] for row in rows} - {"**profile**"}
+    assert origins == {one.name for one in sets_of(name) if any(one.has(key) for key in ("gain", "read", "row"))}
+
+
+def test_published_numbers_are_evaluated_by_their_form() -> None:
+    assert number_at(0.5, 100, None) == 0.5
+    assert number_at(["per_iso", 0.5, 1.0], 100, None) == 51
+    assert number_at(["root", 1.0, 0.03], 100, None) == 2
+    assert math.isclose(number_at(["line", 2.0, 1.0], 100, 3.0), 9 * math.e)
+    assert number_at(["by_iso", 100, 1.5, 200, 2.5], 200, None) == 2.5
+    assert number_at(["by_iso", 100, 1.5, 200, 2.5], 150, None) is None
+    assert number_at(["by_stop", 1.0, 2.0, 3.0, 5.0], 200, None) == 4
+    assert number_at(["by_stop", [1.0, 2.0], [3.0, 4.0]], 100, None) == [2, 3]
+
+
+def test_electrons_and_tukey_scales_become_standard_deviations() -> None:
+    noise = physical_profiles()["oppo_reno10x"]
+    entry = {"source": "ELD", "gain": ["per_iso", 0.02], "read_e": ["by_iso", 100, 1.5], "tukey": 3.0, "shape": 0.0}
+    one = PublishedSet(entry, noise)
+    assert one.number("read", 100) == 3
+    assert math.isclose(one.number("tukey", 100), math.pi * math.sqrt(3))
