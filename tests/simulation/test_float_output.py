@@ -294,7 +294,8 @@ def test_rounding_noise_masks_nothing_in_float_frames(settings: Settings) -> Non
     effects_of = {}
     for dtype in ("uint16", "float32"):
         config = settings(*noise, f"output.dtype={dtype}")
-        config.noise.branches[0].column_std_dn = 1e-4
+        for branch in config.noise.branches:
+            branch.column_std_dn = 1e-4
         effects_of[dtype] = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image())).effects
     assert "column" not in effects_of["uint16"]
     assert "column" in effects_of["float32"]

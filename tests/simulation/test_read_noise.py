@@ -122,18 +122,22 @@ def test_plan_has_gain_and_read_variance_of_profile(settings: Settings, noise: s
 
 
 def test_tukey_scale_is_multiplied_by_standard_deviation_of_shape(settings: Settings) -> None:
-    """Sony A7S II from ISO 200 to 1600, without scatter: ln scale = 0.740 ln K + 0.862, ln row = 0.788 ln K - 0.342."""
-    plan = planned(settings, picture(), "noise=sony_a7s2", "noise.iso=800")
+    config = settings("noise=sony_a7s2", "noise.iso=800")
+    branch = config.noise.branches[0]
+    branch.read_shape, branch.read_std_dn = -0.0857, ["scale_line", 0.740, 0.862, 0]
+    branch.row_std_dn = ["line", 0.788, -0.342, 0]
+    validate_config(config)
+    plan = plan_image(config, f"{7:064x}", facts=facts_of(picture()))
     assert plan.physics is not None
-    gain, scale = 9.563e-4 * 800, (4095 - 240) / (16383 - 512)
+    gain, scale = 9.563e-4 * 800, (4095 - 240) / (16300 - 512)
     assert plan.physics.dn_per_e == pytest.approx(gain * scale, rel=1e-15)
-    deviation = math.exp(0.740 * math.log(gain) + 0.862) * float(tukey_deviation(plan.physics.read_shape))
+    deviation = math.exp(0.740 * math.log(gain) + 0.862) * float(tukey_deviation(-0.0857))
     assert plan.physics.read_std_dn == pytest.approx(deviation * scale, rel=1e-9)
     assert plan.physics.row_std_dn == pytest.approx(math.exp(0.788 * math.log(gain) - 0.342) * scale, rel=1e-12)
 
 
 def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:
-    config = settings("noise=oppo_reno10x", "noise.iso=800")
+    config = settings("noise=oppo_reno10x", "noise.iso=800", "noise.scatter=image")
     config.noise.branches[0].read_std_dn = ["line", 0.5, 1.25, 0.25]
     validate_config(config)
     facts = facts_of(picture())
