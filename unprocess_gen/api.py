@@ -370,6 +370,7 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
         "pattern": plan.pattern,
         "layout": plan.layout,
         "dtype": plan.dtype,
+        "clean_dtype": plan.clean_dtype,
         "black_level_dn": plan.black_level_dn,
         "white_level_dn": plan.white_level_dn,
     }

@@ -216,10 +216,12 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     conditions = {column.empty_if for column in COLUMNS} - {""}
     failed = {condition for condition in conditions if "the source failed" in condition}
     passed = {"the source did not fail"}
-    absent = {"no effect uses one, or effects.assumed is off"}
+    same = "the clean array has the dtype of the noisy one, or the source failed"
+    absent = {"no effect uses one, or effects.assumed is off", same}
     holding = {
         "pair": (row_of(PHYSICAL), passed | absent),
-        "assumed": (row_of(dataclasses.replace(PHYSICAL, assumed=("prnu_std",))), passed),
+        "assumed": (row_of(dataclasses.replace(PHYSICAL, assumed=("prnu_std",))), passed | {same}),
+        "float clean": (row_of(dataclasses.replace(PHYSICAL, clean_dtype="float32")), passed | absent - {same}),
         "without effects": (row_of(bare), passed | absent | {one for one in failed if one.startswith("no effect")}),
         "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed | absent),
         "failed frame": (failed_row(video, SHA256, 0, 7, "corrupt", "why"), (failed | absent) - {NO_VIDEO}),

@@ -54,7 +54,12 @@ def pair(height: int, width: int, seed: int = 0) -> Pair:
 
 
 def in_json(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {column.name: row[column.name] for column in COLUMNS if column.in_json}
+    """Return what ``KEY.json`` holds of a row: columns that were added after 0.1 only if they are not empty."""
+    return {
+        column.name: row[column.name]
+        for column in COLUMNS
+        if column.in_json and (column.since == "0.1" or row[column.name] != column.empty)
+    }
 
 
 def read_json(path: Path, name: str) -> dict:

@@ -61,6 +61,9 @@ HEIGHTS = (1, 2, 3, 5, 8, 17, 33)
 WIDTHS = (1, 2, 15, 16, 17, 33, 63, 64, 65, 127, 129, 255, 257, 511, 512, 513, 577, 1023, 1025, 2049)
 """Sides at and next to the sizes of vectors, blocks of random words and segments."""
 
+FLOAT_CLEAN = "clean float32"
+"""Select a clean frame of float32 and a noisy frame of uint16, in place of a dtype."""
+
 MAX_SITES = 9000
 READ_SHAPES = (0.0, -0.1, 0.1571, -0.45, 5.0)
 """Shapes of Tukey's distribution; few, because each table takes 0.2 s."""
@@ -120,7 +123,8 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
         level=dice.pick((0, 0, 1, 99, 4095)),
         draw=dice.pick((0, 0, 1, 99, 4095)),
         frame=dice.pick((0, 0, 1, 12345, 2**31)),
-        dtype=dtype,
+        dtype=UINT16 if dtype == FLOAT_CLEAN else dtype,
+        clean_dtype=FLOAT32 if dtype == FLOAT_CLEAN else "",
         layout=layout,
     )
     plan = with_noise(plan, kind, dice)
@@ -231,7 +235,7 @@ def simulate(one: Case) -> Pair:
 
 def simulate_reference(one: Case) -> Pair:
     """Simulate the reference: with its formulas for integer frames, with the exact curve for frames in float32."""
-    if one.plan.dtype == UINT16:
+    if not one.plan.clean_normalised:
         return reference_pair(one.srgb, one.plan, one.origin)
     return make_pair(one.srgb, replace(one.plan, methods=(REFERENCE_METHOD,)), one.origin)
 
@@ -263,7 +267,7 @@ COUNTS = [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
 @pytest.mark.parametrize("kind", KINDS)
 def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count: int, figure: Figure) -> None:
     failed = {}
@@ -273,6 +277,17 @@ def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count:
             failed[f"case({kind!r}, {number}, {dtype!r})"] = text
     assert failed == {}
     figure("kernels", f"{count} random plans, {kind}, {dtype}: 0 pairs differ from the reference")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_float_clean_frames_change_no_noisy_frame(kind: str) -> None:
+    for number in range(QUICK // 5):
+        one = case(kind, number, FLOAT_CLEAN)
+        pair = simulate(one)
+        rounded = simulate(replace(one, plan=replace(one.plan, clean_dtype="")))
+        floats = simulate(replace(one, plan=replace(one.plan, clean_dtype="", dtype=FLOAT32)))
+        assert pair.noisy.tobytes() == rounded.noisy.tobytes(), number
+        assert one.plan.averaged or pair.clean.tobytes() == floats.clean.tobytes(), number
 
 
 # Crops and levels -----------------------------------------------------------------------------------------------------
@@ -286,7 +301,7 @@ def mosaics(pair: Pair, one: Case) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
 @pytest.mark.parametrize("kind", KINDS)
 def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, count: int) -> None:
     failed = []
@@ -319,7 +334,7 @@ def with_other_noise(plan: Plan, kinds: Sequence[str], dice: Dice) -> Plan:
 
 
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
 @pytest.mark.parametrize("kinds", [KINDS[:1], KINDS[1:4], KINDS[:4]], ids=["one normal", "counts", "mixed"])
 def test_levels_of_random_plans_equal_separate_pairs(kinds: Sequence[str], dtype: str, count: int) -> None:
     failed = {}
@@ -399,7 +414,7 @@ def test_rare_words_are_where_they_were_found(stream: str, word: int, at: tuple[
     assert words(KEY, stream, (1, 1), origin=(y, x), frame=frame).item() == word
 
 
-@pytest.mark.parametrize("dtype", [UINT16, FLOAT32])
+@pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
 @pytest.mark.parametrize(("stream", "word", "at"), SITES)
 def test_pairs_at_rare_words_equal_the_reference(stream: str, word: int, at: tuple[int, int, int], dtype: str) -> None:
     kinds = KINDS[:2] if stream == "heteroscedastic" else KINDS[2:4] if stream in ("shot", "read") else KINDS[3:]

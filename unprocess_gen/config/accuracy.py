@@ -212,7 +212,7 @@ def choose_methods(
         Whether frames are normalised floats. They are not rounded and are exact under every budget. Their stage
         ``effects`` is recorded as NumPy, as 0.1 computed it.
     steep : bool
-        Whether `is_steep` excludes float32.
+        Whether float32 is excluded: by `is_steep`, or because the unrounded clean frame is part of the dataset.
 
     Returns
     -------

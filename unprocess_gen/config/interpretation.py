@@ -412,8 +412,24 @@ def dequantize_method(source: SourceConfig) -> str:
     return str(DEQUANTIZE.word(source.dequantize))
 
 
+def has_float_clean(config: Config) -> bool:
+    """Return whether clean frames are normalised and noisy frames are integer DN.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+
+    Returns
+    -------
+    bool
+        True with ``output.clean_dtype=float32`` and ``output.dtype=uint16``.
+    """
+    return config.output.clean_dtype == FLOAT32 and not is_normalised(config)
+
+
 def is_normalised(config: Config) -> bool:
-    """Return whether frames are normalised.
+    """Return whether noisy frames are normalised.
 
     Parameters
     ----------

@@ -522,6 +522,13 @@ class OutputConfig:
         "type of the arrays: uint16 in DN, or float32 with 0 at black and 1 at white, not rounded",
         Choice(("uint16", "float32")),
     )
+    clean_dtype: Optional[str] = key(
+        None,
+        "type of clean frames: float32, 0 at black and 1 at white, holds the unrounded mean of noisy frames in uint16",
+        Choice(("uint16", "float32")),
+        null="the type of dtype",
+        since="0.2",
+    )
     layout: str = key(
         "mosaic",
         "layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue rows, "

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import yaml
 
-from unprocess_gen.config.interpretation import canonical_patch, uses_assumed
+from unprocess_gen.config.interpretation import canonical_patch, has_float_clean, uses_assumed
 from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
 from unprocess_gen.config.schema import Config, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
@@ -83,6 +83,8 @@ def dataset_yaml(config: Config) -> str:
     settings["source"]["patch"] = canonical_patch(config.source)
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
+    if not has_float_clean(config):
+        settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():
         settings[group] = {key: _canonical(value) if key in keys else value for key, value in settings[group].items()}
     return yaml.safe_dump({"seed": settings.pop("seed"), **settings}, sort_keys=False, allow_unicode=True, width=120)

@@ -16,6 +16,7 @@ from unprocess_gen.config.interpretation import (
     NO_CLIP,
     accuracy_budget,
     effect_switch,
+    has_float_clean,
     is_normalised,
     is_physical,
     missing_number,
@@ -30,6 +31,7 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.config.values import one_of, value_text
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.reference import colour
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
@@ -101,7 +103,9 @@ def check_values(config: Config) -> None:
         check_noise(noise, config.scene)
     _check_levels(config)
     _check_effects(config)
-    choose_methods(accuracy_budget(config.accuracy), uses_physics(config.noise), is_normalised(config))
+    choose_methods(
+        accuracy_budget(config.accuracy), uses_physics(config.noise), is_normalised(config), has_float_clean(config)
+    )
     _check_output(config)
 
 
@@ -210,6 +214,10 @@ def _check_output(config: Config) -> None:
 
     Integers are rounded and clipped; float32 is not.
     """
+    if is_normalised(config) and config.output.clean_dtype == UINT16:
+        raise ConfigError(
+            "output.clean_dtype=uint16: output.dtype=float32 has no rounded clean frame; expected float32 or null"
+        )
     quantise = config.effects.quantise and effect_switch(config.effects, "quantise")
     if is_normalised(config):
         if quantise == "on":

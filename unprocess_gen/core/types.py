@@ -270,6 +270,8 @@ class Plan:
         values.
     dtype, layout : str
         Dtype and layout of both frames.
+    clean_dtype : str
+        Dtype of the clean frame if it differs from ``dtype``; empty if it does not.
     assumed : tuple of str
         Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
     """
@@ -312,11 +314,17 @@ class Plan:
     dtype: str = UINT16
     layout: str = MOSAIC
     assumed: tuple[str, ...] = ()
+    clean_dtype: str = ""
 
     @property
     def normalised(self) -> bool:
-        """True if frames are float32, 0 at black and 1 at white, without rounding to DN."""
+        """True if noisy frames are float32, 0 at black and 1 at white, without rounding to DN."""
         return self.dtype == FLOAT32
+
+    @property
+    def clean_normalised(self) -> bool:
+        """True if the clean frame is float32, 0 at black and 1 at white, without rounding to DN."""
+        return (self.clean_dtype or self.dtype) == FLOAT32
 
     @property
     def uses_reference(self) -> bool:

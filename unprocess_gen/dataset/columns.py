@@ -408,6 +408,10 @@ COLUMNS = (
         "assumed", str, "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT, Plan,
         spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off",
     ),
+    Column(
+        "clean_dtype", str, "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), Plan,
+        since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed",
+    ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

@@ -46,6 +46,7 @@ from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.reference.cfa import CHANNELS
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
+from unprocess_gen.simulation.reference.sensor import quantise
 
 FRAMES = ("clean", "noisy")
 
@@ -102,8 +103,8 @@ def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> ExportSu
     Raises
     ------
     ConfigError
-        If a key does not exist or failed, a frame is not a uint16 mosaic or too small or large for a DNG, another file
-        of that name exists, the folder cannot be written, or tifffile is missing. Nothing is written then.
+        If a key does not exist or failed, a noisy frame is not of uint16, a frame is too small or large for a DNG,
+        another file of that name exists, the folder cannot be written, or tifffile is missing. Nothing is written then.
     DamageError
         If a frame differs from its row.
     MachineError
@@ -156,7 +157,10 @@ def _writable(row: Row) -> Row:
 def _content(pairs: RawPairs, file: _File) -> bytes:
     sample = pairs[file.number]
     frame = sample.clean if file.frame == "clean" else sample.noisy
-    content = encode(mosaic_dn(frame, sample.row), sample.row, file.frame)
+    dn = mosaic_dn(frame, sample.row)
+    if dn.dtype != np.uint16:  # the clean frame of clean_dtype=float32
+        dn = quantise(dn, 0, 2 ** int(sample.row["bits"]) - 1)
+    content = encode(dn, sample.row, file.frame)
     if array_xxh3(frame) != sample.row[f"{file.frame}_xxh3"]:
         raise DamageError(f"{pairs.path}: the {file.frame} frame of {file.key} differs from the digest in its row")
     return content

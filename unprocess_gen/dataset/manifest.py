@@ -305,7 +305,8 @@ def _check_together(row: Row) -> None:
     for name in _NEEDED:
         if row[name] is None or row[name] == "":
             raise ValueError(f"{name} is empty")
-    size = int(row["width"] or 0) * int(row["height"] or 0) * (4 if row["dtype"] == "float32" else 2)
+    is_float = "float32" in (row["dtype"], row["clean_dtype"])
+    size = int(row["width"] or 0) * int(row["height"] or 0) * (4 if is_float else 2)
     if size > FRAME_BYTES:
         raise ValueError(
             f"width={row['width']}, height={row['height']}: an array of {size} bytes; expected at most {FRAME_BYTES}"

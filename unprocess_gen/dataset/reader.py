@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.types import PACKED, UINT16, Float, Frame, Row
+from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
 from unprocess_gen.dataset.shards import (
     CLEAN,
     ArrayFormat,
     Member,
-    array_format,
+    frame_formats,
     map_array,
     noisy_member,
     read_index,
@@ -45,8 +45,9 @@ class Sample(_Frames):
     Attributes
     ----------
     clean, noisy : ndarray
-        Frames in the ``dtype`` and ``layout`` of the row: uint16 in DN, or float32 with 0 at black and 1 at white;
-        mosaics [H, W], or packed planes [4, H / 2, W / 2] in the order of `cfa.PLANES`.
+        Frames in the ``dtype`` and ``layout`` of the row: uint16 in DN, or float32 with 0 at black and 1 at white. The
+        clean frame has the dtype ``clean_dtype`` unless that is empty. Mosaics [H, W], or packed planes
+        [4, H / 2, W / 2] in the order of `cfa.PLANES`.
     row : dict
         Manifest row: value by column.
     dataset : str
@@ -78,7 +79,8 @@ def mosaic_dn(frame: Frame, row: Row) -> Frame | Float:
         uint16 values unchanged; float32 values scaled from 0 at black and 1 at white to DN.
     """
     mosaic = unpack(frame, str(row["pattern"])) if row["layout"] == PACKED else frame
-    if row["dtype"] == UINT16:
+    is_float_clean = row.get("clean_dtype") == FLOAT32 and mosaic.dtype == np.float32
+    if row["dtype"] == UINT16 and not is_float_clean:
         return mosaic
     return in_dn(mosaic, (int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)))
 
@@ -182,9 +184,11 @@ class _Dataset:
         """Return the pair whose row begins at a byte."""
         row = dict(read_row(self._manifest, offset))
         shard = int(row["shard"] or 0)
-        form = array_format(str(row["dtype"]), str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0))
         members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
-        clean, noisy = (self._array(shard, f"{sample_key(row)}.{member}", form) for member in members)
+        clean, noisy = (
+            self._array(shard, f"{sample_key(row)}.{member}", form)
+            for member, form in zip(members, frame_formats(row), strict=True)
+        )
         return Sample(clean, noisy, row, self.name)
 
     def _array(self, shard: int, name: str, form: ArrayFormat) -> Frame:

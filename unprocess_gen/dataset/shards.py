@@ -30,7 +30,7 @@ import xxhash
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import little_endian
-from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame
+from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame, Row
 
 RECORD = 512
 END = b"\0" * (2 * RECORD)
@@ -122,6 +122,24 @@ def array_format(dtype: str, layout: str, height: int, width: int) -> ArrayForma
     return ArrayFormat(dtype, shape)
 
 
+def frame_formats(row: Row) -> tuple[ArrayFormat, ArrayFormat]:
+    """Return the formats of the clean and of the noisy frame of a row.
+
+    Parameters
+    ----------
+    row : Row
+        Row of a pair.
+
+    Returns
+    -------
+    clean, noisy : ArrayFormat
+        They differ if ``clean_dtype`` is not empty.
+    """
+    layout, height, width = str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0)
+    noisy = array_format(str(row["dtype"]), layout, height, width)
+    return noisy._replace(dtype=str(row["clean_dtype"] or row["dtype"])), noisy
+
+
 def _tar_header(name: str, size: int) -> bytes:
     info = tarfile.TarInfo(name)
     info.size = size
@@ -132,25 +150,27 @@ def _padding(size: int) -> int:
     return -size % RECORD
 
 
-def image_bytes(array: ArrayFormat, json_bytes: int, pairs: int = 1) -> int:
+def image_bytes(array: ArrayFormat, json_bytes: int, pairs: int = 1, clean: ArrayFormat | None = None) -> int:
     """Return the bytes of one sample in a shard.
 
     Parameters
     ----------
     array : ArrayFormat
-        Format of its frames.
+        Format of its noisy frames.
     json_bytes : int
         Size of its JSON (`manifest.json_size`).
     pairs : int
         Number of noisy frames.
+    clean : ArrayFormat, optional
+        Format of the clean frame, if it is another one.
 
     Returns
     -------
     int
         Bytes with tar headers and padding.
     """
-    size = len(array.header) + array.size
-    return sum(RECORD + member + _padding(member) for member in (*[size] * (1 + pairs), json_bytes))
+    sizes = [len(form.header) + form.size for form in (clean or array, *[array] * pairs)]
+    return sum(RECORD + member + _padding(member) for member in (*sizes, json_bytes))
 
 
 def shard_bytes(pairs: list[int]) -> int:
@@ -322,6 +342,14 @@ def map_array(path: Path, member: Member, array: ArrayFormat) -> Frame:
 # ------------------------------------------------------------------------------------------------------- verifying
 
 
+class ExpectedFrame(NamedTuple):
+    """Hold member, XXH3-128 and format of a frame."""
+
+    member: str
+    digest: str
+    array: ArrayFormat
+
+
 class ExpectedSample(NamedTuple):
     """Hold what a shard must contain of one sample.
 
@@ -329,17 +357,14 @@ class ExpectedSample(NamedTuple):
     ----------
     key : str
         Key of the sample.
-    array : ArrayFormat
-        Format of its frames.
-    frames : tuple of (str, str)
-        Member and XXH3-128 of each frame.
+    frames : tuple of ExpectedFrame
+        The clean frame, then the noisy ones.
     json : bytes
         Content of ``KEY.json``.
     """
 
     key: str
-    array: ArrayFormat
-    frames: tuple[tuple[str, str], ...]
+    frames: tuple[ExpectedFrame, ...]
     json: bytes
 
 
@@ -369,9 +394,9 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
     """
     with path.open("rb") as stream:
         for sample in samples:
-            head = sample.array.header
-            size = len(head) + sample.array.size
-            for member, digest in sample.frames:
+            for member, digest, array in sample.frames:
+                head = array.header
+                size = len(head) + array.size
                 found = [*_check_bytes(stream, _tar_header(f"{sample.key}.{member}", size), "tar header")]
                 found += _check_bytes(stream, head, "npy header")
                 found += _check_digest(stream, size - len(head), digest)
@@ -403,13 +428,13 @@ def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dic
     with path.open("rb") if path.is_file() else io.BytesIO() as stream:
         at = 0
         for sample in samples:
-            size, head = sample.array.size, len(sample.array.header)
             frames = {}
-            for member, digest in sample.frames:
+            for member, digest, array in sample.frames:
+                size, head = array.size, len(array.header)
                 content = _read_at(stream, Member(at + RECORD + head, size))
                 at += RECORD + head + size + _padding(head + size)
                 if len(content) == size and xxhash.xxh3_128_hexdigest(content) == digest:
-                    frames[member] = np.frombuffer(content, sample.array.description).reshape(sample.array.shape)
+                    frames[member] = np.frombuffer(content, array.description).reshape(array.shape)
             at += RECORD + len(sample.json) + _padding(len(sample.json))
             yield frames
 

@@ -58,8 +58,9 @@ def source_bytes(config: Config, name: str, height: int, width: int) -> int:
         return 0
     patches = list_patches(rule, 0, height, width, output.layout)
     json_bytes = json_size(name, pairs)
-    forms = (array_format(output.dtype, output.layout, patch.height, patch.width) for patch in patches)
-    return sum(image_bytes(form, json_bytes, pairs) for form in forms)
+    noisy = [array_format(output.dtype, output.layout, patch.height, patch.width) for patch in patches]
+    clean = [form._replace(dtype=output.clean_dtype or output.dtype) for form in noisy]
+    return sum(image_bytes(form, json_bytes, pairs, of_clean) for form, of_clean in zip(noisy, clean, strict=True))
 
 
 def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:

@@ -22,7 +22,15 @@ from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_rows, row_json
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
-from unprocess_gen.dataset.shards import CLEAN, ExpectedSample, array_format, check_members, noisy_member, shard_name
+from unprocess_gen.dataset.shards import (
+    CLEAN,
+    ExpectedFrame,
+    ExpectedSample,
+    check_members,
+    frame_formats,
+    noisy_member,
+    shard_name,
+)
 from unprocess_gen.pipeline.workspace import read_dataset
 
 
@@ -237,9 +245,10 @@ def _expected_sample(rows: Sequence[Row]) -> ExpectedSample:
     width, height = rows[0]["width"], rows[0]["height"]
     if not isinstance(width, int) or not isinstance(height, int):
         raise DamageError(f"row {rows[0]['key']}: width and height are {width} and {height}")
-    form = array_format(str(rows[0]["dtype"]), str(rows[0]["layout"]), height, width)
-    noisy = tuple((noisy_member_of(row), str(row["noisy_xxh3"])) for row in rows)
-    return ExpectedSample(sample_key(rows[0]), form, ((CLEAN, str(rows[0]["clean_xxh3"])), *noisy), row_json(rows))
+    of_clean, of_noisy = frame_formats(rows[0])
+    clean = ExpectedFrame(CLEAN, str(rows[0]["clean_xxh3"]), of_clean)
+    noisy = (ExpectedFrame(noisy_member_of(row), str(row["noisy_xxh3"]), of_noisy) for row in rows)
+    return ExpectedSample(sample_key(rows[0]), (clean, *noisy), row_json(rows))
 
 
 def noisy_member_of(row: Row) -> str:

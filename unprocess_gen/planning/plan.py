@@ -18,6 +18,7 @@ from unprocess_gen.config.interpretation import (
     dequantize_method,
     effect_switch,
     gain_distributions,
+    has_float_clean,
     is_normalised,
     is_physical,
     noise_distributions,
@@ -28,7 +29,7 @@ from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
-from unprocess_gen.core.types import Facts, Plan
+from unprocess_gen.core.types import FLOAT32, Facts, Plan
 from unprocess_gen.planning.effect_contributions import signal_range
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
@@ -200,7 +201,8 @@ class Planner:
         self._levels = [PhysicalLevel(one) if is_physical(one.noise) else TwoNumberLevel(one) for one in levels]
         budget, counts_electrons = accuracy_budget(config.accuracy), uses_physics(config.noise)
         self._methods, self._steep_methods = (
-            choose_methods(budget, counts_electrons, is_normalised(config), steep) for steep in (False, True)
+            choose_methods(budget, counts_electrons, is_normalised(config), steep or has_float_clean(config))
+            for steep in (False, True)
         )
         self._recorded: dict[str, Any] = {
             "downscale": config.source.downscale,
@@ -222,6 +224,7 @@ class Planner:
             "law_distance": config.accuracy.law_distance,
             "dtype": config.output.dtype,
             "layout": config.output.layout,
+            "clean_dtype": FLOAT32 if has_float_clean(config) else "",
         }
 
     def levels(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.core.types import FLOAT32, Float, Frame, Row
+from unprocess_gen.core.types import Float, Frame, Row
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.reports.report_files import require_libraries
 from unprocess_gen.simulation.reference.sensor import noisy_limits
@@ -160,8 +160,8 @@ def fit_pair(clean: Frame, noisy: Frame, row: Row) -> NoiseFit | None:
         None if fewer than three clean DN have enough sites.
     """
     expected = _expected_noise(row)
-    rounded = row["dtype"] != FLOAT32
-    rounding = ROUNDING_VARIANCE if rounded else 0.0
+    rounded = noisy.dtype == np.uint16
+    rounding = ROUNDING_VARIANCE * (int(rounded) + int(clean.dtype == np.uint16)) / 2
     moments = _moments_by_dn(*(mosaic_dn(frame, row).astype(np.float64) for frame in (clean, noisy)))
     dn = np.arange(moments.shape[1])
     signal = np.maximum(dn - expected.black_dn, 0.0)

@@ -41,8 +41,8 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     Returns
     -------
     Pair
-        Clean and noisy frame: uint16 [H, W] in DN, unless ``plan.dtype`` or ``plan.layout`` differ; counts of clipped,
-        saturated and zero-variance sites.
+        Clean and noisy frame: uint16 [H, W] in DN, unless dtypes or layout of the plan differ; counts of
+        clipped, saturated and zero-variance sites.
 
     Raises
     ------
@@ -193,22 +193,23 @@ def _read_out(clean_dn: Float, clipped: tuple[int, int], plan: Plan, origin: tup
     levels_dn = plan.black_level_dn, plan.white_level_dn
     lowest, highest = (low, high) if plan.averaged else levels_dn
     read_dn = noisy_dn if plan.normalised else np.rint(noisy_dn)
-    clean: Frame
-    noisy: Frame
-    if plan.normalised:
-        clean, noisy = normalise(averaged_dn, lowest, highest, levels_dn), normalise(noisy_dn, low, high, levels_dn)
-    else:
-        clean, noisy = quantise(averaged_dn, lowest, highest), quantise(noisy_dn, low, high)
+    clean = _frame_of(averaged_dn, lowest, highest, plan.clean_normalised, levels_dn)
+    noisy = _frame_of(noisy_dn, low, high, plan.normalised, levels_dn)
 
     counts = Counts(
         clean_clipped_low=clipped[0],
         clean_clipped_high=clipped[1],
         noisy_clipped_low=int((read_dn < low).sum()),
         noisy_clipped_high=int((read_dn > high).sum()),
-        saturated=int((clean == (1 if plan.normalised else plan.white_level_dn)).sum()),
+        saturated=int((clean == (1 if plan.clean_normalised else plan.white_level_dn)).sum()),
         zero_variance=int((noise.noise_variance(clean_dn, plan) == 0).sum()),
     )
     return Pair(clean, noisy, counts)
+
+
+def _frame_of(dn: Float, low: float, high: float, normalised: bool, levels_dn: tuple[int, int]) -> Frame:
+    """Clip unrounded DN, then normalise or round them."""
+    return normalise(dn, low, high, levels_dn) if normalised else quantise(dn, low, high)
 
 
 def _arrange_pair(pair: Pair, plan: Plan, origin: tuple[int, int]) -> Pair:

@@ -121,6 +121,8 @@ GOLDEN_PLANS = {
 GOLDEN_PLANS |= {
     "normalised": replace(GOLDEN_PLAN, dtype=FLOAT32, sensor_clip="none"),
     "normalised_counts": replace(GOLDEN_PLANS["physical"], dtype=FLOAT32, sensor_clip="none"),
+    "float_clean": replace(GOLDEN_PLAN, clean_dtype=FLOAT32),
+    "float_clean_counts": replace(GOLDEN_PLANS["physical"], clean_dtype=FLOAT32),
 }
 GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
@@ -132,6 +134,8 @@ GOLDEN = {
     "near": ("b4c0b18f1bbccbf881c82b00455253e9", "c0308c77164902cd319646844ca0b470"),
     "normalised": ("aa19fde7d361bcc67ca6c9e52c8d8634", "4de3ab500ebd73704139d53f4f3d8ee3"),
     "normalised_counts": ("db1e51d036e01d5eaca3d0ebedbab809", "f5e3fd88d4091be074264896a692346f"),
+    "float_clean": ("aa19fde7d361bcc67ca6c9e52c8d8634", "249b904acb59298a603502c2424e4712"),
+    "float_clean_counts": ("db1e51d036e01d5eaca3d0ebedbab809", "034a49f0e3f78996ab8d340da875038e"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
 GOLDEN_PAIRS = {
@@ -141,6 +145,8 @@ GOLDEN_PAIRS = {
     "reference": ("reference",),
     "normalised": ("normalised",),
     "normalised_electrons": ("normalised_counts",),
+    "float_clean": ("float_clean",),
+    "float_clean_electrons": ("float_clean_counts",),
 }
 """Golden pairs for each form of the renderer. A run tests only the forms that it needs: compiling one takes seconds."""
 
@@ -177,8 +183,9 @@ def kernels(plan: Plan) -> str:
     if plan.uses_reference:
         return "reference"
     noise = "electrons" if plan.counts_electrons else "gaussian"
-    if plan.normalised:
-        return "normalised_electrons" if noise == "electrons" else "normalised"
+    if plan.clean_normalised:
+        form = "normalised" if plan.normalised else "float_clean"
+        return f"{form}_electrons" if noise == "electrons" else form
     return "float32" if uses_scene32(plan) else noise
 
 

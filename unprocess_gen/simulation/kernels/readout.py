@@ -1,7 +1,8 @@
 """Read out the frames of a strip: round to the sensor's integers or normalise, clip, count, and write.
 
 `Integers` rounds approximate DN and asks the noise for the exact value of sites whose error bound reaches a rounding
-boundary. `Normalised` needs the exact value of every site, because float32 frames are not rounded to DN.
+boundary. `Normalised` needs the exact value of every site, because float32 frames are not rounded to DN. `FloatClean`
+reads the noisy frames as the former and the clean frame as the latter.
 """
 
 from __future__ import annotations
@@ -87,9 +88,21 @@ class Normalised(NamedTuple):
     planes: NDArray[np.int64]
 
 
+class FloatClean(NamedTuple):
+    """Hold what N noisy frames of uint16 and a clean frame of float32 need; members as in `Integers`."""
+
+    limits_dn: Float
+    averaged: bool
+    black_dn: float
+    span_dn: float
+    white: float
+    packed: bool
+    planes: NDArray[np.int64]
+
+
 def readout_of(
     plans: Sequence[Plan], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
-) -> Integers | Normalised:
+) -> Integers | Normalised | FloatClean:
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
     black_dn = float(first.black_level_dn)
@@ -99,13 +112,13 @@ def readout_of(
     ]
     packed = first.layout == PACKED
     planes = _planes(first.pattern, origin[0] % 2, origin[1] % 2)
-    kind: Any = Normalised if first.normalised else Integers
-    readout: Integers | Normalised = kind(
+    kind: Any = Normalised if first.normalised else FloatClean if first.clean_normalised else Integers
+    readout: Integers | Normalised | FloatClean = kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
         averaged=first.averaged,
         black_dn=black_dn,
         span_dn=float(first.white_level_dn) - black_dn,
-        white=1.0 if first.normalised else float(first.white_level_dn),
+        white=1.0 if first.clean_normalised else float(first.white_level_dn),
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
@@ -174,7 +187,7 @@ average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Ele
 
 @inner
 def _read_integers(
-    readout: Integers,
+    readout: Any,
     noise: Any,
     n: int,
     key: PhiloxKey,
@@ -296,7 +309,7 @@ def _read_normalised(
 
 @inner
 def _normalise(
-    readout: Normalised, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace
+    readout: Any, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace
 ) -> bool:
     """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`; return whether any DN is clipped.
 
@@ -323,7 +336,7 @@ def _normalise(
 
 @inner
 def _write_normalised(
-    readout: Normalised, may_saturate: bool, strip: Strip, workspace: Workspace, out: Pointer, counts: Pointer
+    readout: Any, may_saturate: bool, strip: Strip, workspace: Workspace, out: Pointer, counts: Pointer
 ) -> None:
     low, high = readout.black_dn, readout.black_dn + readout.span_dn
     if readout.averaged:
@@ -360,12 +373,12 @@ def count_zero_variance(noise: Any, n: int, strip: Strip, workspace: Workspace, 
         counts[5] += count
 
 
-read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised})
+read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised, FloatClean: _read_integers})
 """Sample the noise of frame n in a strip, read it out, and count its clipped sites.
 
 Arguments: read-out, noise, n, key, strip, workspace, pointer to the strip in the frame, counts.
 """
-write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised})
+write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
 """Read out the clean frame of a strip.
 
 Arguments: read-out, whether sites can be saturated, strip, workspace, pointer to the strip in the frame, counts.

@@ -83,8 +83,8 @@ def _fill_frames(
     """
     first, shape = plans[0], (srgb.shape[0], srgb.shape[1])
     frame_shape = (4, shape[0] // 2, shape[1] // 2) if first.layout == PACKED else shape
-    dtype = np.float32 if first.normalised else np.uint16
-    clean, noisy = np.empty(frame_shape, dtype=dtype), np.empty((count, *frame_shape), dtype=dtype)
+    clean = np.empty(frame_shape, dtype=np.float32 if first.clean_normalised else np.uint16)
+    noisy = np.empty((count, *frame_shape), dtype=np.float32 if first.normalised else np.uint16)
     counts = np.zeros((max(count, 1), 6), dtype=np.int64)
     scene, noise, readout = _records(tuple(plans), shape, 256 if srgb.itemsize == 1 else 65536, origin)
     scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
@@ -130,7 +130,7 @@ def pass_key(plan: Plan) -> tuple[object, ...]:
 
 def uses_scene32(plan: Plan) -> bool:
     """Return whether a plan is rendered in float32: only integer frames with one normal per site are."""
-    return plan.uses_float32 and not plan.normalised and not plan.counts_electrons
+    return plan.uses_float32 and not plan.clean_normalised and not plan.counts_electrons
 
 
 @kernel

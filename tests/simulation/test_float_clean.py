@@ -1,0 +1,173 @@
+"""Clean frames in float32 next to noisy frames in DN: the unrounded mean of the noise, in every file and command."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.datasets import Make, Settings
+
+import unprocess_gen as ug
+from unprocess_gen import RawPairs
+from unprocess_gen.config.serialization import dataset_yaml
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.reader import mosaic_dn
+from unprocess_gen.dataset.shards import json_inside
+from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.reports import photon_transfer as transfer
+from unprocess_gen.reports.estimate import estimate_run
+
+NIGHT = ("noise=sony_a7s2", "scene=night", "sensor=generic_14bit")
+FLOAT_CLEAN = (*NIGHT, "output.clean_dtype=float32")
+
+
+@pytest.fixture(scope="module")
+def mixed(photos: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Dataset with float32 clean frames, which tests do not modify."""
+    out = tmp_path_factory.mktemp("mixed") / "ds"
+    make(photos, out, *FLOAT_CLEAN)
+    return out
+
+
+@pytest.fixture(scope="module")
+def rounded(photos: Path, make: Make, mixed: Path) -> Path:
+    """The same dataset with rounded clean frames."""
+    out = mixed.parent / "rounded"
+    make(photos, out, *NIGHT)
+    return out
+
+
+def test_clean_frames_are_float32_and_noisy_frames_do_not_change(mixed: Path, rounded: Path) -> None:
+    for (clean, noisy, row), (levels, other, of_rounded) in zip(RawPairs(mixed), RawPairs(rounded), strict=True):
+        assert (clean.dtype, noisy.dtype) == (np.float32, np.uint16)
+        assert (row["dtype"], row["clean_dtype"], of_rounded["clean_dtype"]) == ("uint16", "float32", "")
+        assert np.array_equal(noisy, other)
+        span_dn = row["white_level_dn"] - row["black_level_dn"]
+        dn = clean.astype(np.float64) * span_dn + row["black_level_dn"]
+        assert np.abs(dn - levels).max() <= 0.5 + 1e-3
+        assert 0 <= clean.min() <= clean.max() <= 1
+
+
+def test_clean_frames_have_more_levels_than_rounded_ones(mixed: Path, rounded: Path) -> None:
+    pairs = zip(RawPairs(mixed), RawPairs(rounded), strict=True)
+    assert all(
+        np.unique(clean).size > 2 * np.unique(levels).size
+        for (clean, *_), (levels, *_) in pairs
+        if np.unique(levels).size > 20
+    )
+
+
+def test_clean_frames_are_those_of_a_float32_dataset_in_every_tier(mixed: Path, photos: Path, make: Make) -> None:
+    floats, fast = mixed.parent / "floats", mixed.parent / "fast"
+    make(photos, floats, *NIGHT, "output.dtype=float32")
+    make(photos, fast, *FLOAT_CLEAN, "accuracy=fast")
+    for expected, ours, of_fast in zip(RawPairs(floats), RawPairs(mixed), RawPairs(fast), strict=True):
+        assert ours.clean.tobytes() == expected.clean.tobytes()
+        assert of_fast.clean.tobytes() == expected.clean.tobytes()
+
+
+def test_json_names_the_dtype_of_the_clean_frame(mixed: Path, rounded: Path) -> None:
+    assert json.loads(json_inside(mixed / "shards/shard-00000.tar")[0])["clean_dtype"] == "float32"
+    assert "clean_dtype" not in json.loads(json_inside(rounded / "shards/shard-00000.tar")[0])
+
+
+def test_every_byte_is_verified_and_every_pair_regenerated(mixed: Path, photos: Path) -> None:
+    assert verify(mixed) == []
+    again = list(replay(read_rows(mixed / "manifest.csv"), str(photos)))
+    assert len(again) == 13
+    assert not any(one.complaint for one in again)
+
+
+@pytest.mark.parametrize("place", [700, -2000], ids=["clean", "noisy"])
+def test_a_flipped_bit_is_found_and_repaired(
+    place: int, mixed: Path, photos: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    shutil.copytree(mixed, tmp_path / "ds")
+    shard = tmp_path / "ds/shards/shard-00000.tar"
+    content = bytearray(shard.read_bytes())
+    content[place] ^= 1
+    shard.write_bytes(content)
+    assert run_main("verify", "ds", "--repair", f"source.root={photos}").code == 0
+    assert shard.read_bytes() == (mixed / "shards/shard-00000.tar").read_bytes()
+
+
+def test_dataset_is_regenerated_from_its_config(mixed: Path, photos: Path, run_main: RunMain) -> None:
+    done = run_main("again", mixed, f"source.root={photos}", "out=again", "n_jobs=1")
+    assert done.code == 0
+    assert "the same as" in done.out
+
+
+def test_estimated_bytes_are_exact(photos: Path, mixed: Path, settings: Settings) -> None:
+    config = settings(*FLOAT_CLEAN)
+    config.source.root = str(photos)
+    written = sum(path.stat().st_size for path in (mixed / "shards").iterdir())
+    assert estimate_run(config, 1, read_all=True).bytes == written
+
+
+def test_plan_warns_of_rounded_clean_frames_only(photos: Path, run_main: RunMain) -> None:
+    assert "no denoiser exceeds a PSNR" in run_main("plan", *NIGHT, f"source.root={photos}").out
+    assert "no denoiser exceeds a PSNR" not in run_main("plan", *FLOAT_CLEAN, f"source.root={photos}").out
+
+
+def test_frames_are_developed_and_converted_to_dn(mixed: Path) -> None:
+    clean, noisy, row = RawPairs(mixed)[0]
+    dn = mosaic_dn(clean, row)
+    assert row["black_level_dn"] <= dn.min() <= dn.max() <= row["white_level_dn"]
+    assert np.array_equal(mosaic_dn(noisy, row), noisy)
+    rounded = np.rint(dn).astype(np.uint16)
+    difference = ug.develop(clean, row).astype(int) - ug.develop(rounded, row)
+    assert np.abs(difference).mean() < 8
+
+
+def test_dng_of_a_clean_frame_is_rounded(mixed: Path, rounded: Path, run_main: RunMain, tmp_path: Path) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    key = next(row["key"] for *_, row in RawPairs(mixed) if min(row["width"], row["height"]) >= 22)
+    for name, folder in (("mixed", mixed), ("rounded", rounded)):
+        assert run_main("dng", folder, "--keys", key, "--to", tmp_path / name).code == 0
+    for frame in ("clean", "noisy"):
+        found, expected = (
+            tifffile.imread(tmp_path / name / f"{key}.{frame}.dng").astype(int) for name in ("mixed", "rounded")
+        )
+        assert (np.abs(found - expected) <= (frame == "clean")).all()  # float32 may move a value across a half
+        assert (found != expected).mean() < 1e-3
+
+
+def test_noise_is_fitted_with_the_rounding_of_one_frame(make: Make, settings: Settings, tmp_path: Path) -> None:
+    make(None, tmp_path / "ds", "source.limit=2", "scene=indoor", "output.clean_dtype=float32")
+    for clean, noisy, row in RawPairs(tmp_path / "ds"):
+        fit = transfer.fit_pair(clean, noisy, row)
+        assert fit is not None
+        assert fit.rounding_dn2 == pytest.approx(1 / 12)
+        assert fit.deviation < 5
+
+
+def test_rounded_clean_frame_next_to_float32_is_refused(settings: Settings) -> None:
+    with pytest.raises(ConfigError, match=r"output\.clean_dtype=uint16: .* expected float32 or null"):
+        validate_config(settings("output.dtype=float32", "output.clean_dtype=uint16"))
+
+
+def test_config_yaml_omits_the_dtype_of_equal_frames(settings: Settings) -> None:
+    assert dataset_yaml(settings("output.clean_dtype=uint16")) == dataset_yaml(settings())
+    floats = "output.dtype=float32"
+    assert dataset_yaml(settings(floats, "output.clean_dtype=float32")) == dataset_yaml(settings(floats))
+    assert "clean_dtype: float32" in dataset_yaml(settings("output.clean_dtype=float32"))
+
+
+def test_patches_and_packed_planes_have_float32_clean_frames(
+    photos: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    overrides = (*FLOAT_CLEAN, "output.layout=packed", "source.patch=[grid,16]", "noise.levels=[800,6400]")
+    make(photos, tmp_path / "ds", *overrides)
+    for clean, noisy, row in RawPairs(tmp_path / "ds"):
+        assert (clean.dtype, clean.shape) == (np.float32, (4, 8, 8))
+        assert (noisy.dtype, noisy.shape) == (np.uint16, (4, 8, 8))
+        assert row["clean_dtype"] == "float32"
+    assert verify(tmp_path / "ds") == []
