@@ -308,9 +308,7 @@ def _read_normalised(
 
 
 @inner
-def _normalise(
-    readout: Any, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace
-) -> bool:
+def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace) -> bool:
     """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`; return whether any DN is clipped.
 
     The product with 1/span takes a fifth of the time of a quotient. It differs from the quotient by three roundings,

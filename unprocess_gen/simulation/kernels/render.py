@@ -23,6 +23,7 @@ from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
+    FloatClean,
     Integers,
     Normalised,
     average_patterns,
@@ -97,7 +98,7 @@ def _fill_frames(
 
 def _records(
     plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, origin: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Integers | Normalised]:
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Integers | Normalised | FloatClean]:
     """Return the scene, the noise and the read-out, whose classes select the compiled code."""
     first = plans[0]
     scene, noise, readout = _records_of_plans(
@@ -115,7 +116,7 @@ def _records(
 @functools.lru_cache(maxsize=4)
 def _records_of_plans(
     plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, corner: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | None, Integers | Normalised]:
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | None, Integers | Normalised | FloatClean]:
     """Return what all patches of an image share; the noise is None if it is counted in electrons."""
     if uses_scene32(plans[0]):
         return scene32_of(plans[0], codes, corner), gaussian_noise32(plans), readout_of(plans, shape, corner, True)
