@@ -159,7 +159,7 @@ def _content(pairs: RawPairs, file: _File) -> bytes:
     frame = sample.clean if file.frame == "clean" else sample.noisy
     dn = mosaic_dn(frame, sample.row)
     if dn.dtype != np.uint16:  # the clean frame of clean_dtype=float32
-        dn = quantise(dn, 0, 2 ** int(sample.row["bits"]) - 1)
+        dn = quantise(dn.astype(np.float64), 0, 2 ** int(sample.row["bits"]) - 1)
     content = encode(dn, sample.row, file.frame)
     if array_xxh3(frame) != sample.row[f"{file.frame}_xxh3"]:
         raise DamageError(f"{pairs.path}: the {file.frame} frame of {file.key} differs from the digest in its row")
