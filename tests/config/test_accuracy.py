@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from decimal import localcontext
 
 import numpy as np
 import pytest
@@ -23,10 +24,13 @@ from unprocess_gen.config.accuracy import (
 from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.exact_distributions import tukey_std
+from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.kernels.electrons import _count_roots
 from unprocess_gen.simulation.pair import make_pair, reference_pair
-from unprocess_gen.simulation.reference.poisson import gaussian_distance, gaussian_from
+from unprocess_gen.simulation.reference.poisson import core_share, gaussian_distance, gaussian_from
 from unprocess_gen.sources.scenes import synthetic
 
 EXACT = Budget("exact", False, 0.0, 0.0, 1e-6, 0.0)
@@ -196,6 +200,77 @@ def test_distance_is_largest_difference_of_the_two_cdfs(rate_e: float, read_std_
         distance = float(np.abs(np.cumsum(mixture - alone)).max() * (grid[1] - grid[0]))
 
     assert gaussian_distance(rate_e, read_std_e) == pytest.approx(distance, rel=0.12)
+
+
+def tukey_cdf(x: np.ndarray, shape: float, std: float) -> np.ndarray:
+    """Return the distribution function of Tukey's lambda distribution by inverting its quantiles on a grid."""
+    tails = np.logspace(-14, -3, 2000)
+    p = np.concatenate([tails, np.linspace(1e-3, 1 - 1e-3, 8001)[1:-1], 1 - tails[::-1]])
+    quantiles = np.log(p / (1 - p)) if shape == 0 else (p**shape - (1 - p) ** shape) / shape
+    with localcontext(prec=40):
+        return np.asarray(np.interp(x, quantiles * (std / float(tukey_std(shape))), p))
+
+
+def distance_with_tukey(rate_e: float, shape: float, read_std_e: float) -> float:
+    """Return the largest CDF difference between counts and a normal with their mean and variance, both with read noise.
+
+    The difference of the distribution functions of the counts and the normal is convolved with the read noise.
+    """
+    steps, reach = 32, int(10 * math.sqrt(rate_e) + 12)
+    counts = np.arange(max(math.floor(rate_e) - reach, 0), math.floor(rate_e) + reach + 1)
+    log_shares = counts * math.log(rate_e) - rate_e - np.array([math.lgamma(k + 1) for k in counts])
+    low = math.floor(rate_e) - reach
+    x = low + (np.arange(2 * reach * steps) + 0.5) / steps
+    with np.errstate(under="ignore"):
+        cumulated = np.concatenate([[0.0], np.cumsum(np.exp(log_shares))])
+        normal = np.array([0.5 * math.erfc(-(one - rate_e) / math.sqrt(2 * rate_e)) for one in x])
+    of_counts = cumulated[np.clip(np.floor(x).astype(int) - counts[0] + 1, 0, counts.size)]
+    edges = (np.arange(int(-(12 * read_std_e + 10) * steps), int((12 * read_std_e + 10) * steps) + 2) - 0.5) / steps
+    weights = np.diff(tukey_cdf(edges, shape, read_std_e))
+    size = 2 ** math.ceil(math.log2(x.size + weights.size))
+    with np.errstate(under="ignore"):
+        spectrum = np.fft.rfft(of_counts - normal, size) * np.fft.rfft(weights, size)
+        return float(np.abs(np.fft.irfft(spectrum, size)).max())
+
+
+def law_plan(settings: Settings, law: str, shape: float, read_std_e: float, law_distance: float) -> Plan:
+    plan = plan_image(settings("noise=nikon_d850", "accuracy=fast"), "0" * 64, facts=Facts(64, 48, 256, 0, 255))
+    assert plan.physics is not None
+    physics = replace(plan.physics, read_law=law, read_shape=shape, read_std_dn=read_std_e * plan.physics.dn_per_e)
+    return replace(plan, physics=physics, effects=("shot", "read"), law_distance=law_distance)
+
+
+def limits_of(plan: Plan) -> tuple[float, float]:
+    """Return the means up to which, and from which, the kernel draws normals."""
+    assert plan.physics is not None
+    low, high = _count_roots(plan, plan.physics.read_std_dn / plan.physics.dn_per_e, counts_all=False)
+    return low**2, high**2
+
+
+@pytest.mark.parametrize("law_distance", [1e-3, 5e-3, 0.02])
+@pytest.mark.parametrize("shape", [0.3, 0.1571, 0.0, -0.1, -0.2143, -0.2429, -0.3, -0.4, -0.45])
+def test_law_distance_holds_for_tukey_read_noise(settings: Settings, shape: float, law_distance: float) -> None:
+    """Test means next to the limits, from the least read noise with which normals are drawn."""
+    for core_std_e in (0.501, 0.6, 1.0, 3.0, 8.0):
+        read_std_e = core_std_e / core_share(shape)
+        below, above = limits_of(law_plan(settings, "tukey_lambda", shape, read_std_e, law_distance))
+        assert above < math.inf
+        rates = (below, 0.5 * below, above, 1.3 * above) if below < above else (0.1, 1.0, 10.0, 100.0)
+        for rate_e in rates:
+            if 1e-2 < rate_e < 5000:
+                assert distance_with_tukey(rate_e, shape, read_std_e) <= law_distance, (read_std_e, rate_e)
+
+
+def test_law_of_0_1_exceeds_the_law_distance_near_half_an_electron(settings: Settings) -> None:
+    """Its limits are those of normal read noise, on which the bytes of recorded datasets depend."""
+    below, above = limits_of(law_plan(settings, "tukey", -0.2429, 0.5, 5e-3))
+    assert (below, above) == pytest.approx(gaussian_from(0.5, 5e-3), rel=1e-12)
+    assert distance_with_tukey(above, -0.2429, 0.5) == pytest.approx(0.0068, rel=0.03)
+
+
+@pytest.mark.parametrize(("shape", "read_std_e"), [(0.31, 5.0), (1.0, 5.0), (0.0, 0.6), (-0.2429, 0.9)])
+def test_counts_are_drawn_where_no_normal_is_near(settings: Settings, shape: float, read_std_e: float) -> None:
+    assert limits_of(law_plan(settings, "tukey_lambda", shape, read_std_e, 5e-3)) == (0.0, math.inf)
 
 
 def test_methods_of_each_stage_are_in_order_of_cost() -> None:

@@ -143,7 +143,7 @@ physics = st.builds(
     hot_pixel_share=number("hot_pixel_share"),
     hot_pixel_e=number("hot_pixel_e"),
     full_well_e=number("full_well_e"),
-    read_law=st.sampled_from(["gaussian", "tukey"]),
+    read_law=st.sampled_from(["gaussian", "tukey", "tukey_lambda"]),
     read_shape=number("read_shape"),
     read_std_dn=number("read_std_dn"),
     row_std_dn=number("row_std_dn"),
@@ -507,7 +507,7 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     )  # fmt: skip
     numbers = {field.name: LONGEST for field in dataclasses.fields(Physics) if field.type == "float"}
     physics = dataclasses.replace(
-        PHYSICS, **numbers, dark_offset="removed", read_law="gaussian", black_error_dn=(LONGEST,) * 4,
+        PHYSICS, **numbers, dark_offset="removed", read_law="tukey_lambda", black_error_dn=(LONGEST,) * 4,
         sensor_unit="f" * 16, body_key=2**64 - 1,
     )  # fmt: skip
     skipped = tuple(f"{effect}: {reason}" for effect, reason in longest_reasons(settings).items())

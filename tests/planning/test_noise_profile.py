@@ -668,6 +668,7 @@ def test_unknown_effect_is_refused_by_the_command_line(cli: Callable[..., Any]) 
             "expected more than -0.5, where the Tukey-lambda",
         ),
         ({"read_law": "cauchy"}, "branches[0].read_law=cauchy: expected one of gaussian, tukey"),
+<<<<<<< HEAD
         ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
         ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
         (
@@ -693,6 +694,12 @@ def test_unknown_effect_is_refused_by_the_command_line(cli: Callable[..., Any]) 
             "expected a number of 0 or more, up to 1e+09, or a form: per_iso",
         ),
         ({"iso": [50, 6400]}, "has 16 rows from ISO 100; the branch, ISO 50 to 6400, needs 13"),
+=======
+        ({"read_law": "tukey_lambda", "read_shape": -0.46}, "read_shape=-0.46: draws of 32 bits lack more than 12 %"),
+        ({"read_law": "tukey_lambda", "read_shape": ["choice", 0.1, -0.49]}, "expected shapes of -0.45 or more"),
+        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
+        ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
+>>>>>>> a7f89c7 (Add the read law tukey_lambda: variance of all tails, and law distances of its own)
         ({"iso": [800, 100]}, "branches[0].iso=[800, 100]: expected the lowest and the highest ISO"),
     ],
 )

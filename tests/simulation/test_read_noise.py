@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from decimal import Decimal, localcontext
 
 import mpmath
 import numpy as np
@@ -15,7 +16,7 @@ from helpers.published import CRVD
 from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, tukey_table
+from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, draw_variance, tukey_table, unit_tukey_table
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.reference import noise as effects
@@ -75,15 +76,60 @@ def test_tukey_table_has_variance_1(shape: float) -> None:
     assert 0 <= 1 - table_moment(tukey_table(shape), 2) <= float(beyond) + 1e-6
 
 
-@pytest.mark.parametrize(("distribution", "shape"), [("gaussian", 0.0), *(("tukey", shape) for shape in SHAPES)])
+HEAVY_TAILS = (-0.3, -0.35, -0.4, -0.45)
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, *HEAVY_TAILS, -0.49])
+def test_unit_tukey_table_has_variance_1(shape: float) -> None:
+    """The sum over all draws is exact: for shapes whose tails `tukey_table` lacks too."""
+    with localcontext(prec=40):
+        assert abs(draw_variance(unit_tukey_table(shape)) - 1) < Decimal("1e-15")
+
+
+@pytest.mark.parametrize(("shape", "missing"), [(-0.3, 2.35e-4), (-0.4, 0.0151), (-0.45, 0.1225)])
+def test_tukey_table_of_0_1_lacks_variance_of_the_tails(shape: float, missing: float) -> None:
+    with localcontext(prec=40):
+        assert 1 - float(draw_variance(tukey_table(shape))) == pytest.approx(missing, rel=0.01)
+
+
+def test_draw_variance_is_that_of_every_word_of_an_octave() -> None:
+    """Compare with the values of all words j below 2**18, in a table that is 0 above."""
+    table = unit_tukey_table(-0.4).copy()
+    table[18 * SEGMENTS :] = 0
+    j = np.arange(1, 2**18, 2, dtype=np.uint32)
+    values = effects.by_inverse_cdf((j - 1) // 2, table)
+    with localcontext(prec=40):
+        assert float(draw_variance(table)) == pytest.approx(float(values @ values) / 2**31, rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", HEAVY_TAILS)
+def test_quantiles_of_heavy_tails_keep_their_shape(shape: float) -> None:
+    index = np.arange(2**30, 2**31 - 1, 2**22, dtype=np.uint32)
+    table, unit = tukey_table(shape), unit_tukey_table(shape)
+    ratio = effects.by_inverse_cdf(index, unit) / effects.by_inverse_cdf(index, table)
+    assert float(np.ptp(ratio)) < 1e-12
+    with localcontext(prec=40):
+        assert ratio[0] == pytest.approx(1 / math.sqrt(draw_variance(table)), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "shape"),
+    [
+        ("gaussian", 0.0),
+        *(("tukey", shape) for shape in SHAPES),
+        *(("tukey_lambda", shape) for shape in (*SHAPES, -0.3)),
+    ],
+)
 def test_read_noise_has_given_standard_deviation_for_every_distribution(distribution: str, shape: float) -> None:
     std = 300.0
     plan = plan_with("read", read_law=distribution, read_shape=shape, read_std_dn=std)
     deviation = noisy_dn(plan, 32000) - signal_dn(32000)
     table = effects.read_table(plan.physics)  # type: ignore[arg-type]
-    second, fourth, reach = table_moment(table, 2), table_moment(table, 4), float(np.abs(table[0]).sum()) * std + 1
+    with localcontext(prec=40):
+        second = float(draw_variance(table))
+    fourth, reach = table_moment(table, 4), float(np.abs(table[0]).sum()) * std + 1
     variance = std**2 * second + 1 / 12
-    assert abs(second - 1) <= 1e-4
+    assert abs(second - 1) <= (1e-4 if distribution == "tukey" else 1e-9)
     assert bounds_off(deviation, 0, variance, reach) <= 1
     spread = std**4 * fourth + std**2 / 2 + 1 / 80 - variance**2
     assert bounds_off(deviation**2, variance, spread, reach**2) <= 1

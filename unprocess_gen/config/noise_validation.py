@@ -47,6 +47,9 @@ MAX_ELECTRONS = 1e9
 """Largest mean of an exact Poisson count (`simulation.reference.poisson`); no pixel holds as many electrons."""
 
 
+HEAVIEST_TAILS = -0.45
+"""Least shape of ``tukey_lambda``, whose table is 7 % wider than the distribution, so that its variance is 1."""
+
 FARTHEST_NORMAL = 6.4
 """No normal deviate of a 32-bit uniform is farther from 0."""
 
@@ -161,8 +164,24 @@ def _check_branch(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
             gains = _gains_at_ends(branch)
             _check_gain(f"{key}.{name}", noise, branch, gains[0])
         setting.check(f"{key}.{name}", value)
+<<<<<<< HEAD
     _check_shape(f"{key}.read_shape", branch)
     _check_black_error(f"{key}.black_error_dn", branch)
+=======
+    parse_drawn(f"{key}.read_shape", branch.read_shape, READ_SHAPE)
+    _check_tails(key, branch)
+    _check_black_error(f"{key}.black_error_dn", branch.black_error_dn)
+>>>>>>> a7f89c7 (Add the read law tukey_lambda: variance of all tails, and law distances of its own)
+
+
+def _check_tails(key: str, branch: BranchConfig) -> None:
+    """Raise ConfigError for shapes of ``tukey_lambda`` whose variance is mostly in values that are never drawn."""
+    shapes = branch.read_shape if isinstance(branch.read_shape, list) else [branch.read_shape]
+    if branch.read_law == "tukey_lambda" and min(filter(is_number, shapes)) < HEAVIEST_TAILS:
+        raise ConfigError(
+            f"{key}.read_shape={value_text(branch.read_shape)}: draws of 32 bits lack more than 12 % of the variance; "
+            f"expected shapes of {HEAVIEST_TAILS:g} or more"
+        )
 
 
 def _gains_at_ends(branch: BranchConfig) -> tuple[float, float]:

@@ -188,8 +188,9 @@ class BranchConfig:
     dn_per_e: Any = key(None, "system gain K", IsoForm(("per_iso",)), unit="DN per electron")
     read_law: str = key(
         "gaussian",
-        "distribution of the read noise: gaussian, or tukey for Tukey's lambda",
-        Choice(("gaussian", "tukey")),
+        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45; tukey "
+        "is that of version 0.1, whose variance is low for shapes below -0.3",
+        Choice(("gaussian", "tukey", "tukey_lambda")),
     )
     read_shape: Any = key(0.0, "shape of Tukey's lambda distribution", limits.READ_SHAPE)
     read_std_dn: Any = key(

@@ -167,7 +167,8 @@ class Physics:
     full_well_e : float
         Saturation capacity, electrons.
     read_law : str
-        Distribution of the read noise: ``"gaussian"``, or ``"tukey"`` (Tukey's lambda with shape ``read_shape``).
+        Distribution of the read noise: ``"gaussian"``, or Tukey's lambda with shape ``read_shape``, as
+        ``"tukey_lambda"``, or as ``"tukey"`` (version 0.1; `lookup_tables.quantile_table`).
     read_std_dn : float
         Standard deviation of the read noise, DN.
     row_std_dn, column_std_dn : float

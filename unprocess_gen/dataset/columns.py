@@ -358,8 +358,8 @@ COLUMNS = (
     Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure", ELECTRONS, Physics, unit="electrons"),
     Column("full_well_e", float, "saturation capacity; 0 if it is not known", ELECTRONS, Physics, unit="electrons"),
     Column(
-        "read_law", str, "distribution of the read noise: gaussian or tukey",
-        Words(("gaussian", "tukey", "none")), Physics,
+        "read_law", str, "distribution of the read noise: gaussian, tukey or tukey_lambda",
+        Words(("gaussian", "tukey", "tukey_lambda", "none")), Physics,
     ),
     Column("read_shape", float, "shape of Tukey's lambda distribution", Range(-0.5, 10), Physics),
     Column("read_std_dn", float, "standard deviation of the read noise", NOT_NEGATIVE, Physics, unit="DN"),

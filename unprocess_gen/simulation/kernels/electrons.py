@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
-from unprocess_gen.core.lookup_tables import tukey_table
+from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.random_streams import BLOCK, LANES, ROUNDS, purpose, words
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels.body import HOT, WITHOUT_PATTERNS, Body
@@ -70,7 +70,7 @@ from unprocess_gen.simulation.kernels.simd import (
 )
 from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, padded_width
 from unprocess_gen.simulation.reference import noise as reference_noise
-from unprocess_gen.simulation.reference.poisson import gaussian_from
+from unprocess_gen.simulation.reference.poisson import CORE_MARGIN, core_share, gaussian_from
 
 SHOT, DARK, READ, ROW = (np.uint64(purpose(stream)) for stream in ("shot", "dark_current", "read", "row"))
 
@@ -257,17 +257,24 @@ def _error_dn(read_std_dn: float, quantiles: Quantiles, offset_dn: float, most_d
 
 def _count_roots(plan: Plan, read_std_e: float, counts_all: bool) -> tuple[float, float]:
     """Return the square roots of the mean electrons between which a normal is too far from the counts."""
+    law_distance = plan.law_distance
+    if plan.physics is not None and plan.physics.read_law == "tukey_lambda":
+        read_std_e = read_std_e * core_share(plan.physics.read_shape)
+        law_distance = law_distance / CORE_MARGIN
     if "shot:gaussian_where_near" not in plan.methods or read_std_e < MIN_READ_STD_E or counts_all:
         return 0.0, np.inf  # without light no count is needed
+<<<<<<< HEAD
     lowest, highest = gaussian_from(read_std_e, plan.law_distance)
     return math.sqrt(lowest), math.sqrt(highest)
+=======
+    lowest, highest = np.sqrt(gaussian_from(read_std_e, law_distance))
+    return float(lowest), float(highest)
+>>>>>>> a7f89c7 (Add the read law tukey_lambda: variance of all tails, and law distances of its own)
 
 
 @functools.lru_cache(maxsize=8)
 def _read_quantiles(law: str, shape: float) -> Quantiles:
-    if law == "gaussian":
-        return normal_quantiles()
-    return build_quantiles(tukey_table(shape))
+    return normal_quantiles() if law == "gaussian" else build_quantiles(quantile_table(law, shape))
 
 
 # ------------------------------------------------------------------------------------------------------------- sampling

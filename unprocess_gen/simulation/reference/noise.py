@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, tukey_table
+from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, quantile_table
 from unprocess_gen.core.random_streams import Words, words
 from unprocess_gen.core.types import Float, Physics, Plan
 from unprocess_gen.simulation.reference.poisson import poisson
@@ -260,7 +260,7 @@ def read_table(physics: Physics) -> Float:
     ndarray of float64, [1024, 3]
         Table for standard deviation 1, as `lookup_tables.normal_table`.
     """
-    return normal_table() if physics.read_law == "gaussian" else tukey_table(physics.read_shape)
+    return quantile_table(physics.read_law, physics.read_shape)
 
 
 def offsets(plan: Plan, shape: Shape, origin: Origin = (0, 0), fixed_only: bool = False) -> Float:

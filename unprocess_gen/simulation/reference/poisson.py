@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density
+from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density, tukey_core_std
 from unprocess_gen.core.lookup_tables import SEGMENTS, normal_table, sha256
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
@@ -359,6 +359,40 @@ def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]
         far *= 2
     below = _last_accepted(0.0, peak, read_std_e, law_distance) if peak else 0.0
     return below, _last_accepted(far, peak, read_std_e, law_distance)
+
+
+CORE_MARGIN = 1.05
+"""Factor by which law distances with read noise of the law ``tukey_lambda`` may exceed those of `gaussian_distance`.
+
+It covers the steps of single electrons, of which a peaked density shows more."""
+
+MAX_CORE_SHAPE = 0.3
+"""Largest shape of Tukey's lambda distribution with which normals replace counts. The ends of the supports of larger
+shapes show the skewness of the counts; no calibration has such shapes."""
+
+
+@functools.lru_cache(maxsize=64)
+def core_share(shape: float) -> float:
+    """Return how much less than normal read noise Tukey's lambda distribution smooths the steps and skewness of counts.
+
+    The first Edgeworth term is the curvature of the density of normal shot noise plus read noise. A mixture of normal
+    densities has, by Jensen's inequality, at most that of the normal one with its curvature at 0
+    (`exact_distributions.tukey_core_std`). Tests compare the bound with integrated distances for shapes from -0.45.
+
+    Parameters
+    ----------
+    shape : float
+        The distribution's λ, in (-½, 10).
+
+    Returns
+    -------
+    float
+        Factor of the standard deviation, at most 1, for `gaussian_from`; 0 for shapes above `MAX_CORE_SHAPE`.
+    """
+    if shape > MAX_CORE_SHAPE:
+        return 0.0
+    with localcontext(prec=DIGITS):
+        return min(float(tukey_core_std(shape)), 1.0)
 
 
 def _last_accepted(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
