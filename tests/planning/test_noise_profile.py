@@ -343,7 +343,7 @@ def test_sony_a7s2_has_the_published_table_for_both_gains(
     made = physics(on_its_own_sensor(settings, "sony_a7s2", iso))
     with mpmath.workdps(40):
         assert close(made.dn_per_e, mpmath.mpf(9.563e-4) * iso)
-    assert (made.read_law, made.read_shape, made.read_std_dn, made.row_std_dn) == ("tukey", shape, read, row)
+    assert (made.read_law, made.read_shape, made.read_std_dn, made.row_std_dn) == ("tukey_lambda", shape, read, row)
 
 
 def test_dual_gain_of_sony_a7s2_lowers_the_read_noise(settings: Settings) -> None:
@@ -372,7 +372,7 @@ def test_profiles_of_eld_have_published_numbers(settings: Settings, noise: str, 
         assert close(made.dn_per_e, gain)
         assert close(made.read_std_dn, line_of(["", *read], gain))
         assert close(made.row_std_dn, line_of(["", *row], gain))
-    assert made.read_law == "tukey"
+    assert made.read_law == "tukey_lambda"
 
 
 @pytest.mark.parametrize(
@@ -668,7 +668,6 @@ def test_unknown_effect_is_refused_by_the_command_line(cli: Callable[..., Any]) 
             "expected more than -0.5, where the Tukey-lambda",
         ),
         ({"read_law": "cauchy"}, "branches[0].read_law=cauchy: expected one of gaussian, tukey"),
-<<<<<<< HEAD
         ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
         ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), [by_colour, R, G1, B, G2]"),
         (
@@ -694,12 +693,8 @@ def test_unknown_effect_is_refused_by_the_command_line(cli: Callable[..., Any]) 
             "expected a number of 0 or more, up to 1e+09, or a form: per_iso",
         ),
         ({"iso": [50, 6400]}, "has 16 rows from ISO 100; the branch, ISO 50 to 6400, needs 13"),
-=======
         ({"read_law": "tukey_lambda", "read_shape": -0.46}, "read_shape=-0.46: draws of 32 bits lack more than 12 %"),
         ({"read_law": "tukey_lambda", "read_shape": ["choice", 0.1, -0.49]}, "expected shapes of -0.45 or more"),
-        ({"black_error_dn": [1.0, 2.0]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
-        ({"black_error_dn": ["by_log_iso"]}, "expected a number, four (the 2x2 sites), or [by_log_iso, [four], …]"),
->>>>>>> a7f89c7 (Add the read law tukey_lambda: variance of all tails, and law distances of its own)
         ({"iso": [800, 100]}, "branches[0].iso=[800, 100]: expected the lowest and the highest ISO"),
     ],
 )

@@ -164,14 +164,9 @@ def _check_branch(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
             gains = _gains_at_ends(branch)
             _check_gain(f"{key}.{name}", noise, branch, gains[0])
         setting.check(f"{key}.{name}", value)
-<<<<<<< HEAD
     _check_shape(f"{key}.read_shape", branch)
-    _check_black_error(f"{key}.black_error_dn", branch)
-=======
-    parse_drawn(f"{key}.read_shape", branch.read_shape, READ_SHAPE)
     _check_tails(key, branch)
-    _check_black_error(f"{key}.black_error_dn", branch.black_error_dn)
->>>>>>> a7f89c7 (Add the read law tukey_lambda: variance of all tails, and law distances of its own)
+    _check_black_error(f"{key}.black_error_dn", branch)
 
 
 def _check_tails(key: str, branch: BranchConfig) -> None:

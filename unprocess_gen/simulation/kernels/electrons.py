@@ -263,13 +263,8 @@ def _count_roots(plan: Plan, read_std_e: float, counts_all: bool) -> tuple[float
         law_distance = law_distance / CORE_MARGIN
     if "shot:gaussian_where_near" not in plan.methods or read_std_e < MIN_READ_STD_E or counts_all:
         return 0.0, np.inf  # without light no count is needed
-<<<<<<< HEAD
-    lowest, highest = gaussian_from(read_std_e, plan.law_distance)
+    lowest, highest = gaussian_from(read_std_e, law_distance)
     return math.sqrt(lowest), math.sqrt(highest)
-=======
-    lowest, highest = np.sqrt(gaussian_from(read_std_e, law_distance))
-    return float(lowest), float(highest)
->>>>>>> a7f89c7 (Add the read law tukey_lambda: variance of all tails, and law distances of its own)
 
 
 @functools.lru_cache(maxsize=8)
