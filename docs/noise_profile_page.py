@@ -1,4 +1,4 @@
-"""Generate ``docs/reference/noise_profiles.md``: each physical profile beside the published numbers of its camera."""
+"""Generate ``docs/reference/noise_profiles.md``: each physical profile and the published numbers of its camera."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ISOS_OF = {"imx385": (1600, 3200, 6400, 12800, 25600)}
 INTRODUCTION = """\
 # Noise profiles and their sources
 
-For each physical noise profile: its numbers beside every published calibration of the camera, and the source and the
+For each physical noise profile: its numbers and those of every published calibration of the camera, with source and
 uncertainty of each number (`noise.provenance`). Numbers are in DN of the calibration, without scatter.
 
 - Read noise is a standard deviation, in parentheses in electrons. "Tukey" is the standard deviation of a Tukey-lambda

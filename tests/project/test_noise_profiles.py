@@ -1,4 +1,4 @@
-"""The published numbers in docs/noise_sources.yaml, and the physical profiles beside them."""
+"""The published numbers in docs/noise_sources.yaml, compared with the physical profiles."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_numbers_of_a_profile_lie_within_those_of_its_sources(name: str) -> None
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_every_profile_is_beside_its_sources_in_the_table(name: str) -> None:
+def test_table_of_a_profile_has_all_its_sources(name: str) -> None:
     rows = noise_profile_page.comparison_rows(name)
     assert {len(row) for row in rows} == {3 + len(isos_of(name))}
     origins = {row[1].split(",")[0] for row in rows} - {"**profile**"}
