@@ -26,7 +26,8 @@ from unprocess_gen.simulation.kernels.poisson import (
     FLOAT32_RATE,
     LOW_RATE,
     MAX_THRESHOLD_RATE,
-    NORMAL_REACH,
+    NORMAL_REACH2,
+    TRUNCATION_ERRORS,
     count_thresholds,
 )
 from unprocess_gen.simulation.reference import poisson as poissons
@@ -269,11 +270,11 @@ def test_the_guess_leaves_two_counts_in_every_cell() -> None:
 def first_terms(words: np.ndarray, rate: float) -> np.ndarray:
     """Return x by the first terms as compiled: approximate normals, float32, without the integer part of the rate."""
     z, near, f = values_by_lines(words, normal_quantiles()), np.float32(rate), np.float32
-    c, reciprocal = kernels._FIRST_TERMS, f(1) / near
+    c, reciprocal = kernels._TERMS32, f(1) / near
     s = z * (np.sqrt(near) * reciprocal)
     s2 = s * s
     terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * kernels._FIRST_OF_RATE)
+    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * kernels._OF_RECIPROCAL32)
     assert rest.dtype == np.float32
     return np.asarray(np.float64(near) + rest.astype(np.float64))
 
@@ -291,11 +292,12 @@ def real_quantile(rate: float, w: float) -> float:
 
 
 @pytest.mark.parametrize(
-    "rate", [LOW_RATE, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
+    "rate", [LOW_RATE, 5.6, 6.3, 7.1, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
 )
 def test_the_first_terms_are_within_their_error(rate: float) -> None:
     """What remains of the bound is for the words between those that are tested."""
-    w = np.linspace(-NORMAL_REACH, NORMAL_REACH, 201 if rate < LIMIT else 4001)
+    reach = min(math.sqrt(NORMAL_REACH2[0] + NORMAL_REACH2[1] * math.sqrt(rate)), 6.3)
+    w = np.linspace(-reach, reach, 201 if rate < LIMIT else 4001)
     index = [math.erfc(abs(value) / math.sqrt(2)) / 2 * WORDS for value in w]
     words = np.array([min(int(i), SIGN - 1) | SIGN * (v < 0) for i, v in zip(index, w, strict=True)], dtype=np.uint32)
     z = normals(words)  # to 1.5e-7
@@ -303,6 +305,10 @@ def test_the_first_terms_are_within_their_error(rate: float) -> None:
     constant, of_rate, of_reciprocal = EXPANSION_ERRORS
     claimed = constant + of_rate * rate + of_reciprocal / rate
     assert np.abs(first_terms(words, rate) - exact).max() <= claimed - FLOAT32_RATE * rate
+    bounds = [kernels._bounds_by_first_terms.py_func(rate, float(v)) for v in z]
+    assert all(least <= math.floor(x) <= most for (least, most), x in zip(bounds, exact, strict=True))
+    error = TRUNCATION_ERRORS[0] * (3 + math.sqrt(rate)) + TRUNCATION_ERRORS[1] / rate
+    assert max(most - least for least, most in bounds[1:-1]) <= 1 + 2 * error
 
 
 # Approximate counts ---------------------------------------------------------------------------------------------------
@@ -352,7 +358,9 @@ def test_counts_of_low_rates_are_within_their_bounds(inside: tuple[float, ...], 
 
 
 @pytest.mark.parametrize("rate_error", [-0.8 * FLOAT32_RATE, 0.0, 0.8 * FLOAT32_RATE])
-@pytest.mark.parametrize("rate", [8.0, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21])
+@pytest.mark.parametrize(
+    "rate", [5.0, 5.1, 6.3, 8.1, 11.3, 16.1, 19.3, 25.0, 36.4, 49.9, 64.0, 100.3, 1234.5, 1e5, 2.0**21]
+)
 def test_counts_by_expansion_are_within_their_bounds(rate: float, rate_error: float) -> None:
     assert wrong(rate, 20_000, rate_error) == 0
 
@@ -371,8 +379,9 @@ def test_a_rate_beyond_its_error_is_found(rate: float) -> None:
         (0.3, 0.004),
         (1.0, 0.004),
         (4.0, 0.004),
-        (7.9, 0.004),
-        (8.1, 0.01),
+        (4.9, 0.004),
+        (5.1, 0.018),
+        (8.1, 0.012),
         (16.1, 0.007),
         (64.0, 0.004),
         (1e4, 0.014),

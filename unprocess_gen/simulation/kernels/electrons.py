@@ -63,6 +63,7 @@ from unprocess_gen.simulation.kernels.simd import (
     load,
     maximum,
     minimum,
+    movemask,
     pointer_to,
     select,
     square_root,
@@ -89,6 +90,7 @@ MAX_STEPS = 64
 
 _0, _8, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint32(0x7F800000)
 _ZERO32, _FLOAT32_ERROR32 = np.float32(0), np.float32(FLOAT32_ERROR_DN)
+_LOW_RATE32, _EVERY_LANE = np.float32(LOW_RATE), np.uint32(2**VECTOR_WIDTH - 1)
 _RATE_ERROR32, _NORMAL_ERROR32 = np.float32(FLOAT32_RATE), np.float32(2.0**-19)
 _LANES = np.uint64(LANES)
 
@@ -318,15 +320,15 @@ def _count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, wor
     for stream in range(counted):  # a loop, so that machine code contains `fill_counts` once
         is_shot = stream == 0
         if is_shot:
-            highest = _fill_rates(noise, of.dn_per_e, strip, workspace)
+            has_high = _fill_rates(noise, of.dn_per_e, strip, workspace)
         else:
-            highest = np.float32(of.dark_e)
+            has_high = True
             for x in range(strip.total):
-                workspace.rates[x] = highest
+                workspace.rates[x] = of.dark_e
         words, out, error = workspace.words, workspace.electrons, workspace.error_e
         if not is_shot:
             words, out, error = workspace.dark_words, workspace.dark, workspace.dark_error_e
-        fill_counts(strip.total, words, workspace.rates, highest >= LOW_RATE, tables, workspace, out, error)
+        fill_counts(strip.total, words, workspace.rates, has_high, tables, workspace, out, error)
         if is_shot:
             if of.shot == 0.0:
                 _keep_means(strip.total, workspace)
@@ -370,8 +372,8 @@ def _fill_words(key: PhiloxKey, read_purpose: np.uint64, strip: Strip, shot: Poi
 
 
 @inner
-def _fill_rates(noise: Electrons, dn_per_e: float, strip: Strip, workspace: Workspace) -> np.float32:
-    """Fill ``rates`` (float32) with the mean electrons of shot noise; return the highest.
+def _fill_rates(noise: Electrons, dn_per_e: float, strip: Strip, workspace: Workspace) -> bool:
+    """Fill ``rates`` (float32) with the mean electrons of shot noise; return whether any is `LOW_RATE` or more.
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
@@ -385,11 +387,7 @@ def _fill_rates(noise: Electrons, dn_per_e: float, strip: Strip, workspace: Work
         rate = light_dn * e_per_dn * load(response, x)
         highest = maximum(rate, highest)
         store(workspace.rates, x, rate)
-    store(workspace.errors, 0, highest)
-    most = workspace.errors[0]
-    for v in range(1, VECTOR_WIDTH):
-        most = max(most, workspace.errors[v])
-    return np.float32(most)
+    return bool(movemask(less_than(highest, _LOW_RATE32)) != _EVERY_LANE)
 
 
 @inner

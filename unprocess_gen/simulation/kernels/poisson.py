@@ -3,11 +3,11 @@
 Counts are those of `reference.poisson`, for rates up to 1e9. They are computed in two steps.
 
 1. Approximately, float32, eight sites at a time, with a bound of the error that is 0 where the count is certain. Below
-   rate 8: comparison of the word's rank with the distribution function, summed term by term. From rate 8 up: the first
+   rate 5: comparison of the word's rank with the distribution function, summed term by term. From rate 5 up: the first
    terms of the expansion, with an approximate normal.
-2. Exactly, float64, in the reference's order of operations, for sites of which the caller needs more: the complete
-   expansion from rate 64 up, otherwise a guess from a table that is at most one too low, and one comparison with the
-   distribution function.
+2. Exactly, float64, for sites of which the caller needs more: by the first terms again where they suffice, otherwise in
+   the reference's order of operations. That is the complete expansion from rate 64 up; below, a guess from a table that
+   is at most one too low, and one comparison with the distribution function.
 
 Timings and rejected alternatives: ``docs/design/kernels.md``.
 """
@@ -65,7 +65,7 @@ from unprocess_gen.simulation.reference.poisson import (
     poisson_tables,
 )
 
-LOW_RATE = 8.0
+LOW_RATE = 5.0
 """Rate below which counts are found by comparison with the distribution function."""
 
 MAX_THRESHOLD_RATE = 16.0
@@ -195,11 +195,7 @@ def fill_counts(
             lowest, highest = minimum(r, lowest), maximum(r, highest)
         has_low = movemask(less_than(lowest, _LOW)) != 0
         if has_low:
-            store(workspace.errors, 0, minimum(highest, _LOW))
-            most = workspace.errors[0]
-            for n in range(1, VECTOR_WIDTH):
-                most = max(most, workspace.errors[n])
-            _count_low_rates(first, vectors, most, words, rates, out, error)
+            _count_low_rates(first, vectors, words, rates, workspace, out, error)
         if movemask(less_than(highest, _LOW)) != _EVERY_LANE:
             _count_high_rates(first, vectors, has_low, rates, workspace.normals, out, error)
 
@@ -207,13 +203,15 @@ def fill_counts(
 _EVERY_LANE = np.uint32(2**VECTOR_WIDTH - 1)
 
 CDF_ERROR = 2.0**-18
-"""Bound of the error of a distribution function in float32 below rate 8.
+"""Bound of the error of a distribution function in float32 below rate 5.
 
-The largest terms: rounding of the exponent 5e-7, the 18 terms of the recurrence 1e-6, their sum 5e-7, the error of the
-rate 4e-7, exponential and rank 2e-7.
+The largest terms: rounding of the exponent 5e-7, the 13 terms of the recurrence 6e-7, their sum 4e-7, the error of the
+rate 3e-7, exponential and rank 2e-7.
 """
 
-_LOG2E, _CDF_ERROR, _WORD = np.float32(np.log2(np.e)), np.float32(CDF_ERROR), np.float32(2.0**-32)
+_LOG2E, _CENTRE, _WORD = np.float32(np.log2(np.e)), np.float32(0.5 - CDF_ERROR), np.float32(2.0**-32)
+_OPEN = np.float32(2 * CDF_ERROR)
+_OPEN_BITS = np.uint32(_OPEN.view(np.uint32))
 _RECIPROCALS = np.array([0.0, *(1 / k for k in range(1, 32))], dtype=np.float32)
 _EXP2 = tuple(np.float32(c) for c in (1.00000007, 0.693146967, 0.240221197, 0.0555071329, 9.67554206e-3, 1.32764676e-3))
 """Minimax polynomial of 2**f for f from -1/2 to 1/2, relative error 7.5e-8."""
@@ -221,28 +219,52 @@ _EXP2 = tuple(np.float32(c) for c in (1.00000007, 0.693146967, 0.240221197, 0.05
 
 @inner
 def _count_low_rates(
-    first: np.uint64, vectors: int, most: np.float32, words: Pointer, rates: Pointer, out: Pointer, error: Pointer
+    first: np.uint64, vectors: int, words: Pointer, rates: Pointer, workspace: Workspace, out: Pointer, error: Pointer
 ) -> None:
-    """Fill up to a block with the counts of rates below `LOW_RATE`, ``most`` or less.
+    """Fill up to a block with the counts of rates below `LOW_RATE`; errors are 0 or infinite.
 
-    Terms are summed up to a count that 0.2 % of the words exceed; these get an infinite error.
+    Terms are summed up to a count that at most 0.4 % of the words exceed. Gaps are the differences of the distribution
+    function and the word's rank, plus `CDF_ERROR`: negative below the count, and uncertain up to twice that error.
     """
-    steps = int(most + np.float32(3.1) * np.sqrt(most)) + 2
+    steps = _terms_of_block(first, vectors, rates, workspace.errors)
     for n in range(vectors):
         x = first + np.uint64(n) * _8
         rate, word = load(rates, x), load(words, x)
-        # probability up to the word's rank, minus ½
-        centred = apply_signs(_HALF - (to_float32(word & _LOW31_32) + _HALF) * _WORD, word)
-        low, high = centred - _CDF_ERROR, centred + _CDF_ERROR
+        centred = apply_signs(_HALF - to_float32(word & _LOW31_32) * _WORD, word)  # rank of the word, minus ½
         term = _exp_of_minus(rate)
-        cdf, certain, possible = term - _HALF, uint32_zeros(), uint32_zeros()
-        for k in range(1, steps):
-            certain, possible = certain - less_than(cdf, low), possible - less_than(cdf, high)
+        cdf, count = term - _CENTRE, uint32_zeros()
+        closest = count - _ONE_BIT
+        for k in range(1, steps, 2):
+            count, closest = _compare(cdf - centred, count, closest)
             term = term * (rate * _RECIPROCALS[k])
             cdf = cdf + term
-        store(out, x, to_float32(certain))
-        beyond = from_bits(less_than(cdf, high) & _INFINITE_BITS32)
-        store(error, x, to_float32(possible - certain) + beyond)
+            count, closest = _compare(cdf - centred, count, closest)
+            term = term * (rate * _RECIPROCALS[k + 1])
+            cdf = cdf + term
+        store(out, x, to_float32(count))
+        is_open = less_than(closest, _OPEN_BITS) | less_than(cdf - centred, _OPEN)
+        store(error, x, from_bits(is_open & _INFINITE_BITS32))
+
+
+@inner
+def _compare(gap: Vector, count: Vector, closest: Vector) -> tuple[Vector, Vector]:
+    """Return the number of negative gaps, and the bits of the smallest other gap."""
+    bits = to_bits(gap)
+    return count + (bits >> _TOP_BIT), select(less_than(bits, closest), bits, closest)
+
+
+@inner
+def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Pointer) -> int:
+    """Return how many terms of the distribution function the rates below `LOW_RATE` need."""
+    rate = load(rates, first)
+    highest = from_bits(less_than(rate, _LOW) & to_bits(rate))
+    for n in range(1, vectors):
+        rate = load(rates, first + np.uint64(n) * _8)
+        highest = maximum(from_bits(less_than(rate, _LOW) & to_bits(rate)), highest)
+    store(scratch, 0, highest)
+    low, high = max(scratch[0], scratch[1], scratch[2], scratch[3]), max(scratch[4], scratch[5], scratch[6], scratch[7])
+    most = max(low, high)
+    return int(most + np.float32(3.1) * np.sqrt(most)) + 2
 
 
 @inner
@@ -256,24 +278,28 @@ def _exp_of_minus(x: Vector) -> Vector:
     return from_bits(to_bits(power) + (to_bits(shifted) << _23))
 
 
-NORMAL_REACH = 3.5
-"""Normals farther out are not covered by `EXPANSION_ERRORS`."""
+NORMAL_REACH2 = 9.0, 0.5
+"""Squared normals above the sum of these, times 1 and the root of the rate, are not covered by `EXPANSION_ERRORS`."""
 
-EXPANSION_ERRORS = 2e-4, 6.5e-7, 0.033
+EXPANSION_ERRORS = 2e-4, 6.5e-7, 0.034
 """Error of the expansion's first terms: less than the sum of these, times 1, the rate and 1 / rate.
 
-The last term is the truncation, from rate 8 up. The others are those of the approximate normal, 6e-6 (8 + √rate), which
+The last term is the truncation, from rate 5 up. The others are those of the approximate normal, 6e-6 (8 + √rate), which
 is at most 6e-6 (8 + 12.5 + rate / 50), of the rate, and of rounding to float32.
 """
 
-_FIRST_TERMS = tuple(np.float32(c) for c in (1 / 6, -1 / 72, 3.73812511e-3, -1.63447644e-3, 7.86901025e-4))
-_FIRST_OF_RATE = np.float32(-0.025991)
+TRUNCATION_ERRORS = 2e-7, 0.0325
+"""Error of the first terms in float64 with exact normals: less than the sum of these, times 3 + √rate and 1 / rate."""
+
+_TERMS, _OF_RECIPROCAL = (1 / 6, -1 / 72, 3.74468638e-3, -1.52239065e-3, 6.95733048e-4), -0.0305402523
 """Coefficients of x - rate - √rate·z ≈ (z² + 2)·P(s) + c / rate, s = z / √rate.
 
 The first two are those of the expansion; the others minimise the largest error times the rate.
 """
+_TERMS32, _OF_RECIPROCAL32 = tuple(np.float32(c) for c in _TERMS), np.float32(_OF_RECIPROCAL)
 _ERROR, _ERROR_OF_RATE, _ERROR_OF_RECIPROCAL = (np.float32(e) for e in EXPANSION_ERRORS)
-_2F, _1_HALF, _REACH2 = np.float32(2), np.float32(1.5), np.float32(NORMAL_REACH * NORMAL_REACH - 1e-3)
+_2F, _1_HALF = np.float32(2), np.float32(1.5)
+_REACH, _REACH_OF_ROOT = np.float32(NORMAL_REACH2[0] - 1e-3), np.float32(NORMAL_REACH2[1])
 
 
 @inner
@@ -281,7 +307,7 @@ def _count_high_rates(
     first: np.uint64, vectors: int, has_low: bool, rates: Pointer, normals: Pointer, out: Pointer, error: Pointer
 ) -> None:
     """Fill up to a block with the counts of rates from `LOW_RATE` up; ``has_low`` keeps those of lower rates."""
-    c = _FIRST_TERMS
+    c = _TERMS32
     for n in range(vectors):
         x = first + np.uint64(n) * _8
         rate, z = load(rates, x), load(normals, x)
@@ -289,10 +315,13 @@ def _count_high_rates(
         s, z2 = z * (root * reciprocal), z * z
         s2 = s * s
         terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-        value = (rate - _HALF) + (root * z + ((z2 + _2F) * terms + reciprocal * _FIRST_OF_RATE))
+        value = (rate - _HALF) + (root * z + ((z2 + _2F) * terms + reciprocal * _OF_RECIPROCAL32))
         counted = (value + ROUND32) - ROUND32
         most = (rate * _ERROR_OF_RATE + reciprocal * _ERROR_OF_RECIPROCAL) + (_1F + _ERROR)
-        is_open, is_far = less_than(_1_HALF - most, absolute(value - counted)), less_than(_REACH2, z2)
+        is_open, is_far = (
+            less_than(_1_HALF - most, absolute(value - counted)),
+            less_than(root * _REACH_OF_ROOT + _REACH, z2),
+        )
         bound = maximum(from_bits(to_bits(most) & is_open), from_bits(is_far & _INFINITE_BITS32))
         if has_low:
             is_low = less_than(rate, _LOW)
@@ -310,11 +339,28 @@ def exact_count(word: np.uint32, rate: float, tables: CountTables) -> float:
     if not rate > 0.0:
         return 0.0
     z = exact_value(word, tables.quadratics)
+    if rate >= LOW_RATE:
+        least, most = _bounds_by_first_terms(rate, z)
+        if least == most:
+            return least
     if rate >= LIMIT:
         tail = (np.float64(word & np.uint32(0x7FFFFFFF)) + 0.5) * 2.0**-32
         w = _refine_normal(tail, abs(z), tables.tails)
         return float(np.floor(_expansion(rate, -w if np.uint64(word) & _SIGN else w)))
     return float(_count_by_cdf(word, rate, z, tables))
+
+
+@inner
+def _bounds_by_first_terms(rate: float, z: float) -> tuple[float, float]:
+    """Return bounds of the count of a rate from `LOW_RATE` up, from the exact normal of its word."""
+    root = np.sqrt(rate)
+    if z * z > NORMAL_REACH2[0] + NORMAL_REACH2[1] * root:
+        return 0.0, np.inf
+    c, s, reciprocal = _TERMS, z / root, 1.0 / rate
+    terms = c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * c[4])))
+    value = rate + (root * z + ((z * z + 2.0) * terms + reciprocal * _OF_RECIPROCAL))
+    error = TRUNCATION_ERRORS[0] * (3.0 + root) + TRUNCATION_ERRORS[1] * reciprocal
+    return np.floor(value - error), np.floor(value + error)
 
 
 @inner
