@@ -209,10 +209,8 @@ The largest terms: rounding of the exponent 5e-7, the 13 terms of the recurrence
 rate 3e-7, exponential and rank 2e-7.
 """
 
-_LOG2E, _CENTRE, _WORD = np.float32(np.log2(np.e)), np.float32(0.5 - CDF_ERROR), np.float32(2.0**-32)
-_OPEN = np.float32(2 * CDF_ERROR)
-_OPEN_BITS = np.uint32(_OPEN.view(np.uint32))
-_RECIPROCALS = np.array([0.0, *(1 / k for k in range(1, 32))], dtype=np.float32)
+_LOG2E, _CDF_ERROR, _WORD = np.float32(np.log2(np.e)), np.float32(CDF_ERROR), np.float32(2.0**-32)
+_RECIPROCALS = np.array([1 / k for k in range(1, 32)], dtype=np.float32)
 _EXP2 = tuple(np.float32(c) for c in (1.00000007, 0.693146967, 0.240221197, 0.0555071329, 9.67554206e-3, 1.32764676e-3))
 """Minimax polynomial of 2**f for f from -1/2 to 1/2, relative error 7.5e-8."""
 
@@ -223,34 +221,28 @@ def _count_low_rates(
 ) -> None:
     """Fill up to a block with the counts of rates below `LOW_RATE`; errors are 0 or infinite.
 
-    Terms are summed up to a count that at most 0.4 % of the words exceed. Gaps are the differences of the distribution
-    function and the word's rank, plus `CDF_ERROR`: negative below the count, and uncertain up to twice that error.
+    Terms are summed up to a count that at most 0.4 % of the words exceed. Ranks and the distribution function are
+    reduced by ½, so that float32 is precise where they are compared most.
     """
-    steps = _terms_of_block(first, vectors, rates, workspace.errors)
+    pairs = (_terms_of_block(first, vectors, rates, workspace.errors) + 1) // 2
     for n in range(vectors):
         x = first + np.uint64(n) * _8
         rate, word = load(rates, x), load(words, x)
-        centred = apply_signs(_HALF - to_float32(word & _LOW31_32) * _WORD, word)  # rank of the word, minus ½
+        rank = apply_signs(_HALF - to_float32(word & _LOW31_32) * _WORD, word)
+        low, high = rank - _CDF_ERROR, rank + _CDF_ERROR
         term = _exp_of_minus(rate)
-        cdf, count = term - _CENTRE, uint32_zeros()
-        closest = count - _ONE_BIT
-        for k in range(1, steps, 2):
-            count, closest = _compare(cdf - centred, count, closest)
+        cdf, certain, possible = term - _HALF, uint32_zeros(), uint32_zeros()
+        for pair in range(pairs):
+            k = np.uint64(2 * pair)
+            certain, possible = certain - less_than(cdf, low), possible - less_than(cdf, high)
             term = term * (rate * _RECIPROCALS[k])
             cdf = cdf + term
-            count, closest = _compare(cdf - centred, count, closest)
-            term = term * (rate * _RECIPROCALS[k + 1])
+            certain, possible = certain - less_than(cdf, low), possible - less_than(cdf, high)
+            term = term * (rate * _RECIPROCALS[k + _1])
             cdf = cdf + term
-        store(out, x, to_float32(count))
-        is_open = less_than(closest, _OPEN_BITS) | less_than(cdf - centred, _OPEN)
+        store(out, x, to_float32(certain))
+        is_open = less_than(certain, possible) | less_than(cdf, high)
         store(error, x, from_bits(is_open & _INFINITE_BITS32))
-
-
-@inner
-def _compare(gap: Vector, count: Vector, closest: Vector) -> tuple[Vector, Vector]:
-    """Return the number of negative gaps, and the bits of the smallest other gap."""
-    bits = to_bits(gap)
-    return count + (bits >> _TOP_BIT), select(less_than(bits, closest), bits, closest)
 
 
 @inner
@@ -264,7 +256,7 @@ def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Poi
     store(scratch, 0, highest)
     low, high = max(scratch[0], scratch[1], scratch[2], scratch[3]), max(scratch[4], scratch[5], scratch[6], scratch[7])
     most = max(low, high)
-    return int(most + np.float32(3.1) * np.sqrt(most)) + 2
+    return int(most + np.float32(3.1) * np.sqrt(most)) + 1
 
 
 @inner
