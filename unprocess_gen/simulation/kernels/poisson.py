@@ -334,7 +334,7 @@ def exact_count(word: np.uint32, rate: float, tables: CountTables) -> float:
     if rate >= LOW_RATE:
         least, most = _bounds_by_first_terms(rate, z)
         if least == most:
-            return least
+            return float(least)
     if rate >= LIMIT:
         tail = (np.float64(word & np.uint32(0x7FFFFFFF)) + 0.5) * 2.0**-32
         w = _refine_normal(tail, abs(z), tables.tails)
