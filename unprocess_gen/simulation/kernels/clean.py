@@ -3,8 +3,8 @@
 Products of each matrix entry and each code are tabulated, so a site's signal is the sum of three look-ups. Only the
 channel recorded at each CFA site is computed (all three for ``highlight="gray_mean"``).
 
-The first pass over a strip treats every site as unclipped. The second recomputes blocks that contain a signal above
-`Scene.linear_limit`: highlights, clipped or saturated values. Other blocks need neither its division nor its counts.
+The first pass over a strip treats every site as unclipped. The second recomputes vectors that contain a signal above
+`Scene.limits`: highlights, clipped or saturated values. Other vectors need neither its division nor its counts.
 
 Two forms: `Scene` is equal to `reference.unprocess` and `reference.sensor.to_dn` to the last bit (float64, in the
 reference's order of operations). `Scene32` (float32, for accuracy budgets that allow errors) tabulates products that
@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import by_class, inner
-from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels.body import Body
@@ -29,12 +28,12 @@ from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
     Vector,
+    has_any_bit,
     less_than,
     load,
     load_four_bytes,
     maximum,
     minimum,
-    movemask,
     pointer_to,
     store,
     to_bits,
@@ -66,11 +65,13 @@ class Scene(NamedTuple):
     inverse_gains: Float  # [3]
     gray_mean: bool
     highlight_threshold: float
-    linear_limit: float  # signals up to it are neither highlights nor clipped nor saturated
     exposure: float
     brightest: float
+    clipped: float  # light above it counts as clipped
     black_dn: float
     span_dn: float
+    dn_per_signal: float  # scale of the signal with gray_mean
+    limits: Float  # [2, VECTOR_WIDTH + 2]: signals up to it are neither highlights nor clipped nor saturated
     gains: Float  # [2, VECTOR_WIDTH + 2]: of the sites of even and of odd rows; 1 with gray_mean
     headroom: Float  # [2, VECTOR_WIDTH + 2]: factor of the per-channel highlight term, or 0
     response: Float32  # [H * P], relative gain of each pixel; ones if the clean frame has no fixed pattern
@@ -89,21 +90,23 @@ class Scene32(NamedTuple):
     steepness: np.float32  # of the highlight term: 1 / (1 - threshold)
     exposure: np.float32
     brightest: np.float32
-    clipped: np.float32  # light above it counts as clipped; includes FLOAT32_MARGIN
+    clipped: np.float32  # includes FLOAT32_MARGIN
     black_dn: np.uint32
     span_dn: np.float32
     dn_per_signal: np.float32  # without gains
-    limits_dn: Float32  # [2, VECTOR_WIDTH + 2]: `Scene.linear_limit` by site
+    limits: Float32
     signal_per_dn: Float32  # [2, VECTOR_WIDTH + 2]
     gains: Float32
     headroom: Float32
+    response_steps: tuple[int, int]
 
 
 def scene_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene:
     """Return the parameters of a plan for sources of ``codes`` codes."""
     channels = _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
     gray_mean = plan.highlight == "gray_mean"
-    sites = np.array((_site_gains(plan), _headroom(plan))).take(channels, axis=1)
+    of_channels = (_linear_limit(plan),) * 3, _site_gains(plan), _headroom(plan)
+    limits, gains, headroom = np.array(of_channels).take(channels, axis=1)
     return Scene(
         products=_products(plan.rgb2cam, plan.tone, plan.gamma, codes),
         code_count=codes,
@@ -111,13 +114,15 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene:
         inverse_gains=np.array(plan.inverse_gains),
         gray_mean=gray_mean,
         highlight_threshold=plan.highlight_threshold,
-        linear_limit=_linear_limit(plan),
         exposure=plan.exposure,
         brightest=plan.brightest,
+        clipped=plan.brightest,
         black_dn=float(plan.black_level_dn),
         span_dn=float(plan.white_level_dn - plan.black_level_dn),
-        gains=sites[0],
-        headroom=sites[1],
+        dn_per_signal=1.0,
+        limits=limits,
+        gains=gains,
+        headroom=headroom,
         response=ONES,
         response_steps=(0, 0),
     )
@@ -125,8 +130,9 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene:
 
 def with_response(scene: Any, body: Body) -> Scene:
     """Return the scene of a clean frame that contains the PRNU of a body."""
-    # the second pass computes every block, because only it applies the response
-    of_body: Scene = scene._replace(response=body.response, response_steps=body.response_steps, linear_limit=-np.inf)
+    # the second pass computes every vector, because only it applies the response
+    limits = np.full_like(scene.limits, -np.inf)
+    of_body: Scene = scene._replace(response=body.response, response_steps=body.response_steps, limits=limits)
     return of_body
 
 
@@ -138,7 +144,7 @@ def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:
     span_dn = float(plan.white_level_dn - plan.black_level_dn)
     scale = [gain * exposure * span_dn for gain in gains]
     numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
-    limits_dn, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
+    limits, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
     return Scene32(
         products=_products32(plan.rgb2cam, plan.tone, plan.gamma, codes, (1.0,) * 3 if gray_mean else tuple(scale)),
         code_count=codes,
@@ -153,10 +159,11 @@ def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:
         black_dn=np.uint32(plan.black_level_dn),
         span_dn=f(span_dn),
         dn_per_signal=f(exposure * span_dn),
-        limits_dn=limits_dn,
+        limits=limits,
         signal_per_dn=signal_per_dn,
         gains=site_gains,
         headroom=headroom,
+        response_steps=(0, 0),
     )
 
 
@@ -250,9 +257,25 @@ def _sum_products_uint8(codes: Pointer, even: Pointer, odd: Pointer, fours: int,
 
 
 @inner
-def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Scene, out: Pointer) -> None:
+def _gray_mask64(scene: Scene, total: float) -> tuple[float, float]:
+    m = max(total / 3.0 - scene.highlight_threshold, 0.0) / (1.0 - scene.highlight_threshold)
+    return m * m, 1.0 - m * m
+
+
+@inner
+def _gray_mask32(scene: Scene32, total: np.float32) -> tuple[np.float32, np.float32]:
+    m = max(total / np.float32(3) - scene.highlight_threshold, _ZERO32) * scene.steepness
+    return m * m, _ONE32 - m * m
+
+
+_gray_mask = by_class({Scene: _gray_mask64, Scene32: _gray_mask32})
+"""Return the highlight mask of the sum of the channels, and 1 - mask."""
+
+
+@inner
+def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Any, out: Pointer) -> None:
     """Linearise, apply the matrix, and invert the gains with highlights preserved by the mean of the channels."""
-    products, gains, threshold = scene.products, scene.inverse_gains, scene.highlight_threshold
+    products, gains = scene.products, scene.inverse_gains
     channel = 3 * scene.code_count
     for x in range(strip.length):
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
@@ -260,111 +283,134 @@ def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Scene, out: Poin
         red = (products[r] + products[g]) + products[b]
         green = (products[channel + r] + products[channel + g]) + products[channel + b]
         blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
-        m = max(((red + green) + blue) / 3.0 - threshold, 0.0) / (1.0 - threshold)
-        mask = m * m
+        mask, rest = _gray_mask(scene, (red + green) + blue)
         c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
         i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * max(mask + (1.0 - mask) * gains[c], gains[c])
+        out[x] = i * max(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
 
 
 @inner
-def _fill_gray_mean_dn(codes: Pointer, strip: Strip, scene: Scene32, out: Pointer) -> None:
-    """Compute the signal as `_fill_gray_mean_signal` in float32, in DN."""
-    products, gains, threshold = scene.products, scene.inverse_gains, scene.highlight_threshold
-    channel = 3 * scene.code_count
-    for x in range(strip.length):
-        r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
-        g, b = scene.code_count + g, 2 * scene.code_count + b
-        red = (products[r] + products[g]) + products[b]
-        green = (products[channel + r] + products[channel + g]) + products[channel + b]
-        blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
-        m = max(((red + green) + blue) / np.float32(3) - threshold, _ZERO32) * scene.steepness
-        mask = m * m
-        c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
-        i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * max(mask + (_ONE32 - mask) * gains[c], gains[c]) * scene.dn_per_signal
-
-
-@inner
-def _fill_codes(codes: Pointer, is_uint8: bool, strip: Strip, scene: Scene, out: Pointer) -> None:
+def _fill_codes(codes: Pointer, is_uint8: bool, strip: Strip, scene: Any, out: Pointer) -> None:
     """Linearise codes and apply the matrix, for the channel of each site, in either precision."""
     even, odd = _row_products(scene.products, scene.code_count, scene.site_channels, strip.y)
     _sum_products(codes, even, odd, scene.code_count, strip.length, is_uint8, out)
 
 
-# ---------------------------------------------------------------------------------------------------------- clean frame
+# ------------------------------------------------------------------------------------------------- float64 and float32
 
 
 @inner
-def _fill_clean_exact(
-    scene: Scene, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer
-) -> Any:
-    signal = pointer_to(workspace.signal, strip.first)
-    if scene.gray_mean:
-        _fill_gray_mean_signal(codes, strip, scene, signal)
-    else:
-        _fill_codes(codes, is_uint8, strip, scene, signal)
-    has_negative, has_bright = _fill_linear(strip, scene, workspace)
-    if has_bright:
-        _recompute_bright(strip, scene, workspace)
-        counts[1] += _count_above(strip, workspace.bright_light, scene.brightest)
-    if has_negative:
-        counts[0] += _count_negative(strip, workspace.bright_light if scene.response_steps[1] else workspace.signal)
-    return has_bright
+def _linear_dn64(scene: Scene, signal: Vector, gains: Vector) -> Vector:
+    dn: Vector = maximum(signal * gains * scene.exposure, 0.0) * scene.span_dn
+    return dn
 
 
 @inner
-def _fill_linear(strip: Strip, scene: Scene, workspace: Workspace) -> tuple[bool, bool]:
-    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
-    gains, exposure, black, span = _load_sites(scene.gains, strip), scene.exposure, scene.black_dn, scene.span_dn
-    lowest = highest = load(workspace.signal, _0)
-    for n in range(strip.total // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        i = load(workspace.signal, x)
-        lowest, highest = minimum(lowest, i), maximum(highest, i)
-        _store_clean(maximum(i * gains * exposure, 0.0) * span + black, x, workspace)
-    return movemask(less_than(lowest, 0.0)) != 0, movemask(less_than(scene.linear_limit, highest)) != 0
+def _linear_dn32(scene: Scene32, signal: Vector, gains: Vector) -> Vector:
+    return maximum(signal, _ZERO32)
 
 
 @inner
-def _recompute_bright(strip: Strip, scene: Scene, workspace: Workspace) -> None:
-    """Recompute blocks that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
-
-    ``bright_light`` receives their light, and 0 in other blocks.
-    """
+def _bright_light64(scene: Scene, signal: Vector, x: np.uint64, strip: Strip) -> Vector:
     gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
-    threshold, exposure, brightest = scene.highlight_threshold, scene.exposure, scene.brightest
-    limit = np.inf if exposure == 1.0 else 1.0  # clip at white first; otherwise light above white would reappear
     row, column = scene.response_steps
     response = pointer_to(scene.response, strip.y * row + strip.x * column + strip.lead)
-    vectors = strip.total // VECTOR_WIDTH
-    for start in range(0, vectors, BLOCK // VECTOR_WIDTH):
-        end = min(start + BLOCK // VECTOR_WIDTH, vectors)
-        highest = load(workspace.signal, np.uint64(start) * _8)
-        for n in range(start, end):
-            highest = maximum(highest, load(workspace.signal, np.uint64(n) * _8))
-        is_bright = movemask(less_than(scene.linear_limit, highest)) != 0
-        for n in range(start, end):
-            x = np.uint64(n) * _8
-            i = load(workspace.signal, x)
-            if is_bright:
-                m = maximum(i - threshold, 0.0) / (1.0 - threshold)
-                light = minimum(i * gains + i * (m * m) * headroom, limit) * exposure * to_float64(load(response, x))
-                store(workspace.bright_light, x, light)
-                _store_clean(minimum(maximum(light, 0.0), brightest) * scene.span_dn + scene.black_dn, x, workspace)
-            else:
-                store(workspace.bright_light, x, i * 0.0)
+    limit = np.inf if scene.exposure == 1.0 else 1.0  # otherwise light above white would reappear
+    m = maximum(signal - scene.highlight_threshold, 0.0) / (1.0 - scene.highlight_threshold)
+    light = minimum(signal * gains + signal * (m * m) * headroom, limit) * scene.exposure
+    with_pattern: Vector = light * to_float64(load(response, x))
+    return with_pattern
 
 
 @inner
-def _store_clean(dn: Vector, x: np.uint64, workspace: Workspace) -> None:
+def _bright_light32(scene: Scene32, signal: Vector, x: np.uint64, strip: Strip) -> Vector:
+    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
+    limit = np.float32(np.inf) if scene.exposure == _ONE32 else _ONE32
+    i = signal * _load_sites(scene.signal_per_dn, strip)
+    m = maximum(i - scene.highlight_threshold, _ZERO32) * scene.steepness
+    light: Vector = minimum(i * gains + i * (m * m) * headroom, limit) * scene.exposure
+    return light
+
+
+@inner
+def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
+    dn = above_black + scene.black_dn
     rounded = (dn + ROUND) - ROUND
     rounded_dn = to_float32(rounded)
     store(workspace.unrounded_dn, x, dn)
     store(workspace.rounded_dn, x, rounded_dn)
     store(workspace.residual_dn, x, to_float32(dn - rounded))
     store(workspace.clean, x, to_uint32(rounded_dn))
+
+
+@inner
+def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
+    """Store eight clean values: DN above black, and as uint16."""
+    store(workspace.unrounded_dn, x, above_black)
+    store(workspace.clean, x, to_bits(above_black + ROUND32) + scene.black_dn)
+
+
+_linear_dn = by_class({Scene: _linear_dn64, Scene32: _linear_dn32})
+"""Return DN above black of signals that are not bright."""
+_bright_light = by_class({Scene: _bright_light64, Scene32: _bright_light32})
+"""Return the normalised light of signals of any brightness."""
+_store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
+"""Store eight clean values, given as DN above black."""
+
+
+# ---------------------------------------------------------------------------------------------------------- clean frame
+
+
+@inner
+def fill_clean(scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer) -> bool:
+    """Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
+
+    Return whether any site can be saturated.
+    """
+    signal = pointer_to(workspace.signal, strip.first)
+    if scene.gray_mean:
+        _fill_gray_mean_signal(codes, strip, scene, signal)
+    else:
+        _fill_codes(codes, is_uint8, strip, scene, signal)
+    has_negative, has_bright = _fill_linear(scene, strip, workspace)
+    if has_bright:
+        _recompute_bright(scene, strip, workspace)
+        counts[1] += _count_above(strip, workspace.bright_light, scene.clipped)
+    if has_negative:
+        counts[0] += _count_negative(strip, workspace.bright_light if scene.response_steps[1] else workspace.signal)
+    return bool(has_bright)
+
+
+@inner
+def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, bool]:
+    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
+    gains, limits = _load_sites(scene.gains, strip), _load_sites(scene.limits, strip)
+    lowest = highest = load(workspace.signal, _0)
+    for n in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        signal = load(workspace.signal, x)
+        lowest, highest = minimum(lowest, signal), maximum(highest, signal)
+        _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace)
+    return has_any_bit(less_than(lowest, _ZERO32)), has_any_bit(less_than(limits, highest))
+
+
+@inner
+def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
+    """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
+
+    ``bright_light`` receives their light, and 0 elsewhere.
+    """
+    limits = _load_sites(scene.limits, strip)
+    for n in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(n) * _8
+        signal = load(workspace.signal, x)
+        if not has_any_bit(less_than(limits, signal)):
+            store(workspace.bright_light, x, signal * _ZERO32)
+            continue
+        light = _bright_light(scene, signal, x, strip)
+        store(workspace.bright_light, x, light)
+        _store_clean(scene, minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn, x, workspace)
 
 
 @inner
@@ -381,70 +427,3 @@ def _count_above(strip: Strip, values: Pointer, limit: float) -> int:
     for x in range(strip.first, strip.after):
         count += values[x] > limit
     return count
-
-
-# ---------------------------------------------------------------------------------------------------- in float32
-
-
-@inner
-def _fill_clean_float32(
-    scene: Scene32, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer
-) -> Any:
-    signal = pointer_to(workspace.signal, strip.first)
-    if scene.gray_mean:
-        _fill_gray_mean_dn(codes, strip, scene, signal)
-    else:
-        _fill_codes(codes, is_uint8, strip, scene, signal)
-    has_negative, has_bright = _fill_linear32(strip, scene, workspace)
-    if has_negative:
-        counts[0] += _count_negative(strip, workspace.signal)
-    if has_bright:
-        _recompute_bright32(strip, scene, workspace)
-        counts[1] += _count_above(strip, workspace.bright_light, scene.clipped)
-    return has_bright
-
-
-@inner
-def _fill_linear32(strip: Strip, scene: Scene32, workspace: Workspace) -> tuple[bool, bool]:
-    """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
-    lowest = highest = load(workspace.signal, _0)
-    for n in range(strip.total // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        signal = load(workspace.signal, x)
-        lowest, highest = minimum(lowest, signal), maximum(highest, signal)
-        _store_clean32(maximum(signal, _ZERO32), x, scene, workspace)
-    is_bright = less_than(_load_sites(scene.limits_dn, strip), highest)
-    return movemask(less_than(lowest, _ZERO32)) != 0, movemask(is_bright) != 0
-
-
-@inner
-def _recompute_bright32(strip: Strip, scene: Scene32, workspace: Workspace) -> None:
-    """Recompute vectors that contain a bright signal; ``bright_light`` receives their light, and 0 elsewhere."""
-    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
-    limits_dn, signal_per_dn = _load_sites(scene.limits_dn, strip), _load_sites(scene.signal_per_dn, strip)
-    limit = np.float32(np.inf) if scene.exposure == _ONE32 else _ONE32
-    for n in range(strip.total // VECTOR_WIDTH):
-        x = np.uint64(n) * _8
-        signal = load(workspace.signal, x)
-        if movemask(less_than(limits_dn, signal)) == 0:
-            store(workspace.bright_light, x, signal * _ZERO32)
-            continue
-        i = signal * signal_per_dn
-        m = maximum(i - scene.highlight_threshold, _ZERO32) * scene.steepness
-        light = minimum(i * gains + i * (m * m) * headroom, limit) * scene.exposure
-        store(workspace.bright_light, x, light)
-        _store_clean32(minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn, x, scene, workspace)
-
-
-@inner
-def _store_clean32(dn: Vector, x: np.uint64, scene: Scene32, workspace: Workspace) -> None:
-    """Store eight clean values: DN above black, and as uint16."""
-    store(workspace.unrounded_dn, x, dn)
-    store(workspace.clean, x, to_bits(dn + ROUND32) + scene.black_dn)
-
-
-fill_clean = by_class({Scene: _fill_clean_exact, Scene32: _fill_clean_float32})
-"""Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
-
-Arguments: scene, codes, whether they are uint8, strip, workspace, counts. Return whether any site can be saturated.
-"""
