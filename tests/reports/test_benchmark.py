@@ -240,6 +240,15 @@ def test_settings_of_runs_include_both_kinds_of_noise(settings: Settings, profil
         assert list(session.run_settings(settings(*overrides), profiles)) == names
 
 
+@pytest.mark.parametrize("assumed", ["use", "off"])
+def test_runs_decide_about_assumed_numbers_as_given(
+    assumed: str, settings: Settings, profiles: BenchmarkProfiles
+) -> None:
+    configs = session.run_settings(settings(f"effects.assumed={assumed}", "effects.tolerance=0.2"), profiles)
+
+    assert {(config.effects.assumed, config.effects.tolerance) for config in configs.values()} == {(assumed, 0.2)}
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the folder for temporary files of this process."""

@@ -333,7 +333,7 @@ def run_settings(config: Config, profiles: BenchmarkProfiles) -> dict[str, Confi
 
 def _with_other_noise(config: Config, noise: NoiseConfig) -> Config:
     """Replace a noise profile by one of the other kind, and drop effects that do not apply to it."""
-    effects = EffectsConfig(tolerance=config.effects.tolerance)
+    effects = EffectsConfig(tolerance=config.effects.tolerance, assumed=config.effects.assumed)
     return replace(config, noise=noise, effects=effects, clean=CleanConfig())
 
 
