@@ -42,7 +42,7 @@ RECOMMENDATIONS = (
         "NumPy code that can be read and checked; it gives the DN of exact",
     ),
     Recommendation(
-        "quick look", FAST, "its errors cannot be seen in pictures; it saves time mainly with two-parameter noise"
+        "quick look", FAST, "its errors cannot be seen in pictures; with physical noise it takes about as long as exact"
     ),
 )
 
