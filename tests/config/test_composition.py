@@ -103,6 +103,7 @@ REFUSED = [
     ("check_disk=maybe", "check_disk=maybe: expected true or false$"),
     ("source.include={a: 1}", r"source.include=\{a: 1\}: expected a list of at least one pattern such as "),
     ("noise.branches=[1]", r"noise.branches\[0\]: expected a list of mappings with the keys of a branch$"),
+    ("noise.provenance=[{sauce: x}]", r"noise.provenance: sauce: no such key; an item has numbers, .* mean source\?"),
     ("noise.branches=[{isoo: 1}]", r"noise.branches: isoo: no such key; a branch has iso, .*; did you mean iso\?"),
     ("noise.branches=[{iso: x}]", r"noise.branches: iso: expected the lowest and the highest ISO, \[100, 6400\]$"),
     ("source.include=*.jpg", r"source.include=\*.jpg: expected a list, such as \[\*.jpg\]"),

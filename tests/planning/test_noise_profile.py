@@ -756,6 +756,17 @@ def test_provenance_at_an_iso_is_that_of_its_branch(settings: Settings) -> None:
     assert sources(100, 6400) == ["ELD, Profile-2, Gaussian line", "ELD, Profile-1, Gaussian line"]
 
 
+@pytest.mark.parametrize("noise", SAME_SENSOR)
+def test_config_yaml_records_every_table_of_a_profile(settings: Settings, noise: str) -> None:
+    config = on_its_own_sensor(settings, noise, 3200)
+    text = dataset_yaml(config)
+    recorded, _ = parse_dataset_yaml(text)
+    assert recorded.noise == replace(config.noise, provenance=[])
+    assert dataset_yaml(recorded) == text
+    assert "*" not in text.replace("*.", "")  # no YAML aliases, as conf/noise has
+    assert physics(recorded) == physics(config)
+
+
 def test_provenance_does_not_change_a_dataset(settings: Settings) -> None:
     config = settings("noise=nikon_d850")
     text = dataset_yaml(config)
