@@ -12,9 +12,9 @@ from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.random_streams import purpose
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.kernels.normal import exact_value, normal_quantiles
+from unprocess_gen.simulation.kernels.normal import exact_values, fill_rows, normal_quantiles
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, philox_key
-from unprocess_gen.simulation.kernels.simd import pointer_to
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, maximum, pointer_to, store, to_float32
 from unprocess_gen.simulation.kernels.strips import (
     ONES,
     STRIP,
@@ -162,8 +162,10 @@ def _list_defects(
     for n in range(starts.size - 1):
         y, x = n // strips, n % strips * STRIP
         strip, before = locate(origin, y, x, min(STRIP, width - x)), found
-        fill_word_blocks(key, strip, HOT, hot)
-        fill_word_blocks(key, strip, DEAD, dead)
+        if below[0] > 0:  # otherwise any word will do
+            fill_word_blocks(key, strip, HOT, hot)
+        if below[1] > 0:
+            fill_word_blocks(key, strip, DEAD, dead)
         for at in range(strip.first, strip.after):
             if np.uint64(hot[at]) < below[0] or np.uint64(dead[at]) < below[1]:
                 if found < positions.size:
@@ -195,7 +197,8 @@ def _fill_response(
             strip = locate(origin, y, x, min(STRIP, width - x))
             fill_word_blocks(key, strip, PRNU, workspace.words)
             row = pointer_to(target, y * out.shape[1] + x + strip.lead)
-            for n in range(strip.total):
-                workspace.exact_dn[n] = exact_value(workspace.words[n], normal)
-            for n in range(strip.total):
-                row[n] = np.float32(max(1 + prnu_std * workspace.exact_dn[n], 0.0))
+            fill_rows(strip.total, workspace.words, workspace.scratch)
+            for v in range(strip.total // VECTOR_WIDTH):
+                at = np.uint64(v * VECTOR_WIDTH)
+                deviate = exact_values(workspace.words, workspace.scratch, at, normal)
+                store(row, at, to_float32(maximum(deviate * prnu_std + 1.0, 0.0)))
