@@ -151,23 +151,18 @@ def electron_noise(
 def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, int], counts_all: bool) -> Electrons:
     """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
     frames = [_frame(plan, origin, columns, counts_all) for plan in plans]
-    numbers, purposes, quantiles, columns_dn, errors_dn, ranks = ([*members] for members in zip(*frames, strict=True))
-    black_dn, base_dn = float(plans[0].black_level_dn), np.empty((len(plans), 2, columns), dtype=np.float32)
-    for base, column_dn, error_dn in zip(base_dn, columns_dn, errors_dn, strict=True):
-        for y in range(2):
-            for x in range(2):
-                base[y, x::2] = black_dn + (column_dn[x::2] + error_dn[y, x])
+    numbers, purposes, quantiles, offsets, ranks = ([*members] for members in zip(*frames, strict=True))
     return Electrons(
         numbers=np.array(numbers),
         read_purposes=np.array(purposes),
         read_lines=_stack([each.lines for each in quantiles]),
         read_quadratics=_stack([each.quadratics for each in quantiles]),
-        columns_dn=_stack(columns_dn),
-        errors_dn=_stack(errors_dn),
-        base_dn=base_dn,
+        columns_dn=_stack([each.columns_dn for each in offsets]),
+        errors_dn=_stack([each.errors_dn for each in offsets]),
+        base_dn=_stack([each.base_dn for each in offsets]),
         dark_ranks=_stack(ranks),
         padded_width=columns,
-        black_dn=black_dn,
+        black_dn=float(plans[0].black_level_dn),
         body=WITHOUT_PATTERNS,
         tables=count_tables(),
     )
@@ -178,7 +173,40 @@ def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-_Frame = tuple[_Numbers, np.uint64, Quantiles, Float, Float, NDArray[np.uint32]]
+class _Offsets(NamedTuple):
+    """Hold the offsets of a frame: members of `Electrons`, and the largest offset from black, DN."""
+
+    columns_dn: Float
+    errors_dn: Float
+    base_dn: Float32
+    farthest_dn: float
+
+
+@functools.lru_cache(maxsize=16)
+def _offsets(
+    black_dn: float,
+    columns: int,
+    origin: tuple[int, int],
+    body_key: int,
+    column_std_dn: float,
+    black_error_dn: tuple[float, ...],
+) -> _Offsets:
+    """Return the offsets of the columns of a body and of the sites of a tile; a standard deviation of 0 omits columns.
+
+    ``origin`` is that of the first block.
+    """
+    columns_dn = np.zeros(columns)
+    if column_std_dn:
+        normals = reference_noise.normals(words(body_key, "column", (1, columns), origin=(0, origin[1])))
+        columns_dn = column_std_dn * np.asarray(normals[0])
+    errors_dn = np.roll(np.array(black_error_dn, dtype=np.float64).reshape(2, 2), -origin[0], axis=0)
+    base_dn = black_dn + (columns_dn + np.tile(errors_dn, columns // 2))
+    farthest_dn = float(np.abs(columns_dn).max(initial=0.0) + np.abs(errors_dn).max())
+    return _Offsets(columns_dn, errors_dn, base_dn.astype(np.float32), farthest_dn)
+
+
+_Frame = tuple[_Numbers, np.uint64, Quantiles, _Offsets, NDArray[np.uint32]]
+_NO_ERRORS = (0.0, 0.0, 0.0, 0.0)
 _NO_RANKS = np.zeros(MAX_STEPS, dtype=np.uint32)
 
 
@@ -188,19 +216,15 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     if physics is None:
         return _two_parameter_frame(plan, columns, counts_all)
     on = frozenset(plan.effects)
-    columns_dn, errors_dn, farthest_dn = np.zeros(columns), np.zeros((2, 2)), 0.0
-    if "column" in on:
-        columns_dn = physics.column_std_dn * _column_normals(physics.body_key, columns, origin[1])
-        farthest_dn += float(np.abs(columns_dn).max(initial=0.0))
-    if "black_error" in on:
-        errors_dn = reference_noise.black_error(physics, (2, 2), origin)
-        farthest_dn += float(np.abs(errors_dn).max())
+    of_body = (physics.body_key, physics.column_std_dn) if "column" in on else (0, 0.0)
+    errors_dn = physics.black_error_dn if "black_error" in on else _NO_ERRORS
+    offsets = _offsets(float(plan.black_level_dn), columns, origin, *of_body, errors_dn)
     dark_e = physics.dark_e if "dark_current" in on else 0.0
     removed_e = dark_e if physics.dark_offset == "removed" else 0.0
     read_std_dn = physics.read_std_dn if "read" in on else 0.0
     row_std_dn = physics.row_std_dn if "row" in on else 0.0
     quantiles = _read_quantiles(physics.read_law, physics.read_shape)
-    offset_dn = plan.black_level_dn + 6.4 * row_std_dn + farthest_dn
+    offset_dn = plan.black_level_dn + 6.4 * row_std_dn + offsets.farthest_dn
     most_dark_dn = physics.dn_per_e * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
     lowest_root, highest_root = _count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
     fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
@@ -223,14 +247,7 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         b_dn2=b_dn2,
     )
     dark_ranks = _NO_RANKS if ranks is None else np.resize(ranks, MAX_STEPS)
-    return numbers, READ, quantiles, columns_dn, errors_dn, dark_ranks
-
-
-@functools.lru_cache(maxsize=8)
-def _column_normals(body_key: int, columns: int, left: int) -> Float:
-    """Return the normal deviates of a body's columns."""
-    words_of_columns = words(body_key, "column", (1, columns), origin=(0, left))
-    return np.asarray(reference_noise.normals(words_of_columns)[0])
+    return numbers, READ, quantiles, offsets, dark_ranks
 
 
 def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
@@ -248,7 +265,8 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
         a_dn=a_dn,
         b_dn2=b_dn2,
     )
-    return numbers, HETEROSCEDASTIC, quantiles, np.zeros(columns), np.zeros((2, 2)), _NO_RANKS
+    offsets = _offsets(float(plan.black_level_dn), columns, (0, 0), 0, 0.0, _NO_ERRORS)
+    return numbers, HETEROSCEDASTIC, quantiles, offsets, _NO_RANKS
 
 
 def _error_dn(read_std_dn: float, quantiles: Quantiles, offset_dn: float, most_dark_dn: float) -> float:
