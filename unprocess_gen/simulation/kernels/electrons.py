@@ -187,16 +187,16 @@ def _offsets(
     black_dn: float,
     columns: int,
     origin: tuple[int, int],
-    body_key: int,
+    body_key: int | None,
     column_std_dn: float,
     black_error_dn: tuple[float, ...],
 ) -> _Offsets:
-    """Return the offsets of the columns of a body and of the sites of a tile; a standard deviation of 0 omits columns.
+    """Return the offsets of the columns of a body and of the sites of a tile; no body omits columns.
 
     ``origin`` is that of the first block.
     """
     columns_dn = np.zeros(columns)
-    if column_std_dn:
+    if body_key is not None:
         normals = reference_noise.normals(words(body_key, "column", (1, columns), origin=(0, origin[1])))
         columns_dn = column_std_dn * np.asarray(normals[0])
     errors_dn = np.roll(np.array(black_error_dn, dtype=np.float64).reshape(2, 2), -origin[0], axis=0)
@@ -216,7 +216,7 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     if physics is None:
         return _two_parameter_frame(plan, columns, counts_all)
     on = frozenset(plan.effects)
-    of_body = (physics.body_key, physics.column_std_dn) if "column" in on else (0, 0.0)
+    of_body = (physics.body_key, physics.column_std_dn) if "column" in on else (None, 0.0)
     errors_dn = physics.black_error_dn if "black_error" in on else _NO_ERRORS
     offsets = _offsets(float(plan.black_level_dn), columns, origin, *of_body, errors_dn)
     dark_e = physics.dark_e if "dark_current" in on else 0.0
@@ -265,7 +265,7 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
         a_dn=a_dn,
         b_dn2=b_dn2,
     )
-    offsets = _offsets(float(plan.black_level_dn), columns, (0, 0), 0, 0.0, _NO_ERRORS)
+    offsets = _offsets(float(plan.black_level_dn), columns, (0, 0), None, 0.0, _NO_ERRORS)
     return numbers, HETEROSCEDASTIC, quantiles, offsets, _NO_RANKS
 
 
