@@ -77,6 +77,8 @@ def _masks(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
     target[0] = movemask(b)
     target[1] = movemask(less_than(a, a * TWO))
     target[2] = movemask(less_than(ZERO, a))
+    target[3] = movemask(less_than(b, MASK))
+    store(target, 8, less_than(SHIFT, b))
 
 
 @kernel
@@ -176,7 +178,7 @@ CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
     "halves": (_halves, (LONG_WORDS,), np.zeros(25, dtype=np.uint32)),
     "columns": (_columns, (np.arange(4000) * 0.1, 4 * STARTS), np.zeros(24)),
     "uint64": (_uint64, (WORDS,), np.zeros(24, dtype=np.uint64)),
-    "masks": (_masks, (OTHERS, WORDS), np.zeros(3, dtype=np.uint32)),
+    "masks": (_masks, (OTHERS, WORDS), np.zeros(16, dtype=np.uint32)),
     "uint16": (_uint16, (WORDS,), np.zeros(12, dtype=np.uint16)),
     "scalars": (
         _scalars,
@@ -205,10 +207,17 @@ def test_compiled_vectors_equal_numpy_implementation(case: str) -> None:
 
 
 def test_first_lane_is_lowest_bit_of_mask() -> None:
-    out = np.zeros(3, dtype=np.uint32)
+    out = np.zeros(16, dtype=np.uint32)
     _masks(OTHERS, WORDS, out)
-    assert out.tolist() == [0b00011000, 0b10110001, 0b10110001]
+    assert out[:3].tolist() == [0b00011000, 0b10110001, 0b10110001]
     assert VECTOR_WIDTH == 8
+
+
+def test_integers_are_compared_without_sign() -> None:
+    out = np.zeros(16, dtype=np.uint32)
+    _masks(OTHERS, WORDS, out)
+    assert out[3] == 0b11100011
+    assert (out[8:] == np.where(WORDS > SHIFT, 2**32 - 1, 0)).all()
 
 
 def test_store_truncates_to_16_bits_and_writes_eight_values_only() -> None:
