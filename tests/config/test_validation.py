@@ -353,7 +353,7 @@ REFUSED = [
     ("noise=sony_a7s2;noise.prnu_std=0.6", r"noise.prnu_std=0.6: expected 0 to 0.5"),
     ("noise=sony_a7s2;noise.dark_e_per_s=1e6;scene.exposure_s=1e5", r"noise.dark_e_per_s=1000000.0: more than 1e\+09"),
     ("noise=sony_a7s2;noise.dark_doubling_c=0.1;scene.temperature_c=150", r"noise.dark_e_per_s=1.0: more than 1e\+09"),
-    ("sensor.saturated=bright", r"sensor.saturated=bright: expected one of noisy, pinned"),
+    ("sensor.saturated=bright", r"sensor.saturated=bright: expected one of noisy, pinned, auto"),
     ("sensor.dark_offset=halved", r"sensor.dark_offset=halved: expected one of removed, kept"),
     ("sensor.units=0", r"sensor.units=0: expected image, or a number of bodies"),
     ("effects.all=maybe", r"effects.all=maybe: expected one of auto, on, off"),
@@ -497,6 +497,33 @@ def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Sett
 )
 def test_keys_that_do_not_decide_data_keep_the_text(keys: str, settings: Settings) -> None:
     assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "decided"),
+    [
+        (("noise=imx385_iso3200",), "noisy"),
+        (("noise=nikon_d850",), "pinned"),
+        (("noise=nikon_d850", "sensor.clip=black"), "pinned"),
+        (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=null"), "noisy"),
+        (("noise=nikon_d850", "output.dtype=float32", "sensor.clip=none", "noise.full_well_e=60000"), "pinned"),
+        (("noise=nikon_d850", "sensor.saturated=noisy"), "noisy"),
+        (("noise=imx385_iso3200", "sensor.saturated=pinned"), "pinned"),
+    ],
+)
+def test_auto_pins_saturated_sites_of_limited_physical_profiles(
+    overrides: tuple[str, ...], decided: str, settings: Settings
+) -> None:
+    """Plans and recorded configs have the decision; 0.1 records noisy or pinned."""
+    config = settings(*overrides)
+    validate_config(config)
+    assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).saturated == decided
+    assert yaml.safe_load(dataset_yaml(config))["sensor"]["saturated"] == decided
+
+
+@pytest.mark.parametrize("sensor", sorted(path.stem for path in (conf_dir() / "sensor").glob("*.yaml")))
+def test_auto_is_the_default_of_every_sensor(sensor: str, settings: Settings) -> None:
+    assert settings(f"sensor={sensor}").sensor.saturated == "auto"
 
 
 SPELLINGS = [

@@ -72,6 +72,20 @@ def test_noise_of_saturated_sites_is_clipped_at_white(distribution: str) -> None
     assert frame.mean() < WHITE - 200  # (8·61439 + 900)**½ / (2π)**½ is 280
 
 
+@pytest.mark.parametrize("bits", [12, 14, 16])
+def test_physical_noise_keeps_the_mean_of_white_areas(bits: int, settings: Settings) -> None:
+    """With saturated=noisy half of the noise is cut off, and the mean is below white."""
+    chosen = ("noise=sony_a7s2", "noise.iso=6400", f"sensor=generic_{bits}bit", "gains=unity")
+    free, decided = (
+        make_pair(flat(65535), planned(settings, flat(65535), *chosen, f"sensor.saturated={saturated}"))
+        for saturated in ("noisy", "auto")
+    )
+    white = 2**bits - 1
+    assert (decided.clean == white).all()
+    assert float(decided.noisy.mean()) == white
+    assert float(free.noisy.mean()) < white - 8 * 2 ** (bits - 12)
+
+
 @pytest.mark.parametrize("distribution", WHITES)
 def test_pinning_changes_saturated_sites_only(distribution: str) -> None:
     srgb = np.where(np.random.Generator(np.random.Philox(key=5)).random((200, 300, 1)) < 0.3, 65535, 65000)

@@ -160,8 +160,9 @@ class SensorConfig:
     saturated: str = key(
         "noisy",
         "noisy value where the clean frame is saturated: noisy adds noise to the clipped value, as in the article, "
-        "pinned is the white level",
-        Choice(("noisy", "pinned")),
+        "pinned is the white level; auto is pinned for physical profiles that reach a full well or the end of the "
+        "converter, otherwise noisy",
+        Choice(("noisy", "pinned", "auto")),
     )
     dark_offset: str = key(
         "removed",

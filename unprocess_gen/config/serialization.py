@@ -13,7 +13,7 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import yaml
 
-from unprocess_gen.config.interpretation import canonical_patch, has_float_clean, uses_assumed
+from unprocess_gen.config.interpretation import canonical_patch, has_float_clean, saturated_as, uses_assumed
 from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
 from unprocess_gen.config.schema import Config, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
@@ -80,6 +80,7 @@ def dataset_yaml(config: Config) -> str:
     """
     settings = _recorded(config)
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
+    settings["sensor"]["saturated"] = saturated_as(config)
     settings["source"]["patch"] = canonical_patch(config.source)
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing

@@ -23,6 +23,7 @@ from unprocess_gen.config.interpretation import (
     is_physical,
     noise_distributions,
     noise_levels,
+    saturated_as,
     uses_physics,
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
@@ -217,7 +218,7 @@ class Planner:
             "black_level_dn": config.sensor.black_level_dn,
             "white_level_dn": config.sensor.white_level_dn,
             "sensor_clip": config.sensor.clip,
-            "saturated": config.sensor.saturated,
+            "saturated": saturated_as(config),
             "noise": config.noise.name,
             "noise_law": config.noise.law,
             "accuracy": config.accuracy.name,
