@@ -80,8 +80,14 @@ PROMISES = (
     Promise(
         "photon-transfer",
         "The noise in the arrays is what the rows state, for every kind of noise, where its standard deviation is "
-        "above 0.7 DN.",
+        "above 1 DN.",
         ("tests/reports/test_photon_transfer.py",),
+        ("gen-dataset verify DIR --noise",),
+    ),
+    Promise(
+        "noise-check",
+        "A dataset with right noise raises no alarm, and faults of the noise are found in at least 95 % of runs.",
+        ("tests/reports/test_noise_check.py",),
         ("gen-dataset verify DIR --noise",),
     ),
     Promise(

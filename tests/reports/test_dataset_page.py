@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Iterator
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
 from unprocess_gen.planning import plan
-from unprocess_gen.reports import formatting, html_pages, photon_transfer, report_files
+from unprocess_gen.reports import formatting, html_pages, report_files
 from unprocess_gen.reports.dataset_page import page as dataset_report
 from unprocess_gen.reports.dataset_page.statistics import (
     PARAMETER_COLUMNS,
@@ -297,9 +296,10 @@ def test_noise_that_differs_from_the_manifest_is_reported(
     scenes: Path, scenes_page: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "All agree with the manifest." in scenes_page
-    true = photon_transfer.fit_pair
-    monkeypatch.setattr(photon_transfer, "fit_pair", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
-    assert "2 of them differ from the manifest" in dataset_report.dataset_page(scenes)
+    monkeypatch.setattr(dataset_report, "threshold", lambda pairs: 0.0)
+    assert "The noise of 2 of them differs from the manifest: noise of 00000000: " in dataset_report.dataset_page(
+        scenes
+    )
 
 
 def test_dataset_without_pairs_has_a_report(make: Make, tmp_path: Path) -> None:

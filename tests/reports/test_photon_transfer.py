@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make
+from helpers.datasets import Make, Settings
 from helpers.promise_report import Figure
 
-from unprocess_gen import RawPairs
+from unprocess_gen import RawPairs, make_pair
 from unprocess_gen.reports import photon_transfer
 
 
@@ -54,7 +53,7 @@ def test_wrong_numbers_in_a_row_are_detected(scenes: Path, column: str, factor: 
     clean, noisy, row = RawPairs(scenes)[0]
     found = photon_transfer.fit_pair(clean, noisy, row | {column: row[column] * factor})
     assert found is not None
-    assert found.deviation > photon_transfer.ALARM
+    assert found.deviation > 6
 
 
 def test_standard_errors_match_the_spread_of_repeated_draws(make: Make, tmp_path: Path) -> None:
@@ -66,13 +65,9 @@ def test_standard_errors_match_the_spread_of_repeated_draws(make: Make, tmp_path
         assert 0.2 < spread < 2.7
 
 
-def test_pair_without_a_range_of_signals_has_no_fit() -> None:
-    flat = np.full((64, 64), 900, dtype=np.uint16)
-    row = {"effects": "heteroscedastic;quantise", "a_dn": 1.0, "b_dn2": 4.0, "black_level_dn": 240, "bits": 12}
-    row |= {"white_level_dn": 4095, "sensor_clip": "sensor", "key": "00000000"}
-    row |= {"dtype": "uint16", "layout": "mosaic"}
-    row |= dict.fromkeys(("dn_per_e", "row_std_dn", "column_std_dn", "dark_e", "prnu_std", "width", "height"), 0.0)
-    assert photon_transfer.fit_pair(flat, flat, row) is None
+def test_pair_without_a_range_of_signals_has_no_fit(settings: Settings) -> None:
+    pair = make_pair(np.full((64, 64, 3), 90, dtype=np.uint8), settings("camera=identity", "gains=unity"))
+    assert photon_transfer.fit_pair(pair.clean, pair.noisy, pair.row) is None
 
 
 @pytest.mark.parametrize(
@@ -82,7 +77,7 @@ def test_pair_without_a_range_of_signals_has_no_fit() -> None:
 def test_noise_below_rounding_is_not_damage(
     overrides: tuple[str, ...], make: Make, run_main: RunMain, tmp_path: Path
 ) -> None:
-    """Below 0.7 DN, rounding errors depend on the noise."""
+    """Below 1 DN, rounding errors depend on the noise."""
     make(None, tmp_path / "ds", "source.limit=1", *overrides)
     done = run_main("verify", tmp_path / "ds", "--noise")
     assert (done.code, done.err) == (0, "")
@@ -99,13 +94,3 @@ def test_verify_reports_the_pair_farthest_from_its_row(scenes: Path, run_main: R
     assert done.code == 0
     assert "noise of 3 pairs fitted" in done.out
     assert (tmp_path / "curves.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_verify_exits_with_4_if_noise_differs_from_the_rows(
-    scenes: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    true = photon_transfer.fit_pair
-    monkeypatch.setattr(photon_transfer, "fit_pair", lambda *given: replace(true(*given), expected=(9.0, 38.0)))
-    done = run_main("verify", scenes, "--noise")
-    assert done.code == 4
-    assert "noise of 00000000: a 6.9" in done.err

@@ -300,18 +300,27 @@ def _check_noise(folder: Path, to: str | None) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen.reports import photon_transfer
 
-    fits = photon_transfer.fit_dataset(folder)
-    if fits.worst is None:
-        print_result(f"{folder}: no pair has enough sites to fit its noise")
+    found = photon_transfer.examine_dataset(folder)
+    checks = found.checks
+    if not checks.count:
+        print_result(f"{folder}: no pair has enough sites to check its noise")
         return []
+    if found.worst is not None:
+        print_result(
+            f"noise of {counted(found.count, 'pair')} fitted (a, b with 95 % intervals); "
+            f"the farthest from its row: {found.worst}"
+        )
+    unchecked = f"; {checks.unchecked} not checked: too few usable sites, or an effect that cannot be checked"
     print_result(
-        f"noise of {counted(fits.count, 'pair')} fitted (a, b with 95 % intervals); "
-        f"the farthest from its row: {fits.worst}"
+        f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"
+        + (unchecked if checks.unchecked else "")
     )
     if to is not None:
-        photon_transfer.draw_fits(fits.first, Path(to))
+        photon_transfer.draw_fits(found.first, Path(to))
         print_result(f"drawn in {to}")
-    return _reported(folder, (f"noise of {fit}" for fit in fits.wrong))
+    unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
+    more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []
+    return _reported(folder, [*map(str, checks.alarms), *more])
 
 
 def _reported(folder: Path, damages: Iterable[object]) -> list[str]:
@@ -519,7 +528,7 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "verify",
-            "check every byte of a dataset or sweep; repair, regenerate, fit the noise",
+            "check every byte of a dataset or sweep; repair, regenerate, check the noise",
             run_verify,
             (
                 SOURCE,
@@ -528,7 +537,7 @@ VERBS: dict[str, Verb] = {
                 ),
                 Argument(("--to",), "with --noise: draw the fits in FILE (PNG)", "FILE", completes="files"),
                 Argument(("--repair",), "restore damaged files to the same bytes"),
-                Argument(("--noise",), "fit the noise in the arrays and compare it with the manifest"),
+                Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
             ),
             Place("DIR", "the folder of a dataset or of a sweep"),
         ),

@@ -226,7 +226,7 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     quantiles = _read_quantiles(physics.read_law, physics.read_shape)
     offset_dn = plan.black_level_dn + 6.4 * row_std_dn + offsets.farthest_dn
     most_dark_dn = physics.dn_per_e * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
-    lowest_root, highest_root = _count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
+    lowest_root, highest_root = count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
     fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
     a_dn, b_dn2 = plan.variance_line
     numbers = _Numbers(
@@ -254,7 +254,7 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
     """Return shot and read noise whose variance line is that of the plan."""
     a_dn, b_dn2 = plan.variance_line
     read_std_dn, quantiles = math.sqrt(max(b_dn2, 0.0)), normal_quantiles()
-    lowest_root, highest_root = _count_roots(plan, read_std_dn / a_dn, counts_all)
+    lowest_root, highest_root = count_roots(plan, read_std_dn / a_dn, counts_all)
     numbers = _Numbers(
         dn_per_e=a_dn,
         shot=1.0,
@@ -275,7 +275,7 @@ def _error_dn(read_std_dn: float, quantiles: Quantiles, offset_dn: float, most_d
     return read_std_dn * quantiles.error + FLOAT32_ERROR_DN * summands_dn
 
 
-def _count_roots(plan: Plan, read_std_e: float, counts_all: bool) -> tuple[float, float]:
+def count_roots(plan: Plan, read_std_e: float, counts_all: bool) -> tuple[float, float]:
     """Return the square roots of the mean electrons between which a normal is too far from the counts."""
     law_distance = plan.law_distance
     if plan.physics is not None and plan.physics.read_law == "tukey_lambda":

@@ -1,0 +1,121 @@
+"""Faults in the noise of pairs, and how to plant them in a finished dataset whose digests then agree with its bytes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen import RawPairs
+from unprocess_gen.core.files import array_xxh3, file_sha256
+from unprocess_gen.core.types import Frame, Plan
+from unprocess_gen.dataset.shards import shard_name
+from unprocess_gen.pipeline.workspace import dataset_text, fingerprint, read_dataset
+from unprocess_gen.simulation.pair import make_pair
+
+Fault = Callable[[NDArray[np.uint8], Frame, Plan, np.random.Generator], Frame]
+"""Function of photograph, noisy frame, plan and random generator that returns another noisy frame."""
+
+
+def unrounded(srgb: NDArray[np.uint8], plan: Plan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return both frames of a pair in DN, not rounded and without limits."""
+    effects = tuple(effect for effect in plan.effects if effect != "quantise")
+    pair = make_pair(srgb, replace(plan, dtype="float32", sensor_clip="none", effects=effects))
+    span_dn, black_dn = plan.white_level_dn - plan.black_level_dn, plan.black_level_dn
+    clean, noisy = (frame.astype(np.float64) * span_dn + black_dn for frame in (pair.clean, pair.noisy))
+    return clean, noisy
+
+
+def rounded(value_dn: NDArray[np.float64], plan: Plan) -> Frame:
+    """Round and clip a frame as the sensor does."""
+    return np.clip(np.rint(value_dn), 0, 2**plan.bits - 1).astype(np.uint16)
+
+
+def black_level(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Add 20 DN."""
+    return rounded(noisy + 20.0, plan)
+
+
+def without_row_noise(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Simulate the same noise without row offsets."""
+    assert plan.physics is not None
+    return make_pair(srgb, replace(plan, physics=replace(plan.physics, row_std_dn=0.0))).noisy
+
+
+def swapped_greens(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Swap the green sites of each tile."""
+    other = noisy.copy()
+    other[0::2, 1::2], other[1::2, 0::2] = noisy[1::2, 0::2], noisy[0::2, 1::2]
+    return other
+
+
+def swapped_red_and_blue(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Swap the red and the blue site of each tile."""
+    other = noisy.copy()
+    other[0::2, 0::2], other[1::2, 1::2] = noisy[1::2, 1::2], noisy[0::2, 0::2]
+    return other
+
+
+def stripes(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Add an offset to each column, with a tenth of the standard deviation of the read noise."""
+    assert plan.physics is not None
+    _, exact = unrounded(srgb, plan)
+    return rounded(exact + 0.1 * plan.physics.read_std_dn * draws.standard_normal(exact.shape[1]), plan)
+
+
+def uniform(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Replace the noise by uniform noise of the same variance."""
+    clean, _ = unrounded(srgb, plan)
+    row_dn2 = plan.physics.row_std_dn**2 if plan.physics is not None and "row" in plan.effects else 0.0
+    slope, intercept = plan.variance_line
+    std = np.sqrt(slope * (clean - plan.black_level_dn) + intercept + row_dn2)
+    return rounded(clean + std * draws.uniform(-(3**0.5), 3**0.5, clean.shape), plan)
+
+
+def more_signal(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+    """Add 5 % of the signal."""
+    clean, exact = unrounded(srgb, plan)
+    return rounded(exact + 0.05 * (clean - plan.black_level_dn), plan)
+
+
+FAULTS: dict[str, Fault] = {
+    "black level off by 20 DN": black_level,
+    "row noise removed": without_row_noise,
+    "green sites swapped": swapped_greens,
+    "red and blue sites swapped": swapped_red_and_blue,
+    "column stripes of a tenth of the read noise": stripes,
+    "uniform noise of equal variance": uniform,
+    "5 % more signal": more_signal,
+}
+
+
+def replace_noisy_frames(folder: Path, change: Callable[[Frame, Frame, dict[str, object]], Frame]) -> None:
+    """Replace the noisy frames of a dataset, and make all digests those of the new bytes.
+
+    ``change`` returns a frame of the same shape for a clean frame, a noisy frame and a row.
+    """
+    texts: dict[bytes, bytes] = {}
+    for clean, noisy, row in RawPairs(folder):
+        path = folder / "shards" / shard_name(int(row["shard"]))
+        other = np.ascontiguousarray(change(clean, noisy, row))
+        content, old = path.read_bytes(), noisy.tobytes()
+        assert content.count(old) == 1
+        digests = str(row["noisy_xxh3"]).encode(), array_xxh3(other).encode()
+        path.write_bytes(content.replace(old, other.tobytes()).replace(*digests))
+        texts[digests[0]] = digests[1]
+    manifest = folder / "manifest.csv"
+    content = manifest.read_bytes()
+    for old_digest, new_digest in texts.items():
+        content = content.replace(old_digest, new_digest)
+    manifest.write_bytes(content)
+    facts = read_dataset(folder / "dataset.json")
+    for entry in facts["shards"]:
+        if entry["file"] is not None:
+            entry["sha256"] = file_sha256(folder / entry["file"])
+    facts["manifest_sha256"] = hashlib.sha256(content).hexdigest()
+    facts["fingerprint"] = fingerprint(facts["config_sha256"], facts["manifest_sha256"])
+    (folder / "dataset.json").write_text(dataset_text(facts), encoding="utf-8")
