@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from noise_profile_page import profiles_page
+from scene_page import scenes_page
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
@@ -264,5 +265,6 @@ PAGES = {
     "docs/reference/columns.md": columns_page,
     "docs/reference/command_line.md": command_line_page,
     "docs/reference/noise_profiles.md": lambda: profiles_page(table, page),
+    "docs/reference/scenes.md": lambda: scenes_page(table, page),
 }
 """The pages, and the functions that return their text."""

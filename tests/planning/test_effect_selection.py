@@ -663,23 +663,26 @@ def test_column_assumed_is_empty_if_assumed_numbers_are_off(settings: Settings) 
 
 def test_frame_planned_with_assumed_off_is_that_of_0_1(settings: Settings) -> None:
     plan = planned(settings, "long_exposure", "effects.assumed=off")
-    assert {"prnu", "dark_current", "hot_pixels", "dead_pixels"}.isdisjoint(plan.effects)
-    assert sum("is assumed, no source gives it: on only where switched on" in one for one in plan.skipped) == 4
+    assert {"prnu", "dark_current", "hot_pixels", "dead_pixels", "full_well", "column"}.isdisjoint(plan.effects)
+    assert sum("is assumed, no source gives it: on only where switched on" in one for one in plan.skipped) == 6
 
 
 def test_all_on_simulates_known_numbers_and_lists_missing_ones(settings: Settings) -> None:
-    predictions = predictions_of(settings, "effects.all=on")
+    predictions = predictions_of(settings, "effects.all=on", "noise=oppo_reno10x", "noise.full_well_e=null")
     lacking = {name: one.reason for name, one in predictions.items() if not one.simulated}
     assert lacking == {
-        "full_well": "noise=sony_a7s2 gives no full_well_e",
-        "column": "noise=sony_a7s2 gives no column_std_dn",
+        "full_well": "noise=oppo_reno10x gives no full_well_e",
+        "row": "noise=oppo_reno10x gives no row_std_dn",
+        "black_error": "noise=oppo_reno10x gives no black_error_dn",
     }
 
 
 @pytest.mark.parametrize("effect", ["full_well", "column", "black_error"])
 def test_effect_without_a_number_cannot_be_switched_on(settings: Settings, effect: str) -> None:
+    config = settings("noise=oppo_reno10x", "scene=indoor", f"effects.{effect}=on", "noise.full_well_e=null")
+    config.noise.branches[0].column_std_dn = None
     with pytest.raises(ConfigError, match=rf"effects.{effect}=on: noise=oppo_reno10x gives no {effect}_"):
-        validate_config(settings("noise=oppo_reno10x", "scene=indoor", f"effects.{effect}=on"))
+        validate_config(config)
 
 
 @given(sensor=sensors, dark=st.floats(0, 100), more=st.floats(0, 3000), tolerance=tolerances)

@@ -551,9 +551,13 @@ def test_isos_of_a_dataset_follow_their_distribution(settings: Settings) -> None
     assert 500 < isos[100] < 1300
 
 
+HEAT = ("noise.dark_e_per_s=1", "noise.dark_reference_c=25", "noise.dark_doubling_c=7", "noise.hot_pixel_e_per_s=50")
+
+
 @pytest.mark.parametrize(("celsius", "times"), [(25, 1.0), (32, 2.0), (39, 4.0), (18, 0.5), (28.5, math.sqrt(2))])
 def test_dark_current_doubles_with_temperature(settings: Settings, celsius: float, times: float) -> None:
-    made = physics(settings("noise=imx385", "noise.iso=1600", f"scene.temperature_c={celsius}", "scene.exposure_s=4"))
+    scene = f"scene.temperature_c={celsius}", "scene.exposure_s=4"
+    made = physics(settings("noise=imx385", "noise.iso=1600", *HEAT, *scene))
     assert math.isclose(made.dark_e, 4 * times, rel_tol=1e-15)
     assert math.isclose(made.hot_pixel_e, 200 * times, rel_tol=1e-15)
 
@@ -561,7 +565,7 @@ def test_dark_current_doubles_with_temperature(settings: Settings, celsius: floa
 @pytest.mark.parametrize("doubling", [5.0, 8.0])
 def test_doubling_temperature_is_that_of_the_profile(settings: Settings, doubling: float) -> None:
     overrides = (f"noise.dark_doubling_c={doubling}", "noise.dark_reference_c=20", "scene.temperature_c=45")
-    made = physics(settings("noise=imx385", "noise.iso=1600", "scene.exposure_s=1", *overrides))
+    made = physics(settings("noise=imx385", "noise.iso=1600", "scene.exposure_s=1", *HEAT, *overrides))
     assert close(made.dark_e, mpmath.mpf(2) ** (25 / mpmath.mpf(doubling)))
 
 
@@ -778,7 +782,9 @@ def test_provenance_does_not_change_a_dataset(settings: Settings) -> None:
 def test_branch_without_optional_numbers_lacks_their_effects(settings: Settings) -> None:
     config = settings("noise=nikon_d850", "noise.iso=100")
     branch = BranchConfig(iso=[100, 100], dn_per_e=1.0, read_std_dn=2.0)
-    config = replace(config, noise=replace(config.noise, branches=[branch], prnu_std=None, dark_e_per_s=None))
+    config = replace(
+        config, noise=replace(config.noise, branches=[branch], prnu_std=None, dark_e_per_s=None, full_well_e=None)
+    )
     validate_config(config)
     made = physics(config)
     assert (made.row_std_dn, made.column_std_dn, made.black_error_dn) == (0.0, 0.0, (0.0,) * 4)

@@ -22,6 +22,8 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.planning.effect_selection import facts_of
+from unprocess_gen.planning.plan import plan_pairs
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +178,10 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
             r"is not an ISO; expected a list of them for noise=nikon_d850",
         ),
         (("noise=nikon_d850", "noise.levels=2", "noise.full_well_e=9000"), r"the clean frame depends on the ISO"),
+        (
+            ("noise=canon_70d", "noise.levels=[100,800]"),
+            r"full_well_e=28300\.0 ends below white .*effects\.full_well=off",
+        ),
         (("noise=nikon_d850", "noise.levels=2", "clean.includes_fixed_pattern=true"), r"depends on the ISO"),
         (("source.clips=true",), r"source.clips=true: the built-in scenes are not clips"),
         (("source.downscale=0",), r"source.downscale=0: expected 1 to 64"),
@@ -262,3 +268,22 @@ def test_a_copied_clip_has_its_own_parameters(clips: Path, make: Make, tmp_path:
 
 def test_frames_are_regenerated_from_their_rows(filmed: Path, clips: Path) -> None:
     assert [one for one in replay(read_rows(filmed / "manifest.csv"), str(clips)) if one.complaint] == []
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("noise=canon_70d", "noise.levels=[800,3200]"),
+        ("noise=canon_70d", "noise.levels=[100,800]", "effects.full_well=off"),
+        ("noise=nikon_d850", "noise.levels=[100,6400]"),
+        ("noise=imx385", "noise.levels=[1600,25600]"),
+    ],
+)
+def test_levels_are_accepted_if_the_full_well_cannot_change_the_clean_frame(
+    overrides: tuple[str, ...], settings: Settings
+) -> None:
+    """The converter ends before the well at these ISOs."""
+    config = settings(*overrides)
+    validate_config(config)
+    plans = plan_pairs(config, "0" * 64, facts=facts_of(np.full((2, 2, 3), 255, np.uint8)))
+    assert {plan.brightest for plan in plans} == {1.0}

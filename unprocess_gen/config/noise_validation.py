@@ -179,13 +179,44 @@ def _check_tails(key: str, branch: BranchConfig) -> None:
         )
 
 
+def well_ends_first(noise: NoiseConfig, scene: SceneConfig) -> bool:
+    """Return whether a full well can end below white, so that the clean frame depends on the ISO.
+
+    Parameters
+    ----------
+    noise : NoiseConfig
+        A profile that `check_noise` accepts, with the ISO of one noise level.
+    scene : SceneConfig
+        The scene, whose ISO is used if the profile has none.
+
+    Returns
+    -------
+    bool
+        False for profiles with two numbers, and without a full well.
+    """
+    if not is_physical(noise) or noise.full_well_e is None:
+        return False
+    assert noise.white_level_dn is not None and noise.black_level_dn is not None
+    drawn = parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO)
+    low, high = lowest(drawn), highest(drawn)
+    gains = [_gain_at(branch, max(low, branch.iso[0])) for branch in noise.branches if _overlaps(branch, low, high)]
+    return noise.full_well_e * min(gains) < noise.white_level_dn - noise.black_level_dn
+
+
+def _overlaps(branch: BranchConfig, low: float, high: float) -> bool:
+    return branch.iso[0] <= high and low <= branch.iso[1]
+
+
 def _gains_at_ends(branch: BranchConfig) -> tuple[float, float]:
     """Return the system gain at the lowest and the highest ISO of a branch, DN per electron."""
+    return _gain_at(branch, branch.iso[0]), _gain_at(branch, branch.iso[1])
+
+
+def _gain_at(branch: BranchConfig, iso: float) -> float:
     gain = branch.dn_per_e
     if not isinstance(gain, list):
-        return float(gain), float(gain)
-    slope, intercept = gain[1], gain[2] if len(gain) > 2 else 0.0
-    return slope * branch.iso[0] + intercept, slope * branch.iso[1] + intercept
+        return float(gain)
+    return float(gain[1] * iso + (gain[2] if len(gain) > 2 else 0.0))
 
 
 def _check_gain(key: str, noise: NoiseConfig, branch: BranchConfig, lowest_gain: float) -> None:

@@ -25,7 +25,7 @@ from unprocess_gen.config.interpretation import (
     uses_physics,
 )
 from unprocess_gen.config.limits import CAMERA_LAWS, SWITCH, Drawn, LevelRange
-from unprocess_gen.config.noise_validation import check_noise
+from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.schema import PHYSICAL, CameraConfig, Config, EffectsConfig, SourceConfig, all_settings
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.snapshot import restored, snapshot
@@ -175,10 +175,13 @@ def _check_levels(config: Config) -> None:
     noise = config.noise
     if len(noise_levels(noise)) == 1:
         return
-    if noise.full_well_e is not None:
+    if effect_switch(config.effects, "full_well") != "off" and any(
+        well_ends_first(level, config.scene) for level in noise_levels(noise)
+    ):
         raise ConfigError(
-            f"noise.levels={value_text(noise.levels)}: with noise.full_well_e the clean frame depends on the ISO; "
-            "expected null or one level; leave noise.levels out"
+            f"noise.levels={value_text(noise.levels)}: noise.full_well_e={value_text(noise.full_well_e)} ends below "
+            "white there, so the clean frame depends on the ISO; expected one level; leave noise.levels out, or set "
+            "effects.full_well=off"
         )
     if config.clean.includes_fixed_pattern:
         raise ConfigError(

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from unprocess_gen.config.interpretation import (
+    BRANCH_NUMBERS,
     EFFECT_NUMBERS,
     assumed_numbers,
     effect_switch,
@@ -165,7 +166,8 @@ def _forced_decision(config: Config, effect: str) -> ForcedDecision | None:
         )  # recorded: decides bytes of datasets
     if switch == "on":
         return ForcedDecision(True, "switched on")
-    assumed = next((key for key in EFFECT_NUMBERS.get(effect, ()) if key in config.noise.assumed), None)
+    needed = (*EFFECT_NUMBERS.get(effect, ()), *BRANCH_NUMBERS.get(effect, ()))
+    assumed = next((key for key in needed if key in config.noise.assumed), None)
     if assumed is not None and not uses_assumed(config):
         advice = "on only where switched on"  # recorded: decides bytes of datasets
         return ForcedDecision(False, f"{assumed} is assumed, no source gives it: {advice}")

@@ -133,7 +133,7 @@ ASSUMED_TEXTS: dict[str, Callable[[NoiseConfig], str]] = {
 
 ASSUMED_OF_EFFECT = {
     "prnu": ("prnu_std",),
-    "dark_current": ("dark_e_per_s", "dark_reference_c", "dark_doubling_c"),
+    "dark_current": ("dark_e_per_s", "dark_doubling_c"),
     "hot_pixels": ("hot_pixel_share", "hot_pixel_e_per_s"),
     "full_well": ("full_well_e",),
     "row": ("row_std_dn",),

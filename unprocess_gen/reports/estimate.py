@@ -463,7 +463,7 @@ def _physical_lines(config: Config, plans: list[Plan]) -> list[str]:
         f"{value_range([one.read_std_dn for one in physics], 4)} DN standard deviation ({', '.join(distributions)})",
     ]
     if noise.assumed:
-        lines.append(f"          assumed, without a source: {', '.join(noise.assumed)}")
+        lines += _labelled("", [f"assumed, without a source: {', '.join(noise.assumed)}"])
     return [*lines, *_provenance_lines(config, [one.iso for one in physics])]
 
 
