@@ -6,6 +6,8 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Settings
@@ -193,6 +195,17 @@ def test_skipped_effects_are_listed_with_their_reason(settings: Settings, tmp_pa
     assert "skipped   heteroscedastic: noise=none has no variance" in format_estimate(
         config, estimate_run(config, 1, True)
     )
+
+
+@pytest.mark.parametrize(("method", "stated"), [("off", True), ("dither", True), ("dither_all", False)])
+def test_highlights_next_to_empty_bands_are_stated(
+    method: str, stated: bool, settings: Settings, tmp_path: Path
+) -> None:
+    (tmp_path / "p").mkdir()
+    cv2.imwrite(str(tmp_path / "p" / "bright.png"), np.full((20, 20, 3), 254, dtype=np.uint8))
+    config = settings(f"source.root={tmp_path / 'p'}", f"source.dequantize={method}", "gains=paper_max")
+    text = format_estimate(config, estimate_run(config, 1, True))
+    assert ("highlight 100.00% of the sites have highlights next to an empty band" in text) == stated
 
 
 def test_shadows_without_noise_are_reported(settings: Settings, tmp_path: Path) -> None:

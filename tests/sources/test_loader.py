@@ -50,7 +50,7 @@ def test_a_photograph_too_small_to_be_downscaled_is_unsupported(tmp_path: Path) 
         load_source(config, list_photographs(config).sources[0])
 
 
-@pytest.mark.parametrize("override", ["source.downscale=2", "source.dequantize=dither"])
+@pytest.mark.parametrize("override", ["source.downscale=2", "source.dequantize=dither", "source.dequantize=dither_all"])
 def test_downscaled_and_dithered_pairs_are_regenerated_from_rows(
     override: str, photos: Path, make: Make, tmp_path: Path
 ) -> None:
@@ -80,6 +80,39 @@ def test_black_white_and_highlights_are_not_moved(dithered: object) -> None:
     codes = np.arange(256, dtype=np.uint8).reshape(1, 256, 1).repeat(40, axis=0).repeat(3, axis=2)
     moved = (dequantise(codes, dithered, CURVE) != codes.astype(np.uint16) * 257).any(axis=(0, 2))  # type: ignore[arg-type]
     assert moved.tolist() == [0 < code < 255 and CURVE[code] <= 0.9 for code in range(256)]
+
+
+def test_dither_all_fills_every_band_and_keeps_white(settings: Settings) -> None:
+    """Codes keep their order, every 16-bit code above the first half code occurs, and only white is white."""
+    plan = plan_image(settings("source.dequantize=dither_all"), "d" * 64)
+    codes = np.arange(240, 256, dtype=np.uint8)
+    moved = dequantise(codes[None, :, None].repeat(9000, axis=0).repeat(3, axis=2), plan, CURVE)
+    lowest, highest = moved.min(axis=(0, 2)).astype(int), moved.max(axis=(0, 2)).astype(int)
+    assert (lowest[1:] - highest[:-1] == 1).all()
+    assert (lowest[-1], highest[-1], highest[-2]) == (65535, 65535, 65534)
+    assert set(moved[:, 13].ravel().tolist()) == set(range(253 * 257 - 128, 253 * 257 + 129))
+    assert set(moved[:, 14].ravel().tolist()) == set(range(254 * 257 - 128, 65535))
+    assert (dequantise(np.zeros((9, 9, 3), dtype=np.uint8), plan, CURVE) == 0).all()
+
+
+def test_clean_frames_have_levels_in_every_band_with_dither_all(settings: Settings) -> None:
+    srgb = np.full((100, 100, 3), 254, dtype=np.uint8)
+    srgb[50:] = 253
+    srgb[:2] = 255
+    for method in ("off", "dither", "dither_all"):
+        chosen = ("gains=paper_max", "camera=identity", "noise=none", f"source.dequantize={method}")
+        clean = make_pair(srgb, plan_image(settings(*chosen), "d" * 64)).clean
+        green = np.unique(clean[::2, 1::2]).astype(float)
+        assert green[-1] == 4095
+        widest = np.diff(green).max() / (4095 - 240)
+        assert widest < 0.06 if method == "dither_all" else widest > 0.5
+
+
+def test_dither_of_0_1_is_unchanged_below_the_highlights(settings: Settings, dithered: object) -> None:
+    srgb = pixels(6, 30, 40)
+    every = dequantise(srgb, plan_image(settings("source.dequantize=dither_all"), "d" * 64), CURVE)
+    old = dequantise(srgb, dithered, CURVE)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(every[srgb < 254], old[srgb < 254])
 
 
 def test_channels_are_moved_independently(dithered: object) -> None:

@@ -429,7 +429,7 @@ def dequantize_method(source: SourceConfig) -> str:
     Returns
     -------
     str
-        ``off``, or ``dither``: codes get a random offset of up to half a code.
+        ``off``, or ``dither`` and ``dither_all``: codes get a random offset of up to half a code.
     """
     return str(DEQUANTIZE.word(source.dequantize))
 

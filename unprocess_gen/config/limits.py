@@ -254,7 +254,7 @@ SWITCH = Switch(("auto", "on", "off"))
 
 SCATTER = Switch(("off", "body", "image"))
 
-DEQUANTIZE = Switch(("off", "dither"))
+DEQUANTIZE = Switch(("off", "dither", "dither_all"))
 
 CAMERA_LAWS = Choice(("fixed", "convex", "choice", "identity", "custom"))
 

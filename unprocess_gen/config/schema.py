@@ -83,7 +83,7 @@ class SourceConfig:
     dequantize: str = key(
         "off",
         "dither moves 8-bit codes by up to half a code at random, so that gray areas have more than 256 raw levels; 0, "
-        "255 and highlights keep their codes",
+        "255 and highlights keep their codes; dither_all moves highlights too, and code 254 up to white",
         limits.DEQUANTIZE,
     )
     patch: Any = key(

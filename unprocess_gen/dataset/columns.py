@@ -387,7 +387,10 @@ COLUMNS = (
     Column(
         "downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan, unit="pixels"
     ),
-    Column("dequantize", str, "dequantization of 8-bit codes: off or dither", Words(("off", "dither")), Plan),
+    Column(
+        "dequantize", str, "dequantization of 8-bit codes: off, dither or dither_all",
+        Words(("off", "dither", "dither_all")), Plan,
+    ),
     Column("patch", int, "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
     Column(
         "patch_y", int, "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels"

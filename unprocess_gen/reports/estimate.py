@@ -36,6 +36,8 @@ from unprocess_gen.reports.effect_summary import (
     scene_sentence,
     scene_warning,
 )
+from unprocess_gen.reports.empty_bands import NONE as NO_BANDS
+from unprocess_gen.reports.empty_bands import EmptyBands, empty_bands, highlight_sentence
 from unprocess_gen.reports.formatting import byte_size, counted, value_range
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
@@ -82,6 +84,8 @@ class SourceEstimate:
         Number of pixels, and of those that are in no patch.
     clean_levels : int
         Distinct DN in the clean frame; 0 if it is not rounded. Of several patches, in the first.
+    bands : EmptyBands
+        Bands of raw levels that no 8-bit code of the source reaches, in the complete image.
     """
 
     source: Source
@@ -95,6 +99,7 @@ class SourceEstimate:
     pixels: int = 0
     unused_pixels: int = 0
     clean_levels: int = 0
+    bands: EmptyBands = NO_BANDS
     detail: str = ""
 
 
@@ -269,6 +274,7 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
         pixels=width * height,
         unused_pixels=pixels_in_none(cuts, height, width),
         clean_levels=_levels_in(clean),
+        bands=empty_bands(photograph.srgb, levels[0]),
     )
 
 
@@ -404,6 +410,7 @@ def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[
         return []
     levels = [source.clean_levels for source in estimates if source.clean_levels]
     warnings = scene_warning(config, plans, levels), posterisation_warning(plans, levels)
+    highlights = highlight_sentence([source.bands for source in estimates if source.levels])
     lines = _labelled("scene", [scene_sentence(config, plans)])
     if is_physical(config.noise):
         predictions = [of_level for source in estimates for of_level in source.predictions]
@@ -411,6 +418,7 @@ def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[
         lines += _labelled("effects", effect_sentences(config, predictions))
     else:
         lines += _two_number_lines(config, plans)
+    lines += _labelled("highlight", [highlights] if highlights else [])
     lines += _labelled("warning", [warning for warning in warnings if warning])
     return [*lines, *effect_table(config, predictions)] if is_physical(config.noise) else lines
 

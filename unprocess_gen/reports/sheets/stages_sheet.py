@@ -71,7 +71,7 @@ def stages_sheet(pair: SheetPair) -> Picture:
     overview = _averaged(pair.source, window.side)
     detail = pair.source[window.rows, window.columns] / float(np.iinfo(pair.source.dtype).max)
     panels = [_image_panel("source", "", overview, detail)]
-    if plan.dequantize == "dither" and pair.source.dtype == np.uint8:
+    if plan.dequantize != "off" and pair.source.dtype == np.uint8:
         detail = _dithered(pair, pair.source, window)
         panels.append(_image_panel("codes dithered", "by up to half a code", overview, detail))
     for step in PROCESSING_STEPS:

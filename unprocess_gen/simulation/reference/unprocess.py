@@ -43,7 +43,9 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
     """Dither 8-bit codes to 16 bits, so that 256 codes do not become 256 levels of raw.
 
     Each channel of each pixel gets an offset from the random stream ``dequantize``: one of the 257 integers within half
-    an 8-bit code. Codes 0 and 255 and highlights get no offset, because half a code is hundreds of DN there.
+    an 8-bit code. Codes 0 and 255 get none. For ``dither``, highlights get none either, because half a code is hundreds
+    of DN there. For ``dither_all`` they do, and code 254 gets one of 385 integers up to white, which it does not reach:
+    so the 16-bit codes have no gaps, white stays white, and codes keep their order.
 
     Parameters
     ----------
@@ -63,8 +65,13 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
     """
     size = (srgb.shape[0], srgb.shape[1])
     channels = [words(plan.stream_key, "dequantize", size, origin=origin, draw=channel) for channel in range(3)]
-    offsets = (np.stack(channels, axis=-1).astype(np.uint64) * np.uint64(257) >> np.uint64(32)).astype(np.int32) - 128
-    kept = (srgb == 0) | (srgb == 255) | (curve[srgb] > plan.highlight_threshold)
+    kept = (srgb == 0) | (srgb == 255)
+    if plan.dequantize == "dither_all":
+        steps = np.where(srgb == 254, np.uint64(385), np.uint64(257))  # 254 · 257 + 256 is one less than white
+    else:
+        steps = np.broadcast_to(np.uint64(257), srgb.shape)
+        kept |= curve[srgb] > plan.highlight_threshold
+    offsets = (np.stack(channels, axis=-1).astype(np.uint64) * steps >> np.uint64(32)).astype(np.int32) - 128
     return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
 
@@ -176,10 +183,23 @@ def apply_ccm(linear: Float, ccm: tuple[float, ...]) -> Float:
 def invert_gains(
     camera_rgb: Float, inverse_gains: tuple[float, float, float], highlight: str, threshold: float
 ) -> Float:
-    """Invert white balance and brightness gains without clipping, [H, W, 3] to [H, W, 3].
+    """Invert white balance and brightness gains without clipping.
 
-    ``highlight`` (key of `HIGHLIGHTS`) selects the method for intensities above ``threshold``, in [0, 1), of channels
-    with an inverse gain below 1.
+    Parameters
+    ----------
+    camera_rgb : ndarray of float64, [..., 3]
+        White-balanced camera RGB, 0 at black and 1 at white.
+    inverse_gains : tuple of three floats
+        Factors of the red, green and blue channels.
+    highlight : str
+        Key of `HIGHLIGHTS`: the method for highlights of channels with an inverse gain below 1.
+    threshold : float
+        Intensity above which it acts, in [0, 1).
+
+    Returns
+    -------
+    ndarray of float64
+        Light before the gains, same shape.
     """
     invert = HIGHLIGHTS[highlight]
     return invert(camera_rgb, np.array(inverse_gains), threshold)

@@ -1,0 +1,101 @@
+"""Find the bands of raw levels that no code of an 8-bit photograph reaches.
+
+The inverse tone curve is steep at white, and preserved highlights are steeper still: two adjacent codes can be far
+apart in raw. Nothing in the photograph shows where in such a band a site was, so the clean frame has no level there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.simulation.reference.unprocess import invert_gains
+
+WIDE = 0.02
+"""Least width of a band that counts, as a fraction of the raw range. Below the highlights no band is as wide."""
+
+CHANNELS = ("R", "G", "B")
+SITES = (0.25, 0.5, 0.25)
+"""Fraction of the sites of each channel in a Bayer pattern."""
+
+
+class EmptyBands(NamedTuple):
+    """Describe the empty bands of a photograph.
+
+    Attributes
+    ----------
+    share : float
+        Fraction of the sites whose code is next to an empty band; white sites are not counted.
+    widest : tuple of three floats
+        Width of the widest band of each channel, as a fraction of the raw range, for gray pixels.
+    """
+
+    share: float
+    widest: tuple[float, float, float]
+
+
+NONE = EmptyBands(0.0, (0.0, 0.0, 0.0))
+
+
+def empty_bands(srgb: Srgb, plan: Plan) -> EmptyBands:
+    """Find the empty bands of a photograph and count the sites next to them.
+
+    Parameters
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        Display-referred codes.
+    plan : Plan
+        Parameters of the pair.
+
+    Returns
+    -------
+    EmptyBands
+        `NONE` for 16-bit codes and for dithered highlights. Their widest band is next to white: up to 6 % of the range.
+    """
+    if srgb.dtype != np.uint8 or plan.dequantize == "dither_all":
+        return NONE
+    widths = band_widths(plan)
+    wide = widths >= WIDE
+    edges = np.zeros((256, 3), dtype=bool)
+    edges[:255] |= wide
+    edges[1:255] |= wide[:-1]
+    counts = [np.bincount(srgb[..., channel].ravel(), minlength=256) for channel in range(3)]
+    shares = (count[edge].sum() / count.sum() for count, edge in zip(counts, edges.T, strict=True))
+    share = sum(part * one for part, one in zip(SITES, shares, strict=True))
+    red, green, blue = np.where(wide, widths, 0).max(axis=0).tolist()
+    return EmptyBands(float(share), (red, green, blue))
+
+
+def highlight_sentence(bands: Sequence[EmptyBands]) -> str:
+    """Return what `plan` says about empty bands; empty if no site is next to one.
+
+    Parameters
+    ----------
+    bands : sequence of EmptyBands
+        Of the photographs that were read.
+
+    Returns
+    -------
+    str
+        One sentence with the mean share of the sites, the widest bands and the remedy.
+    """
+    share = sum(one.share for one in bands) / len(bands) if bands else 0.0
+    if not share:
+        return ""
+    widest = (max(one.widest[channel] for one in bands) for channel in range(3))
+    widths = ", ".join(f"{width:.0%} in {name}" for name, width in zip(CHANNELS, widest, strict=True) if width)
+    return (
+        f"{share:.2%} of the sites have highlights next to an empty band: two 8-bit codes are up to {widths} of the "
+        "raw range apart; source.dequantize=dither_all fills the bands"
+    )
+
+
+def band_widths(plan: Plan) -> Float:
+    """Return the distance in raw between each code and the next, [255, 3], for gray pixels before the exposure."""
+    gray = np.repeat(linear_table(plan.tone, plan.gamma, 256)[:, None], 3, axis=1)
+    light = invert_gains(gray, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
+    return np.diff(np.minimum(light, 1), axis=0)
