@@ -55,8 +55,8 @@ ELD_LAW = {
     "night": "noise=heteroscedastic noise.law=poisson noise.a=1.46 noise.b=4.7 scene=night",
 }
 """System gain and read noise of the Sony A7S II at ISO 100 and 6400 by ELD's regression, DN of the default sensor."""
-PMN_LAW = {scene: f"noise=nikon_d850 scene={scene}" for scene in ELD_LAW}
-"""A profile with every part of PMN's law, black-level errors included."""
+PMN_LAW = {scene: f"noise=nikon_d850 scene={scene} effects.assumed=off" for scene in ELD_LAW}
+"""A profile with every part of PMN's law, black-level errors included, and no other effect."""
 LEVELS = 5
 LEAST_NS = 20_000_000
 """Processor time of the calls from which the shortest is taken."""
