@@ -28,7 +28,7 @@ from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.kernels.electrons import _count_roots
+from unprocess_gen.simulation.kernels.electrons import count_roots
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.poisson import core_share, gaussian_distance, gaussian_from
 from unprocess_gen.sources.scenes import synthetic
@@ -243,7 +243,7 @@ def law_plan(settings: Settings, law: str, shape: float, read_std_e: float, law_
 def limits_of(plan: Plan) -> tuple[float, float]:
     """Return the means up to which, and from which, the kernel draws normals."""
     assert plan.physics is not None
-    low, high = _count_roots(plan, plan.physics.read_std_dn / plan.physics.dn_per_e, counts_all=False)
+    low, high = count_roots(plan, plan.physics.read_std_dn / plan.physics.dn_per_e, counts_all=False)
     return low**2, high**2
 
 
