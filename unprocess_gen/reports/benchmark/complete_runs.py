@@ -5,8 +5,8 @@ directly after each other; the order is reversed in every second round. A run co
 process, so the thread that hashes and writes is included, and waiting for the disk is not. The worker measures decoding
 and simulation (`pipeline.tasks.StageTimes`); the rest is hashing, writing and committing.
 
-The reported time is that of the fastest round, per pixel. The reference is so slow that it runs in one round only, and
-on fewer photographs.
+The reported time of a stage, per pixel, is its shortest in all rounds, because other programs only lengthen it. The
+reference is so slow that it runs in one round only, and on fewer photographs.
 """
 
 from __future__ import annotations
@@ -340,7 +340,7 @@ class RunCost(NamedTuple):
 
 
 def run_cost(times: Sequence[RunTimes], exact: Sequence[RunTimes]) -> RunCost:
-    """Return the time of a tier's runs: that of the fastest, its shares, and the ratios to exact.
+    """Return the time of a tier's runs: the shortest of each stage, their shares, and the ratios to exact.
 
     Parameters
     ----------
@@ -354,9 +354,9 @@ def run_cost(times: Sequence[RunTimes], exact: Sequence[RunTimes]) -> RunCost:
     """
     if not times:
         return RunCost()
-    least = min(times, key=lambda one: one.total_ns)
+    least, least_exact = (RunTimes(*map(min, zip(*each, strict=True))) for each in (times, exact))
     ratios = [one.total_ns / other.total_ns for one, other in zip(times, exact, strict=False)]
-    ratio = least.total_ns / min(one.total_ns for one in exact)
+    ratio = least.total_ns / least_exact.total_ns
     shares = [stage_ns / least.total_ns for stage_ns in least]
     return RunCost(least.total_ns, ratio, *_quartiles(ratios), *shares)
 

@@ -392,9 +392,9 @@ def _run_conditions(session: BenchmarkSession, files: RunFiles) -> dict[str, str
     place = f"the first of {root}" if root else f"built-in scenes, as JPEG files of quality {JPEG_QUALITY}"
     return {
         "complete runs": f"{counted(files.count, 'photograph')}, {files.pixels / 1e6:.1f} megapixels ({place}); one "
-        f"worker; processor time of all threads, without compilation and without waiting for the disk; fastest of "
-        f"{counted(session.sizes.rounds, 'round')}, for the reference one round with {reference.pixels / 1e6:.1f} "
-        "megapixels; ratios of fastest rounds"
+        "worker; processor time of all threads, without compilation and without waiting for the disk; the shortest of "
+        f"each stage in {counted(session.sizes.rounds, 'round')}, for the reference one round with "
+        f"{reference.pixels / 1e6:.1f} megapixels"
     }
 
 
