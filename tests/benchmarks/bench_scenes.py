@@ -154,7 +154,7 @@ def daylight(photos: list[Srgb], rounds: int) -> None:
     for noise in PROFILES:
         cells = []
         for tier in ("exact", "fast"):
-            profile = physical("scene=daylight", f"noise={noise}", f"accuracy={tier}")
+            profile = physical("scene=daylight", f"noise={noise}", f"accuracy={tier}", "effects.assumed=off")
             two = settings("noise=imx385_iso3200", f"accuracy={tier}")
             ratios = []
             for number, srgb in enumerate(photos):
