@@ -261,7 +261,7 @@ def run_verify(call: Call) -> int:
 
 
 def _finish_verification(folder: Path, found: Iterable[Damage], call: Call) -> int:
-    """Report the damage of a dataset; repair, regenerate and fit the noise as the flags ask; return the exit code."""
+    """Report the damage of a dataset; repair, regenerate and check the noise as the flags ask; return the exit code."""
     from unprocess_gen.pipeline.repair import repair
     from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
     from unprocess_gen.pipeline.verify import verify

@@ -6,6 +6,7 @@ cannot be checked have weight 0.
 
 from __future__ import annotations
 
+import bisect
 from typing import Any
 
 import numpy as np
@@ -105,21 +106,20 @@ class Sums:
     def fill(self) -> None:
         """Compute all sums."""
         self.z, self.cosine, self.double = (np.zeros((4, self._size)) for _ in range(3))
-        self._parts, starts = _segment_starts(self.width), _segment_starts(self.height)
-        self.rows = np.zeros((2, self.height, len(self._parts)))
-        self.columns = np.zeros((2, self.width, len(starts)))
+        self._row_parts, self._column_parts = _segment_starts(self.width), _segment_starts(self.height)
+        self.rows = np.zeros((2, self.height, len(self._row_parts)))
+        self.columns = np.zeros((2, self.width, len(self._column_parts)))
         self.neighbours, self.partners = np.zeros((2, 3)), np.zeros((3, 5))
-        for part, (start, stop) in enumerate(zip(starts, [*starts[1:], self.height], strict=True)):
-            for top in range(start, stop, self._block_rows):
-                self._add_block(top, min(top + self._block_rows, stop), part)
+        for top in range(0, self.height, self._block_rows):
+            self._add_block(top, min(top + self._block_rows, self.height))
 
-    def _add_block(self, top: int, bottom: int, part: int) -> None:
+    def _add_block(self, top: int, bottom: int) -> None:
         z, weight = (np.empty((bottom - top, self.width), np.float32) for _ in range(2))
         clean, noisy = self._clean[top:bottom], self._noisy[top:bottom]
         for plane, (y, x) in enumerate(TILE):
             at = slice(y, None, 2), slice(x, None, 2)
             z[at], weight[at] = self._add_plane(plane, clean[at], noisy[at])
-        self._add_lines(top, bottom, part, z, weight)
+        self._add_lines(top, bottom, z, weight)
         self._add_neighbours(z, weight)
         for kind, planes in enumerate(PARTNERS):
             for first, second in planes:
@@ -148,10 +148,13 @@ class Sums:
         mean = (table.rounding_mean * inverse + table.outlier_mean).astype(np.float32)
         return z - mean[dn], weight
 
-    def _add_lines(self, top: int, bottom: int, part: int, z: Any, weight: Any) -> None:
+    def _add_lines(self, top: int, bottom: int, z: Any, weight: Any) -> None:
+        first = bisect.bisect_right(self._column_parts, top) - 1
+        last = bisect.bisect_left(self._column_parts, bottom)
+        starts = [max(start - top, 0) for start in self._column_parts[first:last]]
         for number, values in enumerate((z * weight, weight * weight)):
-            self.rows[number, top:bottom] = np.add.reduceat(values, self._parts, axis=1, dtype=np.float64)
-            self.columns[number, :, part] += values.sum(axis=0, dtype=np.float64)
+            self.rows[number, top:bottom] = np.add.reduceat(values, self._row_parts, axis=1, dtype=np.float64)
+            self.columns[number, :, first:last] += np.add.reduceat(values, starts, axis=0, dtype=np.float64).T
 
     def _add_neighbours(self, z: Any, weight: Any) -> None:
         used = (weight > 0).astype(np.float32)
