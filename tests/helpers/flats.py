@@ -45,11 +45,15 @@ def picture() -> Srgb:
 
 
 def planned(settings: Settings, srgb: Srgb, *overrides: str, forced: bool = False) -> Plan:
-    """Plan a picture; ``forced`` adds column offsets and black-level errors to profiles that have none."""
+    """Plan a picture; ``forced`` simulates all effects, with numbers for those that a profile does not give."""
     config = settings(*overrides, *(FORCED if forced else ()))
+    if forced:
+        config.noise.gain_by_colour, config.noise.lens_shading = [0.98, 1.0, 1.03], [-0.2, 0.0, -0.1]
+        config.noise.row_correlation = 0.3
     for branch in config.noise.branches if forced else ():
         branch.row_std_dn = branch.row_std_dn or 1.5
         branch.column_std_dn = branch.column_std_dn or 1.25
+        branch.column_temporal_std_dn = 0.75
         branch.black_error_dn = branch.black_error_dn or [0.5, -1.5, 2.5, -3.75]
     validate_config(config)
     return plan_image(config, SHA256, facts=facts_of(srgb))
@@ -74,7 +78,7 @@ SILENT = Physics(
     iso=100.0, exposure_s=1.0, temperature_c=25.0, dn_per_e=8.0, prnu_std=0.0, dark_e=0.0, dark_offset="removed",
     hot_pixel_share=0.0, hot_pixel_e=0.0, full_well_e=1e6, read_law="gaussian", read_shape=0.0, read_std_dn=0.0,
     row_std_dn=0.0, column_std_dn=0.0, black_error_dn=(0.0, 0.0, 0.0, 0.0), dead_pixel_share=0.0, sensor_unit="0",
-    body_key=0xB0D1, fixed_pattern_in_clean=False,
+    body_key=0xB0D1, fixed_pattern_in_clean=False, frame_size=(2**24, 2**24),
 )  # fmt: skip
 
 

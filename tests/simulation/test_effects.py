@@ -13,6 +13,7 @@ from helpers.flats import (
     COUNT,
     SHA256,
     SILENT,
+    SPAN,
     assert_same,
     bounds_off,
     flat,
@@ -109,6 +110,40 @@ def test_row_offsets_differ_between_frames() -> None:
     assert_normal_offsets((one - other)[:, 0] / math.sqrt(2), 300.0)
 
 
+@pytest.mark.parametrize("correlation", [0.9, 0.5, -0.7])
+def test_correlated_rows_are_an_autoregressive_process(correlation: float) -> None:
+    """What a row adds to its share of the row before is independent, with variance 1 - r² of that of an offset."""
+    rows = noisy_dn(plan_with("row", row_std_dn=300.0, row_correlation=correlation), 0, OFFSETS, 1)[:, 0]
+    added = (rows[1:] - correlation * rows[:-1]) / math.sqrt(1 - correlation**2)
+    assert_normal_offsets(added, 300.0)
+    neighbours = added[1:] * added[:-1]
+    assert bounds_off(neighbours, 0, 300.0**4, (REACH * 300) ** 2) <= 1
+    repeated = (1 + correlation**2) / (1 - correlation**2)  # squares of neighbours have the correlation r²
+    bound = bernstein(2 * 300.0**4, (REACH * 300) ** 2, int(rows.size / repeated))
+    assert abs(float((rows**2).mean()) - 300.0**2) <= bound
+
+
+def test_crop_has_the_correlated_offsets_of_its_rows() -> None:
+    plan = plan_with("row", row_std_dn=300.0, row_correlation=0.9)
+    complete, crop = make_pair(flat(0, 200, 4), plan), make_pair(flat(0, 60, 2), plan, (140, 2))
+    assert (crop.noisy == complete.noisy[140:, 2:]).all()
+
+
+def test_temporal_column_offsets_are_new_in_every_frame() -> None:
+    one, other = (
+        noisy_dn(plan_with("column_temporal", column_temporal_std_dn=300.0, frame=frame), 0, 3, OFFSETS)
+        for frame in (1, 2)
+    )
+    assert (one == one[:1]).all()
+    assert_normal_offsets(one[0], 300.0)
+    assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
+
+
+def test_average_of_frames_contains_no_temporal_column_offsets() -> None:
+    plan = plan_with("column_temporal", column_temporal_std_dn=300.0, fixed_pattern_in_clean=True)
+    assert (make_pair(flat(3000, 8, 64), plan).clean == np.rint(signal_dn(3000)) + BLACK).all()
+
+
 def test_column_has_one_offset_of_given_standard_deviation() -> None:
     deviation = noisy_dn(plan_with("column", column_std_dn=300.0), 0, 5, OFFSETS)
     assert (deviation == deviation[:1]).all()
@@ -122,6 +157,51 @@ def test_column_offsets_are_fixed_per_sensor_unit() -> None:
     )
     assert (one == later).all()
     assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
+
+
+# Gain by colour and lens shading -------------------------------------------------------------------------------------
+
+
+def test_each_colour_counts_electrons_by_its_gain() -> None:
+    """DN are multiples of the gain; the clean frame does not depend on it."""
+    gains, code = (0.5, 1.0, 2.0), 600
+    plan = plan_with("shot", "gain_by_colour", gain_by_colour=gains)
+    deviation = noisy_dn(plan, code)
+    for colour, relative in zip("RGB", gains, strict=True):
+        for site in (place for place in range(4) if plan.pattern[place] == colour):
+            counts = deviation[site // 2 :: 2, site % 2 :: 2] / (8 * relative)
+            assert (counts == np.rint(counts)).all()
+            assert_poisson(counts, signal_dn(code) / (8 * relative))
+    assert (make_pair(flat(code), plan).clean == make_pair(flat(code), plan_with("shot")).clean).all()
+
+
+def test_all_colours_saturate_at_the_dn_of_the_full_well() -> None:
+    plan = plan_with("shot", "full_well", "gain_by_colour", gain_by_colour=(0.5, 1.0, 2.0), full_well_e=2000.0)
+    assert noisy_dn(plan, 40000, 64, 64).max() == 16000
+
+
+def test_lens_shading_follows_its_polynomial_in_both_frames() -> None:
+    shading, (height, width) = (-0.3, 0.1, -0.2), (301, 400)
+    plan = plan_with("lens_shading", lens_shading=shading, frame_size=(height, width))
+    y, x = np.mgrid[:height, :width]
+    square = ((y - 150) ** 2 + (x - 199.5) ** 2) / (150**2 + 199.5**2)
+    expected = signal_dn(50000) * (1 + shading[0] * square + shading[1] * square**2 + shading[2] * square**3)
+    pair = make_pair(flat(50000, height, width), plan)
+    assert np.abs(pair.clean - (expected + BLACK)).max() <= 0.5 + SPAN * 2.0**-24
+    assert (pair.noisy == pair.clean).all()
+
+
+def test_image_outside_the_frame_of_the_shading_is_refused() -> None:
+    plan = plan_with("lens_shading", lens_shading=(-0.3, 0.0, 0.0), frame_size=(40, 60))
+    with pytest.raises(ValueError, match=r"exceeds the frame \[40, 60\] of the lens shading at \[30, 0\]"):
+        make_pair(flat(0, 11, 60), plan, (30, 0))
+
+
+def test_crop_has_the_shading_of_its_place() -> None:
+    plan = plan_with("shot", "lens_shading", lens_shading=(-0.5, 0.0, 0.0), frame_size=(200, 300))
+    complete, crop = make_pair(flat(9000, 200, 300), plan), make_pair(flat(9000, 60, 100), plan, (100, 150))
+    assert (crop.clean == complete.clean[100:160, 150:250]).all()
+    assert (crop.noisy == complete.noisy[100:160, 150:250]).all()
 
 
 # Dark current ---------------------------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ from unprocess_gen.core.types import (
     Plan,
     Srgb,
 )
+from unprocess_gen.planning.effect_selection import LATER_EFFECTS
 from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
@@ -47,6 +48,9 @@ T = TypeVar("T")
 KINDS = ("gaussian", "poisson", "shot and read", "physical", "averaged")
 """Noise of a case: two numbers as one normal or as counts, a physical profile without and with all effects, and fixed
 patterns in the clean frame."""
+
+WITH_LATER_EFFECTS = ("later effects", "later effects averaged")
+"""Kinds with the effects that version 0.1 did not have; `KINDS` keep the digests of its frames."""
 
 SENSORS = (
     *((8, 0, 255), (10, 64, 1023), (12, 240, 4095), (12, 0, 4095), (14, 513, 15520), (14, 1024, 16383)),
@@ -129,7 +133,26 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
     )
     plan = with_noise(plan, kind, dice)
     origin = dice.pick(((0, 0), *((int(dice.power(0, 13)), int(dice.power(0, 13))) for _ in range(3)), (2**20 + 1, 63)))
-    return Case(drawn_image(dice, even=layout == PACKED), plan, origin)
+    srgb = drawn_image(dice, even=layout == PACKED)
+    if kind in WITH_LATER_EFFECTS:
+        plan = with_later_effects(plan, origin, (srgb.shape[0], srgb.shape[1]), Dice(f"later {kind} {dtype} {number}"))
+    return Case(srgb, plan, origin)
+
+
+def with_later_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
+    """Add lens shading, gains by colour, temporal column noise and correlated rows to a plan of a physical profile."""
+    assert plan.physics is not None
+    few_rows = origin[0] < 2**14  # correlated offsets are computed from row 0
+    physics = replace(
+        plan.physics,
+        row_correlation=dice.pick((0.0, 0.7, -0.4, 0.999)) if few_rows else 0.0,
+        column_temporal_std_dn=dice.at_most(9),
+        gain_by_colour=dice.pick(((1.0, 1.0, 1.0), (0.97, 1.0, 1.04), (0.1, 3.0, 10.0))),
+        lens_shading=dice.pick(((-0.3, 0.05, -0.1), (-0.9, 0.0, 0.0), (-0.001, -0.002, 0.0))),
+        frame_size=tuple(start + side + int(dice.power(0, 8)) for start, side in zip(origin, shape, strict=True)),
+    )
+    on = {*plan.effects, *(one for one in LATER_EFFECTS if not dice.chance(0.3))}
+    return replace(plan, physics=physics, effects=tuple(one for one in EFFECTS if one in on))
 
 
 def drawn_curve(dice: Dice) -> dict[str, object]:
@@ -171,8 +194,8 @@ def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
         on = tuple(one for one in on if one != omitted)
     else:
         share = dice.pick((0.0, 0.2, 0.5))
-        on = tuple(one for one in EFFECTS if not dice.chance(share))
-    physics = replace(physics, fixed_pattern_in_clean=kind == "averaged")
+        on = tuple(one for one in EFFECTS if one not in LATER_EFFECTS and not dice.chance(share))
+    physics = replace(physics, fixed_pattern_in_clean=kind.endswith("averaged"))
     return replace(plan, a_dn=dn_per_e, b_dn2=physics.read_std_dn * physics.read_std_dn, effects=on, physics=physics)
 
 
@@ -268,7 +291,7 @@ COUNTS = [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)]
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS))
 def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count: int, figure: Figure) -> None:
     failed = {}
     for number in range(count):
@@ -302,7 +325,7 @@ def mosaics(pair: Pair, one: Case) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS))
 def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, count: int) -> None:
     failed = []
     for number in range(count):

@@ -140,6 +140,8 @@ EFFECT_NUMBERS = {
     "hot_pixels": ("hot_pixel_share", "hot_pixel_e_per_s"),
     "full_well": ("full_well_e",),
     "dead_pixels": ("dead_pixel_share",),
+    "gain_by_colour": ("gain_by_colour",),
+    "lens_shading": ("lens_shading",),
 }
 """Keys of a profile that must have a number for an effect to be simulated."""
 
@@ -148,6 +150,7 @@ BRANCH_NUMBERS = {
     "read": ("read_law", "read_shape", "read_std_dn"),
     "row": ("row_std_dn",),
     "column": ("column_std_dn",),
+    "column_temporal": ("column_temporal_std_dn",),
     "black_error": ("black_error_dn",),
 }
 """Keys of each branch of a profile that must have a value for an effect to be simulated."""

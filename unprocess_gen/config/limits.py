@@ -129,6 +129,21 @@ class Numbers(Limit):
 
 
 @dataclass(frozen=True)
+class NumberList(Limit):
+    """A list of ``count`` numbers, each within ``numbers``."""
+
+    count: int
+    numbers: Numbers
+
+    def __str__(self) -> str:
+        return f"a list of {self.count} numbers, each {self.numbers}"
+
+    def allows(self, value: Any) -> bool:
+        """Return whether the value is a list of so many allowed numbers."""
+        return len(value) == self.count and all(map(self.numbers.allows, value))
+
+
+@dataclass(frozen=True)
 class NumberOrWord(Limit):
     """A number, or one word; ``text`` contains ``{word}`` and ``{numbers}``."""
 
@@ -299,6 +314,8 @@ PATCH = Described(
 )
 LEVELS = Described(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
 ISO_RANGE = Described("the lowest and the highest ISO, [100, 6400]")
+GAIN_BY_COLOUR = NumberList(3, Numbers(0.1, 10))
+LENS_SHADING = NumberList(3, Numbers(-10, 10))
 BLACK_ERROR = Described(
     "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "
     "[four], …], whose fours are in the order R, G1, B, G2 if by_colour precedes it"

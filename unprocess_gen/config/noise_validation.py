@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -142,6 +142,8 @@ def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
     _check_calibration(noise)
     for number, branch in enumerate(noise.branches):
         _check_branch(f"noise.branches[{number}]", noise, branch)
+    if noise.lens_shading is not None:
+        _check_shading(noise.lens_shading)
     for name in noise.assumed:
         one_of("noise.assumed", name, ASSUMABLE)
     for number, statement in enumerate(noise.provenance):
@@ -314,6 +316,23 @@ BLACK_ERROR_WORDS: tuple[list[str], ...] = (
     ["by_colour", "by_log_iso"],
 )
 """Words that may precede the black-level errors of a branch."""
+
+
+DARKEST = 0.01
+"""Least relative illumination. Chosen: far below that of lenses."""
+
+
+def _check_shading(coefficients: Sequence[float]) -> None:
+    """Raise ConfigError unless the relative illumination is from `DARKEST` to 1 in all of the frame."""
+    settings_of(NoiseConfig)["lens_shading"].check("noise.lens_shading", coefficients)
+    first, second, third = coefficients
+    squares = [n / 256 for n in range(257)]
+    places = [1 + square * (first + square * (second + square * third)) for square in squares]
+    if min(places) < DARKEST or max(places) > 1:
+        raise ConfigError(
+            f"noise.lens_shading={value_text(coefficients)}: the relative illumination within the frame is "
+            f"{min(places):.3g} to {max(places):.3g}; expected {DARKEST:g} to 1"
+        )
 
 
 def _check_black_error(key: str, branch: BranchConfig) -> None:

@@ -214,6 +214,14 @@ class BranchConfig:
         unit="DN of the profile",
         null="not known, so the effect column cannot be simulated",
     )
+    column_temporal_std_dn: Any = key(
+        None,
+        "standard deviation of the part of column offsets that is new in every frame",
+        IsoForm(("root", "line")),
+        unit="DN of the profile",
+        null="not known, so the effect column_temporal cannot be simulated",
+        since="0.2",
+    )
     black_error_dn: Any = key(
         None,
         "error of the black level",
@@ -385,6 +393,31 @@ class NoiseConfig:
     full_well_e: Optional[float] = key(
         None, "saturation capacity", Numbers(1, 1e9), unit="electrons", null=UNKNOWN, section=PHYSICAL
     )
+    row_correlation: Optional[float] = key(
+        None,
+        "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the effect row",
+        Numbers(-0.999, 0.999),
+        null="independent rows",
+        section=PHYSICAL,
+        since="0.2",
+    )
+    gain_by_colour: Optional[list[float]] = key(
+        None,
+        "system gain of red, green and blue, relative to dn_per_e",
+        limits.GAIN_BY_COLOUR,
+        null="equal gains, so the effect gain_by_colour cannot be simulated",
+        section=PHYSICAL,
+        since="0.2",
+    )
+    lens_shading: Optional[list[float]] = key(
+        None,
+        "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
+        "full frame, 1 in the corners",
+        limits.LENS_SHADING,
+        null="not known, so the effect lens_shading cannot be simulated",
+        section=PHYSICAL,
+        since="0.2",
+    )
     assumed: list[str] = key(
         [],
         "keys whose numbers no source gives for this camera; effects.assumed decides about their effects",
@@ -458,6 +491,13 @@ class EffectsConfig:
     heteroscedastic: Optional[str] = key(
         None, "noise of a two-parameter profile, its only effect", limits.SWITCH, null=AS_ALL
     )
+    lens_shading: Optional[str] = key(
+        None,
+        "less light towards the corners, in the clean and the noisy frame",
+        limits.SWITCH,
+        null=AS_ALL,
+        since="0.2",
+    )
     prnu: Optional[str] = key(None, "unequal response of pixels; fixed pattern", limits.SWITCH, null=AS_ALL)
     shot: Optional[str] = key(None, "Poisson counts of electrons", limits.SWITCH, null=AS_ALL)
     dark_current: Optional[str] = key(None, "Poisson counts of thermal electrons", limits.SWITCH, null=AS_ALL)
@@ -467,9 +507,15 @@ class EffectsConfig:
     full_well: Optional[str] = key(
         None, "saturation capacity, at which the clean and the noisy frame are clipped", limits.SWITCH, null=AS_ALL
     )
+    gain_by_colour: Optional[str] = key(
+        None, "a system gain of its own for each colour", limits.SWITCH, null=AS_ALL, since="0.2"
+    )
     read: Optional[str] = key(None, "noise of the amplifier and the converter", limits.SWITCH, null=AS_ALL)
     row: Optional[str] = key(None, "an offset of each row, new in every frame", limits.SWITCH, null=AS_ALL)
     column: Optional[str] = key(None, "an offset of each column; fixed pattern", limits.SWITCH, null=AS_ALL)
+    column_temporal: Optional[str] = key(
+        None, "an offset of each column, new in every frame", limits.SWITCH, null=AS_ALL, since="0.2"
+    )
     black_error: Optional[str] = key(
         None, "difference between black and the black level, by CFA site; fixed pattern", limits.SWITCH, null=AS_ALL
     )

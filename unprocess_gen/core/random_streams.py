@@ -40,6 +40,7 @@ STREAMS = {
     "dequantize": 10,
     "patch": 11,
     "scatter": 12,
+    "column_temporal": 13,
 }
 """Stream numbers by purpose. Every existing dataset depends on them: add new ones, never renumber."""
 

@@ -183,6 +183,16 @@ class Physics:
         Key of the body's fixed patterns (`random_streams.body_key`).
     fixed_pattern_in_clean : bool
         Whether the clean frame contains the fixed patterns too.
+    row_correlation : float
+        Correlation of the offsets of neighbouring rows, between -1 and 1.
+    column_temporal_std_dn : float
+        Standard deviation of a column's offset that is new in every frame, DN.
+    gain_by_colour : tuple of three floats
+        System gain of red, green and blue, relative to ``dn_per_e``.
+    lens_shading : tuple of three floats
+        Coefficients of r², r⁴ and r⁶ in the relative illumination; r is 1 in the corners.
+    frame_size : (int, int)
+        Height and width of the full frame if its lens shading is known, else 0; pixels.
     """
 
     iso: float
@@ -205,6 +215,11 @@ class Physics:
     sensor_unit: str
     body_key: int
     fixed_pattern_in_clean: bool
+    row_correlation: float = 0.0
+    column_temporal_std_dn: float = 0.0
+    gain_by_colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    lens_shading: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frame_size: tuple[int, int] = (0, 0)
 
 
 REFERENCE_METHOD, FLOAT32_METHOD = "colour:numpy_float64", "colour:fused_float32"

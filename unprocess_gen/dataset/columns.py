@@ -205,7 +205,9 @@ class Column:
 
     @property
     def not_applicable(self) -> Value:
-        """Return the value for pairs to which the column does not apply: ``none`` or 0."""
+        """Return the value for pairs to which the column does not apply: ``none`` or 0, empty in later columns."""
+        if self.since != FIRST:
+            return self.empty
         return "none" if self.type is str else self.type("0")
 
     def parse(self, cell: str) -> Value:
@@ -414,6 +416,35 @@ COLUMNS = (
     Column(
         "clean_dtype", str, "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), Plan,
         since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed",
+    ),
+    Column(
+        "row_correlation", float, "correlation of the offsets of neighbouring rows", Range(-0.999, 0.999), Physics,
+        since="0.2", empty_if="it is 0",
+    ),
+    Column(
+        "column_temporal_std_dn", float, "standard deviation of the part of column offsets that is new in every frame",
+        NOT_NEGATIVE, Physics, unit="DN", since="0.2", empty_if="it is 0",
+    ),
+    *(
+        Column(
+            f"gain_{colour}", float, f"system gain of {colour}, relative to dn_per_e", Range(0.1, 10), Physics,
+            "gain_by_colour", since="0.2", empty_if="all are 1",
+        )
+        for colour in ("r", "g", "b")
+    ),
+    *(
+        Column(
+            f"lens_shading_{power}", float, f"coefficient of r^{power} in the relative illumination", Range(-10, 10),
+            Physics, "lens_shading", since="0.2", empty_if="all are 0",
+        )
+        for power in (2, 4, 6)
+    ),
+    *(
+        Column(
+            f"frame_{side}", int, f"{side} of the full frame, to which the lens shading belongs", COORDINATE, Physics,
+            "frame_size", unit="pixels", since="0.2", empty_if="there is no lens shading",
+        )
+        for side in ("height", "width")
     ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""

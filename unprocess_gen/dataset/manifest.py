@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -149,11 +150,21 @@ def detail_text(text: str) -> str:
 _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
+_DEFAULTS = {
+    record: {field.name: field.default for field in dataclasses.fields(record)}
+    for record in (Plan, Physics, Patch, Counts)
+}
+"""Default of each field; `dataclasses.MISSING` for fields without one."""
+
+
 def _cells(record: Plan | Physics | Patch | Counts) -> dict[str, Value]:
-    """Return the values of all columns that hold a record."""
+    """Return the values of all columns that hold a record; later columns are empty at the default of their field."""
     cells: dict[str, Value] = {}
     for field, columns in columns_of(type(record)).items():
         value = getattr(record, field)
+        if columns[0].since != FIRST and value == _DEFAULTS[type(record)][field]:
+            cells |= {column.name: column.empty for column in columns}
+            continue
         values = value if len(columns) > 1 else (value,)
         cells |= {column.name: column.from_field(item) for column, item in zip(columns, values, strict=True)}
     return cells

@@ -18,9 +18,12 @@ from decimal import Decimal, localcontext
 from functools import cached_property
 from operator import add, mul
 
+import numpy as np
+
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Facts, Physics
 from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.noise import illumination_at
 
 STATISTICS = (
     *("pixel", "row mean", "column mean", "plane mean"),
@@ -41,6 +44,9 @@ QUANTISATION_VARIANCE = 1 / 12
 
 MEAN_ABS_NORMAL = 0.7978845608028654
 """Mean absolute value of a standard normal deviate, √(2/π)."""
+
+SHADING_PLACES = 64
+"""Squares of the distance from the centre at which lens shading is predicted."""
 
 FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
 """Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
@@ -352,16 +358,46 @@ def _read(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
 
 
 def _row(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
-    variance, height = frame.physics.row_std_dn * frame.physics.row_std_dn, frame.facts.height
-    per_frame = variance, variance, variance / height, variance / max(height // 2, 1)
-    of_clip = (each / frame.facts.frames for each in per_frame) if frame.facts.frames > 1 else ()
-    return Contribution((*per_frame, *of_clip))
+    """Predict row offsets; correlation r divides the number of independent rows of a mean by (1 + r) / (1 - r)."""
+    physics, height = frame.physics, frame.facts.height
+    variance = physics.row_std_dn * physics.row_std_dn
+    rows, rows_of_plane = float(height), float(max(height // 2, 1))
+    if physics.row_correlation > 0:
+        together = (1 + physics.row_correlation) / (1 - physics.row_correlation)
+        rows, rows_of_plane = max(rows / together, 1.0), max(rows_of_plane / together, 1.0)
+    return Contribution(_new_in_each_frame(frame, (variance, variance, variance / rows, variance / rows_of_plane)))
+
+
+def _new_in_each_frame(frame: FrameModel, variances: tuple[float, float, float, float]) -> PerStatistic:
+    """Return variances in one frame, followed by those in the mean of a clip."""
+    frames = frame.facts.frames
+    return variances if frames == 1 else (*variances, *(each / frames for each in variances))
 
 
 def _column(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
     variance, width = frame.physics.column_std_dn * frame.physics.column_std_dn, frame.facts.width
     per_frame = variance, variance / width, variance, variance / max(width // 2, 1)
     return Contribution(per_frame if frame.facts.frames == 1 else (*per_frame, *per_frame))
+
+
+def _column_temporal(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    std_dn, width = frame.physics.column_temporal_std_dn, frame.facts.width
+    variance = std_dn * std_dn
+    per_frame = variance, variance / width, variance, variance / max(width // 2, 1)
+    return Contribution(_new_in_each_frame(frame, per_frame))
+
+
+def _lens_shading(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    """Predict lens shading by the light that the darkest place loses."""
+    places = illumination_at(np.arange(SHADING_PLACES + 1) / SHADING_PLACES, frame.physics.lens_shading)
+    return _independent(frame, 0.0, level_dn * float(1 - places.min()))
+
+
+def _gain_by_colour(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
+    """Predict gains by colour as a change of the shot noise: the standard deviation differs by a factor √gain."""
+    shot_dn = math.sqrt(VARIANCES["shot"](frame.physics, level_dn))
+    most_dn = shot_dn * max(abs(math.sqrt(gain) - 1) for gain in frame.physics.gain_by_colour)
+    return _independent(frame, most_dn * most_dn)
 
 
 def _black_error(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
@@ -373,14 +409,17 @@ def _quantise(frame: FrameModel, level_dn: float, masking: float) -> Contributio
 
 
 CONTRIBUTIONS: dict[str, Callable[[FrameModel, float, float], Contribution]] = {
+    "lens_shading": _lens_shading,
     "prnu": _prnu,
     "shot": _shot,
     "dark_current": _dark_current,
     "hot_pixels": _hot_pixels,
     "full_well": _full_well,
+    "gain_by_colour": _gain_by_colour,
     "read": _read,
     "row": _row,
     "column": _column,
+    "column_temporal": _column_temporal,
     "black_error": _black_error,
     "dead_pixels": _dead_pixels,
     "quantise": _quantise,

@@ -38,12 +38,16 @@ from unprocess_gen.planning.effect_contributions import (
 )
 from unprocess_gen.simulation.reference.noise import EFFECTS
 
+LATER_EFFECTS = ("lens_shading", "gain_by_colour", "column_temporal")
+"""Effects that version 0.1 did not have. Rows of profiles without their numbers do not name them."""
+
 MIN_OUTLIERS = 0.1
 """Expected outliers per frame from which hot and dead pixels are simulated."""
 
 COST_NS = {
-    "heteroscedastic": 1.8, "prnu": 3.3, "shot": 9.5, "dark_current": 15.5, "hot_pixels": 1.0, "full_well": 0.1,
-    "read": 1.8, "row": 0.1, "column": 0.1, "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3,
+    "heteroscedastic": 1.8, "lens_shading": 0.4, "prnu": 3.3, "shot": 9.5, "dark_current": 15.5, "hot_pixels": 1.0,
+    "full_well": 0.1, "gain_by_colour": 0.1, "read": 1.8, "row": 0.1, "column": 0.1, "column_temporal": 0.1,
+    "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3,
 }  # fmt: skip
 """Cost of each effect, nanoseconds per pixel (``tests/benchmarks/bench_scenes.py``; AVX2, one thread).
 
@@ -166,6 +170,8 @@ def _forced_decision(config: Config, effect: str) -> ForcedDecision | None:
         )  # recorded: decides bytes of datasets
     if switch == "on":
         return ForcedDecision(True, "switched on")
+    if effect == "lens_shading":  # not noise that other noise could hide, and the levels of an image share it
+        return ForcedDecision(True, "part of the clean frame")
     needed = (*EFFECT_NUMBERS.get(effect, ()), *BRANCH_NUMBERS.get(effect, ()))
     assumed = next((key for key in needed if key in config.noise.assumed), None)
     if assumed is not None and not uses_assumed(config):
@@ -188,12 +194,15 @@ class EffectRules:
         Black level of the sensor, DN.
     assumed : mapping of str to tuple of str
         Assumed numbers that each effect uses; empty with ``effects.assumed=off``.
+    unnamed : frozenset of str
+        Effects that rows do not name as skipped.
     """
 
     forced: Mapping[str, ForcedDecision | None]
     tolerance: float
     black_level_dn: float
     assumed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    unnamed: frozenset[str] = frozenset()
 
 
 def effect_rules(config: Config) -> EffectRules:
@@ -211,7 +220,8 @@ def effect_rules(config: Config) -> EffectRules:
     """
     forced = {effect: _forced_decision(config, effect) for effect in EFFECTS}
     assumed = {effect: assumed_numbers(config.noise, effect) for effect in EFFECTS} if uses_assumed(config) else {}
-    return EffectRules(forced, config.effects.tolerance, float(config.sensor.black_level_dn), assumed)
+    unnamed = frozenset(effect for effect in LATER_EFFECTS if missing_number(config.noise, effect) is not None)
+    return EffectRules(forced, config.effects.tolerance, float(config.sensor.black_level_dn), assumed, unnamed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,8 +255,11 @@ class Selection:
 
     @property
     def skipped(self) -> tuple[str, ...]:
-        """Return the other effects with the reasons that rows record; predicts only what the image decided."""
-        off = (effect for effect in EFFECTS if effect not in self.on)
+        """Return the other effects with the reasons that rows record; predicts only what the image decided.
+
+        Effects that version 0.1 did not have are named only if the profile gives their numbers.
+        """
+        off = (effect for effect in EFFECTS if effect not in self.on and effect not in self.rules.unnamed)
         return tuple(f"{effect}: {self._reason(effect)}" for effect in off)
 
     def _reason(self, effect: str) -> str:

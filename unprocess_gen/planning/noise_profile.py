@@ -23,7 +23,7 @@ from unprocess_gen.core.random_streams import body_key, scatter_uniforms
 from unprocess_gen.core.types import Distribution, Physics
 from unprocess_gen.simulation.reference import cfa
 
-SCATTER_NAMES = ("read_shape", "read_std", "row_std", "column_std")
+SCATTER_NAMES = ("read_shape", "read_std", "row_std", "column_std", "column_temporal_std")
 """Draws of a camera body at an ISO; the position is the counter in the stream. Datasets depend on it: append only."""
 
 MIDDLE = 0.5
@@ -83,6 +83,7 @@ class PhysicalNoise:
         shape = self._shape(branch, iso, uniforms["read_shape"])
         read_std = number(branch.read_std_dn, iso=iso, gain=gain, uniform=uniforms["read_std"], shape=shape)
         errors = _black_error(branch, iso, sensor.pattern)
+        of_columns = number(branch.column_temporal_std_dn, iso=iso, gain=gain, uniform=uniforms["column_temporal_std"])
         return Physics(
             iso=iso,
             exposure_s=seconds,
@@ -104,6 +105,10 @@ class PhysicalNoise:
             sensor_unit=unit,
             body_key=body_key(seed, noise.name, unit),
             fixed_pattern_in_clean=self.fixed_pattern_in_clean,
+            row_correlation=noise.row_correlation or 0.0,
+            column_temporal_std_dn=of_columns * scale,
+            gain_by_colour=_three(noise.gain_by_colour or (1.0, 1.0, 1.0)),
+            lens_shading=_three(noise.lens_shading or (0.0, 0.0, 0.0)),
         )
 
     def _scatter(self, uniforms: Mapping[str, float], iso: float, seed: int, unit: str) -> Mapping[str, float]:
@@ -127,6 +132,11 @@ class PhysicalNoise:
         if self.scatter == "off":
             return sorted(shapes.numbers)[len(shapes.numbers) // 2]
         return draw_parameter(shapes, uniform)
+
+
+def _three(numbers: Sequence[float]) -> tuple[float, float, float]:
+    first, second, third = map(float, numbers)
+    return first, second, third
 
 
 def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:

@@ -46,11 +46,11 @@ from unprocess_gen.simulation.reference.sensor import noise_in_dn
 PARAMETERS = (
     *("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b"),
     *("iso", "exposure_s", "temperature_c", "exposure_ratio", "read_shape", "read_std", "row_std", "column_std"),
-    "sensor_unit",
+    *("sensor_unit", "column_temporal_std"),
 )
 """Names of the draws; the position is the counter in the stream. All datasets depend on it: append, never reorder."""
 
-NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std")
+NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std", "column_temporal_std")
 """Parameters that every noise level draws separately."""
 
 
@@ -340,6 +340,8 @@ class PhysicalLevel:
         if facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
         physics = self._noise.draw(uniforms, clean.stream_key, clean.seed)
+        if any(physics.lens_shading):
+            physics = replace(physics, frame_size=(facts.height, facts.width))
         span_dn = float(clean.white_level_dn - clean.black_level_dn)
         signals = signal_range(
             facts, clean.tone, clean.gamma, clean.inverse_gains, clean.exposure, span_dn, clean.rgb2cam

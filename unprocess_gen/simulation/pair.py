@@ -47,7 +47,8 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     Raises
     ------
     ValueError
-        If ``srgb`` has another dtype or shape, or an odd side with ``layout="packed"``.
+        If ``srgb`` has another dtype or shape, or an odd side with ``layout="packed"``, or if the plan has lens shading
+        and the image is not inside the plan's frame.
     """
     return next(make_pairs(srgb, [plan], origin))
 
@@ -77,7 +78,7 @@ def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 
         If the clean frames of the plans differ, or as in `make_pair`.
     """
     for plan in plans:
-        _check_image(srgb, plan)
+        _check_image(srgb, plan, origin)
     if any(_clean_frame_parameters(plan) != _clean_frame_parameters(plans[0]) for plan in plans[1:]):
         raise ValueError(
             "the clean frames of the plans differ; expected plans that differ in noise, level and draw only"
@@ -126,7 +127,11 @@ def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
         plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
         effects=(), skipped=(), assumed=(), physics=None, level=0, draw=0, frame=0,
     )  # fmt: skip
-    return without_noise, plan.brightest, plan.averaged and (plan.physics, plan.effects, plan.sensor_clip)
+    physics = plan.physics
+    shading = None
+    if physics is not None and "lens_shading" in plan.effects:
+        shading = physics.lens_shading, physics.frame_size
+    return without_noise, plan.brightest, shading, plan.averaged and (physics, plan.effects, plan.sensor_clip)
 
 
 def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
@@ -151,7 +156,7 @@ def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> 
     ValueError
         As `make_pair`.
     """
-    _check_image(srgb, plan)
+    _check_image(srgb, plan, origin)
     return _arrange_pair(_reference_pair(_dequantise(srgb, plan, origin), plan, origin), plan, origin)
 
 
@@ -166,7 +171,8 @@ def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float |
     light = unprocess(srgb, plan, origin, curve)
     if plan.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
         light = np.minimum(light, 1) * plan.exposure
-    return noise.respond(light, plan, origin) if plan.averaged else light
+    factor = noise.light_factor(plan, light.shape, origin)
+    return light if factor is None else light * factor
 
 
 def _clean_dn(light: Float, plan: Plan) -> Float:
@@ -246,9 +252,20 @@ _DTYPES = np.dtype(np.uint8), np.dtype(np.uint16)
 """Dtypes of images; comparing with a class takes six times as long as with a dtype."""
 
 
-def _check_image(srgb: Srgb, plan: Plan) -> None:
-    """Raise ValueError if an image has an unusable dtype or shape."""
+def _check_image(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> None:
+    """Raise ValueError if an image has an unusable dtype or shape, or is not inside the frame of the lens shading."""
     if srgb.dtype not in _DTYPES or srgb.ndim != 3 or srgb.shape[2] != 3:
         raise ValueError(f"srgb={srgb.dtype} {list(srgb.shape)}: unusable array; expected uint8 or uint16 [H, W, 3]")
     if plan.layout == PACKED and (srgb.shape[0] % 2 or srgb.shape[1] % 2):
         raise ValueError(f"srgb={list(srgb.shape)}: odd side; expected even height and width for layout={PACKED}")
+    if plan.physics is not None and "lens_shading" in plan.effects:
+        _check_inside(srgb.shape, plan.physics.frame_size, origin)
+
+
+def _check_inside(shape: tuple[int, ...], frame_size: tuple[int, int], origin: tuple[int, int]) -> None:
+    """Raise ValueError if an image is not inside the frame to which the lens shading belongs."""
+    if origin[0] + shape[0] > frame_size[0] or origin[1] + shape[1] > frame_size[1]:
+        raise ValueError(
+            f"srgb={list(shape)}: exceeds the frame {list(frame_size)} of the lens shading at {list(origin)}; "
+            "expected a part of the frame"
+        )

@@ -95,6 +95,7 @@ GOLDEN_PHYSICS = Physics(
     sensor_unit="0",
     body_key=0xFEDCBA9876543210,
     fixed_pattern_in_clean=False,
+    frame_size=(4096, 4096),
 )
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,

@@ -19,7 +19,7 @@ import numpy as np
 from unprocess_gen.core.types import Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.reports.noise_check.law import EFFECTS, NoiseLaw
+from unprocess_gen.reports.noise_check.law import NoiseLaw, is_supported
 from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Score, Scores, scores_of
 from unprocess_gen.reports.noise_check.sums import Sums
 
@@ -157,7 +157,7 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row) -> Sums | None:
     Returns
     -------
     Sums or None
-        None if the pair has too few usable sites, or an effect that `law.EFFECTS` does not have.
+        None if the pair has too few usable sites, or noise that `law.is_supported` excludes.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row) -> Sums | None:
         If the row is not a plan.
     """
     plan = plan_from_row(row)
-    if not EFFECTS.keys() >= set(plan.effects):
+    if not is_supported(plan):
         return None
     with np.errstate(under="ignore"):
         sums = Sums(NoiseLaw(plan, patch_from_row(row)), mosaic_dn(clean, row), mosaic_dn(noisy, row))

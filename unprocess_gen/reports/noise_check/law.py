@@ -146,6 +146,7 @@ def _none(plan: Plan) -> list[Term]:
 
 EFFECTS: dict[str, Callable[[Plan], list[Term]]] = {
     "heteroscedastic": _heteroscedastic,
+    "lens_shading": _none,  # the clean frame has it too
     "prnu": _prnu,
     "shot": _shot,
     "dark_current": _dark_current,
@@ -154,11 +155,29 @@ EFFECTS: dict[str, Callable[[Plan], list[Term]]] = {
     "read": _read,
     "row": _row,  # also `NoiseLaw.row_std_dn`
     "column": _none,  # `NoiseLaw.offset_dn`
+    "column_temporal": _none,  # `NoiseLaw.offset_dn`, because the row determines it
     "black_error": _none,  # `NoiseLaw.offset_dn`
     "dead_pixels": _none,  # `NoiseLaw.dead`
     "quantise": _quantise,
 }
 """What each effect adds to the noise of a site. A new effect enters the checks here."""
+
+
+def is_supported(plan: Plan) -> bool:
+    """Return whether the noise of a plan can be checked.
+
+    Parameters
+    ----------
+    plan : Plan
+        Plan of a pair.
+
+    Returns
+    -------
+    bool
+        False for gains by colour and for correlated rows: signal and rows are taken to be alike and independent.
+    """
+    correlated = "row" in plan.effects and _physics(plan).row_correlation != 0
+    return EFFECTS.keys() >= set(plan.effects) and not correlated
 
 
 def _physics(plan: Plan) -> Physics:
@@ -233,10 +252,14 @@ class NoiseLaw:
         if physics is None:
             return np.zeros((2, patch.width)), np.zeros((2, 2))
         dark = self._number("dark_current", "dark_e") * physics.dn_per_e if physics.dark_offset == "kept" else 0.0
+        temporal: Float = np.zeros(patch.width)
+        if "column_temporal" in plan.effects:
+            temporal = reference.column_temporal(plan, patch.width, patch.origin[1])
         if not plan.averaged:
-            return reference.offsets(plan, (2, patch.width), patch.origin, fixed_only=True) + dark, np.zeros((2, 2))
+            fixed = reference.offsets(plan, (2, patch.width), patch.origin, fixed_only=True)
+            return fixed + temporal + dark, np.zeros((2, 2))
         errors = reference.black_error(physics, (2, 2), patch.origin) if "black_error" in plan.effects else 0.0
-        return np.zeros((2, patch.width)), np.zeros((2, 2)) + errors + dark
+        return np.zeros((2, patch.width)) + temporal, np.zeros((2, 2)) + errors + dark
 
     def signal(self, clean_dn: Float, site: tuple[int, int]) -> Float:
         """Return the signal above black that causes shot noise, for DN of the clean frame at a site of the tile."""

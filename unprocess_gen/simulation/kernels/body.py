@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.lookup_tables import exponential_levels
-from unprocess_gen.core.random_streams import purpose
+from unprocess_gen.core.random_streams import BLOCK, purpose
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.kernels.normal import exact_values, fill_rows, normal_quantiles
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, philox_key
@@ -26,6 +26,7 @@ from unprocess_gen.simulation.kernels.strips import (
     scratch_of_thread,
     workspace_in,
 )
+from unprocess_gen.simulation.reference.noise import light_factor
 
 PRNU, HOT, DEAD = (np.uint64(purpose(stream)) for stream in ("prnu", "hot_pixels", "dead_pixels"))
 HOT_STEP = np.uint64(purpose("hot_pixels", draw=1))
@@ -95,6 +96,23 @@ def fixed_patterns(plan: Plan) -> FixedPatterns:
         physics.hot_pixel_e if "hot_pixels" in on else 0.0,
         physics.dead_pixel_share if "dead_pixels" in on else 0.0,
     )
+
+
+class Response(NamedTuple):
+    """Hold factors of the light of each pixel, as `Body.response` and `Body.response_steps`."""
+
+    factors: Float32
+    steps: tuple[int, int]
+
+
+def clean_response(plan: Plan, body: Body, shape: tuple[int, int], origin: tuple[int, int]) -> Response | None:
+    """Return by what the light of the clean frame is multiplied, as `reference.noise.light_factor`."""
+    if "lens_shading" not in plan.effects:
+        return Response(body.response, body.response_steps) if plan.averaged else None
+    pitch, first = padded_width(origin[1], shape[1]), origin[1] % BLOCK
+    factors = np.ones((shape[0], pitch), dtype=np.float32)
+    factors[:, first : first + shape[1]] = light_factor(plan, shape, origin)
+    return Response(factors.reshape(-1), (pitch, 1))
 
 
 def forget_bodies() -> None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.kernels.body import Body
+from unprocess_gen.simulation.kernels.body import Response
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
@@ -128,12 +128,12 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene:
     )
 
 
-def with_response(scene: Any, body: Body) -> Scene:
-    """Return the scene of a clean frame that contains the PRNU of a body."""
+def with_response(scene: Any, response: Response) -> Scene:
+    """Return the scene of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
     limits = np.full_like(scene.limits, -np.inf)
-    of_body: Scene = scene._replace(response=body.response, response_steps=body.response_steps, limits=limits)
-    return of_body
+    changed: Scene = scene._replace(response=response.factors, response_steps=response.steps, limits=limits)
+    return changed
 
 
 def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:

@@ -88,7 +88,7 @@ noise and 0.001/√rate at this value, in addition to the 0.07/√rate of `accur
 MAX_STEPS = 64
 """Most thresholds of `poisson.count_thresholds`."""
 
-_0, _8, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint32(0x7F800000)
+_0, _8, _16, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint64(16), np.uint32(0x7F800000)
 _ZERO32, _FLOAT32_ERROR32 = np.float32(0), np.float32(FLOAT32_ERROR_DN)
 _LOW_RATE32, _EVERY_LANE = np.float32(LOW_RATE), np.uint32(2**VECTOR_WIDTH - 1)
 _RATE_ERROR32, _NORMAL_ERROR32 = np.float32(FLOAT32_RATE), np.float32(2.0**-19)
@@ -102,12 +102,18 @@ class Electrons(NamedTuple):
     read_purposes: NDArray[np.uint64]  # [N]
     read_lines: NDArray[np.uint64]  # [N, 4097]
     read_quadratics: Float  # [N, 4096]
+    gains: Float  # [N, 2, 2, 2]: DN per electron, then full well in electrons, of the sites of a tile
+    gain_lanes: Float32  # [N, 2, 3, 8]: DN per electron, electrons per DN and full well of eight sites of a row
+    rows_dn: Float  # [N, H]: offsets of correlated rows; else one 0
+    rows_step: int  # H; 0 if rows are independent
     columns_dn: Float  # [N, P]
+    fixed_columns_dn: Float  # [P]: without the part that is new in every frame
     errors_dn: Float  # [N, 2, 2]: black-level errors of the sites of a tile
     base_dn: Float32  # [N, 2, P]: black level, column and black-level error
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
+    full_dn: float  # DN of the full well in a clean frame with fixed patterns
     body: Body
     tables: CountTables
 
@@ -115,7 +121,6 @@ class Electrons(NamedTuple):
 class _Numbers(NamedTuple):
     """Hold the numbers of one frame; comments and defaults give the values that switch an effect off."""
 
-    dn_per_e: float
     shot: float  # 0
     read_std_dn: float  # 0
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
@@ -127,8 +132,7 @@ class _Numbers(NamedTuple):
     dark_steps: float = 0.0  # thresholds of the dark signal; below 0 if it has too many
     fewest_dark: float = 0.0  # smallest count of the dark signal
     removed_e: float = 0.0  # mean dark signal that the camera subtracts
-    kept_dark_dn: float = 0.0  # in a clean frame with fixed patterns
-    full_well_e: float = np.inf
+    kept_dark_e: float = 0.0  # in a clean frame with fixed patterns
     row_std_dn: float = 0.0
 
 
@@ -142,9 +146,29 @@ def electron_noise(
     plans: Sequence[Plan], body: Body, shape: tuple[int, int], origin: tuple[int, int], counts_all: bool
 ) -> Electrons:
     """Return the noise of frames of one body; ``counts_all`` forbids normals in place of counts."""
-    left = origin[1] // BLOCK * BLOCK if any("column" in plan.effects for plan in plans) else 0
+    left = origin[1] // BLOCK * BLOCK if any(_COLUMN_EFFECTS.intersection(plan.effects) for plan in plans) else 0
     columns = padded_width(origin[1], shape[1])
-    return _electron_noise(tuple(plans), columns, (origin[0] % 2, left), counts_all)._replace(body=body)
+    noise = _electron_noise(tuple(plans), columns, (origin[0] % 2, left), counts_all)._replace(body=body)
+    if not any(map(_has_correlated_rows, plans)):
+        return noise
+    return noise._replace(rows_dn=_correlated_rows(plans, origin[0], shape[0]), rows_step=shape[0])
+
+
+_COLUMN_EFFECTS = frozenset({"column", "column_temporal"})
+_INDEPENDENT_ROWS = np.zeros(1)
+
+
+def _has_correlated_rows(plan: Plan) -> bool:
+    return plan.physics is not None and plan.physics.row_correlation != 0 and "row" in plan.effects
+
+
+def _correlated_rows(plans: Sequence[Plan], top: int, height: int) -> Float:
+    """Return the offsets of correlated rows, [N, H] DN; 0 in frames without them."""
+    rows_dn = np.zeros((len(plans), height))
+    for of_frame, plan in zip(rows_dn, plans, strict=True):
+        if _has_correlated_rows(plan):
+            of_frame[:] = reference_noise.row(plan, height, top)
+    return rows_dn
 
 
 @functools.lru_cache(maxsize=8)
@@ -152,17 +176,27 @@ def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, in
     """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
     frames = [_frame(plan, origin, columns, counts_all) for plan in plans]
     numbers, purposes, quantiles, offsets, ranks = ([*members] for members in zip(*frames, strict=True))
+    gains, first = [_gains_of(plan, origin[0]) for plan in plans], plans[0]
+    fixed = offsets[0].columns_dn
+    if "column_temporal" in first.effects:
+        fixed = _fixed_offsets(first, columns, origin).columns_dn
     return Electrons(
         numbers=np.array(numbers),
         read_purposes=np.array(purposes),
         read_lines=_stack([each.lines for each in quantiles]),
         read_quadratics=_stack([each.quadratics for each in quantiles]),
+        gains=_stack([each.sites for each in gains]),
+        gain_lanes=_stack([each.lanes for each in gains]),
+        rows_dn=_INDEPENDENT_ROWS,
+        rows_step=0,
         columns_dn=_stack([each.columns_dn for each in offsets]),
+        fixed_columns_dn=fixed,
         errors_dn=_stack([each.errors_dn for each in offsets]),
         base_dn=_stack([each.base_dn for each in offsets]),
         dark_ranks=_stack(ranks),
         padded_width=columns,
-        black_dn=float(plans[0].black_level_dn),
+        black_dn=float(first.black_level_dn),
+        full_dn=_full_well_e(first) * (1.0 if first.physics is None else first.physics.dn_per_e) + first.black_level_dn,
         body=WITHOUT_PATTERNS,
         tables=count_tables(),
     )
@@ -171,6 +205,40 @@ def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, in
 def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
     """Return arrays along a new first axis; a single one is not copied."""
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
+
+
+class _Gains(NamedTuple):
+    """Hold `Electrons.gains` and `Electrons.gain_lanes` of one frame, and the highest gain, DN per electron."""
+
+    sites: Float
+    lanes: Float32
+    highest: float
+
+
+@functools.lru_cache(maxsize=16)
+def _gains(dn_per_e: float, relative: tuple[float, ...], full_well_e: float) -> _Gains:
+    """Return the gains of the sites (0, 0), (0, 1), (1, 0), (1, 1) with these gains relative to ``dn_per_e``."""
+    tile = np.array(relative).reshape(2, 2)
+    sites = np.stack([dn_per_e * tile, full_well_e / tile])
+    lanes = np.tile(np.stack([sites[0], 1 / sites[0], sites[1]], axis=1), VECTOR_WIDTH // 2)
+    return _Gains(sites, lanes.astype(np.float32), float(sites[0].max()))
+
+
+def _gains_of(plan: Plan, top: int) -> _Gains:
+    """Return the gains of a frame whose first row is ``top``."""
+    if plan.physics is None:
+        return _gains(plan.a_dn, _EQUAL, math.inf)
+    relative: tuple[float, ...] = _EQUAL
+    if "gain_by_colour" in plan.effects:
+        relative = tuple(reference_noise.relative_gains(plan, (2, 2), (top, 0)).ravel().tolist())
+    return _gains(plan.physics.dn_per_e, relative, _full_well_e(plan))
+
+
+_EQUAL = (1.0, 1.0, 1.0, 1.0)
+
+
+def _full_well_e(plan: Plan) -> float:
+    return plan.physics.full_well_e if plan.physics is not None and "full_well" in plan.effects else math.inf
 
 
 class _Offsets(NamedTuple):
@@ -216,31 +284,30 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     if physics is None:
         return _two_parameter_frame(plan, columns, counts_all)
     on = frozenset(plan.effects)
-    of_body = (physics.body_key, physics.column_std_dn) if "column" in on else (None, 0.0)
-    errors_dn = physics.black_error_dn if "black_error" in on else _NO_ERRORS
-    offsets = _offsets(float(plan.black_level_dn), columns, origin, *of_body, errors_dn)
+    offsets = _fixed_offsets(plan, columns, origin)
+    if "column_temporal" in on:
+        offsets = _with_columns(offsets, reference_noise.column_temporal(plan, columns, origin[1]))
     dark_e = physics.dark_e if "dark_current" in on else 0.0
     removed_e = dark_e if physics.dark_offset == "removed" else 0.0
     read_std_dn = physics.read_std_dn if "read" in on else 0.0
     row_std_dn = physics.row_std_dn if "row" in on else 0.0
     quantiles = _read_quantiles(physics.read_law, physics.read_shape)
     offset_dn = plan.black_level_dn + 6.4 * row_std_dn + offsets.farthest_dn
-    most_dark_dn = physics.dn_per_e * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
+    counts_all = counts_all or "gain_by_colour" in on  # the limits between counts and normals hold for one gain
+    most_dark_dn = _gains_of(plan, origin[0]).highest * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
     lowest_root, highest_root = count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
     fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
     a_dn, b_dn2 = plan.variance_line
     numbers = _Numbers(
-        dn_per_e=physics.dn_per_e,
         shot=float("shot" in on),
         dark_e=dark_e,
         dark_steps=-1.0 if ranks is None else len(ranks),
         fewest_dark=fewest_dark,
         removed_e=removed_e,
-        kept_dark_dn=0.0 if removed_e else dark_e * physics.dn_per_e,
-        full_well_e=physics.full_well_e if "full_well" in on else np.inf,
+        kept_dark_e=0.0 if removed_e else dark_e,
         read_std_dn=read_std_dn,
         error_dn=_error_dn(read_std_dn, quantiles, offset_dn, most_dark_dn),
-        row_std_dn=row_std_dn,
+        row_std_dn=0.0 if _has_correlated_rows(plan) else row_std_dn,
         lowest_root=lowest_root,
         highest_root=highest_root,
         a_dn=a_dn,
@@ -250,13 +317,31 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     return numbers, READ, quantiles, offsets, dark_ranks
 
 
+def _fixed_offsets(plan: Plan, columns: int, origin: tuple[int, int]) -> _Offsets:
+    """Return the offsets that all frames of a body have."""
+    physics, on = plan.physics, plan.effects
+    assert physics is not None
+    of_body = (physics.body_key, physics.column_std_dn) if "column" in on else (None, 0.0)
+    errors_dn = physics.black_error_dn if "black_error" in on else _NO_ERRORS
+    return _offsets(float(plan.black_level_dn), columns, origin, *of_body, errors_dn)
+
+
+def _with_columns(fixed: _Offsets, more_dn: Float) -> _Offsets:
+    """Add offsets of columns."""
+    base_dn = (fixed.base_dn + more_dn).astype(np.float32)
+    return fixed._replace(
+        columns_dn=fixed.columns_dn + more_dn,
+        base_dn=base_dn,
+        farthest_dn=fixed.farthest_dn + float(np.abs(more_dn).max(initial=0.0)),
+    )
+
+
 def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
     """Return shot and read noise whose variance line is that of the plan."""
     a_dn, b_dn2 = plan.variance_line
     read_std_dn, quantiles = math.sqrt(max(b_dn2, 0.0)), normal_quantiles()
     lowest_root, highest_root = count_roots(plan, read_std_dn / a_dn, counts_all)
     numbers = _Numbers(
-        dn_per_e=a_dn,
         shot=1.0,
         read_std_dn=read_std_dn,
         error_dn=_error_dn(read_std_dn, quantiles, float(plan.black_level_dn), 0.0),
@@ -298,7 +383,7 @@ def _read_quantiles(law: str, shape: float) -> Quantiles:
 @inner
 def _load_numbers(noise: Electrons, n: int) -> _Numbers:
     v = pointer_to(noise.numbers, np.uint64(n * NUMBERS))
-    return _Numbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12], v[13], v[14])
+    return _Numbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12])
 
 
 @inner
@@ -309,8 +394,8 @@ def add_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, worksp
     fill_values_by_lines(
         strip.total, workspace.read_words, pointer_to(noise.read_lines, n * 4097), workspace.lines, workspace.normals
     )
-    f = np.float32
-    per_e, std, full_well_e, margin = f(of.dn_per_e), f(of.read_std_dn), f(of.full_well_e), f(of.error_dn)
+    f, lanes = np.float32, pointer_to(noise.gain_lanes, 24 * (2 * n + (strip.y & 1)))
+    per_e, full_well_e, std, margin = load(lanes, _0), load(lanes, _16), f(of.read_std_dn), f(of.error_dn)
     row_dn = f(workspace.row_dn[0])
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
     has_dark = of.dark_e > 0.0
@@ -331,14 +416,15 @@ def _count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, wor
     """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, and all words."""
     of, tables = _load_numbers(noise, n), noise.tables
     _fill_words(key, noise.read_purposes[n] | key[2], strip, workspace.words, workspace.read_words)
-    workspace.row_dn[0] = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
+    row_dn = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
+    workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
     if of.dark_e > 0.0:
         fill_word_blocks(key, strip, DARK, workspace.dark_words)
     counted = 2 if of.dark_steps < 0.0 else 1
     for stream in range(counted):  # a loop, so that machine code contains `fill_counts` once
         is_shot = stream == 0
         if is_shot:
-            has_high = _fill_rates(noise, of.dn_per_e, strip, workspace)
+            has_high = _fill_rates(noise, n, strip, workspace)
         else:
             has_high = True
             for x in range(strip.total):
@@ -390,12 +476,12 @@ def _fill_words(key: PhiloxKey, read_purpose: np.uint64, strip: Strip, shot: Poi
 
 
 @inner
-def _fill_rates(noise: Electrons, dn_per_e: float, strip: Strip, workspace: Workspace) -> bool:
+def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> bool:
     """Fill ``rates`` (float32) with the mean electrons of shot noise; return whether any is `LOW_RATE` or more.
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
-    black, e_per_dn = np.float32(noise.black_dn), np.float32(1.0 / dn_per_e)
+    black, e_per_dn = np.float32(noise.black_dn), load(pointer_to(noise.gain_lanes, 24 * (2 * n + (strip.y & 1))), _8)
     row, column = noise.body.response_steps
     response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
     highest = load(workspace.rounded_dn, _0) - load(workspace.rounded_dn, _0)
@@ -478,7 +564,7 @@ def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace
     of = _load_numbers(noise, n)
     electrons = np.float64(workspace.electrons[x])
     if workspace.error_e[x] > _ZERO32:
-        electrons = _exact_shot(noise, of, x, strip, workspace)
+        electrons = _exact_shot(noise, of, n, x, strip, workspace)
     if of.dark_e > 0.0:
         dark = np.float64(workspace.dark[x])
         if workspace.dark_error_e[x] > _ZERO32:
@@ -491,11 +577,11 @@ def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace
 
 
 @inner
-def _exact_shot(noise: Electrons, of: _Numbers, x: int, strip: Strip, workspace: Workspace) -> float:
+def _exact_shot(noise: Electrons, of: _Numbers, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
     """Return the electrons of light: a count, a normal in its place, or the mean."""
     row, column = noise.body.response_steps
     response = np.float64(noise.body.response[strip.y * row + (strip.x + strip.lead + x) * column])
-    rate = (workspace.unrounded_dn[x] - noise.black_dn) / of.dn_per_e * response
+    rate = (workspace.unrounded_dn[x] - noise.black_dn) / noise.gains[8 * n + 2 * (strip.y & 1) + (x & 1)] * response
     if of.shot == 0.0:
         return float(rate)
     root, word = np.sqrt(np.float32(rate)), workspace.words[x]
@@ -510,7 +596,8 @@ def _dn(
     noise: Electrons, of: _Numbers, n: int, x: int, electrons: float, read: float, strip: Strip, workspace: Workspace
 ) -> float:
     """Return the DN of ``electrons`` and read noise of ``read`` standard deviations, with the offsets of the site."""
-    dn = min(electrons, of.full_well_e) * of.dn_per_e + noise.black_dn
+    site = 8 * n + 2 * (strip.y & 1) + (x & 1)
+    dn = min(electrons, noise.gains[site + 4]) * noise.gains[site] + noise.black_dn
     dn = dn + of.read_std_dn * read
     offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
     return float(dn + (offset_dn + noise.errors_dn[4 * n + 2 * (strip.y & 1) + (x & 1)]))
@@ -558,8 +645,9 @@ def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> N
     for d in range(first, after):
         workspace.defects[body.positions[d]] = body.means_e[d]
     for x in range(strip.total):
-        dn = (clean_dn[x] + workspace.defects[x] * of.dn_per_e) + of.kept_dark_dn
-        dn = min(dn, of.full_well_e * of.dn_per_e + noise.black_dn)
-        offset_dn = 0.0 + noise.columns_dn[strip.x + strip.lead + x]
+        gain = noise.gains[2 * (strip.y & 1) + (x & 1)]
+        dn = (clean_dn[x] + workspace.defects[x] * gain) + of.kept_dark_e * gain
+        dn = min(dn, noise.full_dn)
+        offset_dn = 0.0 + noise.fixed_columns_dn[strip.x + strip.lead + x]
         dn = dn + (offset_dn + noise.errors_dn[2 * (strip.y & 1) + (x & 1)])
         clean_dn[x] = dn if workspace.defects[x] >= 0.0 else 0.0

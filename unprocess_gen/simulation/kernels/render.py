@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.types import PACKED, Counts, Frame, Pair, Plan, Srgb
-from unprocess_gen.simulation.kernels.body import body_of, fixed_patterns
+from unprocess_gen.simulation.kernels.body import body_of, clean_response, fixed_patterns
 from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene32_of, scene_of, with_response
 from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
@@ -107,8 +107,10 @@ def _records(
     if noise is not None:
         return scene, noise, readout
     body = body_of(first, shape, origin)
+    response = clean_response(first, body, shape, origin)
+    if response is not None:
+        scene = with_response(scene, response)
     if first.averaged:  # the clean frame contains the response, so the noise does not
-        scene = with_response(scene, body)
         body = body._replace(response=ONES, response_steps=(0, 0))
     return scene, electron_noise(plans, body, shape, origin, counts_all=first.normalised), readout
 

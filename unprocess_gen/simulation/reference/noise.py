@@ -11,6 +11,10 @@ or the tiles. Fixed patterns are keyed by the camera body and are constant over 
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, quantile_table
@@ -19,8 +23,8 @@ from unprocess_gen.core.types import Float, Physics, Plan
 from unprocess_gen.simulation.reference.poisson import poisson
 
 EFFECTS = (
-    *("prnu", "shot", "dark_current", "hot_pixels", "full_well"),  # in electrons
-    *("read", "row", "column", "black_error", "dead_pixels", "quantise"),  # in DN
+    *("lens_shading", "prnu", "shot", "dark_current", "hot_pixels", "full_well"),  # in electrons
+    *("gain_by_colour", "read", "row", "column", "column_temporal", "black_error", "dead_pixels", "quantise"),  # in DN
 )
 """Effects of a physical profile, in the order in which light meets them."""
 
@@ -164,7 +168,9 @@ def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """Add the effects of a physical profile, in order, to the unrounded clean frame; [H, W] DN, not clipped."""
     physics = plan.physics
     assert physics is not None
-    electrons = (clean_dn - plan.black_level_dn) / physics.dn_per_e
+    relative = relative_gains(plan, clean_dn.shape, origin)
+    gain = physics.dn_per_e * relative
+    electrons = (clean_dn - plan.black_level_dn) / gain
     if "prnu" in plan.effects and not physics.fixed_pattern_in_clean:  # otherwise the clean frame contains it
         electrons = electrons * response(physics, electrons.shape, origin)
     if "shot" in plan.effects:
@@ -174,14 +180,83 @@ def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     if "hot_pixels" in plan.effects:
         electrons = electrons + hot_pixels(plan, electrons, origin)
     if "full_well" in plan.effects:
-        electrons = np.minimum(electrons, physics.full_well_e)
-    noisy_dn = electrons * physics.dn_per_e + plan.black_level_dn
+        electrons = np.minimum(electrons, physics.full_well_e / relative)
+    noisy_dn = electrons * gain + plan.black_level_dn
     if "read" in plan.effects:
         noisy_dn = noisy_dn + read(plan, noisy_dn, origin)
     noisy_dn = noisy_dn + offsets(plan, noisy_dn.shape, origin)
     if "dead_pixels" in plan.effects:
         noisy_dn = np.where(dead(physics, noisy_dn.shape, origin), 0.0, noisy_dn)
     return noisy_dn
+
+
+def relative_gains(plan: Plan, shape: Shape, origin: Origin = (0, 0)) -> Float:
+    """Return the system gain of each CFA site relative to ``dn_per_e``, [H, W]; 1 without ``gain_by_colour``."""
+    assert plan.physics is not None
+    if "gain_by_colour" not in plan.effects:
+        return np.ones(shape)
+    sites = [plan.physics.gain_by_colour["RGB".index(colour)] for colour in plan.pattern]
+    return _by_site(sites, shape, origin)
+
+
+def _by_site(sites: Sequence[float], shape: Shape, origin: Origin) -> Float:
+    """Repeat the values of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, [H, W]."""
+    tile = np.array(sites).reshape(2, 2)
+    y, x = (np.arange(start, start + count) % 2 for start, count in zip(origin, shape, strict=True))
+    return np.asarray(tile[y[:, None], x[None, :]])
+
+
+def illumination_at(square: Float, coefficients: tuple[float, float, float]) -> Float:
+    """Return the relative illumination at a squared distance from the centre, in units of the corner's.
+
+    A polynomial in r², as in the opcode FixVignetteRadial of DNG 1.4 and in Lensfun's model "pa"; those correct the
+    shading or describe it with the centre at 1.
+
+    Parameters
+    ----------
+    square : ndarray of float64
+        r², 0 in the centre and 1 in the corners.
+    coefficients : tuple of three floats
+        Coefficients of r², r⁴ and r⁶.
+
+    Returns
+    -------
+    ndarray of float64
+        1 in the centre, same shape.
+    """
+    first, second, third = coefficients
+    return 1 + square * (first + square * (second + square * third))
+
+
+def illumination(plan: Plan, shape: Shape, origin: Origin = (0, 0)) -> Float:
+    """Return the relative illumination of each pixel (lens shading).
+
+    Parameters
+    ----------
+    plan : Plan
+        Parameters of a pair with a physical profile.
+    shape : (int, int)
+        Height and width.
+    origin : (int, int)
+        Row and column of the first pixel in the full frame.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        At most 1; rounded to float32, the dtype in which kernels store the pattern. Ones without ``lens_shading``.
+    """
+    physics = plan.physics
+    if physics is None or "lens_shading" not in plan.effects:
+        return np.ones(shape)
+    # Twice the distance from the centre is an integer, so that its square is exact.
+    rows, columns = (
+        2 * (np.arange(start, start + count) - 0.0) - (full - 1)
+        for start, count, full in zip(origin, shape, physics.frame_size, strict=True)
+    )
+    corner = float(sum((full - 1) ** 2 for full in physics.frame_size)) or 1.0
+    square = (rows * rows)[:, None] + (columns * columns)[None, :]
+    place = illumination_at(square / corner, physics.lens_shading)
+    return np.asarray(place).astype(np.float32).astype(np.float64)
 
 
 def response(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> Float:
@@ -272,14 +347,27 @@ def offsets(plan: Plan, shape: Shape, origin: Origin = (0, 0), fixed_only: bool 
         rows = row(plan, height, origin[0])
     if "column" in plan.effects:
         columns = column(plan.physics, width, origin[1])
+    if "column_temporal" in plan.effects and not fixed_only:
+        columns = columns + column_temporal(plan, width, origin[1])
     offset_dn = rows[:, None] + columns[None, :]
     return offset_dn + black_error(plan.physics, shape, origin) if "black_error" in plan.effects else offset_dn
 
 
 def row(plan: Plan, height: int, top: int = 0) -> Float:
-    """Draw the offset of each row (banding), [H] DN; different in every frame."""
-    assert plan.physics is not None
-    return np.asarray(plan.physics.row_std_dn * normals(_image_words(plan, "row", (height, 1), (top, 0)))[:, 0])
+    """Draw the offset of each row (banding), [H] DN; different in every frame.
+
+    With a correlation r, z(y) = r·z(y - 1) + √(1 - r²)·n(y) for normal deviates n, an autoregressive process of order 1
+    (Box and Jenkins 1970) with the standard deviation of n. It begins at row 0 of the full frame, so that a crop has
+    the offsets of its rows.
+    """
+    physics = plan.physics
+    assert physics is not None
+    if physics.row_correlation == 0:
+        return np.asarray(physics.row_std_dn * normals(_image_words(plan, "row", (height, 1), (top, 0)))[:, 0])
+    independent = normals(_image_words(plan, "row", (top + height, 1), (0, 0)))[:, 0].tolist()
+    before, share = physics.row_correlation, math.sqrt(1 - physics.row_correlation * physics.row_correlation)
+    correlated = itertools.accumulate(independent, lambda last, n: before * last + share * n)
+    return physics.row_std_dn * np.array(list(correlated)[top:])
 
 
 def column(physics: Physics, width: int, left: int = 0) -> Float:
@@ -287,11 +375,16 @@ def column(physics: Physics, width: int, left: int = 0) -> Float:
     return np.asarray(physics.column_std_dn * normals(_body_words(physics, "column", (1, width), (0, left)))[0])
 
 
+def column_temporal(plan: Plan, width: int, left: int = 0) -> Float:
+    """Draw the part of each column's offset that is new in every frame, [W] DN."""
+    assert plan.physics is not None
+    std_dn = plan.physics.column_temporal_std_dn
+    return np.asarray(std_dn * normals(_image_words(plan, "column_temporal", (1, width), (0, left)))[0])
+
+
 def black_error(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> Float:
     """Return the black-level error of each CFA site, [H, W] DN."""
-    errors = np.array(physics.black_error_dn).reshape(2, 2)
-    y, x = (np.arange(start, start + count) % 2 for start, count in zip(origin, shape, strict=True))
-    return np.asarray(errors[y[:, None], x[None, :]])
+    return _by_site(physics.black_error_dn, shape, origin)
 
 
 def dead(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> np.ndarray:
@@ -302,10 +395,29 @@ def dead(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> np.ndarray:
 # ----------------------------------------------------------------- fixed patterns in the average of many frames
 
 
-def respond(light: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
-    """Multiply light [H, W] by the relative gain of the pixels if ``prnu`` is simulated."""
+def light_factor(plan: Plan, shape: Shape, origin: Origin = (0, 0)) -> Float | None:
+    """Return by what the light of the clean frame is multiplied: lens shading, and PRNU if the clean frame has it.
+
+    Parameters
+    ----------
+    plan : Plan
+        Parameters of a pair.
+    shape : (int, int)
+        Height and width.
+    origin : (int, int)
+        Row and column of the first pixel in the full frame.
+
+    Returns
+    -------
+    ndarray of float64, [H, W], or None
+        Values of float32; None if nothing changes the light.
+    """
+    shaded = "lens_shading" in plan.effects and plan.physics is not None
+    if not plan.averaged or "prnu" not in plan.effects:
+        return illumination(plan, shape, origin) if shaded else None
     assert plan.physics is not None
-    return light * response(plan.physics, light.shape, origin) if "prnu" in plan.effects else light
+    pattern = response(plan.physics, shape, origin)
+    return (pattern * illumination(plan, shape, origin)).astype(np.float32).astype(np.float64) if shaded else pattern
 
 
 def average(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
@@ -315,10 +427,11 @@ def average(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     """
     physics = plan.physics
     assert physics is not None
+    gain = physics.dn_per_e * relative_gains(plan, clean_dn.shape, origin)
     if "hot_pixels" in plan.effects:
-        clean_dn = clean_dn + hot_pixel_means(physics, clean_dn.shape, origin) * physics.dn_per_e
+        clean_dn = clean_dn + hot_pixel_means(physics, clean_dn.shape, origin) * gain
     if "dark_current" in plan.effects and physics.dark_offset == "kept":
-        clean_dn = clean_dn + physics.dark_e * physics.dn_per_e
+        clean_dn = clean_dn + physics.dark_e * gain
     if "full_well" in plan.effects:
         clean_dn = np.minimum(clean_dn, physics.full_well_e * physics.dn_per_e + plan.black_level_dn)
     clean_dn = clean_dn + offsets(plan, clean_dn.shape, origin, fixed_only=True)
