@@ -100,11 +100,11 @@ def facts(given: str) -> dict[str, Any]:
 
 
 def hash_kernel_arguments() -> Any:
-    """Hash all arguments of later calls of the outer kernel, except the last three, which it fills."""
+    """Hash all arguments of later calls of the outer kernel, except the last four, which it fills."""
     kernel, arguments_digest = render._render, hashlib.sha256()
 
     def hash_and_call(*arguments: Any) -> None:
-        for one in members(arguments[:-3]):
+        for one in members(arguments[:-4]):
             arguments_digest.update(np.asarray(one).tobytes())
         kernel(*arguments)
 

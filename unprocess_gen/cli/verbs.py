@@ -528,7 +528,7 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "verify",
-            "check every byte of a dataset or sweep; repair, regenerate, check the noise",
+            "check every byte of a dataset or sweep; repair, regenerate, check noise",
             run_verify,
             (
                 SOURCE,

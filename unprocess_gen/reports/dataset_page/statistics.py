@@ -131,6 +131,7 @@ PARAMETER_COLUMNS = (
     ParameterColumn("read_std_dn", ("read_std",), physical=True),
     ParameterColumn("row_std_dn", ("row_std",), physical=True),
     ParameterColumn("column_std_dn", ("column_std",), physical=True),
+    ParameterColumn("column_temporal_std_dn", ("column_temporal_std",), physical=True),
 )
 """Numeric columns that the report shows; ``physical`` ones only for physical noise profiles."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -150,7 +151,7 @@ _large_body = functools.lru_cache(maxsize=LARGE_CROPS)(_body)
 def _expected_defects(patterns: FixedPatterns, sites: int) -> int:
     """Return a number of defects that is rarely exceeded: six standard deviations above the mean."""
     mean = (patterns.hot_share + patterns.dead_share) * sites
-    return int(mean + 6 * mean**0.5) + 8
+    return int(mean + 6 * math.sqrt(mean)) + 8
 
 
 def word_threshold(fraction: float) -> np.uint64:

@@ -209,7 +209,7 @@ The largest terms: rounding of the exponent 5e-7, the 13 terms of the recurrence
 rate 3e-7, exponential and rank 2e-7.
 """
 
-_LOG2E, _CDF_ERROR, _WORD = np.float32(np.log2(np.e)), np.float32(CDF_ERROR), np.float32(2.0**-32)
+_LOG2E, _CDF_ERROR, _WORD = np.float32(1.4426950408889634), np.float32(CDF_ERROR), np.float32(2.0**-32)
 _RECIPROCALS = np.array([1 / k for k in range(1, 32)], dtype=np.float32)
 _EXP2 = tuple(np.float32(c) for c in (1.00000007, 0.693146967, 0.240221197, 0.0555071329, 9.67554206e-3, 1.32764676e-3))
 """Minimax polynomial of 2**f for f from -1/2 to 1/2, relative error 7.5e-8."""
