@@ -51,7 +51,7 @@ from unprocess_gen.simulation.kernels import body, render
 from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.philox import philox_keys
 from unprocess_gen.simulation.kernels.render import uses_scene32
-from unprocess_gen.simulation.kernels.strips import STRIP, scratch_of_thread
+from unprocess_gen.simulation.kernels.strips import STRIP, allocate_scratch
 from unprocess_gen.simulation.pair import make_pair
 
 KERNELS = {
@@ -164,7 +164,7 @@ def doubles() -> str:
     for plan in plans():
         shape, origin, dtype = codes.shape[:2], (5, 7), np.float32 if plan.normalised else np.uint16
         scene, noise, readout = render._records((plan,), shape, 256, origin)
-        scratch = scratch_of_thread(np.float32 if uses_scene32(plan) else np.float64)
+        scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
         clean, noisy = np.empty(codes[..., 0].size, dtype=dtype), np.empty((1, codes[..., 0].size), dtype=dtype)
         counts = np.zeros((1, 6), dtype=np.int64)
         render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
