@@ -374,17 +374,19 @@ def _new_in_each_frame(frame: FrameModel, variances: tuple[float, float, float, 
     return variances if frames == 1 else (*variances, *(each / frames for each in variances))
 
 
+def _of_columns(frame: FrameModel, std_dn: float) -> tuple[float, float, float, float]:
+    """Return the variances of independent offsets of columns in the statistics of one frame."""
+    variance, width = std_dn * std_dn, frame.facts.width
+    return variance, variance / width, variance, variance / max(width // 2, 1)
+
+
 def _column(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
-    variance, width = frame.physics.column_std_dn * frame.physics.column_std_dn, frame.facts.width
-    per_frame = variance, variance / width, variance, variance / max(width // 2, 1)
+    per_frame = _of_columns(frame, frame.physics.column_std_dn)
     return Contribution(per_frame if frame.facts.frames == 1 else (*per_frame, *per_frame))
 
 
 def _column_temporal(frame: FrameModel, level_dn: float, masking: float) -> Contribution:
-    std_dn, width = frame.physics.column_temporal_std_dn, frame.facts.width
-    variance = std_dn * std_dn
-    per_frame = variance, variance / width, variance, variance / max(width // 2, 1)
-    return Contribution(_new_in_each_frame(frame, per_frame))
+    return Contribution(_new_in_each_frame(frame, _of_columns(frame, frame.physics.column_temporal_std_dn)))
 
 
 def _lens_shading(frame: FrameModel, level_dn: float, masking: float) -> Contribution:

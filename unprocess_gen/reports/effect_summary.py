@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from unprocess_gen.config.interpretation import is_physical, missing_number
+from unprocess_gen.config.interpretation import HEAT, assumed_numbers, is_physical, missing_number
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config, NoiseConfig
 from unprocess_gen.config.yaml_files import read_yaml_mapping
@@ -131,18 +131,6 @@ ASSUMED_TEXTS: dict[str, Callable[[NoiseConfig], str]] = {
 }
 """Value of each number that a profile may mark as assumed."""
 
-ASSUMED_OF_EFFECT = {
-    "prnu": ("prnu_std",),
-    "dark_current": ("dark_e_per_s", "dark_doubling_c"),
-    "hot_pixels": ("hot_pixel_share", "hot_pixel_e_per_s"),
-    "full_well": ("full_well_e",),
-    "row": ("row_std_dn",),
-    "column": ("column_std_dn",),
-    "black_error": ("black_error_dn",),
-    "dead_pixels": ("dead_pixel_share",),
-}
-"""Numbers named behind each effect. Hot pixels share temperature and doubling with the dark current."""
-
 
 def assumed_text(noise: NoiseConfig, effect: str) -> str:
     """Return the assumed numbers of an effect, such as ``assumed 0.5 %``; empty if all are published.
@@ -159,7 +147,10 @@ def assumed_text(noise: NoiseConfig, effect: str) -> str:
     str
         Words for a bracket.
     """
-    values = [ASSUMED_TEXTS[key](noise) for key in ASSUMED_OF_EFFECT.get(effect, ()) if key in noise.assumed]
+    keys = assumed_numbers(noise, effect)
+    if effect == "hot_pixels":  # the dark current names the temperature and the doubling
+        keys = tuple(key for key in keys if key not in HEAT)
+    values = [ASSUMED_TEXTS[key](noise) for key in keys]
     return f"assumed {', '.join(values)}" if values else ""
 
 
