@@ -174,8 +174,8 @@ COLUMNS_INTRODUCTION = """\
 # Manifest columns
 
 `manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order; later
-versions append columns. `KEY.json` in the shards holds the same values, typed, without `detail` and without empty
-values of columns that were added after version 0.1.
+versions append columns. `KEY.json` in the shards holds the same values, typed, without `detail`, `source_noise_dn` and
+empty values of columns that were added after version 0.1.
 
 An empty cell means that the value does not exist. Numbers are written so that they read back exactly. The columns of
 physical profiles, marked with an asterisk, are 0 or `none` in rows of other profiles."""

@@ -215,8 +215,9 @@ def test_every_column_has_a_meaning() -> None:
     assert all(column.meaning for column in COLUMNS)
 
 
-BY_DEFAULT = {"it is 0", "all are 1", "all are 0", "there is no lens shading"}
-"""Conditions of the columns of effects that version 0.1 did not have."""
+(UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
+BY_DEFAULT = {"it is 0", "all are 1", "all are 0", "there is no lens shading", UNMEASURED}
+"""Conditions of numbers that version 0.1 did not have."""
 
 
 def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
@@ -227,10 +228,13 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     failed = {condition for condition in conditions if "the source failed" in condition}
     passed = {"the source did not fail"}
     same = "the clean array has the dtype of the noisy one, or the source failed"
-    absent = {"no effect uses one, or effects.assumed is off", same, *BY_DEFAULT}
+    unassumed = "no effect uses one, or effects.assumed is off"
+    absent = {unassumed, same, *BY_DEFAULT}
+    measured = pair_row("0" * 8, SOURCE, SHA256, 1, 0, PHYSICAL, PAIR, ("1" * 32, "2" * 32), PATCH, 1.5)
     holding = {
         "pair": (row_of(PHYSICAL), passed | absent),
-        "assumed": (row_of(dataclasses.replace(PHYSICAL, assumed=("prnu_std",))), passed | {same, *BY_DEFAULT}),
+        "measured": (measured, passed | absent - {UNMEASURED}),
+        "assumed": (row_of(dataclasses.replace(PHYSICAL, assumed=("prnu_std",))), passed | absent - {unassumed}),
         "float clean": (row_of(dataclasses.replace(PHYSICAL, clean_dtype="float32")), passed | absent - {same}),
         "without effects": (row_of(bare), passed | absent | {one for one in failed if one.startswith("no effect")}),
         "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed | absent),

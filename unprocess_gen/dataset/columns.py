@@ -446,6 +446,11 @@ COLUMNS = (
         )
         for side in ("height", "width")
     ),
+    Column(
+        "source_noise_dn", float, "estimated noise of the source itself, in the green plane of the clean frame",
+        NOT_NEGATIVE, unit="DN", since="0.2", in_json=False,
+        empty_if="the source failed, is a built-in scene or an array, or no tile of 32 x 32 pixels is free of clipping",
+    ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 

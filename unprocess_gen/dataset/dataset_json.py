@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from unprocess_gen.dataset.columns import NOT_NEGATIVE
 from unprocess_gen.dataset.shards import shard_name
 
 MAX_BYTES = 2**30
@@ -53,6 +54,8 @@ def _check_entry(number: int, entry: Any) -> None:
     for key in ("pairs", "failed", "bytes"):
         _check(entry, key, _is_count, "a number of 0 or more")
     _check(entry, "sha256", lambda value: _is_digest(value) or entry["file"] is None, "64 hexadecimal digits")
+    if "source_noise_dn" in entry:
+        _check(entry, "source_noise_dn", _is_noise, "a list of null and numbers of 0 or more")
 
 
 def _check(facts: dict[str, Any], key: str, allows: Callable[[Any], bool], expected: str) -> None:
@@ -72,6 +75,10 @@ def _is_count(value: Any) -> bool:
 
 def _is_counts(value: Any) -> bool:
     return isinstance(value, dict) and all(map(_is_count, value.values()))
+
+
+def _is_noise(value: Any) -> bool:
+    return isinstance(value, list) and all(one is None or one in NOT_NEGATIVE for one in value)
 
 
 def _is_source(value: Any) -> bool:

@@ -51,6 +51,7 @@ def pair_row(
     pair: Pair,
     digests: tuple[str, str],
     patch: Patch,
+    source_noise_dn: float | None = None,
 ) -> Row:
     """Return the row of a pair.
 
@@ -74,6 +75,8 @@ def pair_row(
         XXH3-128 of the clean and of the noisy array, 32 hexadecimal digits each.
     patch : Patch
         Part of the full frame that the pair shows.
+    source_noise_dn : float or None
+        Noise of the source itself, DN; None if it was not estimated.
 
     Returns
     -------
@@ -92,6 +95,7 @@ def pair_row(
         "clean_xxh3": digests[0],
         "noisy_xxh3": digests[1],
         "clip": source.clip,
+        "source_noise_dn": source_noise_dn,
         **_cells(plan),
         **physics,
         **_cells(patch),

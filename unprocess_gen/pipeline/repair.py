@@ -304,12 +304,22 @@ def _readable_rows_in_order(folder: Path, facts: Facts) -> Iterator[Row]:
         if row["status"] == "failed":
             failures.setdefault(row["shard"], []).append(row)
     for number, entry in enumerate(facts["shards"]):
-        inside = _rows_inside(folder / entry["file"]) if entry["file"] and _is_intact(folder, entry) else []
+        inside = _rows_inside(folder, entry) if _is_intact(folder, entry) else []
         yield from sorted([*inside, *failures.get(number, [])], key=lambda row: int(image_key(row)))
 
 
-def _rows_inside(shard: Path) -> list[Row]:
-    return [row for content in json_inside(shard) for row in rows_of_json(content)]
+def _rows_inside(folder: Path, entry: Facts) -> list[Row]:
+    """Return the rows of an intact shard; ``source_noise_dn``, which they lack, is in its entry."""
+    if not entry["file"]:
+        return []
+    rows = (row for content in json_inside(folder / entry["file"]) for row in rows_of_json(content))
+    noises = iter(entry.get("source_noise_dn", ()))
+    return [
+        {**row, "source_noise_dn": noise}
+        for of_image in group_by_image(rows)
+        for noise in [next(noises, None)]
+        for row in of_image
+    ]
 
 
 def _regenerated_rows(folder: Path, facts: Facts, config: Config, temporary: Path) -> Iterator[Row]:
@@ -320,8 +330,7 @@ def _regenerated_rows(folder: Path, facts: Facts, config: Config, temporary: Pat
         if entry.get("provisional"):
             yield from (failed_row(source, None, task.shard, config.seed, "worker_died") for source in task.sources)
         elif _is_intact(folder, entry):
-            rows = _rows_inside(folder / entry["file"]) if entry["file"] else []
-            inside = {image_key(of_image[0]): of_image for of_image in group_by_image(rows)}
+            inside = {image_key(of_image[0]): of_image for of_image in group_by_image(_rows_inside(folder, entry))}
             for source in task.sources:
                 yield from inside.get(key_text(source.index)) or [_failure(config, task, source)]
         else:

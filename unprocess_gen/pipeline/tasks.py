@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Row, Source
+from unprocess_gen.core.types import Row, Source, Value
+from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.shards import shard_name
 
 Item = TypeVar("Item")
@@ -146,4 +147,11 @@ class ShardResult:
             "failed": len(self.rows) - pairs,
             "bytes": self.bytes,
             "sha256": self.sha256,
+            **self._source_noise(),
         }
+
+    def _source_noise(self) -> dict[str, list[Value]]:
+        """Return the column ``source_noise_dn`` of each image, from which a lost manifest is restored."""
+        pairs = (row for row in self.rows if row["status"] == "ok")
+        values = [of_image[0]["source_noise_dn"] for of_image in group_by_image(pairs)]
+        return {"source_noise_dn": values} if any(value is not None for value in values) else {}

@@ -29,6 +29,7 @@ from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask, StageTimes
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
+from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.listing import source_file
@@ -116,6 +117,7 @@ def make_image(context: RunContext, shard: int, source: Source, writer: ShardWri
     with log.times.simulating():
         facts = facts_for(config, photograph.srgb, source.frames)
         plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame)
+        noise_dn = None if config.source.root is None else source_noise_dn(photograph.srgb, plans[0])
     log.failures.update(dict.fromkeys(_self_test(context, plans)))
     rows: list[Row] = []
     height, width = photograph.srgb.shape[:2]
@@ -126,7 +128,10 @@ def make_image(context: RunContext, shard: int, source: Source, writer: ShardWri
             pairs = make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin)
         for plan, pair, digests in _add_frames(writer, key, plans, log.times.each_simulated(pairs)):
             row_key = pair_key(key, plan, several=len(plans) > 1)
-            sample.append(pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch))
+            row = pair_row(
+                row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn
+            )
+            sample.append(row)
         writer.add_rows(key, row_json(sample))
         rows += sample
     return rows

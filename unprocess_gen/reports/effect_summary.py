@@ -343,3 +343,33 @@ def posterisation_warning(plans: Sequence[Plan], levels: Sequence[int]) -> str |
         f"clean frames are rounded to {value_range(levels)} levels; compared with them no denoiser exceeds a PSNR of "
         f"{bound} dB (peak: white of the darkened scene); output.clean_dtype=float32 keeps the unrounded mean"
     )
+
+
+NOISY_SOURCE = 0.2
+"""Noise of a source, relative to the simulated noise, above which ``plan`` counts it: it adds 2 % to the total."""
+
+
+def source_noise_sentences(ratios: Sequence[float], downscale: int) -> list[str]:
+    """Return how many sources bring visible noise into the clean frame, and the remedy.
+
+    Parameters
+    ----------
+    ratios : sequence of float
+        For each source, its noise relative to the simulated noise (`source_noise.noise_ratio`).
+    downscale : int
+        The setting ``source.downscale``.
+
+    Returns
+    -------
+    list of str
+        One sentence; empty without a ratio.
+    """
+    if not ratios:
+        return []
+    noisy = sum(ratio > NOISY_SOURCE for ratio in ratios)
+    text = (
+        f"the noise of {noisy} of {len(ratios)} sources exceeds a fifth of the simulated noise "
+        f"({value_range(ratios, 2)} of it)"
+    )
+    remedy = f"; it stays in the clean frame: source.downscale={2 * downscale} averages it" if noisy else ""
+    return [text + remedy]

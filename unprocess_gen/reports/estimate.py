@@ -28,6 +28,7 @@ from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.sizes import source_bytes
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
+from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.reports.benchmark.measure import measure_tier_times
 from unprocess_gen.reports.effect_summary import (
     effect_sentences,
@@ -35,6 +36,7 @@ from unprocess_gen.reports.effect_summary import (
     posterisation_warning,
     scene_sentence,
     scene_warning,
+    source_noise_sentences,
 )
 from unprocess_gen.reports.empty_bands import NONE as NO_BANDS
 from unprocess_gen.reports.empty_bands import EmptyBands, empty_bands, highlight_sentence
@@ -86,6 +88,8 @@ class SourceEstimate:
         Distinct DN in the clean frame; 0 if it is not rounded. Of several patches, in the first.
     bands : EmptyBands
         Bands of raw levels that no 8-bit code of the source reaches, in the complete image.
+    noise_ratio : float or None
+        Noise of the source itself relative to the simulated noise; None for built-in scenes, or if it is not known.
     """
 
     source: Source
@@ -100,6 +104,7 @@ class SourceEstimate:
     unused_pixels: int = 0
     clean_levels: int = 0
     bands: EmptyBands = NO_BANDS
+    noise_ratio: float | None = None
     detail: str = ""
 
 
@@ -275,6 +280,7 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
         unused_pixels=pixels_in_none(cuts, height, width),
         clean_levels=_levels_in(clean),
         bands=empty_bands(photograph.srgb, levels[0]),
+        noise_ratio=None if config.source.root is None else noise_ratio(photograph.srgb, levels[0]),
     )
 
 
@@ -419,6 +425,8 @@ def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[
     else:
         lines += _two_number_lines(config, plans)
     lines += _labelled("highlight", [highlights] if highlights else [])
+    ratios = [source.noise_ratio for source in estimates if source.noise_ratio is not None]
+    lines += _labelled("source", source_noise_sentences(ratios, config.source.downscale))
     lines += _labelled("warning", [warning for warning in warnings if warning])
     return [*lines, *effect_table(config, predictions)] if is_physical(config.noise) else lines
 

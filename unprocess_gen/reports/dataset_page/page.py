@@ -260,7 +260,7 @@ def _parameters(statistics: ManifestStatistics) -> dict[str, Any]:
     shown = {
         parameter.column: statistics.parameters[parameter.column]
         for parameter in PARAMETER_COLUMNS
-        if statistics.physical or not parameter.physical
+        if (statistics.physical or not parameter.physical) and statistics.parameters[parameter.column].linear.number
     }
     numbers = {name: short_number(column.linear.least, 6) for name, column in shown.items() if column.is_constant}
     lines = [(name, value, MEANINGS[name]) for name, value in (texts | numbers).items()]

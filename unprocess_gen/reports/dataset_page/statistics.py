@@ -109,6 +109,7 @@ class ParameterColumn(NamedTuple):
     column: str
     draws: tuple[str, ...] = ()
     physical: bool = False
+    empty_is_zero: bool = True
 
 
 PARAMETER_COLUMNS = (
@@ -132,6 +133,7 @@ PARAMETER_COLUMNS = (
     ParameterColumn("row_std_dn", ("row_std",), physical=True),
     ParameterColumn("column_std_dn", ("column_std",), physical=True),
     ParameterColumn("column_temporal_std_dn", ("column_temporal_std",), physical=True),
+    ParameterColumn("source_noise_dn", empty_is_zero=False),
 )
 """Numeric columns that the report shows; ``physical`` ones only for physical noise profiles."""
 
@@ -233,8 +235,8 @@ class ManifestStatistics:
         for row in pairs:
             self._add_texts(row)
         sites = np.array([float(row["width"] or 0) * float(row["height"] or 0) for row in pairs])
-        for name, statistics in self.parameters.items():
-            statistics.add(_numbers(pairs, name))
+        for parameter in PARAMETER_COLUMNS:
+            self.parameters[parameter.column].add(_numbers(pairs, parameter.column, parameter.empty_is_zero))
         for name, statistics in self.site_fractions.items():
             statistics.add(_numbers(pairs, name) / sites)
 
@@ -265,5 +267,6 @@ def _batches(rows: Iterable[Row]) -> Iterator[list[Row]]:
     return iter(lambda: list(itertools.islice(rows, BATCH_ROWS)), [])
 
 
-def _numbers(rows: Sequence[Row], name: str) -> Float:
-    return np.array([float(row[name] or 0) for row in rows], dtype=np.float64)
+def _numbers(rows: Sequence[Row], name: str, empty_is_zero: bool = True) -> Float:
+    values = (row[name] for row in rows)
+    return np.array([float(value or 0) for value in values if empty_is_zero or value is not None], dtype=np.float64)
