@@ -96,8 +96,8 @@ def source_noise_dn(srgb: Srgb, plan: Plan) -> float | None:
     Returns
     -------
     float or None
-        Median over the quieter half of the tiles, DN, rounded to `DECIMALS`; None if no tile can be used. As the quieter
-        tiles are used, white noise is underestimated, by 7 % for many tiles.
+        Median over the quieter half of the tiles, DN, rounded to `DECIMALS`; None if no tile can be used. Because the
+        quieter tiles are used, white noise is underestimated, by 7 % for many tiles.
     """
     std_dn = np.sort(tile_noise(srgb, plan).std_dn)
     return round(float(std_dn[(std_dn.size - 1) // 2]), DECIMALS) if std_dn.size else None
