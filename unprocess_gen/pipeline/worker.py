@@ -128,9 +128,7 @@ def make_image(context: RunContext, shard: int, source: Source, writer: ShardWri
             pairs = make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin)
         for plan, pair, digests in _add_frames(writer, key, plans, log.times.each_simulated(pairs)):
             row_key = pair_key(key, plan, several=len(plans) > 1)
-            row = pair_row(
-                row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn
-            )
+            row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
             sample.append(row)
         writer.add_rows(key, row_json(sample))
         rows += sample
