@@ -129,8 +129,8 @@ def _green_sites(srgb: Srgb, pattern: str) -> Srgb:
     top, left = divmod(pattern.index("G"), 2)
     inside = np.arange(0, TILE, 2)
     rows, columns = _starts(height)[:, None] + (inside + top), _starts(width)[:, None] + (inside + left)
-    tiles = srgb[rows[:, None, :, None], columns[None, :, None, :]]
-    return tiles.reshape(-1, TILE // 2, TILE // 2, 3)
+    tiles: Srgb = srgb[rows[:, None, :, None], columns[None, :, None, :]].reshape(-1, TILE // 2, TILE // 2, 3)
+    return tiles
 
 
 def _starts(length: int) -> NDArray[np.intp]:
