@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
@@ -416,6 +417,43 @@ def test_only_files_that_share_a_size_are_opened(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(sources.os, "open", lambda path, *args: opened.append(path) or system_open(path, *args))
     number_twins(str(tmp_path), found)
     assert [Path(path).name for path in opened] == ["a.jpg", "b.jpg"]
+
+
+def numbers_of_complete_digests(root: Path, found: tuple[Source, ...]) -> list[int]:
+    """Return the occurrence of each file by the simple rule: hash every file, count those before it."""
+    digests = [hashlib.sha256((root / source.path).read_bytes()).digest() for source in found]
+    return [digests[:place].count(digest) for place, digest in enumerate(digests)]
+
+
+@given(files=st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3), st.integers(0, 2), st.booleans()), max_size=12))
+@settings(max_examples=50)
+def test_numbers_equal_those_of_complete_digests(
+    files: list[tuple[int, int, int, bool]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    root = tmp_path_factory.mktemp("twins")
+    for place, (first, middle, last, small) in enumerate(files):
+        length = 3 if small else sources.TAIL_BYTES + middle
+        content = bytes([first]) + bytes(length) + bytes([last])
+        (root / f"{place:02d}.jpg").write_bytes(content)
+    found = listed(root).sources if files else ()
+    assert [source.occurrence for source in number_twins(str(root), found)] == numbers_of_complete_digests(root, found)
+
+
+def test_only_files_of_equal_size_and_end_are_hashed(tmp_path: Path) -> None:
+    body = bytes(3 * sources.TAIL_BYTES)
+    for name, content in {"a": b"1" + body, "b": body + b"2", "c": b"3" + body, "d": body + b"4"}.items():
+        (tmp_path / f"{name}.jpg").write_bytes(content)
+    numbered = number_twins(str(tmp_path), listed(tmp_path).sources)
+    assert [source.sha256 is not None for source in numbered] == [True, False, True, False]
+    assert [source.occurrence for source in numbered] == [0, 0, 0, 0]
+
+
+def test_only_the_end_of_a_file_of_shared_size_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in "ab":
+        (tmp_path / f"{name}.jpg").write_bytes(bytes(100_000) + name.encode())
+    found = listed(tmp_path).sources
+    monkeypatch.setattr(sources.hashlib, "file_digest", lambda *_: pytest.fail("read completely"))
+    assert number_twins(str(tmp_path), found) == found
 
 
 def test_unreadable_identical_files_keep_number_zero(tmp_path: Path) -> None:

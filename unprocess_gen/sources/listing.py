@@ -14,6 +14,7 @@ from __future__ import annotations
 import errno
 import fnmatch
 import hashlib
+import itertools
 import os
 import re
 import stat
@@ -22,7 +23,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO, NamedTuple, TypeVar
+
+import xxhash
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import leads_outside
@@ -32,6 +35,10 @@ _Result = TypeVar("_Result")
 
 MAX_FILE_BYTES = 2**30
 """Larger photographs are refused unread. 2^26 pixels of 16-bit RGBA, the largest accepted image, take half of it."""
+
+TAIL_BYTES = 4096
+"""Bytes at the end of a file that `number_twins` reads first. The ends of photographs of one size nearly always differ;
+their beginnings, which hold the metadata of a camera, often do not."""
 
 NAMED_SUFFIXES = 5
 """Suffixes of unmatched files that `unmatched_sentence` names; the others are summed."""
@@ -92,20 +99,12 @@ class Listing:
         return sum(self.unmatched.values())
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """One directory entry: ``path`` relative to the root; ``status`` is None if ``stat`` failed with ``error``."""
+class _Found(NamedTuple):
+    """A file or other entry that a glob matches: path below the root, and size or reason as in `Source`."""
 
     path: str
-    matched: bool
-    status: os.stat_result | None
-    error: OSError | None = None
-
-    def is_folder(self) -> bool:
-        return self.status is not None and stat.S_ISDIR(self.status.st_mode)
-
-    def is_file(self) -> bool:
-        return self.status is not None and stat.S_ISREG(self.status.st_mode)
+    size_bytes: int | None
+    reason: str | None
 
 
 def list_folder(
@@ -138,24 +137,21 @@ def list_folder(
     """
     status = root_status(root)
     if stat.S_ISREG(status.st_mode):
-        return Listing((_as_source(0, _Entry(Path(root).name, matched=True, status=status)),))
-    found, skipped = _walk(root, matcher(include), recursive)
-    matched = sorted((entry for entry in found if entry.matched), key=lambda entry: os.fsencode(entry.path))
-    unmatched = [entry.path for entry in found if entry.is_file() and not entry.matched]
+        return Listing((_as_source(0, _found(Path(root).name, status)),))
+    walk = _Walk(root, matcher(include), matcher(video))
+    matched = sorted(walk.matched(recursive), key=lambda found: os.fsencode(found.path))
     if not matched:
-        is_video = matcher(video)
         advice = (
             "set source.clips=true to read videos as clips"
-            if any(is_video(path) for path in unmatched)
+            if walk.has_video
             else "choose a folder of photographs or other globs"
         )
         raise ConfigError(
             f"source.root={root}: no file matches source.include={list(include)} "
             f"({'with' if recursive else 'without'} sub-folders); {advice}"
         )
-    sources = tuple(_as_source(index, entry) for index, entry in enumerate(matched[:limit]))
-    suffixes = Counter(PurePosixPath(encode_name(path)).suffix.lower() for path in unmatched)
-    return Listing(sources, skipped, dict(sorted(suffixes.items(), key=lambda item: (-item[1], item[0]))))
+    sources = tuple(_as_source(index, found) for index, found in enumerate(itertools.islice(matched, limit)))
+    return Listing(sources, walk.skipped, dict(sorted(walk.unmatched.items(), key=lambda item: (-item[1], item[0]))))
 
 
 def unmatched_sentence(unmatched: dict[str, int]) -> str:
@@ -203,6 +199,8 @@ def encode_name(path: str) -> str:
     str
         Valid UTF-8 without line ends; `decode_name` reverses it.
     """
+    if path.isascii() and not _UNSAFE.search(path):
+        return path  # the same object: a million names need no second copy
     text = os.fsencode(path).decode("utf-8", "surrogateescape")
     return _UNSAFE.sub(lambda match: _percent(match.group()), text)
 
@@ -314,15 +312,40 @@ def _stamp(file: BinaryIO) -> Stamp:
 def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     """Assign files of equal content the numbers 0, 1, … in listing order (``occurrence``).
 
-    Only files that share a size are read; their ``sha256`` is kept. A file that cannot be read keeps number 0, since
-    it has no pixels to distinguish.
+    Files of one size are compared by their last `TAIL_BYTES`. Only files that share size and tail are read completely;
+    their ``sha256`` is kept. A file that cannot be read keeps number 0, since it has no pixels to distinguish.
+
+    Parameters
+    ----------
+    root : str
+        Value of ``source.root``.
+    sources : sequence of Source
+        In listing order.
+
+    Returns
+    -------
+    tuple of Source
+        The same sources, numbered.
+
+    Raises
+    ------
+    MachineError
+        If a file has another size than when it was listed.
     """
     sharing = Counter(source.size_bytes for source in sources)
-    seen: Counter[str] = Counter()
-    return tuple(
-        source if source.size_bytes is None or sharing[source.size_bytes] == 1 else _number(root, source, seen)
-        for source in sources
-    )
+    by_size: dict[int, list[int]] = {}
+    for place, source in enumerate(sources):
+        if source.size_bytes is not None and sharing[source.size_bytes] > 1:
+            by_size.setdefault(source.size_bytes, []).append(place)
+    numbered = list(sources)
+    for places in by_size.values():
+        tails = [_tail_digest(root, sources[place]) for place in places]
+        alike = Counter(tails)
+        seen: Counter[str] = Counter()
+        for place, tail in zip(places, tails, strict=True):
+            if tail is not None and alike[tail] > 1:
+                numbered[place] = _number(root, sources[place], seen)
+    return tuple(numbered)
 
 
 def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
@@ -423,58 +446,95 @@ def root_status(root: str) -> os.stat_result:
 
 def matcher(include: Iterable[str]) -> Callable[[str], bool]:
     """Return a function that says whether a relative path matches one of the globs of `list_folder`."""
-    globs = [("/" in glob, re.compile(fnmatch.translate(glob), re.IGNORECASE)) for glob in include]
-    return lambda path: any(rule.match(path if full else path.rpartition("/")[2]) for full, rule in globs)
+    globs = tuple(include)
+    of_path, of_name = (_one_of(glob for glob in globs if ("/" in glob) is full) for full in (True, False))
+    return lambda path: of_name(path.rpartition("/")[2]) is not None or of_path(path) is not None
 
 
-def _walk(root: str, matches: Callable[[str], bool], recursive: bool) -> tuple[list[_Entry], int]:
-    """Return all entries below ``root``, and the number of folders skipped because they contain themselves."""
-    found: list[_Entry] = []
-    skipped = 0
-    # a stack instead of recursion: folders may be nested deeper than Python's call stack
-    waiting = [("", frozenset((_identity(Path(root).stat()),)))]
-    while waiting:
-        folder, ancestors = waiting.pop()
-        entries = _scan(root, folder, matches)
-        found += entries
-        for entry in entries if recursive else ():
-            _check_not_lost(root, entry)
-            if entry.status is None or not entry.is_folder():
-                continue
-            if _identity(entry.status) in ancestors:
-                skipped += 1
-            else:
-                waiting.append((entry.path, ancestors | {_identity(entry.status)}))
-    return found, skipped
+def _one_of(globs: Iterable[str]) -> Callable[[str], re.Match[str] | None]:
+    """Return the ``match`` of one regular expression for several globs, which matches nothing if there are none."""
+    return re.compile("|".join(map(fnmatch.translate, globs)) or r"(?!)", re.IGNORECASE).match
 
 
-def _scan(root: str, folder: str, matches: Callable[[str], bool]) -> list[_Entry]:
+class _Walk:
+    """Walk a folder once, keeping only what a listing needs of each entry.
+
+    A ``stat_result`` per entry would take 700 bytes per file; here a matched file takes 64 bytes and its path, and
+    others are counted.
+
+    Attributes
+    ----------
+    skipped : int
+        Folders not entered because they contain themselves.
+    unmatched : Counter of str
+        Regular files that no glob matches, by suffix.
+    has_video : bool
+        Whether one of them is a video.
+    """
+
+    def __init__(self, root: str, matches: Callable[[str], bool], is_video: Callable[[str], bool]) -> None:
+        self._root = root
+        self._matches = matches
+        self._is_video = is_video
+        self.skipped = 0
+        self.unmatched: Counter[str] = Counter()
+        self.has_video = False
+
+    def matched(self, recursive: bool) -> Iterator[_Found]:
+        """Yield the entries that a glob matches, in the order of the walk."""
+        # a stack instead of recursion: folders may be nested deeper than Python's call stack
+        waiting = [("", frozenset((_identity(Path(self._root).stat()),)))]
+        while waiting:
+            folder, ancestors = waiting.pop()
+            for path, status, error in _scan(self._root, folder):
+                matched = self._matches(path)
+                if matched:
+                    yield _found(path, status)
+                if status is None:
+                    if recursive and not matched:
+                        _check_not_lost(self._root, path, error)
+                elif stat.S_ISDIR(status.st_mode):
+                    if recursive and _identity(status) in ancestors:
+                        self.skipped += 1
+                    elif recursive:
+                        waiting.append((path, ancestors | {_identity(status)}))
+                elif stat.S_ISREG(status.st_mode) and not matched:
+                    self._count_unmatched(path)
+
+    def _count_unmatched(self, path: str) -> None:
+        self.unmatched[PurePosixPath(encode_name(path)).suffix.lower()] += 1
+        self.has_video = self.has_video or self._is_video(path)
+
+
+def _scan(root: str, folder: str) -> Iterator[tuple[str, os.stat_result | None, OSError | None]]:
+    """Yield path, status and error of each entry of a folder; the status is None if ``stat`` failed with the error."""
     prefix = folder + "/" if folder else ""
     try:
         with os.scandir(os.path.join(root, folder)) as entries:
-            return [_entry(entry, prefix + entry.name, matches(prefix + entry.name)) for entry in entries]
+            for entry in entries:
+                yield prefix + entry.name, *_status(entry)
     except OSError as error:
         raise _unreadable_folder(root, folder, error) from None
 
 
-def _entry(entry: os.DirEntry[str], path: str, matched: bool) -> _Entry:
+def _status(entry: os.DirEntry[str]) -> tuple[os.stat_result | None, OSError | None]:
     try:
         status = entry.stat()
         if stat.S_ISDIR(status.st_mode) and not status.st_ino:
             status = Path(entry.path).stat()  # on Windows, DirEntry.stat gives no numbers that identify a folder
-        return _Entry(path, matched, status)
     except OSError as error:
-        return _Entry(path, matched, None, error)
+        return None, error
+    return status, None
 
 
 def _identity(status: os.stat_result) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
-def _check_not_lost(root: str, entry: _Entry) -> None:
+def _check_not_lost(root: str, path: str, error: OSError | None) -> None:
     """Raise ConfigError for an unreadable entry that may be a folder of photographs; broken links cannot be one."""
-    if entry.error is not None and not entry.matched and entry.error.errno not in _BROKEN_LINK:
-        raise _unreadable_folder(root, entry.path, entry.error)
+    if error is not None and error.errno not in _BROKEN_LINK:
+        raise _unreadable_folder(root, path, error)
 
 
 def _unreadable_folder(root: str, folder: str, error: OSError) -> ConfigError:
@@ -485,13 +545,14 @@ def _unreadable_folder(root: str, folder: str, error: OSError) -> ConfigError:
     )
 
 
-def _as_source(index: int, entry: _Entry) -> Source:
-    name = encode_name(entry.path)
-    if entry.status is None:
-        return Source(index, name, entry.path, None, "unreadable")
-    if not entry.is_file():
-        return Source(index, name, entry.path, None, "not_a_file")
-    return Source(index, name, entry.path, entry.status.st_size)
+def _found(path: str, status: os.stat_result | None) -> _Found:
+    if status is None:
+        return _Found(path, None, "unreadable")
+    return _Found(path, status.st_size, None) if stat.S_ISREG(status.st_mode) else _Found(path, None, "not_a_file")
+
+
+def _as_source(index: int, found: _Found) -> Source:
+    return Source(index, encode_name(found.path), *found)
 
 
 def _percent(text: str) -> str:
@@ -535,6 +596,17 @@ def _reading(source: Source, action: Callable[[], _Result]) -> _Result:
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise SourceError("unreadable", f"{source.name}: {why}") from None
+
+
+def _tail_digest(root: str, source: Source) -> int | None:
+    """Return a digest of a file's last `TAIL_BYTES`, None if it cannot be read."""
+    try:
+        with _opened(root, source) as file:
+            start = max(0, (source.size_bytes or 0) - TAIL_BYTES)
+            _reading(source, lambda: file.seek(start))
+            return xxhash.xxh3_64_intdigest(_reading(source, lambda: file.read(TAIL_BYTES)))
+    except SourceError:
+        return None
 
 
 def _number(root: str, source: Source, seen: Counter[str]) -> Source:
