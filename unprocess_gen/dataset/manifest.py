@@ -459,15 +459,13 @@ def readable_rows(path: Path) -> Iterator[Row]:
     Row
         Intact rows. The first line is ignored: each line is read with the header of the version that fits it.
     """
-    try:
-        lines = path.read_bytes().splitlines(keepends=True)
-    except OSError:
-        return
-    for line in lines[1:]:
-        for names in HEADERS:
-            with contextlib.suppress(csv.Error, ValueError):
-                yield _typed(names, line)
-                break
+    with contextlib.suppress(OSError), path.open("rb") as stream:
+        stream.readline(MAX_LINE_BYTES + 1)
+        while line := stream.readline(MAX_LINE_BYTES + 1):
+            for names in HEADERS:
+                with contextlib.suppress(csv.Error, ValueError):
+                    yield _typed(names, line)
+                    break
 
 
 def read_row(path: Path, at: int) -> Row:

@@ -36,9 +36,9 @@ from unprocess_gen.core.errors import (
 )
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Frame, Row, Source
-from unprocess_gen.dataset.columns import HEADERS
+from unprocess_gen.dataset.columns import HEADERS, NAMES
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
-from unprocess_gen.dataset.manifest import failed_row, readable_rows, rows_of_json, write_rows
+from unprocess_gen.dataset.manifest import failed_row, read_rows, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import (
     CLEAN,
     ExpectedSample,
@@ -51,7 +51,7 @@ from unprocess_gen.dataset.shards import (
 from unprocess_gen.pipeline.generate import shard_tasks, tally
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
-from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, rows_by_shard
+from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, shard_rows
 from unprocess_gen.pipeline.worker import make_shard
 from unprocess_gen.pipeline.workspace import (
     Workspace,
@@ -149,13 +149,15 @@ def _repair(folder: Path, root: str | None, temporary: Path) -> Iterator[RepairS
     yield from step
     config = _config(folder / "config.yaml", root)
     yield from _manifest(folder, facts, config, temporary)
-    rows = rows_by_shard(folder / "manifest.csv")
-    for number in sorted(rows):
-        yield from _shard(folder, number, [row for row in rows[number] if row["status"] == "ok"], root, temporary)
-    names = {shard_name(number) for number in rows if any(row["status"] == "ok" for row in rows[number])}
+    names = set()
+    for number, rows in shard_rows(folder / "manifest.csv"):
+        pairs = [row for row in rows if row["status"] == "ok"]
+        yield from _shard(folder, number, pairs, root, temporary)
+        if pairs:
+            names.add(shard_name(number))
     yield from _set_aside(folder, names)
     if not facts:
-        yield _dataset(folder, text, rows, config, temporary)
+        yield _dataset(folder, text, config, temporary)
 
 
 def _intact_facts(folder: Path) -> Facts:
@@ -263,7 +265,8 @@ def _manifest(folder: Path, facts: Facts, config: Config, temporary: Path) -> It
 
 def _is_intact_manifest(folder: Path) -> bool:
     try:
-        rows_by_shard(folder / "manifest.csv")
+        for _ in shard_rows(folder / "manifest.csv"):
+            pass
     except DamageError:
         return False
     return _is_proved(folder, file_sha256(folder / "manifest.csv"), _fingerprint(folder))
@@ -281,14 +284,19 @@ def _write_manifest(rows: Iterable[Row], path: Path, facts: Facts, temporary: Pa
 
     Tries the header of every version, because the lost manifest may be of an older one.
     """
-    part, rows = temporary / path.name, list(rows)
+    complete, part = temporary / f"{path.name}.all", temporary / path.name
+    _write_csv(complete, rows, NAMES)
     for names in HEADERS:
-        with part.open("w", encoding="utf-8", newline="") as stream:
-            write_rows(stream, rows, names)
+        _write_csv(part, read_rows(complete), names)
         if file_sha256(part) == facts["manifest_sha256"]:
             _place(part, path)
             return True
     return False
+
+
+def _write_csv(path: Path, rows: Iterable[Row], names: Sequence[str]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        write_rows(stream, rows, names)
 
 
 def _is_intact(folder: Path, entry: Facts) -> bool:
@@ -421,15 +429,16 @@ def _move_aside(folder: Path, path: Path) -> Path:
 # ---------------------------------------------------------------------------------------------------- dataset.json
 
 
-def _dataset(folder: Path, text: str, rows: dict[int, list[Row]], config: Config, temporary: Path) -> RepairStep:
+def _dataset(folder: Path, text: str, config: Config, temporary: Path) -> RepairStep:
     """Restore ``dataset.json`` from the other files: to the same bytes if its facts about the run are readable."""
     path = folder / "dataset.json"
     old = _readable(path)
-    pairs, failed, sites = tally(row for number in sorted(rows) for row in rows[number])
+    manifest = folder / "manifest.csv"
+    pairs, failed, sites = tally(read_rows(manifest))
     known = dataset_facts(
         text,
-        file_sha256(folder / "manifest.csv"),
-        [_entry(folder, number, rows[number], old) for number in sorted(rows)],
+        file_sha256(manifest),
+        [_entry(folder, number, rows, old) for number, rows in shard_rows(manifest)],
         {"pairs": pairs, "failed": failed, "sites": sites},
     )
     digest = old.pop("dataset_sha256", None)

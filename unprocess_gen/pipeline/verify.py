@@ -5,12 +5,15 @@ every byte of its sample except the contents of the arrays, of which it records 
 the manifest member by member (`shards.check_members`), and damage is reported by shard, key and member.
 
 Each shard is read once for its members, at the speed of XXH3. If they are intact, a second pass computes its SHA-256
-at about 1.5 GB/s.
+at about 1.5 GB/s. The manifest is read once, in step with the shards, so that memory does not grow with its rows.
 """
 
 from __future__ import annotations
 
 import csv
+import heapq
+import itertools
+import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,18 +93,17 @@ def _verify(folder: Path) -> list[Damage]:
         )
     damages: list[Damage] = []
     facts: dict[str, Any] = {}
-    rows: dict[int, list[Row]] | None = None
     try:
         facts = read_dataset(folder / "dataset.json")
     except DamageError as error:
         damages.append(Damage("dataset.json", _without_path(error)))
     damages += _check_files(folder, facts)
+    listed = {number: entry for number, entry in enumerate(facts.get("shards", [])) if entry["file"] is not None}
     try:
-        rows = rows_by_shard(folder / "manifest.csv")
-        return damages + list(_check_shards(folder, facts.get("shards"), rows))
+        return damages + _check_shards(folder, listed, shard_rows(folder / "manifest.csv"))
     except DamageError as error:
         damages.append(Damage("manifest.csv", _without_path(error)))
-    return damages + list(_check_shards(folder, facts.get("shards"), None))
+    return damages + _check_shards(folder, listed, iter(()))
 
 
 def is_sweep(folder: Path) -> bool:
@@ -196,34 +198,78 @@ def _check_files(folder: Path, facts: dict[str, Any]) -> Iterator[Damage]:
             yield Damage(name, f"its SHA-256 is {found}, dataset.json records {facts[field]}")
 
 
-def rows_by_shard(manifest: Path) -> dict[int, list[Row]]:
-    """Return a manifest's rows by the number of their shard; raise DamageError if it cannot be read."""
-    rows: dict[int, list[Row]] = {}
-    for row in read_rows(manifest):
-        shard = row["shard"]
-        if not isinstance(shard, int):
-            raise DamageError(f"{manifest}: row {row['key']} names no shard")
-        rows.setdefault(shard, []).append(row)
-    return rows
+ShardRows = tuple[int, list[Row]]
+"""Number of a shard, and its rows in the order of the manifest."""
 
 
-def _check_shards(
-    folder: Path, entries: list[dict[str, Any]] | None, rows: dict[int, list[Row]] | None
-) -> Iterator[Damage]:
-    """Compare the shards with ``dataset.json`` and the manifest, or with the one of them that is readable."""
-    listed = {number: entry for number, entry in enumerate(entries or []) if entry["file"] is not None}
-    filled = {number for number, some in (rows or {}).items() if any(row["status"] == "ok" for row in some)}
-    wanted = {shard_name(number): number for number in sorted(listed.keys() | filled)}
+def shard_rows(manifest: Path) -> Iterator[ShardRows]:
+    """Read the rows of a manifest shard by shard.
+
+    Parameters
+    ----------
+    manifest : Path
+        A ``manifest.csv``.
+
+    Yields
+    ------
+    int
+        Number of a shard.
+    list of Row
+        All its rows, failed ones too.
+
+    Raises
+    ------
+    DamageError
+        If the manifest cannot be read, or its shards are not in ascending order.
+    """
+    last = -1
+    for number, rows in itertools.groupby(read_rows(manifest), key=_shard_of):
+        some = list(rows)
+        if number is None:
+            raise DamageError(f"{manifest}: row {some[0]['key']} names no shard")
+        if number <= last:
+            raise DamageError(
+                f"{manifest}: row {some[0]['key']} of shard {number} follows rows of shard {last}; expected shards in "
+                "ascending order"
+            )
+        last = number
+        yield number, some
+
+
+def _shard_of(row: Row) -> int | None:
+    shard = row["shard"]
+    return shard if isinstance(shard, int) else None
+
+
+def _check_shards(folder: Path, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]) -> list[Damage]:
+    """Compare the shards with ``dataset.json`` and the manifest, or with the one of them that is readable.
+
+    ``listed`` has the entries of shards with a file, in ascending order; ``of_manifest`` is empty if the manifest
+    cannot be read. Raises DamageError if that is found out on the way.
+    """
     present = {path.name for path in (folder / "shards").iterdir()} if (folder / "shards").is_dir() else set()
-    for name in sorted(present - wanted.keys()):
-        yield Damage(f"shards/{name}", "is not part of this dataset")
-    for name, number in wanted.items():
-        if name not in present:
-            yield Damage(f"shards/{name}", "is missing")
-        else:
-            path = folder / "shards" / name
-            damages = list(_check_members(path, rows[number] if number in filled and rows else []) if rows else ())
-            yield from damages or _check_sha256(path, listed.get(number))
+    foreign, damages = set(present), list[Damage]()
+    first = next(of_manifest, None)
+    for number, rows in _merged(listed, itertools.chain([] if first is None else [first], of_manifest)):
+        pairs = [row for row in rows if row["status"] == "ok"]
+        if not pairs and number not in listed:
+            continue
+        path = folder / "shards" / shard_name(number)
+        foreign.discard(path.name)
+        if path.name not in present:
+            damages.append(Damage(f"shards/{path.name}", "is missing"))
+            continue
+        found = [] if first is None else list(_check_members(path, pairs))
+        damages += found or _check_sha256(path, listed.get(number))
+    return [Damage(f"shards/{name}", "is not part of this dataset") for name in sorted(foreign)] + damages
+
+
+def _merged(listed: Iterable[int], of_manifest: Iterable[ShardRows]) -> Iterator[ShardRows]:
+    """Yield every shard that ``dataset.json`` or the manifest has, in ascending order; without rows if only listed."""
+    without_rows: Iterable[ShardRows] = ((number, []) for number in listed)
+    shards = heapq.merge(without_rows, of_manifest, key=operator.itemgetter(0))
+    for number, parts in itertools.groupby(shards, key=operator.itemgetter(0)):
+        yield number, [row for _, rows in parts for row in rows]
 
 
 def _check_members(path: Path, rows: Iterable[Row]) -> Iterator[Damage]:
