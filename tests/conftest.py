@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ import cv2
 import hypothesis
 import numpy as np
 import pytest
+from helpers import object_store as servers
 from helpers.commands import COMMAND, Cli, Done, RunMain, environment
 from helpers.configs import composed
 from helpers.datasets import MadeHash, Make, Settings, TreeHash
@@ -25,9 +27,12 @@ from PIL import Image
 
 from unprocess_gen.cli import main as entry_point
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.sources import loader
 from unprocess_gen.sources.scenes import synthetic
+
+_BUCKETS = itertools.count()
 
 pytest_plugins = ["helpers.linux_only", "helpers.promise_report"]
 
@@ -94,6 +99,27 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     image(pixels(13, 17, 131)).save(folder / "wide.png")
     (folder / "notes.txt").write_text("not a photograph")
     return folder
+
+
+@pytest.fixture(scope="session")
+def s3_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Return the endpoint of an S3 server that runs in a process of its own."""
+    pytest.importorskip("obstore")
+    with servers.moto_server(tmp_path_factory.mktemp("moto") / "log") as endpoint:
+        yield endpoint
+
+
+@pytest.fixture
+def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Let this process, and those that it starts, use the S3 server; return its endpoint."""
+    servers.use(monkeypatch, s3_server)
+    return s3_server
+
+
+@pytest.fixture
+def bucket(s3: str) -> ObjectPath:
+    """Return the URL of an empty bucket."""
+    return servers.create_bucket(s3, f"bucket-{next(_BUCKETS):04d}")
 
 
 @pytest.fixture(scope="session")

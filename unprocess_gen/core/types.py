@@ -52,6 +52,8 @@ class Source:
         Number of clips before this one with the same ``clip_sha256``.
     frames : int
         Number of frames in the clip; 1 for a photograph.
+    etag : str or None
+        ETag of the object in an object store, which identifies its content; None for files and scenes.
     """
 
     index: int
@@ -66,6 +68,7 @@ class Source:
     clip_sha256: str | None = None
     clip_occurrence: int = 0
     frames: int = 1
+    etag: str | None = None
 
     @property
     def is_video(self) -> bool:

@@ -1,0 +1,277 @@
+"""Objects of S3: listing, range reads, create-only writes, retries, and errors in one sentence."""
+
+from __future__ import annotations
+
+import builtins
+import os
+import pickle
+import threading
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from helpers import object_store as servers
+from helpers.object_store import Proxy
+
+from unprocess_gen.core import object_store
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.object_store import (
+    MAX_PIECE,
+    ObjectChangedError,
+    ObjectFacts,
+    ObjectPath,
+    StoreAccessError,
+    any_path,
+    is_url,
+    local_copy,
+)
+
+QUICK = {"init_backoff": timedelta(milliseconds=1), "max_backoff": timedelta(milliseconds=20), "base": 2}
+
+CONTENT = bytes(range(251)) * 1000
+
+
+@pytest.fixture
+def slow_proxy(s3: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+    """Return a proxy that this process uses, with retries after a few milliseconds."""
+    from obstore import store
+
+    def quick(url: str, client_options: dict[str, Any], retry_config: dict[str, Any]) -> object:
+        retry_config = {**retry_config, "backoff": QUICK}
+        return actual(url, client_options=client_options, retry_config=retry_config)
+
+    actual = store.from_url
+    monkeypatch.setattr(store, "from_url", quick)
+    with servers.proxy(s3) as proxy:
+        servers.use(monkeypatch, proxy.endpoint)
+        yield proxy
+    object_store._store.cache_clear()
+
+
+def test_only_known_schemes_are_urls() -> None:
+    assert all(map(is_url, ("s3://bucket", "gs://bucket/a", "az://container/a b")))
+    assert not any(
+        map(is_url, ("bucket", "s3:/bucket", "/s3://bucket", "./s3://bucket", "http://a/b", None, Path("a")))
+    )
+    assert any_path("s3:") == Path("s3:")
+
+
+def test_url_keeps_its_key_as_written() -> None:
+    path = any_path("s3://bucket/a b/50%/é#?.jpg/")
+    assert isinstance(path, ObjectPath)
+    assert (path.bucket, path.key, path.name) == ("bucket", "a b/50%/é#?.jpg", "é#?.jpg")
+    assert str(path.parent / path.name) == str(path) == "s3://bucket/a b/50%/é#?.jpg"
+    assert pickle.loads(pickle.dumps(path)) == path
+
+
+def test_url_without_bucket_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"s3:///key: not the URL of an object store; expected s3://BUCKET"):
+        ObjectPath("s3:///key")
+
+
+def test_hostile_names_keep_their_spelling(bucket: ObjectPath) -> None:
+    names = ["a b.jpg", "%41.jpg", "ü#?.jpg", "d/x+y=&.jpg", "-lead", "~z", "back\\slash", "a[1]{2}|^`\"<>*'.jpg"]
+    for name in names:
+        (bucket / name).write_bytes(name.encode())
+    assert sorted(found.key for found in bucket.objects()) == sorted(names)
+    assert [(bucket / name).read_bytes().decode() for name in names] == names
+
+
+def test_listing_follows_prefixes_and_levels(bucket: ObjectPath) -> None:
+    for name in ("photos/a", "photos/sub/b", "photos2/c", "d"):
+        (bucket / name).write_bytes(b"12")
+    photos = bucket / "photos"
+    assert sorted(found.key for found in photos.objects()) == ["a", "sub/b"]
+    assert [found.key for found in photos.objects(recursive=False)] == ["a"]
+    assert sorted(path.name for path in bucket.iterdir()) == ["d", "photos", "photos2"]
+    assert photos.is_dir() and photos.exists() and not photos.is_file()
+    assert (bucket / "d").is_file() and not (bucket / "d").is_dir()
+    assert not (bucket / "none").exists() and (bucket / "none").facts() is None
+
+
+def test_reader_seeks_like_a_file(bucket: ObjectPath, tmp_path: Path) -> None:
+    (bucket / "data").write_bytes(CONTENT)
+    (tmp_path / "data").write_bytes(CONTENT)
+    with (bucket / "data").open() as remote, (tmp_path / "data").open("rb") as local:
+        for seek, size in (
+            ((0,), 10),
+            ((70000,), 3),
+            ((-5, 2), 99),
+            ((-20, 1), 4),
+            ((len(CONTENT) + 9,), 5),
+            ((1,), -1),
+        ):
+            assert (remote.seek(*seek), remote.read(size)) == (local.seek(*seek), local.read(size))
+        assert (remote.seek(250), remote.readline()) == (local.seek(250), local.readline())
+    assert (bucket / "data").read_range(250, 3) == CONTENT[250:253]
+    assert (bucket / "data").read_range(len(CONTENT) - 2, 9) == CONTENT[-2:]
+    assert (bucket / "data").read_range(len(CONTENT) + 2, 9) == b""
+    assert (bucket / "data").stat().st_size == len(CONTENT)
+
+
+def test_empty_object_reads_as_no_bytes(bucket: ObjectPath) -> None:
+    (bucket / "empty").write_bytes(b"")
+    assert (bucket / "empty").read_bytes() == b""
+    assert (bucket / "empty").stat().st_size == 0
+
+
+def test_pieces_of_large_objects_are_joined(bucket: ObjectPath, tmp_path: Path) -> None:
+    large = os.urandom(2 * MAX_PIECE + 12345)
+    (tmp_path / "large").write_bytes(large)
+    (bucket / "large").put_file(tmp_path / "large")
+    assert (bucket / "large").read_bytes() == large
+    with local_copy(bucket / "large") as copy:
+        assert copy.read_bytes() == large
+    assert not copy.exists()
+    with local_copy(tmp_path / "large") as same:
+        assert same == tmp_path / "large"
+
+
+def test_sequential_reading_takes_few_requests(slow_proxy: Proxy, bucket: ObjectPath) -> None:
+    (bucket / "data").write_bytes(bytes(2**22))
+    before = slow_proxy.count("GET")
+    with (bucket / "data").open() as stream:
+        while stream.readline(2**12):
+            pass
+    assert slow_proxy.count("GET") - before <= 8
+
+
+def test_missing_object_is_a_missing_file(bucket: ObjectPath) -> None:
+    for action in ((bucket / "none").read_bytes, (bucket / "none").open().read, (bucket / "none").stat):
+        with pytest.raises(FileNotFoundError, match=f"s3://{bucket.bucket}/none"):
+            action()
+
+
+def test_missing_bucket_is_named_in_one_line(s3: str) -> None:
+    missing = ObjectPath("s3://no-such-bucket/photos")
+    for action in (lambda: list(missing.objects()), lambda: missing.write_bytes(b"1"), missing.exists):
+        with pytest.raises(
+            StoreAccessError, match=r"^s3://no-such-bucket/photos: access was refused \(.*Bucket"
+        ) as error:
+            action()
+        assert "\n" not in str(error.value)
+
+
+def test_refused_credentials_are_named_in_one_line(slow_proxy: Proxy, bucket: ObjectPath) -> None:
+    for slow_proxy.answer in (lambda *_: 401, lambda *_: 403):
+        with pytest.raises(StoreAccessError, match=rf"^{bucket}/a: access was refused \(40[13] .*AWS_ACCESS_KEY_ID$"):
+            (bucket / "a").read_bytes()
+
+
+def test_create_writes_only_if_absent(bucket: ObjectPath) -> None:
+    assert (bucket / "one").create(b"first")
+    assert not (bucket / "one").create(b"second")
+    assert (bucket / "one").read_bytes() == b"first"
+
+
+def test_one_of_many_creators_wins(bucket: ObjectPath) -> None:
+    outcomes: list[tuple[int, bool]] = []
+    start = threading.Barrier(8)
+
+    def create(number: int) -> None:
+        start.wait()
+        outcomes.append((number, (bucket / "raced").create(str(number).encode())))
+
+    threads = [threading.Thread(target=create, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    winners = [number for number, won in outcomes if won]
+    assert len(outcomes) == 8 and len(winners) == 1
+    assert (bucket / "raced").read_bytes() == str(winners[0]).encode()
+
+
+def test_changed_etag_is_reported(bucket: ObjectPath) -> None:
+    path = bucket / "changing"
+    path.write_bytes(b"before")
+    facts = path.facts()
+    assert isinstance(facts, ObjectFacts)
+    assert path.read_bytes(facts.etag) == b"before"
+    path.write_bytes(b"after!")
+    with pytest.raises(ObjectChangedError, match=rf"^{path}: "):
+        path.read_bytes(facts.etag)
+
+
+def test_object_replaced_while_read_is_reported(bucket: ObjectPath) -> None:
+    path = bucket / "changing"
+    path.write_bytes(bytes(2**20))
+    with path.open() as stream:
+        stream.read(10)
+        path.write_bytes(b"1" * 2**20)
+        with pytest.raises(ObjectChangedError):
+            stream.read()
+
+
+def test_deleting_twice_is_no_error(bucket: ObjectPath) -> None:
+    (bucket / "a").write_bytes(b"1")
+    (bucket / "a").delete()
+    (bucket / "a").delete()
+    assert not (bucket / "a").exists()
+
+
+def test_failing_answers_are_repeated(slow_proxy: Proxy, bucket: ObjectPath) -> None:
+    answers = iter([503, 500, 0, 503, 0, 503, 503, 0])
+    slow_proxy.answer = lambda *_: next(answers)
+    (bucket / "a").write_bytes(b"1")
+    assert (bucket / "a").read_bytes() == b"1"
+    assert [found.key for found in bucket.objects()] == ["a"]
+
+
+def test_lasting_failure_ends_in_one_line(slow_proxy: Proxy, bucket: ObjectPath) -> None:
+    slow_proxy.answer = lambda *_: 503
+    with pytest.raises(MachineError, match=rf"^{bucket}/a: the object store failed \(503 .*; rerun when it answers$"):
+        (bucket / "a").read_bytes()
+    assert len(slow_proxy.requests) == object_store.MAX_RETRIES + 1
+
+
+def test_slow_answer_is_repeated(slow_proxy: Proxy, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bucket / "a").write_bytes(b"1")
+    monkeypatch.setattr(object_store, "REQUEST_TIMEOUT_S", 0.3)
+    object_store._store.cache_clear()
+    slow_proxy.delay_s = 0.6
+
+    def recover(*_: str) -> int:
+        slow_proxy.delay_s = 0.6 if len(slow_proxy.requests) < 3 else 0.0
+        return 0
+
+    slow_proxy.answer = recover
+    assert (bucket / "a").read_bytes() == b"1"
+
+
+def test_unreachable_server_ends_in_one_line(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_store, "MAX_RETRIES", 0)
+    servers.use(monkeypatch, f"http://127.0.0.1:{servers.free_port()}")
+    with pytest.raises(MachineError, match=r"^s3://bucket/a: the object store failed \(.*\); rerun when it answers$"):
+        ObjectPath("s3://bucket/a").read_bytes()
+    object_store._store.cache_clear()
+
+
+def test_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    imported = builtins.__import__
+
+    def without_obstore(name: str, *arguments: Any, **named: Any) -> ModuleType:
+        if name.startswith("obstore"):
+            raise ImportError(name)
+        return imported(name, *arguments, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without_obstore)
+    with pytest.raises(ConfigError, match=r"^s3://bucket/a: object stores need obstore; .*pip install '\.\[remote\]'"):
+        ObjectPath("s3://bucket/a").read_bytes()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_forked_process_is_refused_instead_of_hanging(bucket: ObjectPath) -> None:
+    (bucket / "a").write_bytes(b"1")
+    pid = os.fork()
+    if pid == 0:
+        try:
+            (bucket / "a").read_bytes()
+        except MachineError as error:
+            os._exit(0 if "spawn" in str(error) else 1)
+        finally:
+            os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
