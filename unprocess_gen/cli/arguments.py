@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import AnyPath, any_path
 from unprocess_gen.core.suggestions import did_you_mean
 
 ANY_VALUE = ("…",)
@@ -146,7 +147,7 @@ class Call:
     ----------
     values : mapping
         Values by `Argument.key`; arguments that were not given are absent.
-    path : Path or None
+    path : Path, ObjectPath or None
         The verb's place.
     overrides : list of str
         Config overrides and Hydra's flags, in the order given.
@@ -155,7 +156,7 @@ class Call:
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
-    path: Path | None = None
+    path: AnyPath | None = None
     overrides: list[str] = field(default_factory=list)
     words: list[str] = field(default_factory=list)
 
@@ -330,7 +331,7 @@ def _assign_words(verb: Verb, words: list[str], values: dict[str, Any]) -> Call:
             raise ConfigError(f"{verb.name}: {word}: given twice, also as {known[key].names[0]}; expected one of them")
         else:
             values[known[key].key] = _read(known[key], f"{verb.name}: {key}=", text)
-    return Call(values, None if path is None else Path(path), words=others)
+    return Call(values, None if path is None else any_path(path), words=others)
 
 
 def _expected(verb: Verb, word: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import xxhash
 
 from unprocess_gen.core.errors import MachineError
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import DESCRIPTIONS, Frame
 
 RESUME = "finished shards are kept; rerun to resume"
@@ -55,12 +56,12 @@ def little_endian(array: Frame) -> Frame:
     return np.ascontiguousarray(array, dtype=DESCRIPTIONS[array.dtype.name])
 
 
-def file_sha256(path: Path) -> str:
+def file_sha256(path: AnyPath) -> str:
     """Return the SHA-256 of a file.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         The file.
 
     Returns
@@ -72,14 +73,14 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def machine_error(error: OSError, path: Path, advice: str = "") -> MachineError:
+def machine_error(error: OSError, path: AnyPath, advice: str = "") -> MachineError:
     """Turn a failed file operation into one sentence: which path, why, and how much space is free if it matters.
 
     Parameters
     ----------
     error : OSError
         What the operating system reported.
-    path : Path
+    path : Path or ObjectPath
         The file or folder in use, for errors that name none.
     advice : str
         What to do, appended to the sentence.
@@ -90,7 +91,7 @@ def machine_error(error: OSError, path: Path, advice: str = "") -> MachineError:
         For the caller to raise.
     """
     reason = error.strerror or str(error)
-    if error.errno in NO_SPACE:
+    if error.errno in NO_SPACE and isinstance(path, Path):
         with suppress(OSError):
             reason += f" ({free_bytes(path)} bytes free)"
     if error.errno == errno.ENOENT and not path.exists():

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from unprocess_gen.core.errors import ConfigError, MachineError
-from unprocess_gen.core.files import machine_error
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -303,6 +302,22 @@ def any_path(text: str | os.PathLike[str] | ObjectPath) -> AnyPath:
     return ObjectPath(text) if isinstance(text, str) and is_url(text) else Path(text)
 
 
+def folder_name(path: AnyPath) -> str:
+    """Return the name of a folder, for ``.`` and ``..`` too.
+
+    Parameters
+    ----------
+    path : Path or ObjectPath
+        The folder.
+
+    Returns
+    -------
+    str
+        Its last part.
+    """
+    return path.name if isinstance(path, ObjectPath) else path.name or path.resolve().name
+
+
 @contextmanager
 def local_copy(path: AnyPath, etag: str | None = None) -> Iterator[Path]:
     """Provide a file on the local disk.
@@ -323,8 +338,10 @@ def local_copy(path: AnyPath, etag: str | None = None) -> Iterator[Path]:
     ------
     FileNotFoundError
         If there is no such object.
+    OSError
+        If the local disk is full or fails.
     MachineError
-        If the store does not answer, or the disk is full.
+        If the store does not answer.
     """
     if isinstance(path, Path):
         yield path
@@ -332,14 +349,9 @@ def local_copy(path: AnyPath, etag: str | None = None) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="unprocess_gen-") as folder:
         file = Path(folder) / path.name
         reader = _RangeReader(path, etag, first_piece=MAX_PIECE)
-        try:
-            with file.open("wb") as stream:
-                while piece := reader.read(MAX_PIECE):
-                    stream.write(piece)
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise machine_error(error, file) from error
+        with file.open("wb") as stream:
+            while piece := reader.read(MAX_PIECE):
+                stream.write(piece)
         yield file
 
 

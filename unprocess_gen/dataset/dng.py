@@ -39,6 +39,7 @@ import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import plan_from_row
@@ -81,12 +82,12 @@ class _File(NamedTuple):
         return f"{self.key}.{self.frame}.dng"
 
 
-def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> ExportSummary:
+def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> ExportSummary:
     """Write frames of a dataset's pairs as ``to/KEY.FRAME.dng``.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
     keys : str
         Pairs to write (`selection.parse_keys`).
@@ -129,7 +130,7 @@ def export(folder: Path, keys: str, frames: Sequence[str], to: Path) -> ExportSu
     return ExportSummary(len(written), len(present), without)
 
 
-def _numbers(manifest: Path, keys: str) -> dict[str, int]:
+def _numbers(manifest: AnyPath, keys: str) -> dict[str, int]:
     """Return the key and the number of every selected pair; ConfigError if a frame of one cannot be a DNG file."""
     return {str(_writable(row)["key"]): number for number, row in select_pairs(manifest, keys).rows.items()}
 

@@ -17,10 +17,10 @@ import dataclasses
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TextIO
 
 from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source, Value
 from unprocess_gen.dataset.columns import COLUMNS, FIRST, HEADERS, NAMES, Record, columns_of
 from unprocess_gen.dataset.keys import key_text
@@ -375,12 +375,12 @@ def _cell(value: Value) -> str:
     return "" if value is None else repr(value) if isinstance(value, float) else str(value)
 
 
-def read_header(path: Path) -> tuple[str, ...]:
+def read_header(path: AnyPath) -> tuple[str, ...]:
     """Return the columns that a manifest has.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         A ``manifest.csv``.
 
     Returns
@@ -398,12 +398,12 @@ def read_header(path: Path) -> tuple[str, ...]:
         return tuple(name for name in NAMES if name in manifest.header)
 
 
-def read_rows(path: Path) -> Iterator[Row]:
+def read_rows(path: AnyPath) -> Iterator[Row]:
     """Read the typed rows of a manifest, one at a time.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         A ``manifest.csv`` of this or an older version. Unknown columns are left out; missing newer ones are empty.
 
     Returns
@@ -419,12 +419,12 @@ def read_rows(path: Path) -> Iterator[Row]:
     return (row for _, row in rows_with_offsets(path))
 
 
-def rows_with_offsets(path: Path) -> Iterator[tuple[int, Row]]:
+def rows_with_offsets(path: AnyPath) -> Iterator[tuple[int, Row]]:
     """Read rows with the position of their lines. A row is one line, since no value contains a line end.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         A ``manifest.csv``.
 
     Yields
@@ -446,12 +446,12 @@ def rows_with_offsets(path: Path) -> Iterator[tuple[int, Row]]:
             at += len(line)
 
 
-def readable_rows(path: Path) -> Iterator[Row]:
+def readable_rows(path: AnyPath) -> Iterator[Row]:
     """Read those lines of a damaged manifest that are still rows.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         A ``manifest.csv``; it need not exist.
 
     Yields
@@ -468,15 +468,23 @@ def readable_rows(path: Path) -> Iterator[Row]:
                     break
 
 
-def read_row(path: Path, at: int) -> Row:
+def read_columns(path: AnyPath) -> tuple[str, ...]:
+    """Return the first line of a manifest, columns unknown to this version included; raise as `read_header`."""
+    with _opened(path) as manifest:
+        return manifest.header
+
+
+def read_row(path: AnyPath, at: int, columns: Sequence[str] = ()) -> Row:
     """Read one row.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         A ``manifest.csv``.
     at : int
         Byte offset from `rows_with_offsets`.
+    columns : sequence of str, optional
+        The result of `read_columns`, which is read from the file if it is not given.
 
     Returns
     -------
@@ -489,7 +497,7 @@ def read_row(path: Path, at: int) -> Row:
         If no row begins there.
     """
     try:
-        with _opened(path) as (stream, header):
+        with _opened(path, columns) as (stream, header):
             stream.seek(at)
             return _typed(header, stream.readline(MAX_LINE_BYTES + 1))
     except DamageError as error:
@@ -497,11 +505,14 @@ def read_row(path: Path, at: int) -> Row:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Manifest]:
-    """Open a manifest after its header; DamageError for everything that goes wrong until it is closed."""
+def _opened(path: AnyPath, columns: Sequence[str] = ()) -> Iterator[Manifest]:
+    """Open a manifest after its header; DamageError for everything that goes wrong until it is closed.
+
+    If ``columns`` are given, the header is not read.
+    """
     try:
         with path.open("rb") as stream:
-            header = tuple(_cells_of(stream.readline(MAX_LINE_BYTES + 1)))
+            header = tuple(columns or _cells_of(stream.readline(MAX_LINE_BYTES + 1)))
             missing = [column.name for column in COLUMNS if column.since == FIRST and column.name not in header]
             if missing:
                 raise DamageError(f"{path}: not a manifest, column {missing[0]} is missing")

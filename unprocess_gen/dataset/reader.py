@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import operator
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, folder_name
 from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row
 from unprocess_gen.dataset.keys import sample_key
-from unprocess_gen.dataset.manifest import read_row, rows_with_offsets
+from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
 from unprocess_gen.dataset.shards import (
     CLEAN,
     ArrayFormat,
@@ -95,15 +97,18 @@ class RawPairs:
     No file stays open and only the position of each row is kept (12 bytes), so an instance can be pickled, forked and
     shared between threads. Needs neither Numba nor OpenCV nor Hydra.
 
+    A pair of an object store takes three requests, and more for the first pair of each shard. Such an instance cannot
+    be used in a forked process: give a DataLoader ``multiprocessing_context="spawn"`` or ``"forkserver"``.
+
     Parameters
     ----------
     path : str or Path
-        Folder of a finished dataset, or of a sweep. A sweep's datasets follow each other as in its ``sweep.csv``; jobs
-        that left no dataset are omitted.
+        Folder of a finished dataset, or of a sweep; or its URL in an object store, such as ``s3://bucket/ds``. A
+        sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted.
 
     Attributes
     ----------
-    path : Path
+    path : Path or ObjectPath
         The folder.
 
     Raises
@@ -126,8 +131,8 @@ class RawPairs:
     (dtype('uint16'), '00000000')
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Path | ObjectPath) -> None:
+        self.path = any_path(path)
         self._datasets = [_Dataset(folder) for folder in _dataset_folders(self.path)]
         offsets = [dataset.offsets() for dataset in self._datasets]
         self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
@@ -169,10 +174,11 @@ class RawPairs:
 class _Dataset:
     """Read pairs of one dataset by the byte offsets of their rows."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self.path = path
-        self.name = path.name or path.resolve().name
+        self.name = folder_name(path)
         self._manifest = path / "manifest.csv"
+        self._columns: tuple[str, ...] = ()
         self._indexes: dict[int, dict[str, Member]] = {}
 
     def offsets(self) -> NDArray[np.int64]:
@@ -182,7 +188,8 @@ class _Dataset:
 
     def read(self, offset: int) -> Sample:
         """Return the pair whose row begins at a byte."""
-        row = dict(read_row(self._manifest, offset))
+        self._columns = self._columns or read_columns(self._manifest)
+        row = dict(read_row(self._manifest, offset, self._columns))
         shard = int(row["shard"] or 0)
         members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
         clean, noisy = (
@@ -201,7 +208,7 @@ class _Dataset:
         return map_array(path, member, form)
 
 
-def _dataset_folders(path: Path) -> list[Path]:
+def _dataset_folders(path: AnyPath) -> list[AnyPath]:
     """Return the folder of a dataset, or those of the finished datasets of a sweep."""
     table = path / SWEEP_TABLE
     if (path / "manifest.csv").exists() or not table.exists():
@@ -209,12 +216,12 @@ def _dataset_folders(path: Path) -> list[Path]:
     return [path / folder for folder in sweep_folders(table)]
 
 
-def sweep_folders(table: Path) -> list[str]:
+def sweep_folders(table: AnyPath) -> list[str]:
     """Return the folders of the finished datasets of a sweep.
 
     Parameters
     ----------
-    table : Path
+    table : Path or ObjectPath
         The ``sweep.csv``, of this or an older version.
 
     Returns
@@ -230,12 +237,12 @@ def sweep_folders(table: Path) -> list[str]:
     return [folder for folder, exit_code in read_sweep_table(table) if exit_code in FINISHED]
 
 
-def read_sweep_table(table: Path) -> list[tuple[str, str]]:
+def read_sweep_table(table: AnyPath) -> list[tuple[str, str]]:
     """Return folder and exit code of every job of a sweep.
 
     Parameters
     ----------
-    table : Path
+    table : Path or ObjectPath
         The ``sweep.csv``, of this or an older version.
 
     Returns
@@ -249,7 +256,8 @@ def read_sweep_table(table: Path) -> list[tuple[str, str]]:
         If the file cannot be read, lacks the columns ``folder`` and ``exit``, or names a folder elsewhere.
     """
     try:
-        with table.open(encoding="utf-8", newline="") as stream:
+        with table.open("rb") as content:
+            stream = io.TextIOWrapper(content, encoding="utf-8", newline="")
             jobs = [(row["folder"] or "", row["exit"] or "") for row in csv.DictReader(stream, strict=True)]
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise DamageError(f"{table}: not the table of a sweep ({error})") from error

@@ -6,10 +6,10 @@ import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.columns import KEY_TEXT
 from unprocess_gen.dataset.keys import image_key, key_text, sample_key
@@ -101,13 +101,13 @@ def parse_keys(text: str) -> KeySelection:
 
 
 def select_rows(
-    manifest: Path, rows: str | None = None, keys: str | None = None, skipped: list[Row] | None = None
+    manifest: AnyPath, rows: str | None = None, keys: str | None = None, skipped: list[Row] | None = None
 ) -> Iterator[Row]:
     """Select rows of a manifest.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         A ``manifest.csv``.
     rows : str, optional
         ``A:B``: positions from 0, B not included. Ignored if ``keys`` is given.
@@ -157,12 +157,12 @@ def select_rows(
             raise ConfigError(f"--keys {written or name}: {manifest} has no such key; {known}; {KEYS_FORM}")
 
 
-def select_pairs(manifest: Path, keys: str) -> SelectedPairs:
+def select_pairs(manifest: AnyPath, keys: str) -> SelectedPairs:
     """Select pairs of a dataset.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         The dataset's ``manifest.csv``.
     keys : str
         See `parse_keys`.

@@ -30,6 +30,7 @@ import xxhash
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import little_endian
+from unprocess_gen.core.object_store import AnyPath, ObjectPath
 from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame, Row
 
 RECORD = 512
@@ -305,7 +306,7 @@ class Member(NamedTuple):
     size: int
 
 
-def read_index(path: Path) -> dict[str, Member]:
+def read_index(path: AnyPath) -> dict[str, Member]:
     """Return the members of a shard by name; DamageError unless it is a complete tar archive."""
     index: dict[str, Member] = {}
     try:
@@ -321,22 +322,38 @@ def read_index(path: Path) -> dict[str, Member]:
     return index
 
 
-def map_array(path: Path, member: Member, array: ArrayFormat) -> Frame:
+def map_array(path: AnyPath, member: Member, array: ArrayFormat) -> Frame:
     """Return an array of a shard, mapped copy-on-write: writing to it does not change the file.
 
-    Raises DamageError if the member is not an array of this format, or the file was deleted or truncated.
+    The array of an object is a copy, read with one range request. Raises DamageError if the member is not an array of
+    this format, or the file was deleted or truncated.
     """
-    start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
-    skipped, header = member.offset - start, array.header
+    header = array.header
     try:
-        with path.open("rb") as stream:
-            mapped = mmap.mmap(stream.fileno(), skipped + member.size, access=mmap.ACCESS_COPY, offset=start)
+        content, skipped = _map_member(path, member) if isinstance(path, Path) else (_read_member(path, member), 0)
     except (OSError, ValueError) as error:
         raise DamageError(f"{path}: the member at byte {member.offset} cannot be read ({error})") from error
     size = len(header) + array.size
-    if member.size != size or mapped[skipped : skipped + len(header)] != header:
+    if member.size != size or content[skipped : skipped + len(header)] != header:
         raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {array}")
-    return np.ndarray(array.shape, np.dtype(array.description), mapped, skipped + len(header))
+    return np.ndarray(array.shape, np.dtype(array.description), content, skipped + len(header))
+
+
+def _map_member(path: Path, member: Member) -> tuple[mmap.mmap, int]:
+    """Map a member into memory; return the mapping and the offset of the member in it."""
+    start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
+    skipped = member.offset - start
+    with path.open("rb") as stream:
+        mapped = mmap.mmap(stream.fileno(), skipped + member.size, access=mmap.ACCESS_COPY, offset=start)
+    return mapped, skipped
+
+
+def _read_member(path: ObjectPath, member: Member) -> bytearray:
+    """Return a member as bytes that can be written to, as a mapping can."""
+    content = bytearray(path.read_range(member.offset, member.size))
+    if len(content) < member.size:
+        raise ValueError("the object ends before")
+    return content
 
 
 # ------------------------------------------------------------------------------------------------------- verifying
