@@ -21,6 +21,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
+from unprocess_gen.core.object_store import any_path
 from unprocess_gen.core.types import PACKED, Frame, Pair, Patch, Plan, Row, Source, Srgb, Value
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row
@@ -274,7 +275,7 @@ def verify(folder: PathLike) -> list[_verify.Damage]:
     >>> ug.verify("ds")
     []
     """
-    path = Path(folder)
+    path = any_path(folder)
     if not _verify.is_sweep(path):
         return _verify.verify(path)
     return [
@@ -326,7 +327,7 @@ def replay(
     >>> [(result.key, result.complaint) for result in ug.replay("ds", keys="0-1")]
     [('00000000', ''), ('00000001', '')]
     """
-    manifest = Path(folder)
+    manifest = any_path(folder)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     if keys is not None and not isinstance(keys, str):
         keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))

@@ -23,6 +23,7 @@ from unprocess_gen.cli.messages import print_result, print_results, report, repo
 from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, UnprocessGenError
+from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path
 from unprocess_gen.core.output_paths import DATASET_ENTRIES
 from unprocess_gen.reports.formatting import counted
 
@@ -199,7 +200,7 @@ def run_again(call: Call) -> int:
     config, kind = read_dataset_yaml(folder / "config.yaml")
     if "out" not in call.values:
         raise ConfigError("again: out is missing; expected the folder of the new dataset; give out=…")
-    if Path(call.values["out"]).resolve() == folder.resolve():
+    if _is_same_folder(any_path(call.values["out"]), folder):
         raise ConfigError(f"again: out={call.values['out']}: is the dataset itself; expected another folder")
     root = _root(call)
     if kind != "folder" and root is not None:
@@ -218,8 +219,8 @@ def run_again(call: Call) -> int:
     config.n_jobs = call.values.get("n_jobs", config.n_jobs)
     config.source.max_failed = call.values.get("max_failed", config.source.max_failed)
     validate_config(config)
-    old, new = folder / "manifest.csv", Path(config.out) / "manifest.csv"
-    if root is not None and Path(root).exists() and old.exists():
+    old, new = folder / "manifest.csv", any_path(config.out) / "manifest.csv"
+    if root is not None and any_path(root).exists() and old.exists():
         check_source_sizes(old, root)
     code, _, lines = generate_dataset(config)
     print_results(lines)
@@ -233,6 +234,12 @@ def run_again(call: Call) -> int:
     else:
         print_result(f"the same rows as {folder}, in its columns; {new} has columns of a later version too")
     return code
+
+
+def _is_same_folder(one: AnyPath, other: AnyPath) -> bool:
+    if isinstance(one, Path) and isinstance(other, Path):
+        return one.resolve() == other.resolve()
+    return one == other
 
 
 def run_verify(call: Call) -> int:
@@ -260,7 +267,7 @@ def run_verify(call: Call) -> int:
     return worst(codes)
 
 
-def _finish_verification(folder: Path, found: Iterable[Damage], call: Call) -> int:
+def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -> int:
     """Report the damage of a dataset; repair, regenerate and check the noise as the flags ask; return the exit code."""
     from unprocess_gen.pipeline.repair import repair
     from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
@@ -270,6 +277,8 @@ def _finish_verification(folder: Path, found: Iterable[Damage], call: Call) -> i
     codes: list[int] = []
     damages = _reported(folder, found)
     if damages and "repair" in call.values:
+        if not isinstance(folder, Path):
+            raise ConfigError(f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset")
         for step in repair(folder, source_root(manifest, root)):
             if step.repaired:
                 print_result(step)
@@ -296,7 +305,7 @@ def _complaint(result: ReplayResult) -> str:
     return f"{result.key} ({result.source}): {result.complaint}"
 
 
-def _check_noise(folder: Path, to: str | None) -> list[str]:
+def _check_noise(folder: AnyPath, to: str | None) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen.reports import photon_transfer
 
@@ -323,7 +332,7 @@ def _check_noise(folder: Path, to: str | None) -> list[str]:
     return _reported(folder, [*map(str, checks.alarms), *more])
 
 
-def _reported(folder: Path, damages: Iterable[object]) -> list[str]:
+def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
     """Report damages on stderr; return them as text."""
     texts = [str(damage) for damage in damages]
     for text in texts:
@@ -369,7 +378,9 @@ def run_report(call: Call) -> int:
 
     folder = _dataset("report", call)
     to, root = call.values.get("to"), _root(call)
-    print_result(write_dataset_report(folder, None if to is None else Path(to), None if root is None else Path(root)))
+    print_result(
+        write_dataset_report(folder, None if to is None else Path(to), None if root is None else any_path(root))
+    )
     return 0
 
 
@@ -387,7 +398,7 @@ def run_preview(call: Call) -> int:
         selected = select_pairs(folder / "manifest.csv", call.values["keys"])
         keys, failed = [str(row["key"]) for row in selected.rows.values()], selected.failed
     code, has_root = 0, source_root(folder / "manifest.csv", root) is not None
-    for sheet in write_sheets(folder, to, keys, None if root is None else Path(root), with_stages):
+    for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), with_stages):
         files += len(sheet.files)
         if sheet.missing_source:
             code = SourceChangedError.exit_code if has_root else code
@@ -444,7 +455,7 @@ def _place(verb: str) -> str:
     return place.expected
 
 
-def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False) -> Path:
+def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
     """Return the verb's dataset; refuse anything else, and for a sweep name one of its datasets.
 
     ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
@@ -453,7 +464,8 @@ def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False
     assert path is not None
     # a dataset that was deleted is damage, as in version 0.1; only again, which reads settings, calls it wrong usage
     missing: type[UnprocessGenError] = ConfigError if verb == "again" else DamageError
-    if not os.path.lexists(path):  # False for names that are too long, too
+    # lexists is False for names that are too long, too
+    if not (path.exists() if isinstance(path, ObjectPath) else os.path.lexists(path)):
         kind = "file or folder" if files else "folder"
         raise missing(f"{verb}: {path}: no such {kind}; expected {_place(verb)}")
     if not path.is_dir():
@@ -466,7 +478,7 @@ def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False
     if sweeps:
         return path
     if is_sweep and not (path / "dataset.json").exists():
-        datasets = sorted(file.parent for file in path.glob("*/dataset.json"))
+        datasets = sorted(str(folder) for folder in path.iterdir() if (folder / "dataset.json").is_file())
         example = f", such as {datasets[0]}" if datasets else ""
         raise ConfigError(f"{verb}: {path}: is the folder of a sweep; expected one of its datasets{example}")
     return path

@@ -21,6 +21,7 @@ from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
 from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_text
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import AnyPath
 
 Option = TypeVar("Option")
 
@@ -118,12 +119,12 @@ def _canonical(value: Any) -> Any:
     return float(value) if is_number(value) else value
 
 
-def read_dataset_yaml(path: Path) -> tuple[Config, str]:
+def read_dataset_yaml(path: AnyPath) -> tuple[Config, str]:
     """Read the ``config.yaml`` of a dataset.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         The file, as `dataset_yaml` writes it.
 
     Returns

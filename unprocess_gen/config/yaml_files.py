@@ -10,6 +10,7 @@ import yaml
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import AnyPath
 
 MAX_BYTES = 4 * 2**20
 """Largest file that is read. A dataset's ``config.yaml`` has 3 kB, plus the names in ``source.include``."""
@@ -57,12 +58,12 @@ def read_yaml_mapping(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: {error}") from error
 
 
-def read_yaml_text(path: Path) -> str:
+def read_yaml_text(path: AnyPath) -> str:
     """Read a text file without blocking on pipes or reading more than `MAX_BYTES`.
 
     Parameters
     ----------
-    path : Path
+    path : Path or ObjectPath
         The file.
 
     Returns
@@ -77,7 +78,7 @@ def read_yaml_text(path: Path) -> str:
     OSError
         If the file does not exist or cannot be read.
     """
-    if not stat.S_ISREG(path.stat().st_mode):
+    if isinstance(path, Path) and not stat.S_ISREG(path.stat().st_mode):
         raise ValueError("expected a regular file")
     with path.open("rb") as file:
         content = file.read(MAX_BYTES + 1)

@@ -302,6 +302,22 @@ def any_path(text: str | os.PathLike[str] | ObjectPath) -> AnyPath:
     return ObjectPath(text) if isinstance(text, str) and is_url(text) else Path(text)
 
 
+def open_text(path: AnyPath) -> io.TextIOWrapper:
+    """Open a UTF-8 text file for reading, with its line ends.
+
+    Parameters
+    ----------
+    path : Path or ObjectPath
+        The file.
+
+    Returns
+    -------
+    text file
+        The caller closes it.
+    """
+    return io.TextIOWrapper(path.open("rb"), encoding="utf-8", newline="")
+
+
 def folder_name(path: AnyPath) -> str:
     """Return the name of a folder, for ``.`` and ``..`` too.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import operator
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, folder_name
+from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, folder_name, open_text
 from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
@@ -256,8 +255,7 @@ def read_sweep_table(table: AnyPath) -> list[tuple[str, str]]:
         If the file cannot be read, lacks the columns ``folder`` and ``exit``, or names a folder elsewhere.
     """
     try:
-        with table.open("rb") as content:
-            stream = io.TextIOWrapper(content, encoding="utf-8", newline="")
+        with open_text(table) as stream:
             jobs = [(row["folder"] or "", row["exit"] or "") for row in csv.DictReader(stream, strict=True)]
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise DamageError(f"{table}: not the table of a sweep ({error})") from error

@@ -16,6 +16,7 @@ import numpy as np
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
@@ -63,12 +64,12 @@ class ReplayResult:
         return SourceChangedError.exit_code if self.source_changed else DamageError.exit_code
 
 
-def source_root(manifest: Path, root: str | None) -> str | None:
+def source_root(manifest: AnyPath, root: str | None) -> str | None:
     """Return the folder of the sources.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         The manifest, next to its ``dataset.json``.
     root : str or None
         The folder that the user names; None for the recorded one.
@@ -87,12 +88,12 @@ def source_root(manifest: Path, root: str | None) -> str | None:
     return None if recorded is None else str(recorded)
 
 
-def check_source_sizes(manifest: Path, root: str) -> None:
+def check_source_sizes(manifest: AnyPath, root: str) -> None:
     """Compare the sizes of the source files with those that a manifest records; opens no source.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         The manifest.
     root : str
         Folder of the sources, or the single photograph; it exists.
@@ -120,12 +121,12 @@ def check_source_sizes(manifest: Path, root: str) -> None:
             )
 
 
-def check_source_digests(old: Path, new: Path) -> None:
+def check_source_digests(old: AnyPath, new: AnyPath) -> None:
     """Compare the digests of sources that two manifests record.
 
     Parameters
     ----------
-    old, new : Path
+    old, new : Path or ObjectPath
         The manifests.
 
     Raises
@@ -144,12 +145,12 @@ def check_source_digests(old: Path, new: Path) -> None:
             )
 
 
-def evenly_spaced_rows(manifest: Path, count: int) -> Iterator[Row]:
+def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
     """Return rows of pairs, evenly spaced over a manifest.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         The manifest.
     count : int
         Number of rows; all rows if there are fewer.

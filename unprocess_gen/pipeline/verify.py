@@ -21,6 +21,7 @@ from typing import Any
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_error
+from unprocess_gen.core.object_store import AnyPath, local_copy, open_text
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_rows, row_json
@@ -59,12 +60,12 @@ class SweepVerification:
     damages: tuple[Damage, ...]
 
 
-def verify(folder: Path) -> list[Damage]:
+def verify(folder: AnyPath) -> list[Damage]:
     """Compare every byte of a finished dataset with what it records.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
 
     Returns
@@ -85,7 +86,7 @@ def verify(folder: Path) -> list[Damage]:
         raise machine_error(error, folder) from error
 
 
-def _verify(folder: Path) -> list[Damage]:
+def _verify(folder: AnyPath) -> list[Damage]:
     if not (folder / "dataset.json").exists() and not (folder / "manifest.csv").exists():
         raise DamageError(
             f"{folder}: contains neither dataset.json nor manifest.csv; expected a finished dataset; "
@@ -106,12 +107,12 @@ def _verify(folder: Path) -> list[Damage]:
     return damages + _check_shards(folder, listed, iter(()))
 
 
-def is_sweep(folder: Path) -> bool:
+def is_sweep(folder: AnyPath) -> bool:
     """Return whether a folder is a sweep's: it has a ``sweep.csv`` and is no dataset.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Any folder.
 
     Returns
@@ -122,12 +123,12 @@ def is_sweep(folder: Path) -> bool:
     return (folder / SWEEP_TABLE).is_file() and not (folder / "dataset.json").exists()
 
 
-def verify_sweep(folder: Path) -> Iterator[SweepVerification]:
+def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
     """Verify every dataset that ``sweep.csv`` lists, and find those that an ended sweep left unfinished.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the sweep.
 
     Yields
@@ -150,18 +151,18 @@ def verify_sweep(folder: Path) -> Iterator[SweepVerification]:
             what = f"is missing: the job ended with exit code {exit_code}; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage("dataset.json", what),))
     listed = {name for name, _ in jobs}
-    for name in sorted(path.parent.name for path in folder.glob("*/.work")):
+    for name in sorted(path.name for path in folder.iterdir() if (path / ".work").exists()):
         if name not in listed and not (folder / name / "dataset.json").exists():
             what = "is missing: the sweep ended before this job; rerun the sweep to finish it"
             yield SweepVerification(name, (Damage("dataset.json", what),))
 
 
-def have_same_rows(old: Path, new: Path) -> bool:
+def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
     """Return whether a new manifest has the rows of an older one, in every column that the older one has.
 
     Parameters
     ----------
-    old, new : Path
+    old, new : Path or ObjectPath
         Manifests; ``new`` may have columns that a later version added.
 
     Returns
@@ -171,7 +172,7 @@ def have_same_rows(old: Path, new: Path) -> bool:
     """
     if file_sha256(old) == file_sha256(new):
         return True
-    with old.open(encoding="utf-8", newline="") as first, new.open(encoding="utf-8", newline="") as second:
+    with open_text(old) as first, open_text(new) as second:
         rows, others = csv.reader(first), csv.reader(second)
         names, other_names = next(rows, []), next(others, [])
         if not set(names) <= set(other_names):
@@ -187,7 +188,7 @@ def _without_path(error: DamageError) -> str:
     return str(error).partition(": ")[2]
 
 
-def _check_files(folder: Path, facts: dict[str, Any]) -> Iterator[Damage]:
+def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
     for name, field in (("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")):
         try:
             found = file_sha256(folder / name)
@@ -202,12 +203,12 @@ ShardRows = tuple[int, list[Row]]
 """Number of a shard, and its rows in the order of the manifest."""
 
 
-def shard_rows(manifest: Path) -> Iterator[ShardRows]:
+def shard_rows(manifest: AnyPath) -> Iterator[ShardRows]:
     """Read the rows of a manifest shard by shard.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         A ``manifest.csv``.
 
     Yields
@@ -241,7 +242,9 @@ def _shard_of(row: Row) -> int | None:
     return shard if isinstance(shard, int) else None
 
 
-def _check_shards(folder: Path, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]) -> list[Damage]:
+def _check_shards(
+    folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]
+) -> list[Damage]:
     """Compare the shards with ``dataset.json`` and the manifest, or with the one of them that is readable.
 
     ``listed`` has the entries of shards with a file, in ascending order; ``of_manifest`` is empty if the manifest
@@ -259,8 +262,9 @@ def _check_shards(folder: Path, listed: dict[int, dict[str, Any]], of_manifest: 
         if path.name not in present:
             damages.append(Damage(f"shards/{path.name}", "is missing"))
             continue
-        found = [] if first is None else list(_check_members(path, pairs))
-        damages += found or _check_sha256(path, listed.get(number))
+        with local_copy(path) as file:
+            found = [] if first is None else list(_check_members(file, pairs))
+            damages += found or _check_sha256(file, listed.get(number))
     return [Damage(f"shards/{name}", "is not part of this dataset") for name in sorted(foreign)] + damages
 
 

@@ -35,6 +35,7 @@ from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
 from unprocess_gen.core.files import RESUME, commit_file, machine_error
 from unprocess_gen.core.locks import FolderLock, NoLocksError
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import enclosing_dataset
 from unprocess_gen.core.types import Row, Source
 from unprocess_gen.dataset.columns import NAMES
@@ -338,7 +339,7 @@ def dataset_text(facts: dict[str, Any]) -> str:
     return _text(facts | {"dataset_sha256": hashlib.sha256(_text(facts).encode()).hexdigest()})
 
 
-def read_dataset(path: Path) -> dict[str, Any]:
+def read_dataset(path: AnyPath) -> dict[str, Any]:
     """Read a ``dataset.json`` and check it against its own SHA-256.
 
     Parameters

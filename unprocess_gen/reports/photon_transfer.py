@@ -16,6 +16,7 @@ from typing import BinaryIO
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.types import Float, Frame, Row
 from unprocess_gen.dataset.reader import RawPairs
@@ -98,12 +99,12 @@ class NoiseSummary:
     checks: NoiseChecks
 
 
-def examine_dataset(folder: Path) -> NoiseSummary:
+def examine_dataset(folder: AnyPath) -> NoiseSummary:
     """Fit and check the noise of every pair of a dataset, one pair at a time.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
 
     Returns
@@ -131,7 +132,7 @@ def examine_dataset(folder: Path) -> NoiseSummary:
     return NoiseSummary(count, worst, first, checker.result())
 
 
-def iterate_fits(folder: Path) -> Iterator[NoiseFit]:
+def iterate_fits(folder: AnyPath) -> Iterator[NoiseFit]:
     """Yield the fit of each pair that has enough sites; DamageError if the dataset is damaged."""
     for clean, noisy, row in RawPairs(folder):
         fit = fit_pair(clean, noisy, row)

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import cv2
 import yaml
 
-from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
+from unprocess_gen.core.object_store import AnyPath, folder_name
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.dataset.columns import COLUMNS
@@ -50,16 +51,16 @@ JPEG_QUALITY = 88
 MEANINGS = {column.name: ", ".join(filter(None, (column.meaning, column.unit))) for column in COLUMNS}
 
 
-def write_dataset_report(folder: Path, to: Path | None = None, source: Path | None = None) -> Path:
+def write_dataset_report(folder: AnyPath, to: Path | None = None, source: AnyPath | None = None) -> Path:
     """Write the HTML report of a finished dataset.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
     to : Path, optional
-        File to write; ``report.html`` in the dataset's folder by default.
-    source : Path, optional
+        File to write; ``report.html`` in the dataset's folder by default. Required for a URL.
+    source : Path or ObjectPath, optional
         Folder of the photographs, for the contact sheet; the recorded one by default.
 
     Returns
@@ -79,8 +80,7 @@ def write_dataset_report(folder: Path, to: Path | None = None, source: Path | No
     """
     require_libraries("report")
     _check_finished(folder)
-    to = folder / REPORT if to is None else to
-    _check_to(folder, to)
+    to = _file_to_write(folder, to)
     content = dataset_page(folder, source).encode()
     temporary = to.with_name(to.name + ".part")
     try:
@@ -92,16 +92,23 @@ def write_dataset_report(folder: Path, to: Path | None = None, source: Path | No
     return to
 
 
-def _check_to(folder: Path, to: Path) -> None:
-    if to.resolve() != (folder / REPORT).resolve():
+def _file_to_write(folder: AnyPath, to: Path | None) -> Path:
+    """Return the file of the report, ``report.html`` in a local dataset by default; ConfigError if it may not be."""
+    default = folder / REPORT
+    if to is None and isinstance(default, Path):
+        return default
+    if to is None:
+        raise ConfigError(f"report: {folder} is in an object store; expected a local file; give --to FILE")
+    if not isinstance(default, Path) or to.resolve() != default.resolve():
         check_output_file(to, f"--to {to}", "an HTML page", b"<!doctype html", b"<html")
+    return to
 
 
-def dataset_page(folder: Path, source: Path | None = None) -> str:
+def dataset_page(folder: AnyPath, source: AnyPath | None = None) -> str:
     """Return the HTML report of a finished dataset; DamageError as for `write_dataset_report`."""
     facts = _checked_facts(folder)
     statistics = ManifestStatistics.of_rows(read_rows(folder / "manifest.csv"))
-    name = encode_name(folder.resolve().name)
+    name = encode_name(folder_name(folder))
     sections: dict[str, Any] = {
         "headline": _headline(facts),
         "contact_sheet": _contact_sheet(folder, source) if facts["pairs"] else None,
@@ -128,12 +135,12 @@ def dataset_page(folder: Path, source: Path | None = None) -> str:
     return render_page("dataset.html", title=f"Dataset {name}", **sections)
 
 
-def _check_finished(folder: Path) -> None:
+def _check_finished(folder: AnyPath) -> None:
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json does not exist; expected a finished dataset")
 
 
-def _checked_facts(folder: Path) -> dict[str, Any]:
+def _checked_facts(folder: AnyPath) -> dict[str, Any]:
     """Return the contents of ``dataset.json`` after comparing the digests of manifest and config."""
     _check_finished(folder)
     facts = read_dataset(folder / "dataset.json")
@@ -157,7 +164,7 @@ def _headline(facts: Mapping[str, Any]) -> str:
     )
 
 
-def _contact_sheet(folder: Path, source: Path | None) -> str:
+def _contact_sheet(folder: AnyPath, source: AnyPath | None) -> str:
     """Return the contact sheet as a ``data:`` address; as JPEG, because noise makes a PNG four times as large."""
     sheet = contact_sheet(folder, source=source)
     _, content = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -280,7 +287,7 @@ def _clipping(facts: Mapping[str, Any], statistics: ManifestStatistics) -> dict[
     }
 
 
-def _noise_check(folder: Path) -> dict[str, Any]:
+def _noise_check(folder: AnyPath) -> dict[str, Any]:
     """Return the photon transfer fits, and the failed checks, of a few evenly spaced pairs."""
     pairs = RawPairs(folder)
     numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
@@ -324,10 +331,10 @@ def _noise_check(folder: Path) -> dict[str, Any]:
 
 
 def snippets(
-    folder: Path, entries: Sequence[Mapping[str, Any]], first: tuple[str, int], is_one_size: bool
+    folder: AnyPath, entries: Sequence[Mapping[str, Any]], first: tuple[str, int], is_one_size: bool
 ) -> dict[str, str]:
     """Return code that loads a dataset, by library; ``first`` is the key and the shard number of its first pair."""
-    name = folder.resolve().name
+    name = folder_name(folder)
     key = sample_key({"key": first[0]})
     count = len(entries)
     if re.fullmatch(r"[\w.+-]+", name) and all(entry["file"] for entry in entries):
@@ -357,9 +364,9 @@ def snippets(
     }
 
 
-def _commands(folder: Path, facts: Mapping[str, Any]) -> str:
+def _commands(folder: AnyPath, facts: Mapping[str, Any]) -> str:
     """Return shell commands that regenerate or check the dataset."""
-    name = shlex.quote(folder.resolve().name)
+    name = shlex.quote(folder_name(folder))
     root = " source.root=PHOTOGRAPHS" if facts["source"]["kind"] == "folder" else ""
     return "\n".join(
         (

@@ -11,11 +11,11 @@ import math
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
@@ -212,11 +212,11 @@ class Checker:
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: AnyPath) -> None:
         self._overlaps = np.fromiter(overlaps(folder), dtype=np.float64)
         self._limit = threshold(len(self._overlaps))
         self._pooled: dict[tuple[str, str], PooledScore] = {}
@@ -294,7 +294,7 @@ def curve_group(plan: Plan) -> int:
     return zlib.crc32(repr((curve, plan.black_level_dn, plan.white_level_dn)).encode()) % CURVES
 
 
-def overlaps(folder: Path) -> Iterator[int]:
+def overlaps(folder: AnyPath) -> Iterator[int]:
     """Yield, for each pair of a dataset, how many pairs can have noise values in common with it, including itself.
 
     Patches of a frame share the noise of their common sites. With row or column noise they also share the offsets of

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs, sheet_heading
@@ -53,19 +54,19 @@ class SheetFiles(NamedTuple):
 
 
 def write_sheets(
-    folder: Path, to: Path, keys: Sequence[str] = (), source: Path | None = None, with_stages: bool = False
+    folder: AnyPath, to: Path, keys: Sequence[str] = (), source: AnyPath | None = None, with_stages: bool = False
 ) -> Iterator[SheetFiles]:
     """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
     to : Path
         Folder for the PNG files.
     keys : sequence of str
         As for `contact_sheet`.
-    source : Path, optional
+    source : Path or ObjectPath, optional
         As for `contact_sheet`.
     with_stages : bool
         Whether to write the photograph after each step of unprocessing, too.
@@ -93,17 +94,17 @@ def write_sheets(
         yield SheetFiles(pair.key, str(pair.row["source"]), files, pair.missing_source)
 
 
-def contact_sheet(folder: Path, keys: Sequence[str] = (), source: Path | None = None) -> Picture:
+def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | None = None) -> Picture:
     """Return an overview of some pairs, one strip per pair in the order of the manifest.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or ObjectPath
         Folder of the dataset.
     keys : sequence of str
         Keys of pairs, or of images and patches, which select all of their pairs. By default,
         `sheet_pairs.PAIRS_SHOWN` evenly spaced pairs.
-    source : Path, optional
+    source : Path or ObjectPath, optional
         Folder of the photographs; by default the one recorded in ``dataset.json``.
 
     Returns

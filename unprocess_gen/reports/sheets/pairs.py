@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Plan, Row, Srgb
 from unprocess_gen.dataset.keys import image_key
@@ -37,7 +37,7 @@ class SheetPair:
         return str(self.row["key"])
 
 
-def selected_pairs(folder: Path, keys: Sequence[str], source: Path | None) -> Iterator[SheetPair]:
+def selected_pairs(folder: AnyPath, keys: Sequence[str], source: AnyPath | None) -> Iterator[SheetPair]:
     """Yield pairs in the order of the manifest; a photograph shared by adjacent pairs is decoded once."""
     from unprocess_gen.pipeline.replay import source_root  # imports Numba
     from unprocess_gen.reports.sheets.row_sources import load_row_source  # imports Numba
@@ -68,7 +68,7 @@ def _patch_of(photograph: Srgb | None, missing: str, row: Row) -> tuple[Srgb | N
     return part, ""
 
 
-def _spaced_numbers(folder: Path, pairs: int) -> list[int]:
+def _spaced_numbers(folder: AnyPath, pairs: int) -> list[int]:
     if not pairs:
         raise ConfigError(f"{folder}: every source failed; expected a dataset with at least one pair")
     return evenly_spaced(range(pairs), PAIRS_SHOWN)
