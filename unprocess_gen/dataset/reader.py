@@ -182,12 +182,12 @@ class _Dataset:
 
     def offsets(self) -> NDArray[np.int64]:
         """Return the offsets of the rows of all pairs."""
+        self._columns = read_columns(self._manifest)
         rows = rows_with_offsets(self._manifest)
         return np.fromiter((at for at, row in rows if row["status"] == "ok"), dtype=np.int64)
 
     def read(self, offset: int) -> Sample:
         """Return the pair whose row begins at a byte."""
-        self._columns = self._columns or read_columns(self._manifest)
         row = dict(read_row(self._manifest, offset, self._columns))
         shard = int(row["shard"] or 0)
         members = CLEAN, noisy_member(int(row["level"] or 0), int(row["draw"] or 0))
