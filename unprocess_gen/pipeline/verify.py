@@ -242,9 +242,7 @@ def _shard_of(row: Row) -> int | None:
     return shard if isinstance(shard, int) else None
 
 
-def _check_shards(
-    folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]
-) -> list[Damage]:
+def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]) -> list[Damage]:
     """Compare the shards with ``dataset.json`` and the manifest, or with the one of them that is readable.
 
     ``listed`` has the entries of shards with a file, in ascending order; ``of_manifest`` is empty if the manifest
