@@ -223,19 +223,19 @@ def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: 
 KILLED = """
 import os, signal, sys
 from unprocess_gen.cli.main import main
-from unprocess_gen.pipeline.workspace import Workspace
+from unprocess_gen.pipeline import worker
 
-commit, made = Workspace.commit, []
+commit, made = worker.commit_shard, []
 
 
-def commits(self, shard):
-    commit(self, shard)
+def commits(storage, shard):
+    commit(storage, shard)
     made.append(shard)
     if len(made) == 18:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-Workspace.commit = commits
+worker.commit_shard = commits
 main()
 """
 """A command that is killed once it has committed 18 shards."""

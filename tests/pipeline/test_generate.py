@@ -33,6 +33,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.executors import local
+from unprocess_gen.pipeline.workspace import COUNTS
 
 SHARDS_OF_5 = "output.pairs_per_shard=5"
 
@@ -353,13 +354,13 @@ def test_dataset_without_pairs_is_complete(make: Make, tmp_path: Path) -> None:
 
 def test_source_that_changes_during_a_run_stops_it(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = fill(tmp_path / "p", 2)
-    make_shard = local.make_shard
+    make_and_commit = local.make_and_commit
 
     def changed_before(*arguments: Any) -> Any:
         (source / "001.png").write_bytes(b"shorter")
-        return make_shard(*arguments)
+        return make_and_commit(*arguments)
 
-    monkeypatch.setattr(local, "make_shard", changed_before)
+    monkeypatch.setattr(local, "make_and_commit", changed_before)
     with pytest.raises(MachineError, match=r"source 001.png changed since it was listed: \d+ bytes then, 7 now"):
         make(source, tmp_path / "ds")
     assert not (tmp_path / "ds/dataset.json").exists()
@@ -540,9 +541,7 @@ def test_summary_adds_up_the_counts_of_the_manifest(dataset: Path) -> None:
     rows = [sample.row for sample in RawPairs(dataset)]
     known = facts(dataset)["sites"]
     assert known["all"] == sum(row["width"] * row["height"] for row in rows)
-    assert {name: sum(row[name] for row in rows) for name in runner.COUNTS} == {
-        name: known[name] for name in runner.COUNTS
-    }
+    assert {name: sum(row[name] for row in rows) for name in COUNTS} == {name: known[name] for name in COUNTS}
 
 
 def test_summary_counts_sites_without_noise_variance(make: Make, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.promise_report import Figure
 
-from unprocess_gen.core.locks import FolderLock
+from unprocess_gen.core.locks import LockFile
 from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import verify
 
@@ -231,12 +231,14 @@ def test_damage_to_both_proofs_is_refused_in_one_line(other: str, copy: Path, ru
 def test_dataset_locked_by_a_run_stays_unchanged(copy: Path, run_main: RunMain) -> None:
     flip(copy / FILES[3], 999)
     before = contents(copy)
-    lock = FolderLock(copy)
+    (copy / ".work").mkdir()
+    lock = LockFile(copy / ".work/lock")
     lock.acquire(wait=False)
 
     done = run_main("verify", copy, "--repair")
 
     lock.release()
+    (copy / ".work").rmdir()
     assert done.code == 11
     assert contents(copy) == before
 

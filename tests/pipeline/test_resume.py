@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import itertools
+import json
 import os
 import random
 import shutil
@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,8 +42,10 @@ from PIL import Image
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.messages import logging_to
 from unprocess_gen.core.errors import ConfigError, DamageError, LockedError, MachineError
+from unprocess_gen.core.locks import LockFile, host
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.storage.local import LocalStorage
 from unprocess_gen.pipeline.workspace import read_dataset
 
 TWO = "output.pairs_per_shard=2"
@@ -88,8 +91,8 @@ def test_run_killed_repeatedly_ends_as_if_undisturbed(
     figure("resume", f"same bytes after {kill + 1} kills of one run")
 
 
-FILES = 10
-"""Renames of a run with three shards: sources.json, config.yaml, rows and file of each, manifest and dataset.json."""
+FILES = 11
+"""Files of a run with three shards: the listing, config.yaml, file and record of each, manifest and dataset.json."""
 
 
 @pytest.fixture(scope="module")
@@ -113,18 +116,18 @@ def test_run_killed_around_any_rename_can_be_resumed(
     for renamed in (False, True):
         source, out = six / "p", tmp_path / f"ds-{renamed}"
         seen: list[Path] = []
-        replace = os.replace
 
-        def stops(old: Any, new: Any, renamed: bool = renamed, seen: list[Path] = seen, replace: Any = replace) -> None:
+        def stops(place: Any, old: Any, new: Any, renamed: bool = renamed, seen: list[Path] = seen) -> None:
             stop = len(seen) == number and tmp_path in Path(new).parents
             seen.append(Path(new))
             if not stop or renamed:
-                replace(old, new)
+                place(old, new)
             if stop:
                 raise Killed
 
         with monkeypatch.context() as patch, pytest.raises(Killed):
-            patch.setattr(os, "replace", stops)
+            for name in ("replace", "link"):
+                patch.setattr(os, name, partial(stops, getattr(os, name)))
             make(source, out, TWO)
         make(source, out, TWO)
         assert tree_hash(out) == tree_hash(six / "ds"), renamed
@@ -134,12 +137,18 @@ def test_run_killed_around_any_rename_can_be_resumed(
 
 def test_every_rename_of_a_run_is_tested(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
-    replace = os.replace
-    monkeypatch.setattr(os, "replace", lambda old, new: (seen.append(Path(new).name), replace(old, new)))
+
+    def placed(place: Any, old: Any, new: Any) -> None:
+        seen.append(Path(new).relative_to(tmp_path / "ds").as_posix())
+        place(old, new)
+
+    for name in ("replace", "link"):
+        monkeypatch.setattr(os, name, partial(placed, getattr(os, name)))
     make(fill(tmp_path / "p", 5), tmp_path / "ds", TWO)
     assert seen == [
-        "sources.json", "config.yaml", "00000.json", "shard-00000.tar", "00001.json", "shard-00001.tar", "00002.json",
-        "shard-00002.tar", "manifest.csv", "dataset.json",
+        ".work/sources/00000.json", ".work/listing.json", "config.yaml", "shards/shard-00000.tar",
+        ".work/rows/00000.json", "shards/shard-00001.tar", ".work/rows/00001.json", "shards/shard-00002.tar",
+        ".work/rows/00002.json", "manifest.csv", "dataset.json",
     ]  # fmt: skip
     assert len(seen) == FILES
 
@@ -175,7 +184,7 @@ def begun_template(six: Path, make: Make, tmp_path_factory: pytest.TempPathFacto
     replace = os.replace
 
     def stops(old: Any, new: Any) -> None:
-        if Path(new).name == "00002.json":
+        if Path(new).name == "shard-00002.tar":
             raise Killed
         replace(old, new)
 
@@ -208,20 +217,45 @@ def test_resumed_run_makes_only_missing_shards(begun: Path, make: Make) -> None:
     assert {name: after[name] for name in before} == before
 
 
+def leave(folder: Path) -> Path:
+    """Write half a shard as a process of this host that has ended."""
+    folder.mkdir(parents=True)
+    ended = {"host": host(), "pid": os.getpid(), "start": "0", "mark": "0"}
+    (folder / "owner").write_text(json.dumps(ended))
+    (folder / "shard-00002.tar.1.1").write_bytes(b"half")
+    return folder / "shard-00002.tar.1.1"
+
+
 def test_unfinished_shards_are_deleted_at_the_start(begun: Path, make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    left = begun / "ds/.work/tmp/shard-00002.tar.1.1"
-    left.write_bytes(b"half")
+    left = [leave(begun / "ds/.work/tmp/host-1-a"), begun / "ds/.work/tmp/shard-00002.tar.1.1"]
+    left[1].write_bytes(b"half")  # as version 0.1 left it
     there: list[bool] = []
     count_jobs = runner.effective_jobs
-    monkeypatch.setattr(runner, "effective_jobs", lambda *given: (there.append(left.exists()), count_jobs(*given))[1])
+
+    def counted(*given: Any) -> int:
+        there.extend(path.exists() for path in left)
+        return count_jobs(*given)
+
+    monkeypatch.setattr(runner, "effective_jobs", counted)
     make(begun / "p", begun / "ds", TWO)
-    assert there == [False]
+    assert there == [False, False]
 
 
 def test_unfinished_files_are_deleted_at_the_end(begun: Path, make: Make) -> None:
-    (begun / "ds/.work/tmp/shard-00002.tar.1.1").write_bytes(b"half")
+    of_another_host = begun / "ds/.work/tmp/elsewhere-1-a"
+    of_another_host.mkdir(parents=True)
+    os.utime(of_another_host, (0, 0))
     (begun / "ds/.work/manifest.csv.part").write_text("half")
     make(begun / "p", begun / "ds", TWO)
+    assert_complete(begun / "ds")
+
+
+def test_unfinished_files_of_a_running_process_are_kept(begun: Path, make: Make, tree_hash: TreeHash) -> None:
+    other = LocalStorage(begun / "ds")
+    (other.scratch / "half").write_bytes(b"half")
+    make(begun / "p", begun / "ds", TWO)
+    assert (other.scratch / "half").read_bytes() == b"half"
+    other.close()
     assert_complete(begun / "ds")
 
 
@@ -338,7 +372,8 @@ def test_finished_dataset_without_config_is_damage(finished: Path, make: Make) -
     ("state", "name"),
     [
         ("begun", "config.yaml"),
-        ("begun", ".work/sources.json"),
+        ("begun", ".work/sources/00000.json"),
+        ("begun", ".work/listing.json"),
         ("finished", "dataset.json"),
     ],
 )
@@ -368,14 +403,15 @@ def test_work_folder_left_by_a_kill_is_deleted(finished: Path, make: Make) -> No
 
 
 @contextmanager
-def held(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[None]:
-    folder.mkdir(exist_ok=True)
-    handle = os.open(folder, os.O_RDONLY)
-    fcntl.flock(handle, how)
+def held(folder: Path) -> Iterator[None]:
+    """Lock a folder as a run does."""
+    (folder / ".work").mkdir(parents=True, exist_ok=True)
+    lock = LockFile(folder / ".work/lock")
+    lock.acquire(wait=False)
     try:
         yield
     finally:
-        os.close(handle)
+        lock.release()
 
 
 @pytest.mark.parametrize("name", ["shards/shard-00000.tar", "manifest.csv", "dataset.json", "photo.jpg", "thesis.tex"])
@@ -407,16 +443,11 @@ def test_folder_locked_by_another_run_is_refused_with_11(run_main: RunMain, tmp_
         "",
         "gen-dataset: out=ds: another run is writing to it; wait for that run, or choose another out\n",
     )
-    assert list((tmp_path / "ds").iterdir()) == []
+    assert list((tmp_path / "ds").rglob("*")) == [tmp_path / "ds/.work"]
 
 
 def test_locked_finished_dataset_is_refused(finished: Path, make: Make) -> None:
     with held(finished / "ds"), pytest.raises(LockedError):
-        make(finished / "p", finished / "ds", TWO)
-
-
-def test_run_locks_its_folder_exclusively(finished: Path, make: Make) -> None:
-    with held(finished / "ds", fcntl.LOCK_SH), pytest.raises(LockedError):
         make(finished / "p", finished / "ds", TWO)
 
 
@@ -495,7 +526,7 @@ def test_signal_leaves_no_process_behind(stopped: Stopped) -> None:
 
 
 def test_signal_leaves_the_dataset_unfinished(stopped: Stopped) -> None:
-    assert (stopped.out / ".work/sources.json").exists()
+    assert (stopped.out / ".work/listing.json").exists()
     assert not (stopped.out / "dataset.json").exists()
 
 
@@ -603,7 +634,7 @@ def test_failed_write_ends_with_5_and_a_rerun_finishes(make: Make, tree_hash: Tr
     assert len(lines) == 1
     assert "File too large" in lines[0] and "bytes free" in lines[0]
     assert committed(tmp_path / "ds") == 3
-    assert list((tmp_path / "ds/.work/tmp").iterdir()) == []
+    assert not (tmp_path / "ds/.work/tmp").exists()
     make(source, tmp_path / "ds", ONE)
     make(source, tmp_path / "undisturbed", ONE)
     assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")
@@ -629,7 +660,7 @@ import json, os, resource, sys
 from pathlib import Path
 from unprocess_gen.dataset.columns import NAMES
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline.generate import tally
+from unprocess_gen.pipeline.shard_records import record_name
 from unprocess_gen.pipeline.workspace import Workspace
 
 out, shards = Path(sys.argv[1]), int(sys.argv[2])
@@ -637,13 +668,13 @@ row = next(read_rows(Path(sys.argv[3])))
 record = {"entry": {"file": None, "bytes": 0, "sha256": None}, "rows": [[row[name] for name in NAMES]] * 100}
 with Workspace(out, "seed: 0\\n") as workspace:
     workspace.open()
-    workspace.begin([])
-    first = workspace._rows_path(0)
+    workspace.begin([], shards)
+    first = out / record_name(0)
+    first.parent.mkdir()
     first.write_text(json.dumps(record))
     for shard in range(1, shards):
-        os.link(first, workspace._rows_path(shard))
-    tally(workspace.all_rows(shards, {}))
-    workspace.finish(shards, {}, {"pairs": 100 * shards, "failed": {}})
+        os.link(first, out / record_name(shard))
+    workspace.finish(shards, lambda tally: tally.facts())
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, sum(1 for _ in (out / "manifest.csv").open("rb")))
 """
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import ntpath
 import subprocess
@@ -18,9 +16,6 @@ from helpers.datasets import Make
 from helpers.photographs import pixels
 
 from unprocess_gen.core import files
-from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.locks import FolderLock
-from unprocess_gen.pipeline.workspace import Workspace
 
 SCRIPT = """
 import json, sys
@@ -32,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import unprocess_gen as ug
 from unprocess_gen.cli.main import main
-from unprocess_gen.core.locks import FolderLock
+from unprocess_gen.core.locks import LockFile
 
 def gen_dataset(*arguments):
     sys.argv[1:] = arguments
@@ -53,7 +48,8 @@ found["repair"] = gen_dataset("verify", str(out), "--repair")
 found["after"] = len(ug.verify(out))
 found["sweep"] = gen_dataset("-m", "seed=1,2", f"source.root={root}", f"out={out}-sweep", "n_jobs=1", "source.limit=1")
 found["swept"] = len(ug.RawPairs(f"{out}-sweep"))
-lock = FolderLock(out)
+(out / ".work").mkdir()
+lock = LockFile(out / ".work" / "lock")
 lock.acquire(wait=False)
 found["locked"] = gen_dataset(f"source.root={root}", f"out={out}", "n_jobs=1", "output.pairs_per_shard=1")
 lock.release()
@@ -116,23 +112,3 @@ def test_paths_that_lead_outside_on_windows_are_found(path: str, monkeypatch: py
 @pytest.mark.parametrize("path", ["C:/a", "..\\a", "\\a"])
 def test_names_with_backslashes_and_colons_are_inside_on_linux(path: str) -> None:
     assert not files.leads_outside(path)
-
-
-def test_folder_is_locked_once_and_can_be_locked_after_release(tmp_path: Path) -> None:
-    first, second = FolderLock(tmp_path), FolderLock(tmp_path)
-    first.acquire(wait=False)
-    with pytest.raises(BlockingIOError):
-        second.acquire(wait=False)
-    first.release()
-    second.acquire(wait=True)
-    second.release()
-    first.release()
-
-
-def test_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(handle: int, mode: int) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(ConfigError, match=r"file system cannot lock it \(No locks available\); choose another out"):
-        Workspace(tmp_path, "seed: 0\n").hold()

@@ -7,13 +7,13 @@ import hashlib
 import os
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.locks import FolderLock
+from unprocess_gen.core.locks import LockFile
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -164,10 +164,9 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder; a file system without locks is used without one."""
-    lock = FolderLock(folder)
-    with suppress(OSError):
-        lock.acquire(wait=True)
+    """Hold the lock of a folder's ``sweep.csv``."""
+    lock = LockFile(folder / "sweep.csv.lock")
+    lock.acquire(wait=True)
     try:
         yield
     finally:

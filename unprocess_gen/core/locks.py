@@ -1,48 +1,65 @@
-"""Lock a folder, so that two processes do not write to it at the same time.
+"""Lock a place with a file, so that two processes do not write to it at the same time.
 
-Linux and macOS lock the folder itself (flock). Windows cannot lock folders; there, a file named after the folder is
-locked in the user's folder for temporary files. Both locks end with the process. What differs:
-``docs/design/platforms.md``.
+The file is created only if it does not exist, which is one step on local file systems, NFS and Lustre. It names its
+owner: host, process and the time at which the process started. Whether the owner still runs is decided
+
+* on the same host by the process table, at once;
+* on another host by a heartbeat: the owner renews the file's modification time every `HEARTBEAT_S` seconds, and its
+  lock may be taken over after `STALE_S` seconds without one;
+* on Windows by an attempt to delete the file, which its owner keeps open.
+
+A process that is stopped for longer than `STALE_S` can lose its lock. Callers must therefore stay correct with two
+owners; `pipeline.workspace` does, because every writer makes the same bytes. Design: ``docs/design/platforms.md``.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
+import json
 import os
+import platform
+import subprocess
 import sys
-import tempfile
+import threading
 import time
+import uuid
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
-
 POLL_S = 0.05
-"""Delay between two attempts to lock a file on Windows, which has no call that waits without limit."""
+"""Delay between two attempts while another process holds the lock."""
+HEARTBEAT_S = 10.0
+"""Time between two renewals of a lock."""
+STALE_S = 60.0
+"""Age at which the lock of another host is taken over."""
 
 
-class NoLocksError(OSError):
-    """Report that a file system has no locks."""
+_HELD: set[str] = set()
+"""Marks of the locks that this process holds. A file of this process that is not among them could not be deleted."""
 
 
-class FolderLock:
-    """Hold the lock of a folder, from `acquire` until `release` or the end of the process.
+class LockFile:
+    """Hold a lock from `acquire` until `release` or the end of the process.
 
     Parameters
     ----------
-    folder : Path
-        An existing folder.
+    path : Path
+        The file, in a folder that exists.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._text = ""
+        self._released = threading.Event()
         self._handle: int | None = None
 
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._path
+
     def acquire(self, wait: bool) -> None:
-        """Lock the folder.
+        """Create the file; replace one whose owner has ended.
 
         Parameters
         ----------
@@ -53,63 +70,185 @@ class FolderLock:
         ------
         BlockingIOError
             If another process holds the lock and ``wait`` is False.
-        NoLocksError
-            If the file system has no locks.
         OSError
-            If the folder cannot be opened.
+            If the file cannot be created.
         """
-        handle = self._open()
-        try:
-            _lock(handle, wait)
-        except BaseException as error:
-            os.close(handle)
-            if isinstance(error, OSError) and not isinstance(error, BlockingIOError):
-                raise NoLocksError(error.errno, error.strerror) from error
-            raise
-        self._handle = handle
+        mark = uuid.uuid4().hex
+        owner = {"host": host(), "pid": os.getpid(), "start": process_start(os.getpid()), "mark": mark}
+        self._text = json.dumps(owner)
+        while not self._create():
+            found = self._holder()
+            if found is None:
+                continue
+            if not self._is_held():
+                self._remove(found)
+            elif not wait:
+                raise BlockingIOError("is locked by another process")
+            else:
+                time.sleep(POLL_S)
+        _HELD.add(mark)
+        self._released.clear()
+        threading.Thread(target=self._renew, args=(self._released,), daemon=True).start()
 
     def release(self) -> None:
-        """Unlock the folder, if it is locked."""
-        if self._handle is None:
+        """Delete the file, if this process holds the lock."""
+        if not self._text:
             return
-        os.close(self._handle)
-        self._handle = None
-        if sys.platform == "win32":
-            with contextlib.suppress(OSError):  # another process has opened the file by now and keeps it
-                lock_file(self._folder).unlink()
+        self._released.set()
+        _HELD.discard(json.loads(self._text)["mark"])
+        if self._handle is not None:
+            os.close(self._handle)
+            self._handle = None
+        with suppress(OSError):  # the folder may have been deleted
+            if self._path.read_text(encoding="utf-8") == self._text:
+                self._path.unlink()
+        self._text = ""
 
-    def _open(self) -> int:
-        if sys.platform == "win32":
-            path, flags = lock_file(self._folder), os.O_RDWR | os.O_CREAT
-        else:
-            path, flags = self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-        return os.open(path, flags)
-
-
-def lock_file(folder: Path) -> Path:
-    """Return the file that is locked in place of a folder on Windows; equal for all spellings of the folder."""
-    path = os.path.normcase(os.path.realpath(folder))
-    digest = hashlib.sha256(path.encode("utf-8", "surrogatepass")).hexdigest()[:32]
-    return Path(tempfile.gettempdir(), f"unprocess_gen-{digest}.lock")
-
-
-def _lock(handle: int, wait: bool) -> None:
-    """Lock an open folder or, on Windows, the first byte of an open file."""
-    if sys.platform == "win32":
-        while not _try_lock(handle):
-            if not wait:
-                raise BlockingIOError("is locked by another process")
-            time.sleep(POLL_S)
-    else:
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-
-
-if sys.platform == "win32":
-
-    def _try_lock(handle: int) -> bool:
-        """Lock the first byte of an open file; return False if another process holds it."""
+    def _create(self) -> bool:
+        """Create the file with its text; return False if it exists."""
         try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        except PermissionError:
+            handle = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        except FileExistsError:
             return False
+        except PermissionError:
+            if sys.platform == "win32" and self._path.exists():  # deleted, but still open elsewhere
+                return False
+            raise
+        try:
+            os.write(handle, self._text.encode())
+        except OSError:  # the disk is full
+            os.close(handle)
+            self._path.unlink()
+            raise
+        if sys.platform == "win32":
+            self._handle = handle
+        else:
+            os.close(handle)
         return True
+
+    def _holder(self) -> str | None:
+        """Return the text of the file, None if it was deleted meanwhile."""
+        try:
+            return self._path.read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            return None
+
+    def _is_held(self) -> bool:
+        if sys.platform == "win32":
+            try:
+                self._path.unlink()
+            except PermissionError:
+                return True
+            return False
+        return is_held(self._path)
+
+    def _remove(self, found: str) -> None:
+        """Remove the file of an owner that has ended; put back the file of a process that was quicker."""
+        aside = self._path.with_name(f"{self._path.name}.{uuid.uuid4().hex}")
+        try:
+            self._path.rename(aside)
+        except (FileNotFoundError, PermissionError):
+            return
+        if aside.read_text(encoding="utf-8", errors="replace") != found:
+            with suppress(OSError):
+                os.link(aside, self._path)
+        aside.unlink()
+
+    def _renew(self, released: threading.Event) -> None:
+        while not released.wait(HEARTBEAT_S):
+            with suppress(OSError):
+                os.utime(self._path)
+
+
+def is_held(path: Path) -> bool:
+    """Return whether the owner of a lock file still runs, as far as other processes can see.
+
+    Parameters
+    ----------
+    path : Path
+        The file; one that does not exist is held for as long as its folder is younger than `STALE_S`.
+
+    Returns
+    -------
+    bool
+        False if the owner has ended, or renewed its lock more than `STALE_S` seconds ago.
+    """
+    ended = has_ended(path)
+    return not ended if ended is not None else _age_s(path) < STALE_S
+
+
+def has_ended(path: Path) -> bool | None:
+    """Return whether the owner of a lock file has ended, if this host's process table shows it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    bool or None
+        None if the owner ran on another host or is not named, or if this system reports no processes.
+    """
+    try:
+        owner = json.loads(path.read_text(encoding="utf-8"))
+        if owner["host"] == host() and owner["pid"] == os.getpid() and owner["mark"] in _HELD:
+            return False
+        if owner["host"] == host() and owner["start"] is not None:
+            return owner["pid"] == os.getpid() or bool(process_start(int(owner["pid"])) != owner["start"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # its owner has created the file and not yet written it, or has deleted it
+    return None
+
+
+def _age_s(path: Path) -> float:
+    """Return the time since a file was renewed by the clock of its file system, which may be another machine's."""
+    renewed = (path if path.exists() else path.parent).stat().st_mtime
+    probe = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
+    try:
+        probe.touch()
+        return probe.stat().st_mtime - renewed
+    finally:
+        probe.unlink(missing_ok=True)
+
+
+@cache
+def host() -> str:
+    """Return what identifies this host and its process numbers.
+
+    Returns
+    -------
+    str
+        Name of the host; on Linux also its boot and its namespace of process numbers, because containers can share a
+        name.
+    """
+    parts = [platform.node()]
+    with suppress(OSError):
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
+        parts.append(str(Path("/proc/self/ns/pid").readlink()))
+    return " ".join(parts)
+
+
+def process_start(pid: int) -> str | None:
+    """Return when a process started, which distinguishes it from later processes of its number.
+
+    Parameters
+    ----------
+    pid : int
+        Number of a process of this host.
+
+    Returns
+    -------
+    str or None
+        Empty if no such process runs; None if this system does not report it.
+    """
+    if platform.system() == "Linux":
+        try:
+            state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return ""
+        return "" if state in "ZX" else fields[18]  # proc(5): field 22 is the start in clock ticks since boot
+    if platform.system() == "Darwin":
+        listed = subprocess.run(["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False)
+        return listed.stdout.strip()
+    return None

@@ -32,7 +32,7 @@ def _is_dataset(folder: Path) -> bool:
     try:
         return (
             (folder / "dataset.json").is_file()
-            or (folder / ".work" / "sources.json").is_file()
+            or any((folder / ".work" / name).exists() for name in ("listing.json", "sources.json"))
             or ((folder / "manifest.csv").is_file() and (folder / "shards").is_dir())
         )
     except OSError:  # a folder that may not be searched, above one that may

@@ -13,12 +13,10 @@ again`` is faster.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,13 +46,14 @@ from unprocess_gen.dataset.shards import (
     json_inside,
     shard_name,
 )
-from unprocess_gen.pipeline.generate import shard_tasks, tally
+from unprocess_gen.pipeline.generate import shard_tasks
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
+from unprocess_gen.pipeline.storage.local import LocalStorage
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
 from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, shard_rows
 from unprocess_gen.pipeline.worker import make_shard
 from unprocess_gen.pipeline.workspace import (
-    Workspace,
+    Tally,
     dataset_facts,
     dataset_text,
     fingerprint,
@@ -120,27 +119,14 @@ def repair(folder: Path, root: str | None) -> Iterator[RepairStep]:
     MachineError
         If a file cannot be read or written, or the self-test fails.
     """
-    with Workspace(folder, "") as workspace:
-        workspace.hold()
-        try:
-            with _temporary_folder(workspace) as temporary:
-                yield from _repair(folder, root, temporary)
-        except OSError as error:
-            raise machine_error(error, folder) from error
-
-
-@contextlib.contextmanager
-def _temporary_folder(workspace: Workspace) -> Iterator[Path]:
-    """Create an empty folder on the dataset's file system, and delete it afterwards."""
-    temporary = workspace.work / "repair"
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
+    storage = LocalStorage(folder)
     try:
-        yield temporary
+        storage.hold()
+        yield from _repair(folder, root, storage.scratch)
+    except OSError as error:
+        raise machine_error(error, folder) from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        with contextlib.suppress(OSError):  # files of a run with provisional rows are kept
-            workspace.work.rmdir()
+        storage.close()
 
 
 def _repair(folder: Path, root: str | None, temporary: Path) -> Iterator[RepairStep]:
@@ -434,12 +420,14 @@ def _dataset(folder: Path, text: str, config: Config, temporary: Path) -> Repair
     path = folder / "dataset.json"
     old = _readable(path)
     manifest = folder / "manifest.csv"
-    pairs, failed, sites = tally(read_rows(manifest))
+    tally = Tally()
+    for row in read_rows(manifest):
+        tally.add(row)
     known = dataset_facts(
         text,
         file_sha256(manifest),
         [_entry(folder, number, rows, old) for number, rows in shard_rows(manifest)],
-        {"pairs": pairs, "failed": failed, "sites": sites},
+        tally.facts(),
     )
     digest = old.pop("dataset_sha256", None)
     same = dataset_text(old | known)

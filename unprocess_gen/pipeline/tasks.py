@@ -1,4 +1,4 @@
-"""Records that travel between the coordinator and its workers: a run's context, a shard's task and its result."""
+"""Records that travel between a coordinator and its workers: a run's context, a shard's task, result and report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Row, Source, Value
+from unprocess_gen.core.types import NO_CLIP, Row, Source, Value
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.shards import shard_name
 
@@ -67,20 +67,29 @@ class StageTimes:
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """Hold what all tasks of a run share: config, folder for unfinished shards, coordinator PID.
+    """Hold what all tasks of a run share.
 
-    ``core_to_spare``: whether each worker hashes and writes in a second thread (more cores than workers).
+    Attributes
+    ----------
+    config : Config
+        The config; its ``out`` is where shards are committed.
+    scratch : str
+        Local folder for unfinished files.
+    coordinator_pid : int or None
+        Process that started the workers, with which they end; None if they end on their own.
+    core_to_spare : bool
+        Whether each worker hashes and writes in a second thread (more cores than workers).
     """
 
     config: Config
-    tmp: str
-    coordinator_pid: int
+    scratch: str
+    coordinator_pid: int | None
     core_to_spare: bool = False
 
     @property
     def compiling_path(self) -> Path:
         """The file that a worker creates before it compiles kernels."""
-        return Path(self.tmp) / "compiling"
+        return Path(self.scratch) / "compiling"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +101,7 @@ class ShardTask:
 
     def busy_path(self, context: RunContext) -> Path:
         """Return the file that contains the index of the source in progress; it exists while the shard is made."""
-        return Path(context.tmp) / f"{self.shard}.busy"
+        return Path(context.scratch) / f"{self.shard}.busy"
 
     def busy_source(self, context: RunContext) -> Source | None:
         """Return the source at which the last worker of this shard ended, None if it was at none."""
@@ -120,7 +129,7 @@ class ShardResult:
     rows : tuple of Row
         Manifest rows, in source order.
     killer : str or None
-        Source at which two workers died. The rows are then provisional and there is no file.
+        Source at which workers died, and how often. The rows are then provisional and there is no file.
     self_test : str or None
         Failures of the worker's self-test, if ``self_test=go_on`` accepts them.
     times : StageTimes
@@ -155,3 +164,42 @@ class ShardResult:
         pairs = (row for row in self.rows if row["status"] == "ok")
         values = [of_image[0]["source_noise_dn"] for of_image in group_by_image(pairs)]
         return {"source_noise_dn": values} if any(value is not None for value in values) else {}
+
+    def report(self) -> ShardReport:
+        """Return what the coordinator needs to know of the shard."""
+        of_images = [rows[0] for rows in group_by_image(self.rows)]
+        clips = {
+            (str(row["clip"]), int(row["width"] or 0), int(row["height"] or 0)): None
+            for row in self.rows
+            if row["status"] == "ok" and row["clip"] != NO_CLIP and row["patch"] == 0
+        }
+        failed = sum(row["status"] == "failed" for row in of_images)
+        return ShardReport(
+            self.shard, len(of_images), failed, len(self.rows), tuple(clips), self.killer, self.self_test, self.times
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ShardReport:
+    """Describe a committed shard.
+
+    Attributes
+    ----------
+    shard : int
+        Number of the shard.
+    images, failed, rows : int
+        Number of its sources, of those that failed, and of its rows.
+    frame_sizes : tuple of (str, int, int)
+        Name of each clip with each width and height of its frames.
+    killer, self_test, times
+        As in `ShardResult`.
+    """
+
+    shard: int
+    images: int
+    failed: int
+    rows: int
+    frame_sizes: tuple[tuple[str, int, int], ...] = ()
+    killer: str | None = None
+    self_test: str | None = None
+    times: StageTimes = field(default_factory=StageTimes)

@@ -1,8 +1,8 @@
-"""Make one shard: decode its sources, simulate their pairs, write a temporary tar file, return the rows.
+"""Make one shard: decode its sources, simulate their pairs, write a temporary tar file, commit it.
 
-A worker is a process of the pool, or the coordinator itself if ``n_jobs=1``. It writes only temporary files; the
-coordinator renames them. A worker process exits within a second once its coordinator has died (`_exit_with_parent`):
-loky alone would keep the process, and its memory, for minutes.
+A worker is a process of the pool, the coordinator itself if ``n_jobs=1``, or a process of a cluster. A process of the
+pool exits within a second once its coordinator has died (`_exit_with_parent`): loky alone would keep the process, and
+its memory, for minutes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from unprocess_gen.core.types import Pair, Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
 from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
-from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask, StageTimes
+from unprocess_gen.pipeline.shard_records import commit_shard
+from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, StageTimes
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.source_noise import source_noise_dn
@@ -42,6 +44,50 @@ M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 """Parameters of glibc's mallopt (malloc.h)."""
 KEPT_BYTES = 2**29
 """Freed memory that a worker keeps: the working memory of one 50-megapixel image."""
+
+
+def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
+    """Make one shard, commit it and describe it; raise MachineError as `make_shard`, or if it cannot be committed."""
+    result = make_shard(context, task)
+    try:
+        commit_shard(open_storage(context.config.out), result)
+    except OSError as error:
+        raise machine_error(error, Path(context.config.out), RESUME) from error
+    return result.report()
+
+
+DEATHS = {2: ("two workers died", "its worker died twice"), 4: ("four workers died", "its worker died four times")}
+"""Words for the number of workers that a shard ended: for the manifest, and for the progress."""
+
+
+def commit_provisional(context: RunContext, task: ShardTask, source: Source, deaths: int) -> ShardReport:
+    """Commit rows with the reason ``worker_died`` for a shard that ended its workers, and describe it.
+
+    Parameters
+    ----------
+    context : RunContext
+        Context of the run.
+    task : ShardTask
+        The shard.
+    source : Source
+        The source at which the workers died.
+    deaths : int
+        Number of the workers, a key of `DEATHS`.
+
+    Returns
+    -------
+    ShardReport
+        With ``killer``. The next run retries the shard.
+    """
+    in_row, in_progress = DEATHS[deaths]
+    detail = f"{in_row} at {source.name}; its shard is retried by the next run"
+    rows = [failed_row(one, None, task.shard, context.config.seed, "worker_died", detail) for one in task.sources]
+    result = ShardResult(task.shard, None, 0, None, tuple(rows), killer=f"{source.name}: {in_progress}")
+    try:
+        commit_shard(open_storage(context.config.out), result)
+    except OSError as error:
+        raise machine_error(error, Path(context.config.out), RESUME) from error
+    return result.report()
 
 
 def make_shard(context: RunContext, task: ShardTask) -> ShardResult:
@@ -69,7 +115,7 @@ class ShardLog:
 
 def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
     log = ShardLog()
-    path = Path(context.tmp) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
+    path = Path(context.scratch) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
     busy = task.busy_path(context)
     try:
         with ShardWriter(path, threaded=context.core_to_spare) as writer:
@@ -91,7 +137,7 @@ def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
         for unfinished in (path, busy):
             with suppress(OSError):
                 unfinished.unlink()
-        raise machine_error(error, Path(context.tmp), RESUME) from error
+        raise machine_error(error, Path(context.scratch), RESUME) from error
 
 
 def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, log: ShardLog) -> Iterator[Row]:
@@ -167,10 +213,12 @@ def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
     return failures
 
 
-def _prepare_process(coordinator_pid: int) -> None:
-    """Keep freed memory; in a worker process also ignore Ctrl-C and start the watchdog."""
+def _prepare_process(coordinator_pid: int | None) -> None:
+    """Keep freed memory; in a process of the pool also ignore Ctrl-C and start the watchdog."""
     keep_memory()
-    if os.getpid() != coordinator_pid and not any(thread.name == WATCHDOG for thread in threading.enumerate()):
+    if coordinator_pid is None or coordinator_pid == os.getpid():
+        return
+    if not any(thread.name == WATCHDOG for thread in threading.enumerate()):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         if sys.platform != "win32":  # there, os.getppid does not change when the parent process ends
             threading.Thread(target=_exit_with_parent, args=(coordinator_pid,), name=WATCHDOG, daemon=True).start()

@@ -1,167 +1,150 @@
-"""The output folder of a run: lock, temporary files, commit of shards, manifest and ``dataset.json``.
+"""The output folder of a run: checks, lock, start and end of a dataset.
 
     out/config.yaml              the resolved config, written first
-    out/.work/sources.json       names and sizes of all sources, as the first run listed them
-    out/.work/tmp/               unfinished shards; emptied at every start
-    out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists
-    out/shards/                  committed shards only
+    out/.work/lock               the process that coordinates a run (`core.locks`)
+    out/.work/sources/           all sources as the first run listed them (`listing_record`)
+    out/.work/tmp/WRITER/        unfinished files of one writer, which it deletes when it ends
+    out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists (`shard_records`)
+    out/shards/                  complete shards
     out/manifest.csv             written once every shard is committed or provisional
     out/dataset.json             written last; then .work is deleted, unless a shard is provisional
     out/report.html              the page of the verb ``report``; not part of the dataset
 
-Only the coordinator renames files to their final names: it syncs them first, and commits a shard's rows before the
-shard. So a committed shard has its rows whenever a run is killed, and everything else is regenerated to the same bytes.
-The lock (`core.locks`) ends with the process. Syncing and renaming take 45 ms per shard.
+Workers sync and rename their shards, then the shards' records. A shard without a record is made again, to the same
+bytes, whenever a run is killed. Nothing here depends on the lock for correct data: two runs that hold it at once make
+the same files, and neither deletes what the other one is writing.
 """
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import hashlib
 import itertools
 import json
-import os
 import re
-import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from yaml import YAMLError
 
 from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import ConfigError, DamageError, LockedError
-from unprocess_gen.core.files import RESUME, commit_file, machine_error
-from unprocess_gen.core.locks import FolderLock, NoLocksError
+from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.files import RESUME, file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath
-from unprocess_gen.core.output_paths import enclosing_dataset
-from unprocess_gen.core.types import Row, Source
-from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.core.types import Counts, Row, Source
 from unprocess_gen.dataset.dataset_json import MAX_BYTES, check_dataset_json
-from unprocess_gen.dataset.manifest import read_rows, row_of_values, write_rows
-from unprocess_gen.dataset.shards import shard_name
-from unprocess_gen.pipeline.tasks import ShardResult
+from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.pipeline.listing_record import read_record, recorded_files, write_listing
+from unprocess_gen.pipeline.shard_records import ShardRecords
+from unprocess_gen.pipeline.storage import WORK, open_storage
+from unprocess_gen.pipeline.storage.local import cannot_write
 
 REPORT = "report.html"
 """The page of a dataset, the one file in its folder that is not part of the dataset."""
+
+COUNTS = tuple(one.name for one in fields(Counts))
+"""Columns of the manifest that count sites."""
 
 SHOWN = 3
 """Differences named in an error; the others are counted."""
 
 
 class Workspace:
-    """Hold an output folder for this process, from `open` until `close`."""
+    """Hold an output folder for this process, from `open` until `close`.
 
-    def __init__(self, out: Path, config_yaml: str) -> None:
-        self.out = out
+    Parameters
+    ----------
+    out : str or Path
+        Folder of the dataset.
+    config_yaml : str
+        Text of its ``config.yaml``.
+
+    Attributes
+    ----------
+    storage : Storage
+        Where the dataset is written.
+    records : ShardRecords
+        The committed shards.
+    """
+
+    def __init__(self, out: str | Path, config_yaml: str) -> None:
+        self.out = str(out)
         self.config_yaml = config_yaml
-        self.work = out / ".work"
-        self.tmp = self.work / "tmp"
-        self.rows = self.work / "rows"
-        self.shards = out / "shards"
-        self._lock = FolderLock(out)
+        self.storage = open_storage(self.out)
+        self.records = ShardRecords(self.storage, self.out)
 
     def __enter__(self) -> Workspace:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Release the lock."""
-        self._lock.release()
+        self.storage.close()
 
     def open(self) -> None:
-        """Create the folder if needed, and lock it.
+        """Create the folder if needed, and lock it; a finished dataset is locked only if it can be written to.
 
         Raises LockedError if another run holds it, ConfigError if it cannot be written, contains other files or is
         inside a dataset.
         """
-        self._refuse_datasets_around()
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
-        self.hold()
+        self.storage.open()
         self._refuse_foreign_files()
-
-    def hold(self) -> None:
-        """Lock an existing folder; raise LockedError or ConfigError as `open` does."""
         try:
-            self._lock.acquire(wait=False)
-        except BlockingIOError:
-            raise LockedError(
-                f"out={self.out}: another run is writing to it; wait for that run, or choose another out"
-            ) from None
-        except NoLocksError as error:
-            raise ConfigError(
-                f"out={self.out}: this file system cannot lock it ({error.strerror}); choose another out"
-            ) from error
-        except OSError as error:
-            raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
-
-    def _refuse_datasets_around(self) -> None:
-        """Refuse a folder inside a dataset, finished or begun, which would become a foreign file of that dataset."""
-        dataset = enclosing_dataset(Path(os.path.realpath(self.out)).parent)
-        if dataset is not None:
-            raise ConfigError(
-                f"out={self.out}: is inside the dataset {dataset}; expected a folder outside of it; choose another out"
-            )
+            self.storage.hold()
+        except ConfigError:
+            if not self.is_complete():
+                raise
 
     def _refuse_foreign_files(self) -> None:
         """Refuse a folder that contains files but no dataset, so that no file of the user is overwritten."""
-        foreign = sorted(set(os.listdir(self.out)) - {".work"})
-        if foreign and not (self.out / "config.yaml").exists():
+        found = self.storage.names("")
+        foreign = sorted(found.keys() - {WORK})
+        if foreign and "config.yaml" not in found:
             raise ConfigError(
                 f"out={self.out}: contains {foreign[0]}, but no config.yaml; expected an empty folder or a dataset; "
                 "choose another out"
             )
 
-    @property
-    def complete(self) -> bool:
-        """True if the dataset is finished: no shard is missing or provisional."""
-        path = self.out / "dataset.json"
-        return path.exists() and not any(entry.get("provisional") for entry in read_dataset(path)["shards"])
+    def is_complete(self) -> bool:
+        """Return whether the dataset is finished: no shard is missing or provisional."""
+        facts = self.facts()
+        return facts is not None and not any(entry.get("provisional") for entry in facts["shards"])
+
+    def facts(self) -> dict[str, Any] | None:
+        """Return the contents of ``dataset.json``, None without one; raise DamageError if it is damaged."""
+        if self.storage.size("dataset.json") is None:
+            return None
+        return parse_dataset(self.storage.read("dataset.json"), f"{self.out}/dataset.json")
 
     def check_begun(self, sources: Sequence[Source]) -> None:
         """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences."""
         self._check_same_settings()
-        listing = self.work / "sources.json"
-        if listing.exists():
-            self._check_same_sources(_read_listing(listing), sources)
+        known = dict(recorded_files(self.storage, self.out))
+        if known:
+            self._check_same_sources(known, sources)
 
-    def begin(self, sources: Sequence[Source]) -> None:
-        """Start a dataset, or continue one that an earlier run began and `check_begun` has accepted.
+    def begin(self, sources: Sequence[Source], shards: int) -> None:
+        """Start a dataset of some shards, or continue one that an earlier run began and `check_begun` has accepted.
 
         Raises ConfigError if the folder cannot be written; MachineError if the disk is full.
         """
-        listing = self.work / "sources.json"
         try:
-            self.work.mkdir(exist_ok=True)
-            self.rows.mkdir(exist_ok=True)
-            shutil.rmtree(self.tmp, ignore_errors=True)
-            self.tmp.mkdir(exist_ok=True)  # rmtree can fail while an orphaned worker of a killed run still writes here
-            if not listing.exists():
-                self._write(
-                    listing, json.dumps([[source.name, source.size_bytes, source.sha256] for source in sources])
-                )
-            if not (self.out / "config.yaml").exists():
-                self._write(self.out / "config.yaml", self.config_yaml)
-            self.shards.mkdir(exist_ok=True)  # after config.yaml, by which a later run recognises the folder
-            self._refuse_foreign_shards()
+            if read_record(self.storage, self.out) is None:
+                write_listing(self.storage, sources)
+            if not self.storage.create("config.yaml", self.config_yaml):
+                self._check_same_settings()
+            self.storage.begin()  # after config.yaml, by which a later run recognises the folder
+            self._refuse_foreign_shards(shards)
+            _ = self.storage.scratch
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise machine_error(error, self.out, RESUME) from error
-            raise ConfigError(f"out={self.out}: cannot be written ({error.strerror})") from error
+            raise cannot_write(error, self.out) from error
 
-    def _refuse_foreign_shards(self) -> None:
-        for path in sorted(self.shards.iterdir()):
-            if not self._rows_path(_shard_number(path.name)).exists():
+    def _refuse_foreign_shards(self, shards: int) -> None:
+        for name in sorted(self.storage.names("shards")):
+            if not 0 <= _shard_number(name) < shards:
                 raise ConfigError(
-                    f"out={self.out}: unexpected file {path}; expected only committed shards; remove it or choose "
-                    "another out"
+                    f"out={self.out}: unexpected file {self.out}/shards/{name}; expected only committed shards; remove "
+                    "it or choose another out"
                 )
 
     def check_complete(self, sources: Sequence[Source]) -> dict[str, Any]:
@@ -170,29 +153,43 @@ class Workspace:
         Raises ConfigError if it was made from other settings or sources, DamageError if a shard is missing or has
         another size.
         """
-        if not (self.out / "config.yaml").exists():
+        if self.storage.size("config.yaml") is None:
             raise DamageError(
                 f"{self.out}/config.yaml: is missing from a finished dataset; gen-dataset verify {self.out} "
                 "--repair restores it"
             )
         self._check_same_settings()
-        rows = read_rows(self.out / "manifest.csv")
+        rows = read_rows(self.storage.fetch("manifest.csv"))
         known = {str(row["source"]): (row["source_bytes"], row["source_sha256"]) for row in rows}
         self._check_same_sources(known, sources)
-        facts = read_dataset(self.out / "dataset.json")
+        facts = self.facts()
+        assert facts is not None
+        sizes = self.storage.names("shards")
         for entry in facts["shards"]:
-            _check_size(self.out, entry)
-        shutil.rmtree(self.work, ignore_errors=True)
+            self._check_size(entry, sizes)
+        self.storage.remove_work(keep_records=False)
         return facts
 
+    def _check_size(self, entry: dict[str, Any], sizes: dict[str, int]) -> None:
+        if entry["file"] is None:
+            return
+        size = sizes.get(Path(entry["file"]).name)
+        if size != entry["bytes"]:
+            found = "is missing" if size is None else f"has {size} bytes"
+            raise DamageError(
+                f"{self.out}/{entry['file']}: {found}, expected {entry['bytes']} bytes; gen-dataset verify {self.out} "
+                "--repair restores it"
+            )
+
     def _check_same_settings(self) -> None:
-        path = self.out / "config.yaml"
-        if not path.exists():
+        if self.storage.size("config.yaml") is None:
             return
         try:
-            differing = differences(self.config_yaml, path.read_text(encoding="utf-8"))
+            differing = differences(self.config_yaml, self.storage.read("config.yaml"))
         except (ValueError, YAMLError) as error:
-            raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)}); choose another out") from error
+            raise DamageError(
+                f"{self.out}/config.yaml: cannot be read ({error_in_one_line(error)}); choose another out"
+            ) from error
         if differing:
             raise ConfigError(
                 f"out={self.out}: was begun with other settings: {_first(differing)}; choose another out, or remove it"
@@ -219,98 +216,85 @@ class Workspace:
                 f"out={self.out}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
             )
 
-    def committed(self, count: int) -> list[int]:
-        """Return the numbers, below ``count``, of the shards that are committed."""
-        return [shard for shard in range(count) if self._is_committed(shard)]
-
-    def _is_committed(self, shard: int) -> bool:
-        try:
-            entry = self.entry(shard)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            return False
-        try:
-            _check_size(self.out, entry)
-        except DamageError:
-            return False
-        return True
-
-    def entry(self, shard: int) -> dict[str, Any]:
-        """Return the entry of a committed shard in ``dataset.json``."""
-        return dict(self._record(shard)["entry"])
-
-    def committed_rows(self, shards: Iterable[int]) -> Iterator[Row]:
-        """Yield the rows of committed shards, shard by shard."""
-        for shard in shards:
-            for values in self._record(shard)["rows"]:
-                yield row_of_values(values)
-
-    def _record(self, shard: int) -> dict[str, Any]:
-        record: dict[str, Any] = json.loads(self._rows_path(shard).read_text(encoding="utf-8"))
-        return record
-
-    def _rows_path(self, shard: int) -> Path:
-        return self.rows / f"{shard:05d}.json"
-
-    def commit(self, result: ShardResult) -> None:
-        """Move a finished shard into place, durably: first its rows, then the file; raise MachineError on failure."""
-        record = {"entry": result.entry(), "rows": [[row[name] for name in NAMES] for row in result.rows]}
-        try:
-            self._write(self._rows_path(result.shard), json.dumps(record, separators=(",", ":")))
-            if result.path is not None:
-                commit_file(Path(result.path), self.shards / shard_name(result.shard))
-        except OSError as error:
-            raise machine_error(error, self.out, RESUME) from error
-
-    def finish(self, shards: int, provisional: dict[int, ShardResult], facts: dict[str, Any]) -> dict[str, Any]:
+    def finish(self, shards: int, facts_of: Callable[[Tally], dict[str, Any]]) -> dict[str, Any]:
         """Write ``manifest.csv``, then ``dataset.json``, and return the latter's contents.
 
-        Provisional shards get provisional rows; ``.work`` is then kept, so that the next run retries them. Raises
-        MachineError if a file cannot be written.
+        If a shard is provisional, ``.work`` is kept, so that the next run retries it.
+
+        Parameters
+        ----------
+        shards : int
+            Number of shards; all of them have records.
+        facts_of : callable
+            Takes the counts of all rows; returns what ``dataset.json`` holds beside digests and shards.
+
+        Raises
+        ------
+        MachineError
+            If a file cannot be read or written.
+        DamageError
+            If a record is damaged.
         """
+        entries: list[dict[str, Any]] = []
+        tally = Tally()
         try:
-            manifest_sha256 = self._write_manifest(self.all_rows(shards, provisional))
-            entries = [
-                provisional[shard].entry() if shard in provisional else self.entry(shard) for shard in range(shards)
-            ]
-            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, facts)
-            self._write(self.out / "dataset.json", dataset_text(dataset))
-            shutil.rmtree(self.tmp if provisional else self.work)
+            manifest = self.storage.scratch / "manifest.csv"
+            with manifest.open("w", encoding="utf-8", newline="") as stream:
+                write_rows(stream, tally.counted(self._rows(shards, entries)))
+            manifest_sha256 = file_sha256(manifest)
+            self.storage.commit(manifest, "manifest.csv")
+            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, facts_of(tally))
+            self.storage.write("dataset.json", dataset_text(dataset))
+            self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
         except OSError as error:
-            raise machine_error(error, self.out, RESUME) from error
+            raise machine_error(error, Path(self.out), RESUME) from error
         return dataset
 
-    def all_rows(self, shards: int, provisional: dict[int, ShardResult]) -> Iterator[Row]:
-        """Yield every row of the dataset, in source order."""
+    def _rows(self, shards: int, entries: list[dict[str, Any]]) -> Iterator[Row]:
+        """Yield every row of the dataset in source order, and append the entry of each shard."""
         for shard in range(shards):
-            yield from provisional[shard].rows if shard in provisional else self.committed_rows([shard])
-
-    def _write_manifest(self, rows: Iterable[Row]) -> str:
-        path = self.out / "manifest.csv"
-        with self._written_durably(path) as stream:
-            write_rows(stream, rows)
-        with path.open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
-
-    def _write(self, path: Path, text: str) -> None:
-        with self._written_durably(path) as stream:
-            stream.write(text)
-
-    @contextlib.contextmanager
-    def _written_durably(self, path: Path) -> Iterator[TextIO]:
-        """Open a temporary text file below ``.work``; on leaving, sync it and rename it to ``path``."""
-        temporary = self.work / (path.name + ".part")
-        with temporary.open("w", encoding="utf-8", newline="") as stream:
-            yield stream
-        commit_file(temporary, path)
+            entry, rows = self.records.entry_and_rows(shard)
+            entries.append(entry)
+            yield from rows
 
 
-def _read_listing(path: Path) -> dict[str, Any]:
-    try:
-        return {name: (size, sha256) for name, size, sha256 in json.loads(path.read_text(encoding="utf-8"))}
-    except (ValueError, TypeError) as error:
-        raise DamageError(
-            f"{path}: cannot be read ({error_in_one_line(error)}); remove the folder and start again"
-        ) from error
+@dataclass(slots=True)
+class Tally:
+    """Count the rows of a dataset.
+
+    Attributes
+    ----------
+    pairs : int
+        Rows with status ``ok``.
+    reasons : dict of str to int
+        Failed rows by reason.
+    sites : dict of str to int
+        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
+    """
+
+    pairs: int = 0
+    reasons: dict[str, int] = field(default_factory=dict)
+    sites: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", *COUNTS), 0))
+
+    def counted(self, rows: Iterable[Row]) -> Iterator[Row]:
+        """Yield the rows, and count them."""
+        for row in rows:
+            self.add(row)
+            yield row
+
+    def add(self, row: Row) -> None:
+        """Count one row."""
+        if row["status"] != "ok":
+            self.reasons[str(row["reason"])] = self.reasons.get(str(row["reason"]), 0) + 1
+            return
+        self.pairs += 1
+        self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
+        for name in COUNTS:
+            self.sites[name] += int(row[name] or 0)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the counts as ``dataset.json`` holds them."""
+        return {"pairs": self.pairs, "failed": dict(sorted(self.reasons.items())), "sites": dict(self.sites)}
 
 
 def dataset_facts(
@@ -361,32 +345,28 @@ def read_dataset(path: AnyPath) -> dict[str, Any]:
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"more than {MAX_BYTES} bytes")
         text = path.read_bytes().decode("ascii")
+    except (OSError, ValueError) as error:
+        raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
+    return parse_dataset(text, str(path))
+
+
+def parse_dataset(text: str, place: str) -> dict[str, Any]:
+    """Parse the text of a ``dataset.json`` as `read_dataset` does; ``place`` names it in messages."""
+    try:
         facts = json.loads(text)
         facts.pop("dataset_sha256")
         intact = dataset_text(facts) == text
         if intact:
             check_dataset_json(facts)
-    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
-        raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        raise DamageError(f"{place}: cannot be read ({error_in_one_line(error)})") from error
     if not intact:
-        raise DamageError(f"{path}: was changed: its SHA-256 differs from dataset_sha256")
+        raise DamageError(f"{place}: was changed: its SHA-256 differs from dataset_sha256")
     return dict(facts)
 
 
 def _text(facts: dict[str, Any]) -> str:
     return json.dumps(facts, indent=1) + "\n"
-
-
-def _check_size(out: Path, entry: dict[str, Any]) -> None:
-    if entry["file"] is None:
-        return
-    path = out / entry["file"]
-    size = path.stat().st_size if path.is_file() else None
-    if size != entry["bytes"]:
-        found = "is missing" if size is None else f"has {size} bytes"
-        raise DamageError(
-            f"{path}: {found}, expected {entry['bytes']} bytes; gen-dataset verify {out} --repair restores it"
-        )
 
 
 def _shard_number(name: str) -> int:

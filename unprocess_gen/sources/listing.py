@@ -29,7 +29,7 @@ import xxhash
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import leads_outside
-from unprocess_gen.core.types import NO_CLIP, Row, Source
+from unprocess_gen.core.types import Source
 
 _Result = TypeVar("_Result")
 
@@ -386,13 +386,20 @@ class ClipSizes:
     def __init__(self) -> None:
         self._sizes: dict[str, tuple[int, int] | None] = {}
 
-    def warnings(self, rows: Iterable[Row]) -> tuple[str, ...]:
-        """Return a warning for each clip whose frames first differ in size within these manifest rows.
+    def warnings(self, sizes: Iterable[tuple[str, int, int]]) -> tuple[str, ...]:
+        """Return a warning for each clip whose frames first differ in size.
 
-        Rows of failed sources, of photographs outside clips and of patches are ignored.
+        Parameters
+        ----------
+        sizes : iterable of (str, int, int)
+            Name of a clip, width and height of one of its frames.
+
+        Returns
+        -------
+        tuple of str
+            One sentence for each clip; none for a clip that earlier calls reported.
         """
-        frames = [row for row in rows if row["status"] == "ok" and row["clip"] != NO_CLIP and row["patch"] == 0]
-        texts = (self._warning(str(row["clip"]), int(row["width"] or 0), int(row["height"] or 0)) for row in frames)
+        texts = (self._warning(*size) for size in sizes)
         return tuple(text for text in texts if text)
 
     def _warning(self, clip: str, width: int, height: int) -> str:

@@ -10,8 +10,7 @@ What happens when a worker dies, usually because the system is out of memory:
 If the coordinator dies, its workers exit by themselves (`worker._exit_with_parent`). With ``n_jobs=1`` the coordinator
 does the work, so killing it ends the run; a rerun resumes.
 
-joblib does not limit how many finished shards wait for an earlier one: only their rows are in memory, the shards
-themselves are temporary files.
+Workers commit their shards themselves and report counts, so a slow shard delays no other one.
 """
 
 from __future__ import annotations
@@ -23,9 +22,8 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 
-from unprocess_gen.dataset.manifest import failed_row
-from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
-from unprocess_gen.pipeline.worker import make_shard
+from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
+from unprocess_gen.pipeline.worker import commit_provisional, make_and_commit
 
 TRACKER_FILTER = "ignore:resource_tracker:UserWarning"
 """Silences loky's tracker process, which reports objects of an interrupted run after it has removed them."""
@@ -58,13 +56,13 @@ def own_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_tasks(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardResult]:
-    """Yield the results of all tasks in order, except shards that are retried after a worker died.
+def run_tasks(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardReport]:
+    """Make and commit the shards of all tasks; yield a report of each as soon as it is committed.
 
     With one job joblib is not imported (0.1 s, 8 MB) and the coordinator makes the shards.
     """
     if n_jobs == 1:
-        yield from (make_shard(context, task) for task in tasks)
+        yield from (make_and_commit(context, task) for task in tasks)
         return
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -84,33 +82,26 @@ def run_tasks(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> I
             waiting.remove(task)
 
 
-def _run_alone(context: RunContext, task: ShardTask) -> Iterator[ShardResult]:
-    """Retry one shard with no other worker running.
-
-    If the worker dies again, yield a result without a file; its rows have the provisional reason ``worker_died``.
-    """
+def _run_alone(context: RunContext, task: ShardTask) -> Iterator[ShardReport]:
+    """Retry one shard with no other worker running; if the worker dies again, commit provisional rows."""
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     try:
         yield from _run_pool(context, [task], n_jobs=2)  # n_jobs=1 would make the coordinator do the work, and die
     except TerminatedWorkerError:
         killer = task.busy_source(context) or task.sources[0]
-        detail = f"two workers died at {killer.name}; its shard is retried by the next run"
-        rows = (
-            failed_row(source, None, task.shard, context.config.seed, "worker_died", detail) for source in task.sources
-        )
-        yield ShardResult(task.shard, None, 0, None, tuple(rows), killer=killer.name)
+        yield commit_provisional(context, task, killer, deaths=2)
 
 
-def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardResult]:
-    """Yield the results of a pool of workers in order; raise TerminatedWorkerError if a worker dies."""
+def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> Iterator[ShardReport]:
+    """Yield the reports of a pool of workers as they come; raise TerminatedWorkerError if a worker dies."""
     from joblib import Parallel, delayed
 
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator", batch_size=1, pre_dispatch="2*n_jobs")
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # tasks cancelled by an interrupt
         with _interrupts_ignored(), _tracker_silenced():
-            results = parallel(delayed(make_shard)(context, task) for task in tasks)
+            results = parallel(delayed(make_and_commit)(context, task) for task in tasks)
         with closing(results):
             yield from results
 

@@ -1,0 +1,102 @@
+"""Record the sources of a run below ``.work``, in files that hold a range of them each.
+
+    .work/sources/00000.json    sources 0 to 4095, one list of values for each
+    .work/listing.json          their number, and the digest of those files; written last
+
+A process that makes some shards reads only the files of their sources. A resumed run compares its own listing with the
+record. Version 0.1 recorded name, size and digest of all sources in ``.work/sources.json``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
+
+from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.storage import Storage
+
+PER_FILE = 4096
+"""Sources in a file of the record."""
+
+FOLDER = ".work/sources"
+INDEX = ".work/listing.json"
+OLD_RECORD = ".work/sources.json"
+
+_FIELDS = tuple(field.name for field in fields(Source))
+
+
+@dataclass(frozen=True, slots=True)
+class ListingRecord:
+    """Hold the number of recorded sources, and the SHA-256 of their record."""
+
+    sources: int
+    sha256: str
+
+
+def write_listing(storage: Storage, sources: Sequence[Source]) -> ListingRecord:
+    """Record the sources of a run, unless they are recorded; return what identifies the record."""
+    texts = (_text(sources[first : first + PER_FILE]) for first in range(0, len(sources), PER_FILE))
+    digest = hashlib.sha256()
+    for number, text in enumerate(texts):
+        digest.update(text.encode())
+        storage.write(f"{FOLDER}/{number:05d}.json", text)
+    record = ListingRecord(len(sources), digest.hexdigest())
+    storage.write(INDEX, json.dumps({"sources": record.sources, "sha256": record.sha256}))
+    return record
+
+
+def _text(sources: Iterable[Source]) -> str:
+    return json.dumps([[getattr(source, name) for name in _FIELDS] for source in sources], separators=(",", ":"))
+
+
+def read_record(storage: Storage, place: str) -> ListingRecord | None:
+    """Return what identifies the recorded sources, None if there is no record; raise DamageError if it is damaged."""
+    try:
+        found = json.loads(storage.read(INDEX))
+        return ListingRecord(int(found["sources"]), str(found["sha256"]))
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damage(place, INDEX, error) from error
+
+
+def read_sources(storage: Storage, place: str, first: int, last: int) -> list[Source]:
+    """Return the recorded sources from index ``first`` to before ``last``; raise DamageError if they are damaged."""
+    found: list[Source] = []
+    for number in range(first // PER_FILE, -(-last // PER_FILE)):
+        name = f"{FOLDER}/{number:05d}.json"
+        try:
+            found += [Source(*values) for values in json.loads(storage.read(name))]
+        except (OSError, ValueError, TypeError) as error:
+            raise _damage(place, name, error) from error
+    return [source for source in found if first <= source.index < last]
+
+
+def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, tuple[int | None, str | None]]]:
+    """Yield name, and (size, digest) of every recorded source; nothing if there is no record.
+
+    Raises DamageError if the record is damaged.
+    """
+    record = read_record(storage, place)
+    if record is not None:
+        for first in range(0, record.sources, PER_FILE):
+            for source in read_sources(storage, place, first, min(first + PER_FILE, record.sources)):
+                yield source.name, (source.size_bytes, source.sha256)
+        return
+    try:
+        for name, size, sha256 in json.loads(storage.read(OLD_RECORD)):
+            yield name, (size, sha256)
+    except FileNotFoundError:
+        return
+    except (ValueError, TypeError) as error:
+        raise _damage(place, OLD_RECORD, error) from error
+
+
+def _damage(place: str, name: str, error: Exception) -> DamageError:
+    return DamageError(
+        f"{place}/{name}: cannot be read ({error_in_one_line(error)}); remove the folder and start again"
+    )

@@ -1,0 +1,96 @@
+"""Commit shards and keep their records: rows and entry of each shard, until ``manifest.csv`` exists.
+
+A worker puts a shard in place first and its record second, so the record is the commit: a shard with a record is
+complete. Any number of writers may commit the same shard, because all of them make the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.types import Row
+from unprocess_gen.dataset.columns import NAMES
+from unprocess_gen.dataset.manifest import row_of_values
+from unprocess_gen.dataset.shards import shard_name
+from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.tasks import ShardResult
+
+ROWS = ".work/rows"
+"""Folder of the records below ``out``."""
+
+
+def commit_shard(storage: Storage, result: ShardResult) -> None:
+    """Put a finished shard in place, then its record; raise OSError if the storage fails."""
+    if result.path is not None:
+        storage.commit(Path(result.path), f"shards/{shard_name(result.shard)}")
+    record = {"entry": result.entry(), "rows": [[row[name] for name in NAMES] for row in result.rows]}
+    storage.write(record_name(result.shard), json.dumps(record, separators=(",", ":")))
+
+
+def record_name(shard: int) -> str:
+    """Return the name of a shard's record below ``out``."""
+    return f"{ROWS}/{shard:05d}.json"
+
+
+class ShardRecords:
+    """Read the records of committed shards.
+
+    Parameters
+    ----------
+    storage : Storage
+        Where the dataset is written.
+    place : str
+        Name of the dataset in messages.
+    """
+
+    def __init__(self, storage: Storage, place: str) -> None:
+        self._storage, self._place = storage, place
+
+    def committed(self, shards: Iterable[int]) -> set[int]:
+        """Return which of some shards are committed: their record is readable, not provisional, and fits the file."""
+        recorded, sizes = self._storage.names(ROWS), self._storage.names("shards")
+        return {
+            shard
+            for shard in shards
+            if Path(record_name(shard)).name in recorded and self._is_committed(shard, sizes.get(shard_name(shard)))
+        }
+
+    def recorded(self, shards: Iterable[int]) -> set[int]:
+        """Return which of some shards have a record, provisional ones included."""
+        names = self._storage.names(ROWS)
+        return {shard for shard in shards if Path(record_name(shard)).name in names}
+
+    def _is_committed(self, shard: int, size: int | None) -> bool:
+        try:
+            entry = self._read(shard)["entry"]
+            return not entry.get("provisional") and (entry["file"] is None or entry["bytes"] == size)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return False
+
+    def entry(self, shard: int) -> dict[str, Any]:
+        """Return the entry of a shard in ``dataset.json``."""
+        return dict(self._read(shard)["entry"])
+
+    def rows(self, shard: int) -> Iterator[Row]:
+        """Yield the rows of a shard."""
+        return map(row_of_values, self._read(shard)["rows"])
+
+    def entry_and_rows(self, shard: int) -> tuple[dict[str, Any], list[Row]]:
+        """Return entry and rows of a shard; raise DamageError if its record cannot be read."""
+        try:
+            record = self._read(shard)
+            return dict(record["entry"]), [row_of_values(values) for values in record["rows"]]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise DamageError(
+                f"{self._place}/{record_name(shard)}: cannot be read ({error_in_one_line(error)}); delete the file and "
+                "rerun to make its shard"
+            ) from error
+
+    def _read(self, shard: int) -> dict[str, Any]:
+        record: dict[str, Any] = json.loads(self._storage.read(record_name(shard)))
+        return record
