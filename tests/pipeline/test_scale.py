@@ -36,7 +36,7 @@ def copies(original: Path, tmp_path: Path) -> Path:
 
 
 def edit(folder: Path, change: Callable[[list[str]], None]) -> list[str]:
-    """Change the lines of a manifest, and return the damage that is found besides its digest."""
+    """Change the lines of a manifest, and return the damage that is found apart from its digest."""
     manifest = folder / "manifest.csv"
     lines = manifest.read_text(encoding="utf-8").splitlines(keepends=True)
     change(lines)

@@ -135,7 +135,13 @@ def commit_file(temporary: Path, path: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Make a file's contents, or a folder's renames, survive a loss of power."""
+    """Make a file's contents, or a folder's renames, survive a loss of power.
+
+    Parameters
+    ----------
+    path : Path
+        A file or folder.
+    """
     handle = os.open(
         path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
     )  # Windows syncs only what it may write

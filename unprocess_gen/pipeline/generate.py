@@ -118,7 +118,7 @@ def generate(config: Config, label: str = "") -> Summary:
         workspace.open()
         if workspace.is_complete():
             return _summary(config, workspace.check_complete(listing.sources), listing, started)
-        workspace.check_begun(listing.sources)
+        workspace.check_begun(listing.sources, config.source.root)
         tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
         done = workspace.records.committed(range(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
@@ -178,7 +178,7 @@ def follow(reports: Iterable[ShardReport], progress: Progress) -> tuple[int, Sta
 
 
 def dataset_json_facts(config: Config, listing: Listing, tally: Tally, run: dict[str, Any]) -> dict[str, Any]:
-    """Return what ``dataset.json`` holds beside digests and shards: counts, source, run and versions."""
+    """Return what ``dataset.json`` holds apart from digests and shards: counts, source, run and versions."""
     return {
         **tally.facts(),
         "not_matched": listing.not_matched,

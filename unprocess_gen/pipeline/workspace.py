@@ -10,8 +10,8 @@
     out/dataset.json             written last; then .work is deleted, unless a shard is provisional
     out/report.html              the page of the verb ``report``; not part of the dataset
 
-Workers sync and rename their shards, then the shards' records. A shard without a record is made again, to the same
-bytes, whenever a run is killed. Nothing here depends on the lock for correct data: two runs that hold it at once make
+Workers sync and rename their shards, then the shards' records. A shard without a record is regenerated, to the
+same bytes, whenever a run is killed. Nothing here depends on the lock for correct data: two runs that hold it at once make
 the same files, and neither deletes what the other one is writing.
 """
 
@@ -22,7 +22,7 @@ import itertools
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from unprocess_gen.pipeline.listing_record import read_record, recorded_files, w
 from unprocess_gen.pipeline.shard_records import ShardRecords
 from unprocess_gen.pipeline.storage import WORK, open_storage
 from unprocess_gen.pipeline.storage.local import cannot_write
+from unprocess_gen.sources.listing import content_sha256
 
 REPORT = "report.html"
 """The page of a dataset, the one file in its folder that is not part of the dataset."""
@@ -116,12 +117,22 @@ class Workspace:
             return None
         return parse_dataset(self.storage.read("dataset.json"), f"{self.out}/dataset.json")
 
-    def check_begun(self, sources: Sequence[Source]) -> None:
-        """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences."""
+    def check_begun(self, sources: Sequence[Source], root: str | None) -> None:
+        """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences.
+
+        Files that the earlier run hashed, because others had their size and end, are hashed again: if one of them has
+        changed, another one can have another number among identical files, and so other noise.
+        """
         self._check_same_settings()
         known = dict(recorded_files(self.storage, self.out))
         if known:
-            self._check_same_sources(known, sources)
+            hashed = (
+                replace(source, sha256=content_sha256(root, source))
+                if root is not None and source.size_bytes and known.get(source.name, (0, None))[1]
+                else source
+                for source in sources
+            )
+            self._check_same_sources(known, hashed)
 
     def begin(self, sources: Sequence[Source], shards: int) -> None:
         """Start a dataset of some shards, or continue one that an earlier run began and `check_begun` has accepted.
@@ -195,7 +206,7 @@ class Workspace:
                 f"out={self.out}: was begun with other settings: {_first(differing)}; choose another out, or remove it"
             )
 
-    def _check_same_sources(self, known: dict[str, Any], sources: Sequence[Source]) -> None:
+    def _check_same_sources(self, known: dict[str, Any], sources: Iterable[Source]) -> None:
         found = {source.name: (source.size_bytes, source.sha256) for source in sources}
         differing = [
             *(f"{name} is new" for name in found if name not in known),
@@ -226,7 +237,7 @@ class Workspace:
         shards : int
             Number of shards; all of them have records.
         facts_of : callable
-            Takes the counts of all rows; returns what ``dataset.json`` holds beside digests and shards.
+            Takes the counts of all rows; returns what else than digests and shards ``dataset.json`` holds.
 
         Raises
         ------

@@ -360,7 +360,7 @@ def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     seen: Counter[str] = Counter()
     placed: dict[int, Source] = {}
     for clip, frames in clips.items():
-        digest = _digest(root, frames[0])
+        digest = content_sha256(root, frames[0])
         for frame, source in enumerate(frames):
             placed[source.index] = replace(
                 source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest], frames=len(frames)
@@ -413,7 +413,21 @@ class ClipSizes:
         )
 
 
-def _digest(root: str, source: Source) -> str:
+def content_sha256(root: str, source: Source) -> str:
+    """Return the SHA-256 of a source's file, or that of its name if the file cannot be read.
+
+    Parameters
+    ----------
+    root : str
+        Value of ``source.root``.
+    source : Source
+        One entry of the listing; a digest that it holds is returned.
+
+    Returns
+    -------
+    str
+        64 hex digits.
+    """
     if source.sha256 is not None:
         return source.sha256
     try:
