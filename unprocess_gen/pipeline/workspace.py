@@ -10,9 +10,9 @@
     out/dataset.json             written last; then .work is deleted, unless a shard is provisional
     out/report.html              the page of the verb ``report``; not part of the dataset
 
-Workers sync and rename their shards, then the shards' records. A shard without a record is regenerated, to the
-same bytes, whenever a run is killed. Nothing here depends on the lock for correct data: two runs that hold it at once make
-the same files, and neither deletes what the other one is writing.
+Workers sync and rename their shards, then the shards' records. A shard without a record is regenerated, to the same
+bytes, whenever a run is killed. Correct data do not depend on the lock: two runs that hold it at once make the same
+files, and neither deletes what the other one is writing.
 """
 
 from __future__ import annotations
