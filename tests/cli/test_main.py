@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from helpers.cases import slow_except
 from helpers.commands import COMMAND, Cli, RunMain, messages
 from helpers.datasets import Make
 from helpers.photographs import fill, pixels
@@ -556,8 +558,12 @@ TAKES_SOURCE = {
 }
 
 
-@pytest.mark.parametrize("spelling", SPELLINGS, ids=" ".join)
-@pytest.mark.parametrize("verb", TAKES_SOURCE)
+QUICK_SPELLINGS = [("verify", SPELLINGS[0]), ("replay", SPELLINGS[1]), ("again", SPELLINGS[2])]
+
+
+@pytest.mark.parametrize(
+    ("verb", "spelling"), slow_except(QUICK_SPELLINGS, itertools.product(TAKES_SOURCE, SPELLINGS)), ids=str
+)
 def test_source_has_two_spellings_in_every_verb(
     verb: str, spelling: tuple[str, ...], moved: Path, run_main: RunMain
 ) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.cases import slow_except
 from helpers.commands import RunMain, messages
 from helpers.datasets import Make
 from helpers.photographs import fill
@@ -246,7 +247,7 @@ def start(folder: Path, *arguments: str, prefix: tuple[str, ...] = ()) -> subpro
     )
 
 
-@pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
+@pytest.mark.parametrize("number", slow_except((signal.SIGINT,), ENDS), ids=lambda number: number.name)
 def test_signal_during_a_run_gives_one_line(number: signal.Signals, tmp_path: Path) -> None:
     process = start(tmp_path, "source.limit=2000", "output.pairs_per_shard=1", "n_jobs=1")
     wait_for((tmp_path / "ds/.work").exists)

@@ -57,8 +57,9 @@ def table(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
+@pytest.mark.slow
 @needs_joblib_launcher
-@pytest.mark.parametrize("n_jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_jobs", [1, 2])
 def test_joblib_launcher_generates_the_datasets_of_a_sweep(
     n_jobs: int, cli: Cli, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
 ) -> None:

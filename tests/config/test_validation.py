@@ -607,19 +607,27 @@ def paths_of(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 
 @pytest.mark.parametrize("overrides", [(), ("noise=sony_a7s2", "scene=low_light")], ids=str)
-@hypothesis_settings(max_examples=150)
-@given(data=st.data())
+@pytest.mark.parametrize("examples", [30, pytest.param(600, marks=pytest.mark.slow)])
 def test_edited_config_yaml_is_refused_or_can_be_planned(
-    overrides: tuple[str, ...], data: st.DataObject, settings: Settings, tmp_path_factory: pytest.TempPathFactory
+    examples: int, overrides: tuple[str, ...], settings: Settings, tmp_path: Path
 ) -> None:
-    tree = parse_yaml_mapping(dataset_yaml(settings(*overrides)))
+    @hypothesis_settings(max_examples=examples)
+    @given(data=st.data())
+    def check(data: st.DataObject) -> None:
+        check_edited_config(data, dataset_yaml(settings(*overrides)), tmp_path / "config.yaml")
+
+    check()
+
+
+def check_edited_config(data: st.DataObject, text: str, path: Path) -> None:
+    """Edit the text of a ``config.yaml`` in one place and check that it is refused in one line or can be planned."""
+    tree = parse_yaml_mapping(text)
     *parents, key = data.draw(st.sampled_from(list(paths_of(tree))))
     group = reduce(lambda node, name: node[name], parents, tree)
     if data.draw(st.booleans()):
         group[key] = data.draw(st.sampled_from(HOSTILE))
     elif isinstance(group, dict):
         del group[key]
-    path = tmp_path_factory.mktemp("hostile") / "config.yaml"
     path.write_text(yaml.dump(tree, Dumper=DUMPER), encoding="utf-8")
     try:
         config, _ = read_dataset_yaml(path)

@@ -315,7 +315,7 @@ def with_large_undisturbed(with_large: Path, made_hash: MadeHash) -> str:
 
 @pytest.mark.parametrize(
     ("n_jobs", "megabytes"),
-    [(1, 100), (2, 20), pytest.param(1, 20, marks=pytest.mark.slow), pytest.param(2, 100, marks=pytest.mark.slow)],
+    [(1, 100), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 20), (1, 20), (2, 100)))],
 )
 def test_out_of_memory_is_reported_and_rerun_completes_dataset(
     n_jobs: int,

@@ -187,7 +187,7 @@ def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
 
 @pytest.mark.parametrize(
     ("frames", "sensors"),
-    [(1, 20), (12, 8), pytest.param(1, 40, marks=pytest.mark.slow), pytest.param(12, 16, marks=pytest.mark.slow)],
+    [(1, 20), pytest.param(1, 40, marks=pytest.mark.slow), pytest.param(12, 16, marks=pytest.mark.slow)],
 )
 def test_omitted_effects_are_masked_for_any_sensor(
     settings: Settings, pictures: dict[str, Srgb], frames: int, sensors: int

@@ -169,13 +169,14 @@ def without_vector_code(plain: Made) -> dict[str, str]:
     return {"OPENCV_CPU_DISABLE": ",".join(plain.facts["opencv"]), "OPENCV_IPP": "disabled"}
 
 
-def test_all_settings_together_change_no_byte(make: Make, plain: Made, figure: Figure) -> None:
-    """Libraries use their oldest code, and Python's assertions are off."""
+@pytest.mark.parametrize("flags", [(), pytest.param(("-O",), marks=pytest.mark.slow)], ids=" ".join)
+def test_all_settings_together_change_no_byte(flags: tuple[str, ...], make: Make, plain: Made, figure: Figure) -> None:
+    """Libraries use their oldest code; ``-O`` compiles all Python modules again, without assertions."""
     libraries = {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
 
-    made = make(sys.executable, "-O", **SURROUNDINGS, **libraries, **without_vector_code(plain))
+    made = make(sys.executable, *flags, **SURROUNDINGS, **libraries, **without_vector_code(plain))
 
-    assert made.facts["optimize"] == 1
+    assert made.facts["optimize"] == len(flags)
     assert (made.facts["numpy"], made.facts["opencv"], made.facts["ipp"]) == ([], [], False)
     assert_same(made, plain)
     figure("machines", f"same bytes in {len(files(plain))} files")

@@ -221,7 +221,7 @@ def test_removed_dark_offset_keeps_variance() -> None:
     assert bounds_off(removed, 0, 7.0 * 64, 8 * poisson_reach(7.0)) <= 1
 
 
-@pytest.mark.parametrize("doubling", [7.0, 5.5])
+@pytest.mark.parametrize("doubling", [7.0, pytest.param(5.5, marks=pytest.mark.slow)])
 def test_dark_current_scales_with_temperature_and_exposure_time(settings: Settings, doubling: float) -> None:
     def dark_e(celsius: float, seconds: float) -> float:
         overrides = ("noise=sony_a7s2", f"noise.dark_doubling_c={doubling}", "noise.dark_e_per_s=3")

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.promise_report import Figure
@@ -325,7 +326,13 @@ FOLDER_NAMES = (
 )
 
 
-@pytest.mark.parametrize("name", FOLDER_NAMES, ids=ascii)
+QUICK_NAMES = (
+    *(" a b ", "a'b\"c'", "a,b", "[1,2]", "${oc.env:HOME}", "back\\slash", "new\nline", "-x", "true", "\udcff\udcfe"),
+    "x" * 255,
+)
+
+
+@pytest.mark.parametrize("name", slow_except(QUICK_NAMES, FOLDER_NAMES), ids=ascii)
 def test_folder_of_any_name_is_used_or_refused(name: str, run_main: RunMain, tmp_path: Path) -> None:
     root, out = tmp_path / name, tmp_path / f"{name[:254]}2"
     root.mkdir()

@@ -94,11 +94,13 @@ def assert_cut_outs(patched: Path, full: Path) -> int:
     "overrides",
     [
         LEVELS,
-        ("noise.law=poisson", "source.dequantize=dither", "gains.highlight=gray_mean"),
-        ("noise=nikon_d850", "noise.iso=6400", "effects.prnu=on"),
+        pytest.param(
+            ("noise.law=poisson", "source.dequantize=dither", "gains.highlight=gray_mean"), marks=pytest.mark.slow
+        ),
+        pytest.param(("noise=nikon_d850", "noise.iso=6400", "effects.prnu=on"), marks=pytest.mark.slow),
         (*EVERY_EFFECT, "noise.draws=2", "sensor.saturated=pinned"),
         (*EVERY_EFFECT, "clean.includes_fixed_pattern=true"),
-        ("scene.exposure_ratio=20", "sensor.clip=black"),
+        pytest.param(("scene.exposure_ratio=20", "sensor.clip=black"), marks=pytest.mark.slow),
     ],
     ids=["levels", "poisson", "physical", "every effect", "averaged", "dark"],
 )

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 from helpers.datasets import Settings
 from helpers.flats import (
     BLACK,
@@ -52,13 +53,11 @@ TWO_NUMBERS = {
 # Kernels against the reference ----------------------------------------------------------------------------------------
 
 
-def slow_except(*profiles: str) -> list[object]:
-    """Return every profile; all except the given ones are marked slow."""
-    return [noise if noise in profiles else pytest.param(noise, marks=pytest.mark.slow) for noise in ISOS]
+SCENES = ("daylight", "low_light", "long_exposure")
+QUICK = (*(("nikon_d850", scene) for scene in SCENES), ("imx385", "daylight"))
 
 
-@pytest.mark.parametrize("scene", ["daylight", "low_light", "long_exposure"])
-@pytest.mark.parametrize("noise", slow_except("nikon_d850", "imx385"))
+@pytest.mark.parametrize(("noise", "scene"), slow_except(QUICK, itertools.product(ISOS, SCENES)))
 def test_kernels_equal_reference_for_every_profile_and_scene(settings: Settings, noise: str, scene: str) -> None:
     group = (f"noise={noise}", f"scene={scene}", f"noise.iso={ISOS[noise]}")
     for forced, fixed in itertools.product([False, True], ["false", "true"]):
@@ -295,8 +294,10 @@ def test_other_effects_do_not_change_normal_for_counts(everything: Plan, law_dis
 # Replay ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("forced", [False, True])
-@pytest.mark.parametrize("noise", ISOS)
+REPLAYED = (("imx385", False), ("imx385", True), ("sony_a7s2", True), ("nikon_d850", True), ("canon_70d", False))
+
+
+@pytest.mark.parametrize(("noise", "forced"), slow_except(REPLAYED, itertools.product(ISOS, [False, True])))
 def test_pair_is_regenerated_from_row_alone(settings: Settings, noise: str, forced: bool, tmp_path: Path) -> None:
     overrides = (f"noise={noise}", "scene=low_light", f"noise.iso={ISOS[noise]}", "sensor.units=7")
     plan = planned(settings, picture(), *overrides, forced=forced)

@@ -11,6 +11,7 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 from helpers.kernels import approximate_counts, counts_of_one_rate, exact_counts, values_by_lines
 from helpers.kernels import counts as fast
 from helpers.moments import bernstein
@@ -291,9 +292,10 @@ def real_quantile(rate: float, w: float) -> float:
         )
 
 
-@pytest.mark.parametrize(
-    "rate", [LOW_RATE, 5.6, 6.3, 7.1, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9]
-)
+RATES = (LOW_RATE, 5.6, 6.3, 7.1, 8.3, 9.1, 10.0, 13.4, 17.1, 25.0, 33.3, 47.5, 64.0, 81.3, 1e3, 12345.6, 1e6, 1e9)
+
+
+@pytest.mark.parametrize("rate", slow_except((LOW_RATE, 8.3, 25.0, *RATES[12:]), RATES))
 def test_the_first_terms_are_within_their_error(rate: float) -> None:
     """What remains of the bound is for the words between those that are tested."""
     reach = min(math.sqrt(NORMAL_REACH2[0] + NORMAL_REACH2[1] * math.sqrt(rate)), 6.3)
@@ -343,7 +345,7 @@ CELLS = 64
 @pytest.mark.parametrize(
     ("inside", "dense"),
     [
-        pytest.param((1e-7, 0.5, 1 - 1e-7), 400, id="three rates"),
+        pytest.param((1e-7, 1 - 1e-7), 400, id="two rates"),
         pytest.param(np.linspace(1e-9, 1 - 1e-9, 17), 5000, id="many rates", marks=pytest.mark.slow),
     ],
 )
