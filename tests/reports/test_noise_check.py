@@ -244,7 +244,7 @@ def test_planted_faults_are_found_in_95_percent_of_runs(name: str, settings: Set
         for fault, of_fault in zip(FAULTS, zip(*pairs, strict=True), strict=True):
             found[fault] += bool(alarms(of_fault, count))
     fewest = min(found[fault] for fault in FAULTS)
-    figure("noise-check", f"{name}: each of {len(FAULTS)} faults found in {fewest} of {runs} runs, or more")
+    figure("noise-check", f"{name}: each of {len(FAULTS)} faults found in at least {fewest} of {runs} runs")
     assert fewest >= 0.95 * runs
 
 
