@@ -165,7 +165,7 @@ def _fill_normalised(
     buffers, of, values = workspace_in(scratch, 0), pointers_of(readout), pointer_to(values_dn, 0)
     strip = locate((0, 0), 0, 0, STRIP)
     for start in range(0, out.size, STRIP):
-        _normalise(of, pointer_to(values, start), limits_dn[0], limits_dn[1], strip, buffers)
+        _normalise(of, pointer_to(values, start), limits_dn[0], limits_dn[1], strip, buffers.normalised)
         for x in range(min(STRIP, out.size - start)):
             out[start + x] = buffers.normalised[x]
 

@@ -71,14 +71,14 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 _INNER_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
-def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
-    """Return a function that calls one of several kernels, chosen by the class of its first argument.
+def by_class(implementations: Mapping[Any, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function that calls one of several kernels, chosen by the class of its first argument or arguments.
 
-    Compiled kernels contain only the chosen one, because Numba knows the class when it compiles them.
+    Compiled kernels contain only the chosen one, because Numba knows the classes when it compiles them.
 
     Parameters
     ----------
-    implementations : mapping of class to callable
+    implementations : mapping of class, or of a tuple of classes, to callable
         Return values of `inner` by class of named tuple; all take the same number of arguments.
 
     Returns
@@ -87,21 +87,25 @@ def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[...
         Function for use in kernels.
     """
 
+    first = next(iter(implementations))
+    count = len(first) if isinstance(first, tuple) else 1
+
     def call(*arguments: Any) -> Any:
-        return _implementation(implementations, type(arguments[0]))(*arguments)
+        return _implementation(implementations, [type(each) for each in arguments[:count]])(*arguments)
 
     def choose(*types: Any) -> Any:
-        chosen = _implementation(implementations, types[0].instance_class)
+        chosen = _implementation(implementations, [each.instance_class for each in types[:count]])
         return getattr(chosen, "py_func", chosen)
 
     overload(call, jit_options=_INNER_OPTIONS, strict=False)(choose)
     return call
 
 
-def _implementation(implementations: Mapping[type, Callable[..., Any]], record_class: type) -> Any:
-    if record_class not in implementations:
-        raise TypeError(f"{record_class.__name__}: no kernel takes it")
-    return implementations[record_class]
+def _implementation(implementations: Mapping[Any, Callable[..., Any]], classes: list[type]) -> Any:
+    key = classes[0] if len(classes) == 1 else tuple(classes)
+    if key not in implementations:
+        raise TypeError(f"{', '.join(each.__name__ for each in classes)}: no kernel takes it")
+    return implementations[key]
 
 
 def has_run(kernels: str) -> bool:

@@ -333,7 +333,7 @@ def _bright_light32(scene: Scene32, signal: Vector, x: np.uint64, strip: Strip) 
 
 
 @inner
-def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
+def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: Workspace, clean: Pointer) -> None:
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
     dn = above_black + scene.black_dn
     rounded = (dn + ROUND) - ROUND
@@ -341,14 +341,14 @@ def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: W
     store(workspace.unrounded_dn, x, dn)
     store(workspace.rounded_dn, x, rounded_dn)
     store(workspace.residual_dn, x, to_float32(dn - rounded))
-    store(workspace.clean, x, to_uint32(rounded_dn))
+    store(clean, x, to_uint32(rounded_dn))
 
 
 @inner
-def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
+def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace, clean: Pointer) -> None:
     """Store eight clean values: DN above black, and as uint16."""
     store(workspace.unrounded_dn, x, above_black)
-    store(workspace.clean, x, to_bits(above_black + ROUND32) + scene.black_dn)
+    store(clean, x, to_bits(above_black + ROUND32) + scene.black_dn)
 
 
 _linear_dn = by_class({Scene: _linear_dn64, Scene32: _linear_dn32})
@@ -363,19 +363,21 @@ _store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
 
 
 @inner
-def fill_clean(scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer) -> bool:
+def fill_clean(
+    scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, clean: Pointer, counts: Pointer
+) -> bool:
     """Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
 
-    Return whether any site can be saturated.
+    ``clean`` (uint16) receives the rounded values. Return whether any site can be saturated.
     """
     signal = pointer_to(workspace.signal, strip.first)
     if scene.gray_mean:
         _fill_gray_mean_signal(codes, strip, scene, signal)
     else:
         _fill_codes(codes, is_uint8, strip, scene, signal)
-    has_negative, has_bright = _fill_linear(scene, strip, workspace)
+    has_negative, has_bright = _fill_linear(scene, strip, workspace, clean)
     if has_bright:
-        _recompute_bright(scene, strip, workspace)
+        _recompute_bright(scene, strip, workspace, clean)
         counts[1] += _count_above(strip, workspace.bright_light, scene.clipped)
     if has_negative:
         counts[0] += _count_negative(strip, workspace.bright_light if scene.response_steps[1] else workspace.signal)
@@ -383,7 +385,7 @@ def fill_clean(scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspa
 
 
 @inner
-def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, bool]:
+def _fill_linear(scene: Any, strip: Strip, workspace: Workspace, clean: Pointer) -> tuple[bool, bool]:
     """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
     gains, limits = _load_sites(scene.gains, strip), _load_sites(scene.limits, strip)
     lowest = highest = load(workspace.signal, _0)
@@ -391,12 +393,12 @@ def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, 
         x = np.uint64(n) * _8
         signal = load(workspace.signal, x)
         lowest, highest = minimum(lowest, signal), maximum(highest, signal)
-        _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace)
+        _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace, clean)
     return has_any_bit(less_than(lowest, _ZERO32)), has_any_bit(less_than(limits, highest))
 
 
 @inner
-def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
+def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace, clean: Pointer) -> None:
     """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
 
     ``bright_light`` receives their light, and 0 elsewhere.
@@ -410,7 +412,8 @@ def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
             continue
         light = _bright_light(scene, signal, x, strip)
         store(workspace.bright_light, x, light)
-        _store_clean(scene, minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn, x, workspace)
+        above_black = minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn
+        _store_clean(scene, above_black, x, workspace, clean)
 
 
 @inner

@@ -387,9 +387,8 @@ def _load_numbers(noise: Electrons, n: int) -> _Numbers:
 
 
 @inner
-def add_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> Pointer:
+def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> Pointer:
     """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them: zeros."""
-    _count_electrons(noise, n, key, strip, workspace)
     of = _load_numbers(noise, n)
     fill_values_by_lines(
         strip.total, workspace.read_words, pointer_to(noise.read_lines, n * 4097), workspace.lines, workspace.normals
@@ -412,7 +411,7 @@ def add_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, worksp
 
 
 @inner
-def _count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
+def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
     """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, and all words."""
     of, tables = _load_numbers(noise, n), noise.tables
     _fill_words(key, noise.read_purposes[n] | key[2], strip, workspace.words, workspace.read_words)
@@ -604,9 +603,8 @@ def _dn(
 
 
 @inner
-def fill_exact_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``exact_dn`` with the noisy DN of all sites: of certain counts in loops, then of the other sites."""
-    _count_electrons(noise, n, key, strip, workspace)
+def fill_exact_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+    """Return ``exact_dn``, filled with the noisy DN of all sites: of certain counts in loops, then of the others."""
     of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
     fill_rows(strip.total, workspace.read_words, workspace.scratch)
     for v in range(strip.total // VECTOR_WIDTH):
@@ -628,6 +626,7 @@ def fill_exact_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip,
     for d in range(first, after):
         x = noise.body.positions[d]
         out[x] = exact_electrons_dn(noise, n, x, strip, workspace)
+    return out
 
 
 @inner

@@ -11,7 +11,7 @@ Timings and rejected alternatives: ``docs/design/kernels.md``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,9 +85,14 @@ def gaussian_noise32(plans: Sequence[Plan]) -> Gaussian32:
 
 
 @inner
-def add_gaussian(noise: Gaussian, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> Pointer:
-    """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them."""
+def draw_gaussian(noise: Gaussian | Gaussian32, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``words``."""
     fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
+
+
+@inner
+def add_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+    """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them."""
     fill_depths(strip.total, workspace.words, workspace.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     cancellation = np.float32(abs(b) * CANCELLATION_FRACTION if min(a, b) < 0.0 else 0.0)
@@ -113,9 +118,8 @@ def exact_gaussian_dn(noise: Gaussian, n: int, x: int, strip: Strip, workspace: 
 
 
 @inner
-def fill_exact_gaussian(noise: Gaussian, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``exact_dn`` with the noisy DN of all sites."""
-    fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
+def fill_exact_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+    """Return ``exact_dn``, filled with the noisy DN of all sites."""
     fill_rows(strip.total, workspace.words, workspace.scratch)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     for v in range(strip.total // VECTOR_WIDTH):
@@ -124,6 +128,7 @@ def fill_exact_gaussian(noise: Gaussian, n: int, key: PhiloxKey, strip: Strip, w
         std = square_root(maximum((clean_dn - noise.black_dn) * a + b, 0.0))
         normal = exact_values(workspace.words, workspace.scratch, x, noise.quadratics)
         store(workspace.exact_dn, x, clean_dn + std * normal)
+    return workspace.exact_dn
 
 
 @inner
@@ -133,9 +138,8 @@ def gaussian_line(noise: Gaussian, n: int) -> tuple[float, float, float]:
 
 
 @inner
-def add_gaussian32(noise: Gaussian32, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> Pointer:
+def add_gaussian32(readout: Any, noise: Gaussian32, n: int, strip: Strip, workspace: Workspace) -> Pointer:
     """Fill ``noise_dn`` with clean and noise, in float32; return the base to which the read-out adds it: black."""
-    fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
     fill_coarse_depths(strip.total, workspace.words, workspace.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     for v in range(strip.total // VECTOR_WIDTH):

@@ -22,6 +22,7 @@ from unprocess_gen.simulation.kernels.electrons import (
     add_electrons,
     average_electrons,
     clear_defects,
+    count_electrons,
     electrons_line,
     exact_electrons_dn,
     fill_exact_electrons,
@@ -32,12 +33,12 @@ from unprocess_gen.simulation.kernels.gaussian import (
     Gaussian32,
     add_gaussian,
     add_gaussian32,
+    draw_gaussian,
     exact_gaussian_dn,
     fill_exact_gaussian,
     gaussian_line,
     gaussian_line32,
 )
-from unprocess_gen.simulation.kernels.philox import PhiloxKey
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
@@ -98,6 +99,15 @@ class FloatClean(NamedTuple):
     white: float
     packed: bool
     planes: NDArray[np.int64]
+
+
+class Output(NamedTuple):
+    """Locate what a strip of a frame fills."""
+
+    n: int  # number of the noisy frame
+    sites: Pointer  # the strip in the frame
+    counts: Pointer  # of the frame
+    may_saturate: bool  # whether any site of the clean frame can be saturated
 
 
 def readout_of(
@@ -171,10 +181,25 @@ def _exact_gaussian32_dn(noise: Gaussian32, n: int, x: int, strip: Strip, worksp
     return 0.0
 
 
-_add_noise = by_class({Gaussian: add_gaussian, Gaussian32: add_gaussian32, Electrons: add_electrons})
+draw_noise = by_class({Gaussian: draw_gaussian, Gaussian32: draw_gaussian, Electrons: count_electrons})
+"""Fill the random words and counts of a strip of frame n; arguments: noise, n, key, strip, workspace."""
+sample_noise = by_class(
+    {
+        (Integers, Gaussian): add_gaussian,
+        (Integers, Gaussian32): add_gaussian32,
+        (Integers, Electrons): add_electrons,
+        (Normalised, Gaussian): fill_exact_gaussian,
+        (Normalised, Electrons): fill_exact_electrons,
+        (FloatClean, Gaussian): add_gaussian,
+        (FloatClean, Electrons): add_electrons,
+    }
+)
+"""Compute the noise of a strip of frame n in DN, as its read-out needs it: approximately, or with the clean frame.
+
+Arguments: read-out, noise, n, strip, workspace. Return what the first argument of `read_noisy` after the noise needs.
+"""
 _needs_exact_sites = by_class({Gaussian: _is_approximate, Gaussian32: _is_final, Electrons: _is_approximate})
 _exact_dn = by_class({Gaussian: exact_gaussian_dn, Gaussian32: _exact_gaussian32_dn, Electrons: exact_electrons_dn})
-_fill_exact_dn = by_class({Gaussian: fill_exact_gaussian, Electrons: fill_exact_electrons})  # never for Gaussian32
 _line = by_class({Gaussian: gaussian_line, Gaussian32: gaussian_line32, Electrons: electrons_line})
 _list_defects = by_class({Gaussian: _keep_list, Gaussian32: _keep_list, Electrons: list_defects})
 clear_defects_of = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Electrons: clear_defects})
@@ -186,41 +211,32 @@ average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Ele
 
 
 @inner
-def _read_integers(
-    readout: Any,
-    noise: Any,
-    n: int,
-    key: PhiloxKey,
-    strip: Strip,
-    workspace: Workspace,
-    out: Pointer,
-    counts: Pointer,
-) -> None:
-    base = _add_noise(noise, n, key, strip, workspace)
+def _read_integers(readout: Any, noise: Any, base: Pointer, output: Output, strip: Strip, workspace: Workspace) -> None:
+    n, noisy = output.n, _destination(readout, strip, workspace.noisy, output.sites)
     limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * n))
     low, high = np.float32(limits_dn[0]), np.float32(limits_dn[1])
-    found, has_clipped = _round_and_list(noise, base, low, high, strip, workspace)
+    found, has_clipped = _round_and_list(noise, base, low, high, strip, workspace, noisy)
     found = _list_defects(noise, strip, found, workspace)
     for m in range(found):
         x = workspace.uncertain[m]
         dn = np.float32((_exact_dn(noise, n, x, strip, workspace) + ROUND) - ROUND)
-        has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
+        has_clipped = _replace(x, dn, low, high, workspace, noisy) or has_clipped
     clear_defects_of(noise, strip, workspace)
-    if limits_dn[3] < np.inf:
+    if output.may_saturate and limits_dn[3] < np.inf:
         dn = np.float32((limits_dn[2] + ROUND) - ROUND)
         for x in range(strip.first, strip.after):
             if workspace.unrounded_dn[x] >= limits_dn[3]:
-                has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
+                has_clipped = _replace(x, dn, low, high, workspace, noisy) or has_clipped
     if has_clipped:
-        _count_clipped(strip, workspace.noisy_dn, low, high, counts)
-    _write(readout, strip, workspace.noisy, out)
+        _count_clipped(strip, workspace.noisy_dn, low, high, output.counts)
+    _write(readout, strip, noisy, output.sites)
 
 
 @inner
 def _round_and_list(
-    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
+    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace, noisy: Pointer
 ) -> tuple[int, bool]:
-    """Round half to even, clip and cast; list sites whose error bound reaches a rounding boundary.
+    """Round half to even, clip and cast to ``noisy``; list sites whose error bound reaches a rounding boundary.
 
     Return how many sites are uncertain, and whether any was clipped.
     """
@@ -233,7 +249,7 @@ def _round_and_list(
         dn = load(base, x) + rounded
         clipped = minimum(maximum(dn, low), high)
         store(workspace.noisy_dn, x, dn)
-        store(workspace.noisy, x, to_uint32(clipped))
+        store(noisy, x, to_uint32(clipped))
         clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
         if _needs_exact_sites(noise):
             to_boundary = _HALF32 - absolute(noise_dn - rounded)
@@ -242,10 +258,10 @@ def _round_and_list(
 
 
 @inner
-def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace) -> bool:
+def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace, noisy: Pointer) -> bool:
     """Replace a noisy value with a rounded DN; return whether it is clipped."""
     workspace.noisy_dn[x] = dn
-    workspace.noisy[x] = np.uint16(np.int64(min(max(dn, low), high)))
+    noisy[x] = np.uint16(np.int64(min(max(dn, low), high)))
     return bool(dn < low or dn > high)
 
 
@@ -261,17 +277,16 @@ def _count_clipped(strip: Strip, values: Pointer, low: float, high: float, count
 
 
 @inner
-def _write_integers(
-    readout: Integers, may_saturate: bool, strip: Strip, workspace: Workspace, out: Pointer, counts: Pointer
-) -> None:
+def _write_integers(readout: Integers, output: Output, strip: Strip, workspace: Workspace) -> None:
+    clean = _destination(readout, strip, workspace.clean, output.sites)
     if readout.averaged:
         low, high = readout.limits_dn[0], readout.limits_dn[1]
         for x in range(strip.total):
             dn = (workspace.unrounded_dn[x] + ROUND) - ROUND
-            workspace.clean[x] = np.uint16(np.int32(min(max(dn, low), high)))
-    if may_saturate:
-        counts[4] += _count_equal(strip, workspace.clean, np.uint16(readout.white))
-    _write(readout, strip, workspace.clean, out)
+            clean[x] = np.uint16(np.int32(min(max(dn, low), high)))
+    if output.may_saturate:
+        output.counts[4] += _count_equal(strip, clean, np.uint16(readout.white))
+    _write(readout, strip, clean, output.sites)
 
 
 @inner
@@ -287,28 +302,21 @@ def _count_equal(strip: Strip, values: Pointer, value: Any) -> int:
 
 @inner
 def _read_normalised(
-    readout: Normalised,
-    noise: Any,
-    n: int,
-    key: PhiloxKey,
-    strip: Strip,
-    workspace: Workspace,
-    out: Pointer,
-    counts: Pointer,
+    readout: Normalised, noise: Any, noisy_dn: Pointer, output: Output, strip: Strip, workspace: Workspace
 ) -> None:
-    _fill_exact_dn(noise, n, key, strip, workspace)
     clear_defects_of(noise, strip, workspace)
-    limits_dn, noisy_dn = pointer_to(readout.limits_dn, np.uint64(4 * n)), workspace.exact_dn
-    if limits_dn[3] < np.inf:
+    limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * output.n))
+    noisy = _destination(readout, strip, workspace.normalised, output.sites)
+    if output.may_saturate and limits_dn[3] < np.inf:
         for x in range(strip.total):
             noisy_dn[x] = limits_dn[2] if workspace.unrounded_dn[x] >= limits_dn[3] else noisy_dn[x]
-    if _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, workspace):
-        _count_clipped(strip, noisy_dn, limits_dn[0], limits_dn[1], counts)
-    _write(readout, strip, workspace.normalised, out)
+    if _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, noisy):
+        _count_clipped(strip, noisy_dn, limits_dn[0], limits_dn[1], output.counts)
+    _write(readout, strip, noisy, output.sites)
 
 
 @inner
-def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip: Strip, workspace: Workspace) -> bool:
+def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip: Strip, out: Pointer) -> bool:
     """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`; return whether any DN is clipped.
 
     The product with 1/span takes a fifth of the time of a quotient. It differs from the quotient by three roundings,
@@ -328,29 +336,52 @@ def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip:
         nearer, farther = to_float32(product * _DECREASED), to_float32(product * _INCREASED)
         if has_any_bit(to_bits(nearer) ^ to_bits(farther)):
             farther = to_float32(above_black / readout.span_dn)
-        store(workspace.normalised, x, farther)
+        store(out, x, farther)
     return has_any_bit(clipped_bits)
 
 
 @inner
-def _write_normalised(
-    readout: Any, may_saturate: bool, strip: Strip, workspace: Workspace, out: Pointer, counts: Pointer
-) -> None:
+def _write_normalised(readout: Any, output: Output, strip: Strip, workspace: Workspace) -> None:
+    clean = _destination(readout, strip, workspace.normalised, output.sites)
     low, high = readout.black_dn, readout.black_dn + readout.span_dn
     if readout.averaged:
         low, high = readout.limits_dn[0], readout.limits_dn[1]
-    _normalise(readout, workspace.unrounded_dn, low, high, strip, workspace)
-    if may_saturate:
-        counts[4] += _count_equal(strip, workspace.normalised, np.float32(readout.white))
-    _write(readout, strip, workspace.normalised, out)
+    _normalise(readout, workspace.unrounded_dn, low, high, strip, clean)
+    if output.may_saturate:
+        output.counts[4] += _count_equal(strip, clean, np.float32(readout.white))
+    _write(readout, strip, clean, output.sites)
 
 
 # --------------------------------------------------------------------------------------------------------------- frames
 
 
 @inner
+def _is_direct(readout: Any, strip: Strip) -> bool:
+    """Return whether a strip is written to its frame at once: complete vectors of a mosaic."""
+    return bool(strip.total == strip.length and not readout.packed)
+
+
+@inner
+def _destination(readout: Any, strip: Strip, buffer: Pointer, sites: Pointer) -> Pointer:
+    """Return where a strip is written: the frame, or the buffer from which `_write` copies it."""
+    return sites if _is_direct(readout, strip) else buffer
+
+
+@inner
+def _clean_buffer(readout: Normalised | FloatClean, strip: Strip, workspace: Workspace, sites: Pointer) -> Pointer:
+    return workspace.clean
+
+
+@inner
+def _clean_destination(readout: Integers, strip: Strip, workspace: Workspace, sites: Pointer) -> Pointer:
+    return _destination(readout, strip, workspace.clean, sites)
+
+
+@inner
 def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
     """Write a strip to a frame: in place in a mosaic, or to the planes of its sites."""
+    if _is_direct(readout, strip):
+        return
     if not readout.packed:
         copy_values(strip.length, pointer_to(values, strip.first), out)
         return
@@ -372,12 +403,11 @@ def count_zero_variance(noise: Any, n: int, strip: Strip, workspace: Workspace, 
 
 
 read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised, FloatClean: _read_integers})
-"""Sample the noise of frame n in a strip, read it out, and count its clipped sites.
+"""Read out a strip of a noisy frame, and count its clipped sites.
 
-Arguments: read-out, noise, n, key, strip, workspace, pointer to the strip in the frame, counts.
+Arguments: read-out, noise, what `sample_noise` returned, output, strip, workspace.
 """
 write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
-"""Read out the clean frame of a strip.
-
-Arguments: read-out, whether sites can be saturated, strip, workspace, pointer to the strip in the frame, counts.
-"""
+"""Read out the clean frame of a strip; arguments: read-out, output, strip, workspace."""
+clean_destination = by_class({Integers: _clean_destination, Normalised: _clean_buffer, FloatClean: _clean_buffer})
+"""Return where the clean frame is rounded to; arguments: read-out, strip, workspace, pointer to the strip in the frame."""

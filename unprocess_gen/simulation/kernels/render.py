@@ -26,11 +26,15 @@ from unprocess_gen.simulation.kernels.readout import (
     FloatClean,
     Integers,
     Normalised,
+    Output,
     average_patterns,
+    clean_destination,
     clear_defects_of,
     count_zero_variance,
+    draw_noise,
     read_noisy,
     readout_of,
+    sample_noise,
     write_clean,
 )
 from unprocess_gen.simulation.kernels.simd import pointer_to, pointers_of
@@ -163,15 +167,17 @@ def _render(
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
             at = (y // 2) * (width // 2) + x // 2 if readout.packed else y * width + x
-            source = pointer_to(codes, 3 * (y * width + x))
-            may_saturate = fill_clean(light, source, is_uint8, strip, buffers, all_counts)
+            source, target = pointer_to(codes, 3 * (y * width + x)), pointer_to(clean_sites, at)
+            rounded = clean_destination(frames, strip, buffers, target)
+            may_saturate = fill_clean(light, source, is_uint8, strip, buffers, rounded, all_counts)
             for n in range(noisy.shape[0]):
-                target, of_frame = pointer_to(noisy_sites, n * sites + at), pointer_to(all_counts, 6 * n)
-                read_noisy(frames, sampler, n, load_key(key_words, n), strip, buffers, target, of_frame)
+                draw_noise(sampler, n, load_key(key_words, n), strip, buffers)
+                values, of_frame = sample_noise(frames, sampler, n, strip, buffers), pointer_to(all_counts, 6 * n)
+                output = Output(n, pointer_to(noisy_sites, n * sites + at), of_frame, may_saturate)
+                read_noisy(frames, sampler, values, output, strip, buffers)
                 count_zero_variance(sampler, n, strip, buffers, of_frame)
             if readout.averaged:
                 average_patterns(sampler, strip, buffers)
-            target = pointer_to(clean_sites, at)
-            write_clean(frames, may_saturate or readout.averaged, strip, buffers, target, all_counts)
+            write_clean(frames, Output(0, target, all_counts, may_saturate or readout.averaged), strip, buffers)
             if readout.averaged:
                 clear_defects_of(sampler, strip, buffers)
