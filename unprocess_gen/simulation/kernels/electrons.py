@@ -68,8 +68,9 @@ from unprocess_gen.simulation.kernels.simd import (
     select,
     square_root,
     store,
+    to_float64,
 )
-from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, padded_width
+from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, list_lanes, padded_width
 from unprocess_gen.simulation.reference import noise as reference_noise
 from unprocess_gen.simulation.reference.poisson import CORE_MARGIN, core_share, gaussian_from
 
@@ -102,13 +103,13 @@ class Electrons(NamedTuple):
     read_purposes: NDArray[np.uint64]  # [N]
     read_lines: NDArray[np.uint64]  # [N, 4097]
     read_quadratics: Float  # [N, 4096]
-    gains: Float  # [N, 2, 2, 2]: DN per electron, then full well in electrons, of the sites of a tile
-    gain_lanes: Float32  # [N, 2, 3, 8]: DN per electron, electrons per DN and full well of eight sites of a row
+    gains: Float  # [N, 2, 2, 8]: of eight sites of an even and of an odd row, DN per electron and full well
+    gains32: Float32  # [N, 2, 3, 8]: of the same sites, DN per electron, electrons per DN and full well
     rows_dn: Float  # [N, H]: offsets of correlated rows; else one 0
     rows_step: int  # H; 0 if rows are independent
     columns_dn: Float  # [N, P]
     fixed_columns_dn: Float  # [P]: without the part that is new in every frame
-    errors_dn: Float  # [N, 2, 2]: black-level errors of the sites of a tile
+    errors_dn: Float  # [N, 2, 8]: black-level errors of the same sites
     base_dn: Float32  # [N, 2, P]: black level, column and black-level error
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
@@ -186,7 +187,7 @@ def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, in
         read_lines=_stack([each.lines for each in quantiles]),
         read_quadratics=_stack([each.quadratics for each in quantiles]),
         gains=_stack([each.sites for each in gains]),
-        gain_lanes=_stack([each.lanes for each in gains]),
+        gains32=_stack([each.sites32 for each in gains]),
         rows_dn=_INDEPENDENT_ROWS,
         rows_step=0,
         columns_dn=_stack([each.columns_dn for each in offsets]),
@@ -208,20 +209,25 @@ def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
 
 
 class _Gains(NamedTuple):
-    """Hold `Electrons.gains` and `Electrons.gain_lanes` of one frame, and the highest gain, DN per electron."""
+    """Hold `Electrons.gains` and `Electrons.gains32` of one frame, and the highest gain, DN per electron."""
 
     sites: Float
-    lanes: Float32
+    sites32: Float32
     highest: float
 
 
 @functools.lru_cache(maxsize=16)
 def _gains(dn_per_e: float, relative: tuple[float, ...], full_well_e: float) -> _Gains:
     """Return the gains of the sites (0, 0), (0, 1), (1, 0), (1, 1) with these gains relative to ``dn_per_e``."""
-    tile = np.array(relative).reshape(2, 2)
-    sites = np.stack([dn_per_e * tile, full_well_e / tile])
-    lanes = np.tile(np.stack([sites[0], 1 / sites[0], sites[1]], axis=1), VECTOR_WIDTH // 2)
-    return _Gains(sites, lanes.astype(np.float32), float(sites[0].max()))
+    tile = _sites_of_rows(relative)
+    gains, full_wells_e = dn_per_e * tile, full_well_e / tile
+    sites32 = np.stack([gains, 1 / gains, full_wells_e], axis=1).astype(np.float32)
+    return _Gains(np.stack([gains, full_wells_e], axis=1), sites32, float(gains.max()))
+
+
+def _sites_of_rows(of_tile: Sequence[float]) -> Float:
+    """Return the values of eight sites of an even and of an odd row, ``[2, VECTOR_WIDTH]``, from those of a tile."""
+    return np.tile(np.array(of_tile, dtype=np.float64).reshape(2, 2), VECTOR_WIDTH // 2)
 
 
 def _gains_of(plan: Plan, top: int) -> _Gains:
@@ -267,8 +273,8 @@ def _offsets(
     if body_key is not None:
         normals = reference_noise.normals(words(body_key, "column", (1, columns), origin=(0, origin[1])))
         columns_dn = column_std_dn * np.asarray(normals[0])
-    errors_dn = np.roll(np.array(black_error_dn, dtype=np.float64).reshape(2, 2), -origin[0], axis=0)
-    base_dn = black_dn + (columns_dn + np.tile(errors_dn, columns // 2))
+    errors_dn = np.roll(_sites_of_rows(black_error_dn), -origin[0], axis=0)
+    base_dn = black_dn + (columns_dn + np.tile(errors_dn, columns // VECTOR_WIDTH))
     farthest_dn = float(np.abs(columns_dn).max(initial=0.0) + np.abs(errors_dn).max())
     return _Offsets(columns_dn, errors_dn, base_dn.astype(np.float32), farthest_dn)
 
@@ -393,7 +399,7 @@ def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspac
     fill_values_by_lines(
         strip.total, workspace.read_words, pointer_to(noise.read_lines, n * 4097), workspace.lines, workspace.normals
     )
-    f, lanes = np.float32, pointer_to(noise.gain_lanes, 24 * (2 * n + (strip.y & 1)))
+    f, lanes = np.float32, pointer_to(noise.gains32, 24 * (2 * n + (strip.y & 1)))
     per_e, full_well_e, std, margin = load(lanes, _0), load(lanes, _16), f(of.read_std_dn), f(of.error_dn)
     row_dn = f(workspace.row_dn[0])
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
@@ -480,7 +486,7 @@ def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) ->
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
-    black, e_per_dn = np.float32(noise.black_dn), load(pointer_to(noise.gain_lanes, 24 * (2 * n + (strip.y & 1))), _8)
+    black, e_per_dn = np.float32(noise.black_dn), load(pointer_to(noise.gains32, 24 * (2 * n + (strip.y & 1))), _8)
     row, column = noise.body.response_steps
     response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
     highest = load(workspace.rounded_dn, _0) - load(workspace.rounded_dn, _0)
@@ -580,7 +586,7 @@ def _exact_shot(noise: Electrons, of: _Numbers, n: int, x: int, strip: Strip, wo
     """Return the electrons of light: a count, a normal in its place, or the mean."""
     row, column = noise.body.response_steps
     response = np.float64(noise.body.response[strip.y * row + (strip.x + strip.lead + x) * column])
-    rate = (workspace.unrounded_dn[x] - noise.black_dn) / noise.gains[8 * n + 2 * (strip.y & 1) + (x & 1)] * response
+    rate = (workspace.unrounded_dn[x] - noise.black_dn) / noise.gains[16 * (2 * n + (strip.y & 1)) + (x & 1)] * response
     if of.shot == 0.0:
         return float(rate)
     root, word = np.sqrt(np.float32(rate)), workspace.words[x]
@@ -595,11 +601,12 @@ def _dn(
     noise: Electrons, of: _Numbers, n: int, x: int, electrons: float, read: float, strip: Strip, workspace: Workspace
 ) -> float:
     """Return the DN of ``electrons`` and read noise of ``read`` standard deviations, with the offsets of the site."""
-    site = 8 * n + 2 * (strip.y & 1) + (x & 1)
-    dn = min(electrons, noise.gains[site + 4]) * noise.gains[site] + noise.black_dn
+    row = 2 * n + (strip.y & 1)
+    site = 16 * row + (x & 1)
+    dn = min(electrons, noise.gains[site + 8]) * noise.gains[site] + noise.black_dn
     dn = dn + of.read_std_dn * read
     offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
-    return float(dn + (offset_dn + noise.errors_dn[4 * n + 2 * (strip.y & 1) + (x & 1)]))
+    return float(dn + (offset_dn + noise.errors_dn[8 * row + (x & 1)]))
 
 
 @inner
@@ -607,24 +614,26 @@ def fill_exact_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, w
     """Return ``exact_dn``, filled with the noisy DN of all sites: of certain counts in loops, then of the others."""
     of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
     fill_rows(strip.total, workspace.read_words, workspace.scratch)
-    for v in range(strip.total // VECTOR_WIDTH):
-        at = np.uint64(v) * _8
-        store(out, at, exact_values(workspace.read_words, workspace.scratch, at, quadratics))
-    has_dark = of.dark_e > 0.0
+    has_dark, row = of.dark_e > 0.0, 2 * n + (strip.y & 1)
     dark, error_e = workspace.dark, workspace.error_e
     if has_dark:
         error_e = workspace.total_error_e
     else:
         dark = workspace.zeros  # adding 0 - 0 changes no bit
-    for x in range(strip.total):
-        electrons = np.float64(workspace.electrons[x]) + (np.float64(dark[x]) - of.removed_e)
-        out[x] = _dn(noise, of, n, x, electrons, out[x], strip, workspace)
-    for x in range(strip.total):
-        if error_e[x] > _ZERO32:
-            out[x] = exact_electrons_dn(noise, n, x, strip, workspace)
-    first, after = _defects_of(noise.body, strip)
-    for d in range(first, after):
-        x = noise.body.positions[d]
+    gains, errors_dn = pointer_to(noise.gains, 16 * row), load(pointer_to(noise.errors_dn, 8 * row), _0)
+    dn_per_e, full_well_e, row_dn = load(gains, _0), load(gains, _8), workspace.row_dn[0]
+    columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + strip.x + strip.lead)
+    found = 0
+    for v in range(strip.total // VECTOR_WIDTH):
+        x = np.uint64(v) * _8
+        read = exact_values(workspace.read_words, workspace.scratch, x, quadratics)
+        electrons = to_float64(load(workspace.electrons, x)) + (to_float64(load(dark, x)) - of.removed_e)
+        dn = minimum(electrons, full_well_e) * dn_per_e + noise.black_dn + read * of.read_std_dn
+        store(out, x, dn + ((load(columns_dn, x) + row_dn) + errors_dn))
+        found = list_lanes(less_than(_ZERO32, load(error_e, x)), x, found, workspace)
+    found = list_defects(noise, strip, found, workspace)
+    for m in range(found):
+        x = workspace.uncertain[m]
         out[x] = exact_electrons_dn(noise, n, x, strip, workspace)
     return out
 
@@ -644,9 +653,9 @@ def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> N
     for d in range(first, after):
         workspace.defects[body.positions[d]] = body.means_e[d]
     for x in range(strip.total):
-        gain = noise.gains[2 * (strip.y & 1) + (x & 1)]
+        gain = noise.gains[16 * (strip.y & 1) + (x & 1)]
         dn = (clean_dn[x] + workspace.defects[x] * gain) + of.kept_dark_e * gain
         dn = min(dn, noise.full_dn)
         offset_dn = 0.0 + noise.fixed_columns_dn[strip.x + strip.lead + x]
-        dn = dn + (offset_dn + noise.errors_dn[2 * (strip.y & 1) + (x & 1)])
+        dn = dn + (offset_dn + noise.errors_dn[8 * (strip.y & 1) + (x & 1)])
         clean_dn[x] = dn if workspace.defects[x] >= 0.0 else 0.0

@@ -410,4 +410,4 @@ Arguments: read-out, noise, what `sample_noise` returned, output, strip, workspa
 write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
 """Read out the clean frame of a strip; arguments: read-out, output, strip, workspace."""
 clean_destination = by_class({Integers: _clean_destination, Normalised: _clean_buffer, FloatClean: _clean_buffer})
-"""Return where the clean frame is rounded to; arguments: read-out, strip, workspace, pointer to the strip in the frame."""
+"""Return where a strip of the clean frame is rounded to; arguments: read-out, strip, workspace, place in the frame."""
