@@ -374,7 +374,8 @@ def _clean_buffer(readout: Normalised | FloatClean, strip: Strip, workspace: Wor
 
 @inner
 def _clean_destination(readout: Integers, strip: Strip, workspace: Workspace, sites: Pointer) -> Pointer:
-    return _destination(readout, strip, workspace.clean, sites)
+    destination: Pointer = _destination(readout, strip, workspace.clean, sites)
+    return destination
 
 
 @inner
