@@ -18,10 +18,10 @@ from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text
 
 PEAK = """
-import resource
 {code}
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")))
 """
+"""Prints the peak of the process; ``ru_maxrss`` would include that of its parent before it started the program."""
 
 
 def write_copies(original: Path, folder: Path, pairs: int, per_shard: int) -> Path:
@@ -59,4 +59,4 @@ def peak_megabytes(code: str, *arguments: object) -> float:
     """Run Python code in a process of its own, and return the most memory that it used, in units of 10^6 bytes."""
     command = [sys.executable, "-c", PEAK.format(code=code), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return int(done.stdout.split()[-1]) * 1024 / 1e6
+    return int(done.stdout.split()[-2]) * 1024 / 1e6

@@ -1,7 +1,8 @@
-"""Memory does not grow with the rows of a dataset, and little with the files of a listing."""
+"""Memory does not grow with the rows of a dataset, and by a bounded amount with each file of a listing."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +19,15 @@ import sys
 from pathlib import Path
 from unprocess_gen.pipeline.verify import verify
 assert verify(Path(sys.argv[1])) == []
+"""
+
+LIST = """
+import sys
+from unprocess_gen.config.schema import SourceConfig
+from unprocess_gen.sources.loader import list_photographs
+sources = list_photographs(SourceConfig(root=sys.argv[1])).sources
+assert len(sources) == 1_000_000
+assert sum(source.occurrence for source in sources) == 250_000
 """
 
 
@@ -99,3 +109,19 @@ def test_verify_of_100_000_rows_takes_less_than_300_megabytes(original: Path, tm
     many = peak_megabytes(VERIFY, write_copies(original, tmp_path / "many", 100_000, 8))
     print(f"verify: {few:.0f} MB for 1,000 rows, {many:.0f} MB for 100,000")
     assert many < 300
+    assert many < few + 30
+
+
+@pytest.mark.slow
+def test_listing_of_a_million_files_takes_less_than_1500_megabytes(tmp_path: Path) -> None:
+    """The files are empty except for a hole; half of them share a size with another one, and all ends are equal."""
+    for number in range(1_000_000):
+        folder = tmp_path / f"{number // 1000:03d}"
+        if number % 1000 == 0:
+            folder.mkdir()
+        with (folder / f"photograph_{number:08d}.jpg").open("wb") as file:
+            file.truncate(1 + number % 750_000)
+    peak = peak_megabytes(LIST, tmp_path)
+    shutil.rmtree(tmp_path)
+    print(f"listing: {peak:.0f} MB for a million files")
+    assert peak < 1500

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, Settings
+from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill
 
 from unprocess_gen.core.errors import MachineError
@@ -117,3 +118,94 @@ def test_true_free_space_is_compared(tmp_path: Path, settings: Settings, monkeyp
     monkeypatch.setattr(sizes, "estimate_shards", lambda *_: sizes.SizeEstimate(10**18, 10**18))
     with pytest.raises(MachineError, match="check_disk=false"):
         sizes.check_free_space(config, tasks, tmp_path)
+
+
+# Sources per shard ----------------------------------------------------------------------------------------------------
+
+AUTO = "output.pairs_per_shard=auto"
+
+
+def recorded_number(out: Path) -> int:
+    found = re.search(r"^  pairs_per_shard: (\d+)$", (out / "config.yaml").read_text(), re.MULTILINE)
+    assert found is not None
+    return int(found[1])
+
+
+def test_auto_chooses_shards_of_about_the_goal(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sizes, "SHARD_BYTES", 50_000)
+    summary = make(fill(tmp_path / "p", 30), tmp_path / "ds", AUTO)
+    assert 25_000 < summary.bytes / summary.shards < 100_000
+    assert recorded_number(tmp_path / "ds") == -(-30 // summary.shards)
+
+
+def test_auto_gives_the_bytes_of_its_number(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tree_hash: TreeHash
+) -> None:
+    monkeypatch.setattr(sizes, "SHARD_BYTES", 50_000)
+    source = fill(tmp_path / "p", 20)
+    make(source, tmp_path / "auto", AUTO)
+    make(source, tmp_path / "ds", f"output.pairs_per_shard={recorded_number(tmp_path / 'auto')}")
+    assert tree_hash(tmp_path / "auto") == tree_hash(tmp_path / "ds")
+
+
+def test_recorded_number_has_priority_when_resumed(
+    make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tree_hash: TreeHash
+) -> None:
+    monkeypatch.setattr(sizes, "SHARD_BYTES", 50_000)
+    source = fill(tmp_path / "p", 20)
+    make(source, tmp_path / "ds", AUTO)
+    made = tree_hash(tmp_path / "ds")
+    for path in (tmp_path / "ds/dataset.json", tmp_path / "ds/manifest.csv"):
+        path.unlink()
+    shutil.rmtree(tmp_path / "ds/shards")
+    monkeypatch.setattr(sizes, "SHARD_BYTES", 100_000)
+    make(source, tmp_path / "ds", AUTO)
+    assert tree_hash(tmp_path / "ds") == made
+    assert make(source, tmp_path / "ds", AUTO).made == 0
+
+
+def test_auto_without_readable_source_is_the_default(settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p/a.png").write_bytes(b"not a photograph")
+    config = settings(AUTO, f"source.root={tmp_path / 'p'}")
+    sources = list_photographs(config.source).sources
+    assert sizes.with_pairs_per_shard(config, sources, None).output.pairs_per_shard == 8
+
+
+@pytest.mark.parametrize("recorded", ["", "seed: 0", "output: [", "\0"])
+def test_unreadable_record_is_left_to_other_checks(recorded: str, settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(recorded)
+    config = settings(AUTO, "source.limit=1")
+    sources = list_photographs(config.source).sources
+    assert sizes.with_pairs_per_shard(config, sources, tmp_path / "config.yaml").output.pairs_per_shard > 1
+
+
+def test_plan_states_the_number_of_auto(
+    run_main: RunMain, settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sizes, "SHARD_BYTES", 50_000)
+    config = settings(f"source.root={fill(tmp_path / 'p', 20)}")
+    number = sizes.fitting_pairs_per_shard(config, list_photographs(config.source).sources)
+    done = run_main("plan", f"source.root={tmp_path / 'p'}", AUTO)
+    assert done.code == 0, done.err
+    assert re.search(rf"^pairs +(about )?20, in \d shards of {number}$", done.out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("verb", [("plan",), ()])
+def test_too_many_shards_are_warned_of(
+    verb: tuple[str, ...], run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sizes, "MAX_SHARDS", 2)
+    done = run_main(*verb, f"source.root={fill(tmp_path / 'p', 3)}", "out=ds", ONE, "n_jobs=1")
+    assert done.code == 0, done.err
+    found = " ".join((done.out + done.err).split())
+    assert "output.pairs_per_shard=1: 3 shards; expected at most 2; output.pairs_per_shard=" in found
+    assert " gives shards of about 256 MB" in found
+    done = run_main(*verb, f"source.root={tmp_path / 'p'}", "out=other", "output.pairs_per_shard=2", "n_jobs=1")
+    assert "expected at most" not in done.out + done.err
+
+
+@pytest.mark.parametrize("text", ["${oc.env:PER_SHARD}", "'8'"])
+def test_text_of_a_number_is_a_number(text: str, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PER_SHARD", "8")
+    assert settings(f"output.pairs_per_shard={text}").output.pairs_per_shard == 8

@@ -10,6 +10,7 @@ override replaces a list completely. A mapping would be merged with the default'
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any, Optional
@@ -560,6 +561,10 @@ class AccuracyConfig:
     )
 
 
+AUTO = "auto"
+"""Value of ``output.pairs_per_shard`` that lets a run choose the number."""
+
+
 @documented
 @dataclass
 class OutputConfig:
@@ -583,7 +588,18 @@ class OutputConfig:
         "B",
         Choice(("mosaic", "packed")),
     )
-    pairs_per_shard: int = key(8, "sources per shard, the unit of work and of a retry", Integers(1, 10**6))
+    pairs_per_shard: Any = key(
+        8,
+        "sources per shard, the unit of work and of a retry; auto chooses the number for shards of about 256 MB, and "
+        "config.yaml records it",
+        NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"),
+    )
+
+    def __post_init__(self) -> None:
+        """Convert the text of an integer, such as the value of an environment variable."""
+        if isinstance(self.pairs_per_shard, str):
+            with contextlib.suppress(ValueError):
+                self.pairs_per_shard = int(self.pairs_per_shard)
 
 
 @documented

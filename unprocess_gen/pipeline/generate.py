@@ -28,7 +28,7 @@ from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.progress import Progress
-from unprocess_gen.pipeline.sizes import check_free_space
+from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_pairs_per_shard
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Tally, Workspace
 from unprocess_gen.sources.listing import ClipSizes, Listing
@@ -114,6 +114,7 @@ def generate(config: Config, label: str = "") -> Summary:
     """
     started = time.monotonic()
     listing = list_photographs(config.source)
+    config = with_pairs_per_shard(config, listing.sources, Path(config.out) / "config.yaml")
     with Workspace(config.out, dataset_yaml(config)) as workspace:
         workspace.open()
         if workspace.is_complete():
@@ -130,7 +131,7 @@ def generate(config: Config, label: str = "") -> Summary:
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)
         with Progress(len(listing.sources), images_done, label) as progress:
             progress.report_compiling(context.compiling_path)
-            for warning in listing.warnings:
+            for warning in filter(None, (*listing.warnings, shards_warning(config, listing.sources))):
                 progress.warn(warning)
             rows_made, times = follow(run_tasks(context, todo, n_jobs), progress)
         if workspace.is_complete():  # another run was not kept out by the lock, and has finished the dataset

@@ -1,4 +1,8 @@
-"""Estimate the bytes that shards will take, from image headers, and refuse a run that does not fit the disk."""
+"""Estimate the bytes that shards will take, from image headers.
+
+The estimate decides ``output.pairs_per_shard=auto``, warns of too many shards, and refuses a run that does not fit the
+disk.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from unprocess_gen.config.interpretation import noise_levels, patch_rule
-from unprocess_gen.config.schema import Config
-from unprocess_gen.core.errors import MachineError, SourceError
+from unprocess_gen.config.schema import AUTO, Config, OutputConfig
+from unprocess_gen.config.serialization import read_dataset_yaml
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import PACKED, Source
@@ -23,6 +28,15 @@ from unprocess_gen.sources.scenes import synthetic
 
 SAMPLE = 32
 """Sources whose headers are read; the sizes of longer listings are extrapolated."""
+
+SHARD_BYTES = 256_000_000
+"""Bytes of a shard under ``output.pairs_per_shard=auto``: few enough files, and few enough bytes to make twice."""
+
+MAX_PAIRS_PER_SHARD = 10**6
+"""The limit of ``output.pairs_per_shard``."""
+
+MAX_SHARDS = 200_000
+"""Shards above which a run warns. A million shards take 170 MB in ``dataset.json``, and one folder holds them all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +96,89 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:
     of_shards = [shard_bytes([by_index[source.index] for source in task.sources if by_index[source.index]])
                  for task in tasks]  # fmt: skip
     return SizeEstimate(sum(of_shards), max(of_shards))
+
+
+def with_pairs_per_shard(config: Config, sources: Sequence[Source], config_yaml: Path | None) -> Config:
+    """Return a config whose ``output.pairs_per_shard`` is a number.
+
+    Parameters
+    ----------
+    config : Config
+        Validated config.
+    sources : sequence of Source
+        The listing.
+    config_yaml : Path or None
+        The ``config.yaml`` of the output folder; it need not exist. Its number has priority over an estimate, so that
+        a dataset is resumed as it was begun.
+
+    Returns
+    -------
+    Config
+        The config itself if it has a number, otherwise a copy with one. It decides the bytes of the dataset, and
+        follows from the names and headers of the sources, not from the machine.
+    """
+    if config.output.pairs_per_shard != AUTO:
+        return config
+    number = _recorded_pairs_per_shard(config_yaml) or fitting_pairs_per_shard(config, sources)
+    return replace(config, output=replace(config.output, pairs_per_shard=number))
+
+
+def _recorded_pairs_per_shard(config_yaml: Path | None) -> int | None:
+    """Return the number in a ``config.yaml``, None if there is none; others report what is wrong with the file."""
+    if config_yaml is None or not config_yaml.exists():
+        return None
+    try:
+        number = read_dataset_yaml(config_yaml)[0].output.pairs_per_shard
+    except ConfigError:
+        return None
+    return number if isinstance(number, int) else None
+
+
+def fitting_pairs_per_shard(config: Config, sources: Sequence[Source]) -> int:
+    """Return the number of sources whose pairs take about `SHARD_BYTES`.
+
+    Parameters
+    ----------
+    config : Config
+        Validated config.
+    sources : sequence of Source
+        The listing.
+
+    Returns
+    -------
+    int
+        From the mean size of those sources, among `SAMPLE` of them, that can be read; 1 if a single one takes more. The
+        default if none can be read.
+    """
+    film: dict[str, int] = {}
+    sizes = [size for source in evenly_spaced(sources, SAMPLE) if (size := _header_bytes(config, source, film))]
+    if not sizes:
+        return int(OutputConfig().pairs_per_shard)
+    return min(max(1, SHARD_BYTES * len(sizes) // sum(sizes)), MAX_PAIRS_PER_SHARD)
+
+
+def shards_warning(config: Config, sources: Sequence[Source]) -> str:
+    """Return a warning about more than `MAX_SHARDS` shards, empty if there are fewer.
+
+    Parameters
+    ----------
+    config : Config
+        Validated config, with a number in ``output.pairs_per_shard``.
+    sources : sequence of Source
+        The listing.
+
+    Returns
+    -------
+    str
+        One sentence, with the number for shards of about `SHARD_BYTES`.
+    """
+    per_shard = config.output.pairs_per_shard
+    shards = -(-len(sources) // per_shard)
+    if shards <= MAX_SHARDS:
+        return ""
+    fitting = fitting_pairs_per_shard(config, sources)
+    advice = f"; output.pairs_per_shard={fitting} gives shards of about 256 MB" if fitting > per_shard else ""
+    return f"output.pairs_per_shard={per_shard}: {shards:,} shards; expected at most {MAX_SHARDS:,}{advice}"
 
 
 def check_free_space(config: Config, tasks: Sequence[ShardTask], out: Path) -> None:

@@ -25,7 +25,7 @@ from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
-from unprocess_gen.pipeline.sizes import source_bytes
+from unprocess_gen.pipeline.sizes import shards_warning, source_bytes, with_pairs_per_shard
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.planning.source_noise import noise_ratio
@@ -114,8 +114,8 @@ class RunEstimate:
 
     Attributes
     ----------
-    sources, shards, bytes : int
-        Number of sources and shards, and bytes of all shards.
+    sources, shards, pairs_per_shard, bytes : int
+        Number of sources, of shards and of sources per shard, and bytes of all shards.
     exact : bool
         Whether every source was read.
     pair_seconds : float
@@ -136,11 +136,12 @@ class RunEstimate:
     unmatched : dict of str to int
         Number of files that no pattern of ``source.include`` matches, by suffix.
     warnings : tuple of str
-        Sentences about the listing, such as clips of different photographs.
+        Sentences about the listing, such as clips of different photographs, and about too many shards.
     """
 
     sources: int
     shards: int
+    pairs_per_shard: int
     bytes: int
     exact: bool
     pair_seconds: float
@@ -193,6 +194,8 @@ def estimate_run(
     """
     listing = list_photographs(config.source)
     sources = listing.sources
+    config = with_pairs_per_shard(config, sources, Path(config.out) / "config.yaml")
+    too_many = shards_warning(config, sources)
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
     shards = -(-len(sources) // config.output.pairs_per_shard)
     n_jobs = min(n_jobs, shards)
@@ -204,6 +207,7 @@ def estimate_run(
     return RunEstimate(
         sources=len(sources),
         shards=shards,
+        pairs_per_shard=config.output.pairs_per_shard,
         bytes=size,
         exact=exact,
         pair_seconds=sum(source.seconds for source in estimates) / len(estimates) * len(sources) / n_jobs,
@@ -214,7 +218,7 @@ def estimate_run(
         source_estimates=estimates,
         tier_ns=_tier_ns(config, estimates, tiers or {}),
         unmatched=listing.unmatched,
-        warnings=listing.warnings,
+        warnings=(*listing.warnings, *([too_many] if too_many else [])),
     )
 
 
@@ -348,7 +352,7 @@ def format_estimate(config: Config, estimate: RunEstimate) -> str:
     lines = [
         f"sources   {estimate.sources} in {config.source.root or 'the built-in scenes'}; {sampled} of them read",
         *(f"          {sentence}" for sentence in (unmatched, *estimate.warnings) if sentence),
-        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {config.output.pairs_per_shard}",
+        f"pairs     {about}{estimate.pairs}, in {counted(estimate.shards, 'shard')} of {estimate.pairs_per_shard}",
         *_patch_lines(config, estimate.source_estimates),
         f"bytes     {about}{estimate.bytes:,} in shards, {byte_size(estimate.bytes)}"
         + ("" if estimate.exact else " (--all reads every source: exact)"),
