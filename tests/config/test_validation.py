@@ -345,7 +345,7 @@ REFUSED = [
     ("output.pairs_per_shard=8.0", r"output.pairs_per_shard=8.0: expected 1 to 1000000, or auto"),
     ("output.pairs_per_shard=Auto", r"output.pairs_per_shard=Auto: expected 1 to 1000000, or auto"),
     ("output.pairs_per_shard=null", r"output.pairs_per_shard=null: expected 1 to 1000000, or auto"),
-    ("output.pairs_per_shard=true", r"output.pairs_per_shard=true: expected 1 to 1000000, or auto"),
+    ("output.pairs_per_shard=true", r"output.pairs_per_shard=True: expected 1 to 1000000, or auto"),
     ("noise=imx385", r"scene.iso=100: noise=imx385 is calibrated for ISO 1600, 3200, .* give noise.iso="),
     ("noise=sony_a7s2;noise.iso=1800", r"noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to "),
     ("noise=sony_a7s2;noise.iso=[uniform,1000,3000]", r"noise.iso=\[uniform, 1000, 3000\]: noise=sony_a7s2 is "),

@@ -15,6 +15,7 @@ from helpers.photographs import fill
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline import sizes
 from unprocess_gen.pipeline.generate import shard_tasks
+from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.sources.loader import list_photographs
 
 ONE = "output.pairs_per_shard=1"
@@ -169,7 +170,7 @@ def test_auto_without_readable_source_is_the_default(settings: Settings, tmp_pat
     (tmp_path / "p/a.png").write_bytes(b"not a photograph")
     config = settings(AUTO, f"source.root={tmp_path / 'p'}")
     sources = list_photographs(config.source).sources
-    assert sizes.with_pairs_per_shard(config, sources, None).output.pairs_per_shard == 8
+    assert sizes.with_pairs_per_shard(config, sources, open_storage(str(tmp_path))).output.pairs_per_shard == 8
 
 
 @pytest.mark.parametrize("recorded", ["", "seed: 0", "output: [", "\0"])
@@ -177,7 +178,7 @@ def test_unreadable_record_is_left_to_other_checks(recorded: str, settings: Sett
     (tmp_path / "config.yaml").write_text(recorded)
     config = settings(AUTO, "source.limit=1")
     sources = list_photographs(config.source).sources
-    assert sizes.with_pairs_per_shard(config, sources, tmp_path / "config.yaml").output.pairs_per_shard > 1
+    assert sizes.with_pairs_per_shard(config, sources, open_storage(str(tmp_path))).output.pairs_per_shard > 1
 
 
 def test_plan_states_the_number_of_auto(

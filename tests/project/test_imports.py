@@ -40,6 +40,7 @@ ONLY_IN = {
     "av": {"sources.video.colours", "sources.video.decode"},
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng"},
+    "pyarrow": {"dataset.parquet"},
 }
 """The modules that may import a library."""
 

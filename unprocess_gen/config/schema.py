@@ -594,6 +594,12 @@ class OutputConfig:
         "config.yaml records it",
         NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"),
     )
+    parquet: bool = key(
+        False,
+        "write manifest.parquet too: the manifest as typed columns, compressed with zstd; needs pyarrow",
+        Boolean(),
+        since="0.2",
+    )
 
     def __post_init__(self) -> None:
         """Convert the text of an integer, such as the value of an environment variable."""

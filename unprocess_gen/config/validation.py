@@ -26,7 +26,15 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import CAMERA_LAWS, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
-from unprocess_gen.config.schema import PHYSICAL, CameraConfig, Config, EffectsConfig, SourceConfig, all_settings
+from unprocess_gen.config.schema import (
+    PHYSICAL,
+    CameraConfig,
+    Config,
+    EffectsConfig,
+    OutputConfig,
+    SourceConfig,
+    all_settings,
+)
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.config.values import one_of, value_text
@@ -68,6 +76,7 @@ def validate_config(config: Config) -> None:
     if content is None or not SEED.allows(config.seed) or not _has_allowed_values(content):
         check_values(config)
     _check_environment(config.source)
+    check_parquet(config.output)
 
 
 @functools.lru_cache(maxsize=64)
@@ -107,6 +116,26 @@ def check_values(config: Config) -> None:
         accuracy_budget(config.accuracy), uses_physics(config.noise), is_normalised(config), has_float_clean(config)
     )
     _check_output(config)
+
+
+def check_parquet(output: OutputConfig) -> None:
+    """Check that pyarrow is installed if ``manifest.parquet`` is wanted.
+
+    Parameters
+    ----------
+    output : OutputConfig
+        The format of the dataset.
+
+    Raises
+    ------
+    ConfigError
+        If it is not.
+    """
+    if output.parquet and find_spec("pyarrow") is None:
+        raise ConfigError(
+            "output.parquet=true: needs pyarrow; in the source folder, run: pip install '.[parquet]', or set "
+            "output.parquet=false"
+        )
 
 
 def _check_settings(config: Config) -> None:

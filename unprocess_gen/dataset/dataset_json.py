@@ -12,6 +12,9 @@ from unprocess_gen.dataset.shards import shard_name
 MAX_BYTES = 2**30
 """Largest ``dataset.json`` that is read: three million shards."""
 
+PARQUET_SHA256 = "parquet_sha256"
+"""Key of the digest of ``manifest.parquet``; missing if the dataset has no such file."""
+
 MAX_COUNT = 2**63 - 1
 
 _DIGEST = re.compile("[0-9a-f]{64}")
@@ -34,6 +37,8 @@ def check_dataset_json(facts: Any) -> None:
         raise ValueError("expected an object")
     for key in ("fingerprint", "manifest_sha256", "config_sha256"):
         _check(facts, key, _is_digest, "64 hexadecimal digits")
+    if PARQUET_SHA256 in facts:
+        _check(facts, PARQUET_SHA256, _is_digest, "64 hexadecimal digits")
     _check(facts, "pairs", _is_count, "a number of 0 or more")
     for key in ("failed", "sites"):
         _check(facts, key, _is_counts, "an object of numbers")

@@ -29,6 +29,7 @@ from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_pairs_per_shard
+from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Tally, Workspace
 from unprocess_gen.sources.listing import ClipSizes, Listing
@@ -114,7 +115,7 @@ def generate(config: Config, label: str = "") -> Summary:
     """
     started = time.monotonic()
     listing = list_photographs(config.source)
-    config = with_pairs_per_shard(config, listing.sources, Path(config.out) / "config.yaml")
+    config = with_pairs_per_shard(config, listing.sources, open_storage(config.out))
     with Workspace(config.out, dataset_yaml(config)) as workspace:
         workspace.open()
         if workspace.is_complete():
@@ -142,7 +143,9 @@ def generate(config: Config, label: str = "") -> Summary:
             "n_jobs": n_jobs,
             "shards_made": len(todo),
         }
-        facts = workspace.finish(len(tasks), lambda tally: dataset_json_facts(config, listing, tally, run))
+        facts = workspace.finish(
+            len(tasks), lambda tally: dataset_json_facts(config, listing, tally, run), config.output.parquet
+        )
     return replace(_summary(config, facts, listing, started), made=rows_made, times=times)
 
 

@@ -24,6 +24,7 @@ from typing import Any
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml, source_kind
+from unprocess_gen.config.validation import check_parquet
 from unprocess_gen.core.errors import (
     ConfigError,
     DamageError,
@@ -34,7 +35,9 @@ from unprocess_gen.core.errors import (
 )
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.types import Frame, Row, Source
+from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.columns import HEADERS, NAMES
+from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_image, group_by_sample, image_key, key_text
 from unprocess_gen.dataset.manifest import failed_row, read_rows, readable_rows, rows_of_json, write_rows
 from unprocess_gen.dataset.shards import (
@@ -142,8 +145,16 @@ def _repair(folder: Path, root: str | None, temporary: Path) -> Iterator[RepairS
         if pairs:
             names.add(shard_name(number))
     yield from _set_aside(folder, names)
+    derived = facts.get(PARQUET_SHA256)
+    if config.output.parquet and not _is_intact_parquet(folder, facts):
+        check_parquet(config.output)
+        derived = _write_parquet(folder, temporary)
+        yield RepairStep(parquet.NAME, "written from manifest.csv")
     if not facts:
         yield _dataset(folder, text, config, temporary)
+    elif derived != facts.get(PARQUET_SHA256):
+        _write(temporary, folder / "dataset.json", dataset_text(facts | {PARQUET_SHA256: derived}))
+        yield RepairStep("dataset.json", f"has the SHA-256 of the new {parquet.NAME}")
 
 
 def _intact_facts(folder: Path) -> Facts:
@@ -412,6 +423,26 @@ def _move_aside(folder: Path, path: Path) -> Path:
     return name
 
 
+# ---------------------------------------------------------------------------------------------------------- Parquet
+
+
+def _is_intact_parquet(folder: Path, facts: Facts) -> bool:
+    path = folder / parquet.NAME
+    if not path.is_file():
+        return False
+    sha256 = file_sha256(path)
+    return bool(facts[PARQUET_SHA256] == sha256) if PARQUET_SHA256 in facts else _is_proved(folder, sha256)
+
+
+def _write_parquet(folder: Path, temporary: Path) -> str:
+    """Write ``manifest.parquet`` from the manifest, and return its SHA-256, which depends on the version of pyarrow."""
+    part = temporary / parquet.NAME
+    parquet.write_parquet(folder / "manifest.csv", part)
+    sha256 = file_sha256(part)
+    _place(part, folder / parquet.NAME)
+    return sha256
+
+
 # ---------------------------------------------------------------------------------------------------- dataset.json
 
 
@@ -427,7 +458,7 @@ def _dataset(folder: Path, text: str, config: Config, temporary: Path) -> Repair
         text,
         file_sha256(manifest),
         [_entry(folder, number, rows, old) for number, rows in shard_rows(manifest)],
-        tally.facts(),
+        ({PARQUET_SHA256: file_sha256(folder / parquet.NAME)} if config.output.parquet else {}) | tally.facts(),
     )
     digest = old.pop("dataset_sha256", None)
     same = dataset_text(old | known)

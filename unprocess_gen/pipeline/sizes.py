@@ -12,13 +12,14 @@ from pathlib import Path
 
 from unprocess_gen.config.interpretation import noise_levels, patch_rule
 from unprocess_gen.config.schema import AUTO, Config, OutputConfig
-from unprocess_gen.config.serialization import read_dataset_yaml
+from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import PACKED, Source
 from unprocess_gen.dataset.manifest import json_size
 from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes
+from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.listing import read_bytes
@@ -98,7 +99,7 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:
     return SizeEstimate(sum(of_shards), max(of_shards))
 
 
-def with_pairs_per_shard(config: Config, sources: Sequence[Source], config_yaml: Path | None) -> Config:
+def with_pairs_per_shard(config: Config, sources: Sequence[Source], storage: Storage) -> Config:
     """Return a config whose ``output.pairs_per_shard`` is a number.
 
     Parameters
@@ -107,9 +108,9 @@ def with_pairs_per_shard(config: Config, sources: Sequence[Source], config_yaml:
         Validated config.
     sources : sequence of Source
         The listing.
-    config_yaml : Path or None
-        The ``config.yaml`` of the output folder; it need not exist. Its number has priority over an estimate, so that
-        a dataset is resumed as it was begun.
+    storage : Storage
+        Place of the dataset. If it has a ``config.yaml``, the number there has priority over an estimate, so that a
+        dataset is resumed as it was begun.
 
     Returns
     -------
@@ -119,18 +120,17 @@ def with_pairs_per_shard(config: Config, sources: Sequence[Source], config_yaml:
     """
     if config.output.pairs_per_shard != AUTO:
         return config
-    number = _recorded_pairs_per_shard(config_yaml) or fitting_pairs_per_shard(config, sources)
+    number = _recorded_pairs_per_shard(storage) or fitting_pairs_per_shard(config, sources)
     return replace(config, output=replace(config.output, pairs_per_shard=number))
 
 
-def _recorded_pairs_per_shard(config_yaml: Path | None) -> int | None:
-    """Return the number in a ``config.yaml``, None if there is none; others report what is wrong with the file."""
-    if config_yaml is None or not config_yaml.exists():
-        return None
+def _recorded_pairs_per_shard(storage: Storage) -> int | None:
+    """Return the number in ``config.yaml``, None if there is none; later checks report what is wrong with the file."""
     try:
-        number = read_dataset_yaml(config_yaml)[0].output.pairs_per_shard
-    except ConfigError:
+        config, _ = parse_dataset_yaml(storage.read("config.yaml"))
+    except (OSError, ValueError, ConfigError):
         return None
+    number = config.output.pairs_per_shard
     return number if isinstance(number, int) else None
 
 

@@ -23,6 +23,8 @@ from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath, local_copy, open_text
 from unprocess_gen.core.types import Row
+from unprocess_gen.dataset import parquet
+from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
 from unprocess_gen.dataset.manifest import read_rows, row_json
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
@@ -189,7 +191,10 @@ def _without_path(error: DamageError) -> str:
 
 
 def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
-    for name, field in (("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")):
+    files = [("config.yaml", "config_sha256"), ("manifest.csv", "manifest_sha256")]
+    if PARQUET_SHA256 in facts:
+        files.append((parquet.NAME, PARQUET_SHA256))
+    for name, field in files:
         try:
             found = file_sha256(folder / name)
         except OSError as error:

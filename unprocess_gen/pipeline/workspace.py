@@ -7,6 +7,7 @@
     out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists (`shard_records`)
     out/shards/                  complete shards
     out/manifest.csv             written once every shard is committed or provisional
+    out/manifest.parquet         the manifest as typed columns, if output.parquet is true
     out/dataset.json             written last; then .work is deleted, unless a shard is provisional
     out/report.html              the page of the verb ``report``; not part of the dataset
 
@@ -34,7 +35,8 @@ from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import RESUME, file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import Counts, Row, Source
-from unprocess_gen.dataset.dataset_json import MAX_BYTES, check_dataset_json
+from unprocess_gen.dataset import parquet
+from unprocess_gen.dataset.dataset_json import MAX_BYTES, PARQUET_SHA256, check_dataset_json
 from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.pipeline.listing_record import read_record, recorded_files, write_listing
 from unprocess_gen.pipeline.shard_records import ShardRecords
@@ -227,7 +229,9 @@ class Workspace:
                 f"out={self.out}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
             )
 
-    def finish(self, shards: int, facts_of: Callable[[Tally], dict[str, Any]]) -> dict[str, Any]:
+    def finish(
+        self, shards: int, facts_of: Callable[[Tally], dict[str, Any]], with_parquet: bool = False
+    ) -> dict[str, Any]:
         """Write ``manifest.csv``, then ``dataset.json``, and return the latter's contents.
 
         If a shard is provisional, ``.work`` is kept, so that the next run retries it.
@@ -238,6 +242,8 @@ class Workspace:
             Number of shards; all of them have records.
         facts_of : callable
             Takes the counts of all rows; returns what else than digests and shards ``dataset.json`` holds.
+        with_parquet : bool
+            Whether to write ``manifest.parquet`` too.
 
         Raises
         ------
@@ -253,13 +259,22 @@ class Workspace:
             with manifest.open("w", encoding="utf-8", newline="") as stream:
                 write_rows(stream, tally.counted(self._rows(shards, entries)))
             manifest_sha256 = file_sha256(manifest)
+            derived = self._write_parquet(manifest) if with_parquet else {}
             self.storage.commit(manifest, "manifest.csv")
-            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, facts_of(tally))
+            dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, derived | facts_of(tally))
             self.storage.write("dataset.json", dataset_text(dataset))
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
         except OSError as error:
             raise machine_error(error, Path(self.out), RESUME) from error
         return dataset
+
+    def _write_parquet(self, manifest: Path) -> dict[str, Any]:
+        """Write ``manifest.parquet``; return what ``dataset.json`` holds about it."""
+        path = self.storage.scratch / parquet.NAME
+        parquet.write_parquet(manifest, path)
+        sha256 = file_sha256(path)
+        self.storage.commit(path, parquet.NAME)
+        return {PARQUET_SHA256: sha256}
 
     def _rows(self, shards: int, entries: list[dict[str, Any]]) -> Iterator[Row]:
         """Yield every row of the dataset in source order, and append the entry of each shard."""

@@ -26,6 +26,7 @@ from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.sizes import shards_warning, source_bytes, with_pairs_per_shard
+from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
 from unprocess_gen.planning.source_noise import noise_ratio
@@ -194,7 +195,7 @@ def estimate_run(
     """
     listing = list_photographs(config.source)
     sources = listing.sources
-    config = with_pairs_per_shard(config, sources, Path(config.out) / "config.yaml")
+    config = with_pairs_per_shard(config, sources, open_storage(config.out))
     too_many = shards_warning(config, sources)
     chosen = sources if read_all else evenly_spaced(sources, SAMPLE)
     shards = -(-len(sources) // config.output.pairs_per_shard)
