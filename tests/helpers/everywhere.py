@@ -168,7 +168,7 @@ def doubles() -> str:
         clean, noisy = np.empty(codes[..., 0].size, dtype=dtype), np.empty((1, codes[..., 0].size), dtype=dtype)
         counts = np.zeros((1, 6), dtype=np.int64)
         render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
-        found += [clean, noisy, counts, *scratch]
+        found += [clean, noisy, counts, scratch]
         if isinstance(noise, Electrons):
             found += members(noise.body)
     return digest(*map(np.ascontiguousarray, found))

@@ -37,7 +37,6 @@ from unprocess_gen.simulation.kernels.strips import (
     Float32,
     Scratch,
     Workspace,
-    lead_of,
     locate,
     scratch_of_thread,
     workspace_in,
@@ -53,7 +52,7 @@ _WIDTH = np.uint64(VECTOR_WIDTH)
 def fill_words(key: PhiloxKey, purpose_word: np.uint64, origin: tuple[int, int], scratch: Scratch, out: Words) -> None:
     """Fill ``out`` with the words of a stream, strip by strip."""
     height, width = out.shape
-    workspace, target = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0)
+    workspace, target = workspace_in(scratch), pointer_to(out, 0)
     for y in range(height):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
@@ -162,7 +161,7 @@ def normalised_values(values_dn: Float, black_dn: float, span_dn: float, limits_
 def _fill_normalised(
     values_dn: Float, readout: Normalised, limits_dn: tuple[float, float], scratch: Scratch, out: Float32
 ) -> None:
-    buffers, of, values = workspace_in(scratch, 0), pointers_of(readout), pointer_to(values_dn, 0)
+    buffers, of, values = workspace_in(scratch), pointers_of(readout), pointer_to(values_dn, 0)
     strip = locate((0, 0), 0, 0, STRIP)
     for start in range(0, out.size, STRIP):
         _normalise(of, pointer_to(values, start), limits_dn[0], limits_dn[1], strip, buffers.normalised)
@@ -229,7 +228,7 @@ def _load_words(words: Words, start: int, length: int, buffers: Workspace) -> No
 def _fill_approximate(
     words: Words, rates: Float32, tables: CountTables, scratch: Scratch, out: Float32, error: Float32
 ) -> None:
-    buffers, of = workspace_in(scratch, 0), pointers_of(tables)
+    buffers, of = workspace_in(scratch), pointers_of(tables)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)
@@ -245,7 +244,7 @@ def _fill_approximate(
 
 @kernel
 def _fill_of_one_rate(words: Words, smallest: int, ranks: np.ndarray, scratch: Scratch, out: Float32) -> None:
-    buffers, of = workspace_in(scratch, 0), pointer_to(ranks, 0)
+    buffers, of = workspace_in(scratch), pointer_to(ranks, 0)
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)

@@ -21,7 +21,6 @@ from unprocess_gen.simulation.kernels.strips import (
     STRIP,
     Float32,
     Scratch,
-    lead_of,
     locate,
     padded_width,
     scratch_of_thread,
@@ -176,7 +175,7 @@ def _list_defects(
 
     ``starts`` counts all of them, also those for which the lists have no space.
     """
-    workspace, found, strips = workspace_in(scratch, lead_of(origin)), 0, max(-(-width // STRIP), 1)
+    workspace, found, strips = workspace_in(scratch), 0, max(-(-width // STRIP), 1)
     hot, dead, steps = workspace.words, workspace.read_words, workspace.dark_words
     for n in range(starts.size - 1):
         y, x = n // strips, n % strips * STRIP
@@ -210,7 +209,7 @@ def _fill_response(
     out: Float32,
 ) -> None:
     """Fill ``out`` with 1 plus normal deviates of standard deviation ``prnu_std``, but at least 0."""
-    workspace, target, normal = workspace_in(scratch, lead_of(origin)), pointer_to(out, 0), pointer_to(quadratics, 0)
+    workspace, target, normal = workspace_in(scratch), pointer_to(out, 0), pointer_to(quadratics, 0)
     for y in range(out.shape[0]):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))

@@ -42,7 +42,6 @@ from unprocess_gen.simulation.kernels.strips import (
     ONES,
     STRIP,
     Scratch,
-    lead_of,
     locate,
     scratch_of_thread,
     workspace_in,
@@ -159,7 +158,7 @@ def _render(
         pointers_of(scene),
         pointers_of(noise),
         pointers_of(readout),
-        workspace_in(scratch, lead_of(origin)),
+        workspace_in(scratch),
     )
     codes, clean_sites, noisy_sites = pointer_to(srgb, 0), pointer_to(clean, 0), pointer_to(noisy, 0)
     is_uint8, key_words, all_counts, sites = srgb.itemsize == 1, pointer_to(keys, 0), pointer_to(counts, 0), clean.size

@@ -12,15 +12,15 @@ registers of the processor. Bytes and bits are numbered from the low end, as on 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import from_dtype, types
 from numba.core import cgutils
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import lower_builtin, models, register_model
+from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, infer_getattr, infer_global, signature
+from numba.extending import lower_builtin, lower_getattr_generic, models, register_model
 from numpy.typing import NDArray
 
 VECTOR_WIDTH = 8
@@ -200,6 +200,56 @@ def pointer_to(array: NDArray[Any], at: Index) -> Pointer:
     must outlive the pointer, as arguments of the outer kernel do.
     """
     return array.reshape(-1)[at:]
+
+
+class BuffersType(types.Type):
+    """Describe buffers at constant places of one array to Numba.
+
+    Compiled code passes one pointer instead of one for each buffer.
+    """
+
+    def __init__(self, name: str, places: Mapping[str, tuple[np.dtype[Any], int]]) -> None:
+        self.places = {member: (types.CPointer(from_dtype(dtype)), at) for member, (dtype, at) in places.items()}
+        super().__init__(name=name)
+
+
+@register_model(BuffersType)
+class _BuffersModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, buffers_type: BuffersType) -> None:
+        super().__init__(manager, buffers_type, ir.IntType(8).as_pointer())
+
+
+@infer_getattr
+class _BufferTemplate(AttributeTemplate):
+    key = BuffersType
+
+    def generic_resolve(self, buffers_type: BuffersType, member: str) -> Any:
+        return buffers_type.places[member][0]
+
+
+@lower_getattr_generic(BuffersType)
+def _build_buffer(context: Any, builder: Any, buffers_type: BuffersType, memory: Any, member: str) -> Any:
+    pointer_type, at = buffers_type.places[member]
+    place = builder.gep(memory, [ir.Constant(ir.IntType(64), at)])
+    return builder.bitcast(place, context.get_value_type(pointer_type))
+
+
+def buffers_at(
+    name: str, places: Callable[[np.dtype[Any]], Mapping[str, tuple[np.dtype[Any], int]]]
+) -> Callable[[_Function], _Function]:
+    """Return a decorator that compiles a function of an array as a record of pointers into its data.
+
+    ``places`` returns the dtype of each member and its byte in the data, from the dtype of the array.
+    """
+
+    def build(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
+        data = _build_pointers(context, builder, call.args[0], arguments[0])
+        return builder.bitcast(data, ir.IntType(8).as_pointer())
+
+    return _compiled(
+        lambda array: BuffersType(f"{name}({array.dtype})", places(np.dtype(str(array.dtype)))),
+        build,
+    )
 
 
 def _address(builder: Any, llvm_type: ir.Type, pointer: Any, at: Any) -> Any:

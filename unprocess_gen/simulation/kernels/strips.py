@@ -7,8 +7,9 @@ place in a block and in a vector, because `STRIP` is a multiple of a block.
 
 from __future__ import annotations
 
+import functools
 import threading
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,9 @@ from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
     Vector,
+    buffers_at,
     load,
     movemask,
-    pointer_to,
     store,
 )
 
@@ -31,8 +32,12 @@ STRIP = 512
 SIZE = STRIP + BLOCK
 """Length of the buffers."""
 
+CACHE_LINE = 64
+"""Bytes to whose multiples the buffers are aligned."""
+
 Float32 = NDArray[np.float32]
 Indices = NDArray[np.uint32]
+Lines = NDArray[np.uint64]
 
 ONES = np.ones(SIZE, dtype=np.float32)
 """Relative gain of the pixels without PRNU."""
@@ -41,7 +46,6 @@ _8 = np.uint64(8)
 _MASK_BITS = np.arange(2**VECTOR_WIDTH)[:, None] >> np.arange(VECTOR_WIDTH) & 1
 _LANES_BY_MASK = np.argsort(1 - _MASK_BITS, axis=1, kind="stable").ravel()
 _COUNT_BY_MASK = _MASK_BITS.sum(axis=1)
-_LANES_SIZE, _TABLES_SIZE = _LANES_BY_MASK.size, _LANES_BY_MASK.size + _COUNT_BY_MASK.size
 
 
 def padded_width(left: int, width: int) -> int:
@@ -67,17 +71,12 @@ class Strip(NamedTuple):
 @inner
 def locate(origin: tuple[int, int], y: int, x: int, length: int) -> Strip:
     """Locate the strip of ``length`` pixels from (y, x) of a crop at ``origin`` of the full frame."""
-    lead, first = lead_of(origin), origin[1] % VECTOR_WIDTH
+    first = origin[1] % VECTOR_WIDTH
+    lead = origin[1] % BLOCK - first
     total = (first + length + VECTOR_WIDTH - 1) // VECTOR_WIDTH * VECTOR_WIDTH
     blocks = (lead + total + BLOCK - 1) // BLOCK
     block, row = np.uint64((origin[1] + x) // BLOCK), np.uint64(origin[0] + y)
     return Strip(y, x, length, first, first + length, total, lead, blocks, block, row)
-
-
-@inner
-def lead_of(origin: tuple[int, int]) -> int:
-    """Return `Strip.lead` of a crop at ``origin``."""
-    return origin[1] % BLOCK // VECTOR_WIDTH * VECTOR_WIDTH
 
 
 class Workspace(NamedTuple):
@@ -111,26 +110,37 @@ class Workspace(NamedTuple):
     dark_words: Indices
     scratch: Indices
     uncertain: Indices  # [2 SIZE]: sites to recompute exactly
-    lanes_by_mask: Indices  # for each mask of eight lanes: its set lanes first
-    count_by_mask: Indices  # for each mask: number of set lanes
-    lines: NDArray[np.uint64]  # scratch of look-ups
+    lines: Lines  # scratch of look-ups
     clean: Raw
     noisy: Raw
+    lanes_by_mask: Indices  # for each mask of eight lanes: its set lanes first
+    count_by_mask: Indices  # for each mask: number of set lanes
 
 
-class Scratch(NamedTuple):
-    """Hold the scratch memory of a `Workspace`: few arrays, because Numba takes 0.2 µs to read each.
+_DTYPES = {Float: np.float64, Float32: np.float32, Indices: np.uint32, Lines: np.uint64, Raw: np.uint16}
+_LENGTHS = {"uncertain": 2 * SIZE, "lanes_by_mask": _LANES_BY_MASK.size}
+"""Lengths of the buffers that are not `SIZE`."""
 
-    Python allocates it, since compiling the allocation takes half a second. Each array ends with a spare buffer:
-    negative indices reach it in uncompiled kernels.
+
+@functools.cache
+def _places(dtype: np.dtype[Any]) -> dict[str, tuple[np.dtype[Any], int]]:
+    """Return the dtype of each buffer and the byte of its index 0, for a clean frame of ``dtype``.
+
+    A block lies before each buffer, because random words may begin at negative indices.
     """
+    places, end = {}, 0
+    for name, annotation in get_type_hints(Workspace).items():
+        of_buffer = np.dtype(_DTYPES.get(annotation, dtype))
+        places[name] = of_buffer, end + BLOCK * of_buffer.itemsize
+        end += (BLOCK + _LENGTHS.get(name, SIZE)) * of_buffer.itemsize
+    return places
 
-    stages: Any  # [3 + 1, SIZE]
-    doubles: Float  # [3 + 1, SIZE]
-    singles: Float32  # [17 + 1, SIZE]
-    indices: Indices  # [6 + 1, SIZE], flat, and the tables by mask
-    lines: NDArray[np.uint64]  # [1 + 1, SIZE]
-    frames: Raw  # [2 + 1, SIZE]
+
+Scratch = NDArray[Any]
+"""Scratch memory of a `Workspace`, one array of the dtype of the clean frame: Numba takes 0.2 µs to read each array.
+
+Python allocates it, since compiling the allocation takes half a second.
+"""
 
 
 class _Threads(threading.local):
@@ -152,74 +162,37 @@ def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
     scratch = _threads.scratch.get(dtype)
     if scratch is None:
         scratch = _threads.scratch[dtype] = allocate_scratch(dtype)
-    scratch.stages.fill(0)
+    scratch[: BLOCK + SIZE].fill(0)
     return scratch
 
 
 def allocate_scratch(dtype: Any = np.float64) -> Scratch:
     """Allocate zeroed buffers: kernels also compute the padding of vectors, which must hold finite numbers."""
-    return Scratch(
-        stages=np.zeros((4, SIZE), dtype=dtype),
-        doubles=np.zeros((4, SIZE)),
-        singles=np.zeros((18, SIZE), dtype=np.float32),
-        indices=np.concatenate([_LANES_BY_MASK, _COUNT_BY_MASK, np.zeros(7 * SIZE, dtype=int)]).astype(np.uint32),
-        lines=np.zeros((2, SIZE), dtype=np.uint64),
-        frames=np.zeros((3, SIZE), dtype=np.uint16),
-    )
+    of_last, at = _places(np.dtype(dtype))["count_by_mask"]
+    size = at + (SIZE + BLOCK) * of_last.itemsize
+    memory = np.zeros(size + CACHE_LINE, dtype=np.uint8)
+    start = -memory.ctypes.data % CACHE_LINE
+    scratch: Scratch = memory[start : start + size].view(dtype)
+    workspace = workspace_in(scratch)
+    workspace.lanes_by_mask[: _LANES_BY_MASK.size] = _LANES_BY_MASK
+    workspace.count_by_mask[: _COUNT_BY_MASK.size] = _COUNT_BY_MASK
+    return scratch
 
 
-@inner
-def workspace_in(scratch: Scratch, lead: int) -> Workspace:
-    """Return pointers to the buffers of strips with this ``lead``.
+@buffers_at("Workspace", _places)
+def workspace_in(scratch: Scratch) -> Workspace:
+    """Return pointers to the buffers of strips.
 
-    Random words fill complete blocks, from index -``lead`` on. All other stages begin at index 0, the first vector with
-    pixels of the strip: in patches, a fifth of the elements of blocks lie outside.
+    Random words fill complete blocks, from index -`Strip.lead` on. All other stages begin at index 0, the first vector
+    with pixels of the strip: in patches, a fifth of the elements of blocks lie outside.
     """
-    stages, doubles, singles = (
-        pointer_to(scratch.stages, lead),
-        pointer_to(scratch.doubles, lead),
-        pointer_to(scratch.singles, lead),
-    )
-    tables, lines, frames = (
-        pointer_to(scratch.indices, 0),
-        pointer_to(scratch.lines, lead),
-        pointer_to(scratch.frames, lead),
-    )
-    indices = pointer_to(tables, _TABLES_SIZE + lead)
+    memory = scratch.view(np.uint8)
+    # a view ends with a further block, which negative indices reach in uncompiled kernels
     return Workspace(
-        signal=pointer_to(stages, 0 * SIZE),
-        bright_light=pointer_to(stages, 1 * SIZE),
-        unrounded_dn=pointer_to(stages, 2 * SIZE),
-        exact_dn=pointer_to(doubles, 0 * SIZE),
-        defects=pointer_to(doubles, 1 * SIZE),
-        row_dn=pointer_to(doubles, 2 * SIZE),
-        rounded_dn=pointer_to(singles, 0 * SIZE),
-        residual_dn=pointer_to(singles, 1 * SIZE),
-        noise_dn=pointer_to(singles, 2 * SIZE),
-        error_dn=pointer_to(singles, 3 * SIZE),
-        noisy_dn=pointer_to(singles, 4 * SIZE),
-        normalised=pointer_to(singles, 5 * SIZE),
-        depths=pointer_to(singles, 6 * SIZE),
-        normals=pointer_to(singles, 7 * SIZE),
-        errors=pointer_to(singles, 8 * SIZE),
-        rates=pointer_to(singles, 9 * SIZE),
-        electrons=pointer_to(singles, 10 * SIZE),
-        error_e=pointer_to(singles, 11 * SIZE),
-        dark=pointer_to(singles, 12 * SIZE),
-        dark_error_e=pointer_to(singles, 13 * SIZE),
-        total_e=pointer_to(singles, 14 * SIZE),
-        total_error_e=pointer_to(singles, 15 * SIZE),
-        zeros=pointer_to(singles, 16 * SIZE),
-        words=pointer_to(indices, 0 * SIZE),
-        read_words=pointer_to(indices, 1 * SIZE),
-        dark_words=pointer_to(indices, 2 * SIZE),
-        scratch=pointer_to(indices, 3 * SIZE),
-        uncertain=pointer_to(indices, 4 * SIZE),
-        lanes_by_mask=tables,
-        count_by_mask=pointer_to(tables, _LANES_SIZE),
-        lines=lines,
-        clean=frames,
-        noisy=pointer_to(frames, SIZE),
+        *(
+            memory[at : at + (_LENGTHS.get(name, SIZE) + BLOCK) * dtype.itemsize].view(dtype)
+            for name, (dtype, at) in _places(scratch.dtype).items()
+        )
     )
 
 
