@@ -57,6 +57,7 @@ ELD_LAW = {
 """System gain and read noise of the Sony A7S II at ISO 100 and 6400 by ELD's regression, DN of the default sensor."""
 PMN_LAW = {scene: f"noise=nikon_d850 scene={scene} effects.assumed=off" for scene in ELD_LAW}
 """A profile with every part of PMN's law, black-level errors included, and no other effect."""
+FIXED_PATTERNS = {"prnu", "hot_pixels", "dead_pixels", "column"}
 LEVELS = 5
 LEAST_NS = 20_000_000
 """Processor time of the calls from which the shortest is taken."""
@@ -259,8 +260,11 @@ class Bench:
         return plan_pairs(config, f"{self.number:064x}", facts=facts_for(config, self.srgb))
 
     def with_new_body(self, plan: Plan) -> Plan:
-        """Return the plan with another camera body, whose fixed patterns no pair before had."""
-        if plan.physics is None:
+        """Return the plan with another camera body, whose fixed patterns no pair before had.
+
+        A plan without fixed patterns is the same for every body.
+        """
+        if plan.physics is None or not {*plan.effects} & FIXED_PATTERNS:
             return plan
         return replace(plan, physics=replace(plan.physics, body_key=next(self.bodies)))
 

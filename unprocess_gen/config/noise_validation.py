@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from typing import Any
 
+import numpy as np
+
 from unprocess_gen.config.distributions import highest, lowest, parse_drawn
 from unprocess_gen.config.forms import ISO_FORMS
 from unprocess_gen.config.interpretation import (
@@ -42,6 +44,7 @@ from unprocess_gen.config.schema import (
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import is_number, one_of, value_text
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.simulation.reference.noise import illumination_at
 
 MAX_ELECTRONS = 1e9
 """Largest mean of an exact Poisson count (`simulation.reference.poisson`); no pixel holds as many electrons."""
@@ -326,8 +329,7 @@ def _check_shading(coefficients: Sequence[float]) -> None:
     """Raise ConfigError unless the relative illumination is from `DARKEST` to 1 in all of the frame."""
     settings_of(NoiseConfig)["lens_shading"].check("noise.lens_shading", coefficients)
     first, second, third = coefficients
-    squares = [n / 256 for n in range(257)]
-    places = [1 + square * (first + square * (second + square * third)) for square in squares]
+    places = illumination_at(np.arange(257) / 256, (first, second, third))
     if min(places) < DARKEST or max(places) > 1:
         raise ConfigError(
             f"noise.lens_shading={value_text(coefficients)}: the relative illumination within the frame is "

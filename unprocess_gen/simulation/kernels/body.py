@@ -26,13 +26,16 @@ from unprocess_gen.simulation.kernels.strips import (
     scratch_of_thread,
     workspace_in,
 )
-from unprocess_gen.simulation.reference.noise import light_factor
+from unprocess_gen.simulation.reference.noise import illumination_of_lens
 
 PRNU, HOT, DEAD = (np.uint64(purpose(stream)) for stream in ("prnu", "hot_pixels", "dead_pixels"))
 HOT_STEP = np.uint64(purpose("hot_pixels", draw=1))
 
 SMALL_SITES, SMALL_CROPS, LARGE_CROPS = 2**16, 128, 2
-"""Patterns are kept for the last crops of up to this many sites (0.4 MB each), and for the last larger ones."""
+"""Patterns are kept for the last crops of up to this many sites (0.4 MB each), and for the last larger ones.
+
+Lens shading is kept for as many crops (0.3 MB each), and for the last larger one.
+"""
 
 
 class Body(NamedTuple):
@@ -107,18 +110,37 @@ class Response(NamedTuple):
 
 def clean_response(plan: Plan, body: Body, shape: tuple[int, int], origin: tuple[int, int]) -> Response | None:
     """Return by what the light of the clean frame is multiplied, as `reference.noise.light_factor`."""
-    if "lens_shading" not in plan.effects:
+    physics = plan.physics
+    if physics is None or "lens_shading" not in plan.effects:
         return Response(body.response, body.response_steps) if plan.averaged else None
-    pitch, first = padded_width(origin[1], shape[1]), origin[1] % BLOCK
-    factors = np.ones((shape[0], pitch), dtype=np.float32)
-    factors[:, first : first + shape[1]] = light_factor(plan, shape, origin)
-    return Response(factors.reshape(-1), (pitch, 1))
+    shading = _small_shading if shape[0] * shape[1] <= SMALL_SITES else _large_shading
+    factors = shading(physics.lens_shading, physics.frame_size, shape, origin)
+    if plan.averaged and body.response_steps[0]:
+        factors = (factors * body.response.astype(np.float64)).astype(np.float32)
+    return Response(factors, (padded_width(origin[1], shape[1]), 1))
+
+
+def _shading(
+    coefficients: tuple[float, float, float],
+    frame_size: tuple[int, int],
+    shape: tuple[int, int],
+    origin: tuple[int, int],
+) -> Float32:
+    """Return the relative illumination of each pixel, as `Body.response`."""
+    first = origin[1] % BLOCK
+    factors = np.ones((shape[0], padded_width(origin[1], shape[1])), dtype=np.float32)
+    factors[:, first : first + shape[1]] = illumination_of_lens(coefficients, frame_size, shape, origin)
+    return factors.reshape(-1)
+
+
+_small_shading = functools.lru_cache(maxsize=SMALL_CROPS)(_shading)
+_large_shading = functools.lru_cache(maxsize=1)(_shading)
 
 
 def forget_bodies() -> None:
     """Drop the cached patterns, so that the next frame computes them, as the first frame of a body does."""
-    _small_body.cache_clear()
-    _large_body.cache_clear()
+    for cached in (_small_body, _large_body, _small_shading, _large_shading):
+        cached.cache_clear()
 
 
 def _body(patterns: FixedPatterns, shape: tuple[int, int], origin: tuple[int, int]) -> Body:

@@ -271,12 +271,24 @@ def _offsets(
     """
     columns_dn = np.zeros(columns)
     if body_key is not None:
-        normals = reference_noise.normals(words(body_key, "column", (1, columns), origin=(0, origin[1])))
-        columns_dn = column_std_dn * np.asarray(normals[0])
+        first, after = origin[1] // _COLUMNS, (origin[1] + columns - 1) // _COLUMNS + 1
+        normals = np.concatenate([_column_normals(body_key, part) for part in range(first, after)])
+        columns_dn = column_std_dn * normals[origin[1] - first * _COLUMNS :][:columns]
     errors_dn = np.roll(_sites_of_rows(black_error_dn), -origin[0], axis=0)
     base_dn = black_dn + (columns_dn + np.tile(errors_dn, columns // VECTOR_WIDTH))
     farthest_dn = float(np.abs(columns_dn).max(initial=0.0) + np.abs(errors_dn).max())
     return _Offsets(columns_dn, errors_dn, base_dn.astype(np.float32), farthest_dn)
+
+
+_COLUMNS = 1024
+"""Columns whose normals are computed at once: for a crop alone they would take longer than its pixels."""
+
+
+@functools.lru_cache(maxsize=64)
+def _column_normals(body_key: int, part: int) -> Float:
+    """Return the normals of the columns of a body from ``part * _COLUMNS`` on."""
+    of_part = words(body_key, "column", (1, _COLUMNS), origin=(0, part * _COLUMNS))
+    return np.asarray(reference_noise.normals(of_part)[0])
 
 
 _Frame = tuple[_Numbers, np.uint64, Quantiles, _Offsets, NDArray[np.uint32]]

@@ -254,8 +254,9 @@ def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Poi
         rate = load(rates, first + np.uint64(n) * _8)
         highest = maximum(from_bits(less_than(rate, _LOW) & to_bits(rate)), highest)
     store(scratch, 0, highest)
-    low, high = max(scratch[0], scratch[1], scratch[2], scratch[3]), max(scratch[4], scratch[5], scratch[6], scratch[7])
-    most = max(low, high)
+    most = _0F
+    for lane in range(VECTOR_WIDTH):
+        most = max(most, scratch[lane])
     return int(most + np.float32(3.1) * np.sqrt(most)) + 1
 
 

@@ -219,19 +219,23 @@ class _BuffersModel(models.PrimitiveModel):
         super().__init__(manager, buffers_type, ir.IntType(8).as_pointer())
 
 
+def _type_of_buffer(template: AttributeTemplate, buffers_type: BuffersType, member: str) -> Any:
+    return buffers_type.places[member][0]
+
+
 @infer_getattr
 class _BufferTemplate(AttributeTemplate):
     key = BuffersType
-
-    def generic_resolve(self, buffers_type: BuffersType, member: str) -> Any:
-        return buffers_type.places[member][0]
+    generic_resolve: Any = _type_of_buffer
 
 
-@lower_getattr_generic(BuffersType)
 def _build_buffer(context: Any, builder: Any, buffers_type: BuffersType, memory: Any, member: str) -> Any:
     pointer_type, at = buffers_type.places[member]
     place = builder.gep(memory, [ir.Constant(ir.IntType(64), at)])
     return builder.bitcast(place, context.get_value_type(pointer_type))
+
+
+lower_getattr_generic(BuffersType)(_build_buffer)
 
 
 def buffers_at(

@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, quantile_table
 from unprocess_gen.core.random_streams import Words, words
@@ -248,15 +249,38 @@ def illumination(plan: Plan, shape: Shape, origin: Origin = (0, 0)) -> Float:
     physics = plan.physics
     if physics is None or "lens_shading" not in plan.effects:
         return np.ones(shape)
+    return illumination_of_lens(physics.lens_shading, physics.frame_size, shape, origin).astype(np.float64)
+
+
+def illumination_of_lens(
+    coefficients: tuple[float, float, float], frame_size: Shape, shape: Shape, origin: Origin = (0, 0)
+) -> NDArray[np.float32]:
+    """Return `illumination` of a lens with these coefficients, in a frame of ``frame_size``, as float32.
+
+    Parameters
+    ----------
+    coefficients : tuple of three floats
+        As in `illumination_at`.
+    frame_size : (int, int)
+        Height and width of the full frame.
+    shape : (int, int)
+        Height and width of the crop.
+    origin : (int, int)
+        Row and column of its first pixel in the full frame.
+
+    Returns
+    -------
+    ndarray of float32, [H, W]
+        At most 1.
+    """
     # Twice the distance from the centre is an integer, so that its square is exact.
     rows, columns = (
         2 * (np.arange(start, start + count) - 0.0) - (full - 1)
-        for start, count, full in zip(origin, shape, physics.frame_size, strict=True)
+        for start, count, full in zip(origin, shape, frame_size, strict=True)
     )
-    corner = float(sum((full - 1) ** 2 for full in physics.frame_size)) or 1.0
+    corner = float(sum((full - 1) ** 2 for full in frame_size)) or 1.0
     square = (rows * rows)[:, None] + (columns * columns)[None, :]
-    place = illumination_at(square / corner, physics.lens_shading)
-    return np.asarray(place).astype(np.float32).astype(np.float64)
+    return np.asarray(illumination_at(square / corner, coefficients)).astype(np.float32)
 
 
 def response(physics: Physics, shape: Shape, origin: Origin = (0, 0)) -> Float:
