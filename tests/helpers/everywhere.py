@@ -162,10 +162,13 @@ def doubles() -> str:
     codes = (np.stack([n, n * 7, n * 13], axis=-1) % 256).astype(np.uint8).reshape(2, STRIP, 3)
     found = []
     for plan in plans():
-        shape, origin, dtype = codes.shape[:2], (5, 7), np.float32 if plan.normalised else np.uint16
+        shape, origin = codes.shape[:2], (5, 7)
+        clean_dtype, dtype = (
+            np.float32 if is_float else np.uint16 for is_float in (plan.clean_normalised, plan.normalised)
+        )
         scene, noise, readout = render._records((plan,), shape, 256, origin)
         scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
-        clean, noisy = np.empty(codes[..., 0].size, dtype=dtype), np.empty((1, codes[..., 0].size), dtype=dtype)
+        clean, noisy = np.empty(codes[..., 0].size, clean_dtype), np.empty((1, codes[..., 0].size), dtype)
         counts = np.zeros((1, 6), dtype=np.int64)
         render._render(codes, scene, noise, philox_keys([plan]), origin, readout, scratch, clean, noisy, counts)
         found += [clean, noisy, counts, scratch]
