@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill, pixels
@@ -58,7 +59,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize("recipe", slow_except(("brooks2019_training", "crvd_like"), RECIPES))
 def test_experiment_runs_unmodified(recipe: str, clip: Path, run_main: RunMain, tmp_path: Path) -> None:
     assert run_main(f"+{RECIPE}={recipe}", f"source.root={clip}", "n_jobs=1", "out=ds").code == 0
     assert len(RawPairs(tmp_path / "ds")) == (16 if recipe == "brooks2019_training" else 1)
@@ -83,6 +84,7 @@ def test_dataset_of_an_experiment_is_regenerated_without_the_experiment(
     assert "the same as ds" in run_main("again", "ds", "out=again", *source).out
 
 
+@pytest.mark.slow
 def test_experiments_can_be_swept(clip: Path, run_main: RunMain, tmp_path: Path) -> None:
     done = run_main("-m", f"+{RECIPE}=ipol_demo,eld_low_light", f"source.root={clip}", "out=sweep", "n_jobs=1")
     assert done.code == 0

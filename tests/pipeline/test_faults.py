@@ -541,7 +541,8 @@ def test_out_deleted_after_any_shard_ends_the_run_with_5(
     assert not (tmp_path / "ds").exists()
 
 
-@pytest.mark.parametrize("what", ["ds", pytest.param("p", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["ds", "p"])
 def test_folder_deleted_under_two_workers_ends_the_run_with_5(
     what: str, photographs: Path, undisturbed: str, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:

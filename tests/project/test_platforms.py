@@ -67,7 +67,7 @@ def nested(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("system", ["darwin", "win32"])
+@pytest.mark.parametrize("system", [pytest.param("darwin", marks=pytest.mark.slow), "win32"])
 def test_imitated_system_gives_the_bytes_of_linux(
     system: str, nested: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
 ) -> None:

@@ -202,6 +202,7 @@ def test_missing_library_gives_one_line_that_names_the_extra(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_unreadable_photograph_is_named_and_the_next_one_shown(
     settings: Settings, options: PaperOptions, tmp_path: Path
 ) -> None:

@@ -83,10 +83,12 @@ def test_a_golden_pair_tests_the_kernels_that_simulate_it(name: str) -> None:
         ("float32", ["noise=imx385_iso3200", "accuracy=fast"]),
         ("reference", ["noise=imx385_iso3200", "accuracy=reference"]),
         ("electrons", ["noise=sony_a7s2", "scene=daylight"]),
-        ("electrons", ["noise=sony_a7s2", "scene=daylight", "effects.all=on"]),
-        ("electrons", ["noise=imx385_iso3200", "noise.law=poisson"]),
+        pytest.param("electrons", ["noise=sony_a7s2", "scene=daylight", "effects.all=on"], marks=pytest.mark.slow),
+        pytest.param("electrons", ["noise=imx385_iso3200", "noise.law=poisson"], marks=pytest.mark.slow),
         ("normalised", ["noise=imx385_iso3200", "output.dtype=float32"]),
-        ("normalised", ["noise=imx385_iso3200", "output.dtype=float32", "accuracy=fast"]),
+        pytest.param(
+            "normalised", ["noise=imx385_iso3200", "output.dtype=float32", "accuracy=fast"], marks=pytest.mark.slow
+        ),
         ("normalised_electrons", ["noise=sony_a7s2", "scene=daylight", "output.dtype=float32"]),
     ],
 )

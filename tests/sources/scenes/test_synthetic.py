@@ -90,6 +90,7 @@ def test_a_name_that_is_no_scene_is_refused(name: str) -> None:
         scene(name)
 
 
+@pytest.mark.slow
 def test_scenes_do_not_depend_on_the_vector_units() -> None:
     code = (
         "import hashlib, sys; from unprocess_gen.sources.scenes.synthetic import NAMES, scene;"

@@ -113,7 +113,8 @@ def key(row: dict[str, str]) -> tuple[str, ...]:
     return row["source"], row["frame"], row["clean_xxh3"], row["noisy_xxh3"]
 
 
-@pytest.mark.parametrize("n_jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n_jobs", [1, 2])
 def test_killed_run_of_videos_resumes_to_the_same_bytes(
     n_jobs: int, films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
