@@ -32,7 +32,7 @@ from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Tally, Workspace
-from unprocess_gen.sources.listing import ClipSizes, Listing
+from unprocess_gen.sources.listing import ClipSizes
 from unprocess_gen.sources.loader import list_photographs
 from unprocess_gen.sources.video.decode import is_installed
 
@@ -119,7 +119,7 @@ def generate(config: Config, label: str = "") -> Summary:
     with Workspace(config.out, dataset_yaml(config)) as workspace:
         workspace.open()
         if workspace.is_complete():
-            return _summary(config, workspace.check_complete(listing.sources), listing, started)
+            return summary_of(config.out, workspace.check_complete(listing.sources), started, listing.unmatched)
         workspace.check_begun(listing.sources, config.source.root)
         tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
         done = workspace.records.committed(range(len(tasks)))
@@ -136,17 +136,20 @@ def generate(config: Config, label: str = "") -> Summary:
                 progress.warn(warning)
             rows_made, times = follow(run_tasks(context, todo, n_jobs), progress)
         if workspace.is_complete():  # another run was not kept out by the lock, and has finished the dataset
-            return _summary(config, workspace.check_complete(listing.sources), listing, started)
+            return summary_of(config.out, workspace.check_complete(listing.sources), started, listing.unmatched)
         run = {
             "seconds": round(time.monotonic() - started, 3),
             **{stage: round(stage_s, 3) for stage, stage_s in asdict(times).items()},
             "n_jobs": n_jobs,
             "shards_made": len(todo),
         }
+        not_matched, links = listing.not_matched, listing.skipped_links
         facts = workspace.finish(
-            len(tasks), lambda tally: dataset_json_facts(config, listing, tally, run), config.output.parquet
+            len(tasks),
+            lambda tally: dataset_json_facts(config, not_matched, links, tally, run),
+            config.output.parquet,
         )
-    return replace(_summary(config, facts, listing, started), made=rows_made, times=times)
+    return replace(summary_of(config.out, facts, started, listing.unmatched), made=rows_made, times=times)
 
 
 def follow(reports: Iterable[ShardReport], progress: Progress) -> tuple[int, StageTimes]:
@@ -181,12 +184,31 @@ def follow(reports: Iterable[ShardReport], progress: Progress) -> tuple[int, Sta
     return rows, times
 
 
-def dataset_json_facts(config: Config, listing: Listing, tally: Tally, run: dict[str, Any]) -> dict[str, Any]:
-    """Return what ``dataset.json`` holds apart from digests and shards: counts, source, run and versions."""
+def dataset_json_facts(
+    config: Config, not_matched: int, skipped_links: int, tally: Tally, run: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what ``dataset.json`` holds apart from digests and shards.
+
+    Parameters
+    ----------
+    config : Config
+        The config.
+    not_matched, skipped_links : int
+        What the listing left out.
+    tally : Tally
+        Counts of all rows.
+    run : dict
+        Facts about the run.
+
+    Returns
+    -------
+    dict
+        Counts, source, run and versions.
+    """
     return {
         **tally.facts(),
-        "not_matched": listing.not_matched,
-        "skipped_links": listing.skipped_links,
+        "not_matched": not_matched,
+        "skipped_links": skipped_links,
         "source": {"kind": source_kind(config), "root": _absolute(config.source.root)},
         "run": run | machine(),
         "versions": {package: version(package) for package in PACKAGES},
@@ -214,9 +236,27 @@ def _absolute(root: str | None) -> str | None:
     return None if root is None else os.path.abspath(root)
 
 
-def _summary(config: Config, facts: dict[str, Any], listing: Listing, started: float) -> Summary:
+def summary_of(out: str, facts: dict[str, Any], started: float, unmatched: dict[str, int] | None = None) -> Summary:
+    """Return the outcome of a run that made nothing.
+
+    Parameters
+    ----------
+    out : str
+        Folder of the dataset.
+    facts : dict
+        Contents of its ``dataset.json``.
+    started : float
+        Start of the run (`time.monotonic`).
+    unmatched : dict of str to int, optional
+        Files that no include pattern matches, by suffix.
+
+    Returns
+    -------
+    Summary
+        With ``made`` 0.
+    """
     return Summary(
-        out=Path(config.out),
+        out=Path(out),
         pairs=facts["pairs"],
         failed=facts["failed"],
         sites=facts["sites"],
@@ -224,5 +264,5 @@ def _summary(config: Config, facts: dict[str, Any], listing: Listing, started: f
         bytes=sum(entry["bytes"] for entry in facts["shards"]),
         made=0,
         seconds=time.monotonic() - started,
-        unmatched=listing.unmatched,
+        unmatched=unmatched or {},
     )

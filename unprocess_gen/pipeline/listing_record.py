@@ -1,7 +1,7 @@
 """Record the sources of a run below ``.work``, in files that hold a range of them each.
 
     .work/sources/00000.json    sources 0 to 4095, one list of values for each
-    .work/listing.json          their number, and the digest of those files; written last
+    .work/listing.json          their number, and the digest of each of those files; written last
 
 A process that makes some shards reads only the files of their sources. A resumed run compares its own listing with the
 record. Version 0.1 recorded name, size and digest of all sources in ``.work/sources.json``.
@@ -31,22 +31,25 @@ _FIELDS = tuple(field.name for field in fields(Source))
 
 @dataclass(frozen=True, slots=True)
 class ListingRecord:
-    """Hold the number of recorded sources, and the SHA-256 of their record."""
+    """Hold the number of recorded sources, and the SHA-256 of each file of the record."""
 
     sources: int
-    sha256: str
+    sha256: tuple[str, ...]
 
 
 def write_listing(storage: Storage, sources: Sequence[Source]) -> ListingRecord:
     """Record the sources of a run, unless they are recorded; return what identifies the record."""
     texts = (_text(sources[first : first + PER_FILE]) for first in range(0, len(sources), PER_FILE))
-    digest = hashlib.sha256()
+    digests: list[str] = []
     for number, text in enumerate(texts):
-        digest.update(text.encode())
+        digests.append(_sha256(text))
         storage.write(f"{FOLDER}/{number:05d}.json", text)
-    record = ListingRecord(len(sources), digest.hexdigest())
-    storage.write(INDEX, json.dumps({"sources": record.sources, "sha256": record.sha256}))
-    return record
+    storage.write(INDEX, json.dumps({"sources": len(sources), "sha256": digests}))
+    return ListingRecord(len(sources), tuple(digests))
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _text(sources: Iterable[Source]) -> str:
@@ -57,23 +60,46 @@ def read_record(storage: Storage, place: str) -> ListingRecord | None:
     """Return what identifies the recorded sources, None if there is no record; raise DamageError if it is damaged."""
     try:
         found = json.loads(storage.read(INDEX))
-        return ListingRecord(int(found["sources"]), str(found["sha256"]))
+        return ListingRecord(int(found["sources"]), tuple(map(str, found["sha256"])))
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError) as error:
         raise _damage(place, INDEX, error) from error
 
 
-def read_sources(storage: Storage, place: str, first: int, last: int) -> list[Source]:
-    """Return the recorded sources from index ``first`` to before ``last``; raise DamageError if they are damaged."""
-    found: list[Source] = []
-    for number in range(first // PER_FILE, -(-last // PER_FILE)):
-        name = f"{FOLDER}/{number:05d}.json"
-        try:
-            found += [Source(*values) for values in json.loads(storage.read(name))]
-        except (OSError, ValueError, TypeError) as error:
-            raise _damage(place, name, error) from error
-    return [source for source in found if first <= source.index < last]
+class RecordedListing:
+    """Read the recorded sources of a run; the file that was read last is kept.
+
+    Parameters
+    ----------
+    storage : Storage
+        Where the dataset is written.
+    place : str
+        Its place, for messages.
+    record : ListingRecord
+        What identifies the record.
+    """
+
+    def __init__(self, storage: Storage, place: str, record: ListingRecord) -> None:
+        self._storage, self._place, self._record = storage, place, record
+        self._last: tuple[int, list[Source]] = (-1, [])
+
+    def sources(self, first: int, last: int) -> list[Source]:
+        """Return the sources from index ``first`` to before ``last``; raise DamageError if they are damaged."""
+        files = range(first // PER_FILE, -(-last // PER_FILE))
+        return [source for number in files for source in self._file(number) if first <= source.index < last]
+
+    def _file(self, number: int) -> list[Source]:
+        if self._last[0] != number:
+            name = f"{FOLDER}/{number:05d}.json"
+            try:
+                text = self._storage.read(name)
+                if _sha256(text) != self._record.sha256[number]:
+                    raise ValueError(f"its SHA-256 differs from that in {INDEX}")
+                self._last = number, [Source(*values) for values in json.loads(text)]
+            except (OSError, ValueError, TypeError, IndexError) as error:
+                raise _damage(self._place, name, error) from error
+        return self._last[1]
 
 
 def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, tuple[int | None, str | None]]]:
@@ -83,8 +109,9 @@ def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, tuple[in
     """
     record = read_record(storage, place)
     if record is not None:
+        listing = RecordedListing(storage, place, record)
         for first in range(0, record.sources, PER_FILE):
-            for source in read_sources(storage, place, first, min(first + PER_FILE, record.sources)):
+            for source in listing.sources(first, min(first + PER_FILE, record.sources)):
                 yield source.name, (source.size_bytes, source.sha256)
         return
     try:

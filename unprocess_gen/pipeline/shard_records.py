@@ -65,6 +65,10 @@ class ShardRecords:
         names = self._storage.names(ROWS)
         return {shard for shard in shards if Path(record_name(shard)).name in names}
 
+    def is_committed(self, shard: int) -> bool:
+        """Return whether one shard is committed."""
+        return self._is_committed(shard, self._storage.size(f"shards/{shard_name(shard)}"))
+
     def _is_committed(self, shard: int, size: int | None) -> bool:
         try:
             entry = self._read(shard)["entry"]

@@ -79,12 +79,18 @@ class RunContext:
         Process that started the workers, with which they end; None if they end on their own.
     core_to_spare : bool
         Whether each worker hashes and writes in a second thread (more cores than workers).
+    counts_deaths : bool
+        Whether the deaths of workers at a shard are counted below ``out`` (`deaths`), because nothing else sees them.
+    marker : str
+        Name below ``out`` of the file that contains the index of the source in progress; empty without one.
     """
 
     config: Config
     scratch: str
     coordinator_pid: int | None
     core_to_spare: bool = False
+    counts_deaths: bool = False
+    marker: str = ""
 
     @property
     def compiling_path(self) -> Path:

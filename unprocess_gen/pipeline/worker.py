@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from unprocess_gen.config.interpretation import patch_rule
@@ -26,6 +26,7 @@ from unprocess_gen.core.types import Pair, Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
 from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
+from unprocess_gen.pipeline.deaths import LIMIT, Deaths
 from unprocess_gen.pipeline.shard_records import commit_shard
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, StageTimes
@@ -47,12 +48,29 @@ KEPT_BYTES = 2**29
 
 
 def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
-    """Make one shard, commit it and describe it; raise MachineError as `make_shard`, or if it cannot be committed."""
-    result = make_shard(context, task)
+    """Make one shard, commit it and describe it; raise MachineError as `make_shard`, or if it cannot be committed.
+
+    If deaths are counted and `deaths.LIMIT` workers have died at the shard, commit provisional rows.
+    """
+    storage = open_storage(context.config.out)
     try:
-        commit_shard(open_storage(context.config.out), result)
+        if not context.counts_deaths:
+            return _make_and_commit(context, task)
+        deaths = Deaths(storage, task.shard)
+        if deaths.count >= LIMIT:
+            report = commit_provisional(context, task, deaths.source(task.sources), LIMIT)
+        else:
+            with deaths.marked() as marker:
+                report = _make_and_commit(replace(context, marker=marker if deaths.count else ""), task)
+        deaths.forget()
     except OSError as error:
         raise machine_error(error, Path(context.config.out), RESUME) from error
+    return report
+
+
+def _make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
+    result = make_shard(context, task)
+    commit_shard(open_storage(context.config.out), result)
     return result.report()
 
 
@@ -143,6 +161,8 @@ def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
 def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, log: ShardLog) -> Iterator[Row]:
     for source in task.sources:
         task.busy_path(context).write_text(str(source.index))
+        if context.marker:
+            open_storage(context.config.out).write(context.marker, str(source.index))
         yield from make_image(context, task.shard, source, writer, log)
 
 

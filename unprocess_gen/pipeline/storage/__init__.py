@@ -50,6 +50,9 @@ class Storage(Protocol):
     def commit(self, file: Path, name: str) -> None:
         """Move a finished file of `scratch` to a name, durably; replace a file of that name."""
 
+    def remove(self, name: str) -> None:
+        """Remove a file; ignore one that does not exist."""
+
     def begin(self) -> None:
         """Create the folder of shards; remove unfinished files of processes of this host that have ended."""
 

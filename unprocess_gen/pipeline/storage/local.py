@@ -129,6 +129,10 @@ class LocalStorage:
             stream.write(text)
         return temporary
 
+    def remove(self, name: str) -> None:
+        """Remove a file; ignore one that does not exist."""
+        (self._out / name).unlink(missing_ok=True)
+
     def commit(self, file: Path, name: str) -> None:
         """Move a finished file to a name, durably; replace a file of that name."""
         commit_file(file, self._out / name)

@@ -1,0 +1,64 @@
+"""Count the workers that died at a shard, where no coordinator sees them: by files below ``.work/deaths``.
+
+A worker creates a file before it makes a shard and removes it afterwards. Files that remain are deaths, whatever ended
+the process: a signal, the system out of memory, the end of a batch job. From the second attempt on, the file contains
+the index of the source in progress.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.storage import WORK, Storage
+
+FOLDER = f"{WORK}/deaths"
+
+LIMIT = 4
+"""Deaths at a shard after which it gets provisional rows: as many as Dask allows a task by default."""
+
+
+class Deaths:
+    """Hold the deaths at a shard before this attempt.
+
+    Parameters
+    ----------
+    storage : Storage
+        Where the dataset is written.
+    shard : int
+        Number of the shard.
+    """
+
+    def __init__(self, storage: Storage, shard: int) -> None:
+        self._storage, self._prefix = storage, f"{shard:05d}-"
+        self._names = [f"{FOLDER}/{name}" for name in storage.names(FOLDER) if name.startswith(self._prefix)]
+
+    @property
+    def count(self) -> int:
+        """Number of workers that died at the shard."""
+        return len(self._names)
+
+    def source(self, sources: Sequence[Source]) -> Source:
+        """Return the source at which a worker died, as far as it is known; else the first of the shard."""
+        for name in self._names:
+            with suppress(OSError, ValueError):
+                index = int(self._storage.read(name))
+                return next(source for source in sources if source.index == index)
+        return sources[0]
+
+    @contextmanager
+    def marked(self) -> Iterator[str]:
+        """Yield the name of this attempt's file, which exists until the attempt ends or its process dies."""
+        name = f"{FOLDER}/{self._prefix}{uuid.uuid4().hex}"
+        self._storage.write(name, "")
+        try:
+            yield name
+        finally:
+            self._storage.remove(name)
+
+    def forget(self) -> None:
+        """Remove the files of earlier attempts."""
+        for name in self._names:
+            self._storage.remove(name)
