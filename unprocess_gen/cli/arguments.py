@@ -125,6 +125,8 @@ class Verb:
         Whether it takes config overrides and Hydra's flags.
     words : tuple of str
         Words that are accepted instead of a place.
+    extra : Argument or None
+        A word that may follow the place.
     resumes : bool
         Whether a rerun continues interrupted work.
     """
@@ -136,6 +138,7 @@ class Verb:
     place: Place | None = None
     composes: bool = False
     words: tuple[str, ...] = ()
+    extra: Argument | None = None
     resumes: bool = False
 
 
@@ -257,7 +260,8 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
     known = {argument.key: argument for argument in (*verb.arguments, *STANDARD)}
     values = {key: _read(known[key], f"{verb.name}: {known[key].flags[-1]} ", text) for key, text in given.items()}
     if verb.composes:
-        return Call(values, overrides=_overrides(verb, [*rest, *after], values))
+        words = _take_settings(verb, [*rest, *after], values)
+        return Call(values, overrides=_overrides(verb, words, values))
     for word in rest:
         if word.startswith("-") and word != "-":
             raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}")
@@ -273,6 +277,21 @@ def _read(argument: Argument, spelling: str, text: Any) -> Any:
         return argument.read(os.path.expanduser(text))
     except ValueError:
         raise ConfigError(f"{spelling}{text}: expected {argument.expected}") from None
+
+
+def _take_settings(verb: Verb, words: list[str], values: dict[str, Any]) -> list[str]:
+    """Move the settings of the verb itself, which no config has, from words to values; return the other words."""
+    own = {name: argument for argument in verb.arguments for name in argument.settings}
+    others: list[str] = []
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals or key not in own:
+            others.append(word)
+        elif own[key].key in values:
+            raise ConfigError(f"{verb.name}: {word}: given twice; expected one value")
+        else:
+            values[own[key].key] = _read(own[key], f"{verb.name}: {key}=", text)
+    return others
 
 
 def _overrides(verb: Verb, words: list[str], values: dict[str, Any]) -> list[str]:
@@ -314,12 +333,15 @@ def _assign_words(verb: Verb, words: list[str], values: dict[str, Any]) -> Call:
     known = {name: argument for argument in verb.arguments for name in argument.settings}
     path = None
     if verb.place is not None:
-        existing = next((word for word in words if os.path.lexists(word)), None)
+        existing = None if verb.extra else next((word for word in words if os.path.lexists(word)), None)
         path = existing or next((word for word in words if word and word.partition("=")[0] not in known), None)
         if path is None:
             raise ConfigError(f"{verb.name}: expected {verb.place.expected}")
         words = words.copy()
         words.remove(path)
+    if verb.extra is not None and words and "=" not in words[0]:
+        values[verb.extra.key] = _read(verb.extra, f"{verb.name}: ", words[0])
+        words = words[1:]
     others = []
     for word in words:
         key, equals, text = word.partition("=")

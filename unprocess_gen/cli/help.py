@@ -180,7 +180,10 @@ def verb_help(verb: Verb) -> str:
         Usage, arguments and flags.
     """
     sections = {
-        "Arguments": [(verb.place.metavar, verb.place.expected)] if verb.place else [],
+        "Arguments": [
+            *([(verb.place.metavar, verb.place.expected)] if verb.place else []),
+            *([(verb.extra.metavar, verb.extra.help)] if verb.extra else []),
+        ],
         "Flags and settings": [
             (spelled(argument), argument.help + (" (required)" if argument.required else ""))
             for argument in (*verb.arguments, *STANDARD)
@@ -213,6 +216,7 @@ def synopsis(verb: Verb) -> str:
         One line, such as ``gen-dataset verify DIR [flags]``.
     """
     words = [verb.place.metavar] if verb.place else []
+    words += [f"[{verb.extra.metavar}]"] if verb.extra else []
     words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
     words += [spelled(argument) for argument in verb.arguments if argument.required]
     words += ["[key=value ...]"] if verb.composes else []

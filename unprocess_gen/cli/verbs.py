@@ -97,6 +97,97 @@ def _clipping_line(sites: dict[str, int]) -> str:
     )
 
 
+# --------------------------------------------------------------------------------------------------- a run in parts
+
+
+PART_VARIABLES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDEX")
+"""Variables in which SLURM, PBS and Kubernetes give a job of an array its number."""
+
+
+def run_prepare(call: Call) -> int:
+    """Freeze a run in parts."""
+    from unprocess_gen.cli.hydra_app import compose
+
+    if "parts" not in call.values:
+        raise ConfigError("prepare: parts is missing; expected the number of parts; give parts=…")
+    return compose(call.overrides, partial(_prepare, parts=call.values["parts"]))
+
+
+def _prepare(config: Config, label: str = "", *, parts: int) -> tuple[int, None, list[str]]:
+    from unprocess_gen.pipeline.parts import prepare
+
+    prepared = prepare(config, parts)
+    out = shlex.quote(config.out)
+    if prepared.complete:
+        return DONE, None, [f"{config.out} is complete; nothing to do"]
+    counts = f"{counted(prepared.sources, 'source')}, {counted(prepared.shards, 'shard')}, {counted(parts, 'part')}"
+    how = f"run gen-dataset part {out} K for K = 0 to {parts - 1}, then gen-dataset merge {out}"
+    return DONE, None, [f"{config.out}: {counts}; {how}"]
+
+
+def run_part(call: Call) -> int:
+    """Make one part of a prepared run."""
+    from unprocess_gen.pipeline.parts import make_part
+
+    out, part = str(call.path), call.values.get("part", _part_of_environment())
+    if part is None:
+        raise ConfigError(
+            f"part: its number is missing; expected it after {out}, or in one of {', '.join(PART_VARIABLES)}"
+        )
+    made = make_part(out, part, call.values.get("n_jobs"), call.values.get("source"))
+    if made is None:
+        print_result(f"{out} is complete; nothing to do")
+        return DONE
+    print_result(
+        f"{out}: part {part} of {made.parts}: {counted(made.shards, 'shard')} committed, {made.made} of them "
+        f"({counted(made.rows, 'row')}) in this run, {made.seconds:.1f} s"
+    )
+    return DONE
+
+
+def _part_of_environment() -> int | None:
+    """Return the number of the part that a batch system gives, None without one."""
+    for variable in PART_VARIABLES:
+        if (text := os.environ.get(variable)) is not None:
+            try:
+                return int(text)
+            except ValueError:
+                raise ConfigError(f"part: {variable}={text}: expected an integer") from None
+    return None
+
+
+def run_status(call: Call) -> int:
+    """Print which parts of a prepared run are left."""
+    from unprocess_gen.pipeline.parts import left_text, parts_status
+
+    out = str(call.path)
+    status = parts_status(out)
+    if "left" in call.values:
+        print_result(left_text(status.left))
+    elif status.complete:
+        print_result(f"{out} is complete")
+    else:
+        done = f"{status.parts - len(status.left)} of {counted(status.parts, 'part')}"
+        shards = f"{status.committed} of {counted(status.shards, 'shard')} committed"
+        next_step = f"left: {left_text(status.left)}" if status.left else f"run gen-dataset merge {shlex.quote(out)}"
+        print_result(f"{out}: {done} done, {shards}; {next_step}")
+    return DONE
+
+
+def run_merge(call: Call) -> int:
+    """Write manifest and ``dataset.json`` of a run whose parts are done."""
+    from unprocess_gen.pipeline.parts import merge
+
+    summary, max_failed = merge(str(call.path))
+    print_result(_summary_line(summary, max_failed))
+    if summary.made and summary.sites["all"]:
+        print_result(_clipping_line(summary.sites))
+    return TOO_MANY_FAILED if summary.made and sum(summary.failed.values()) > max_failed else DONE
+
+
+# ---------------------------------------------------------------------------------------------- reports of settings
+
+
 def run_plan(call: Call) -> int:
     """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
     from unprocess_gen.cli.hydra_app import compose
@@ -498,9 +589,18 @@ def _count(text: str) -> int:
     return number
 
 
+def _positive(text: str) -> int:
+    if (number := int(text)) < 1:
+        raise ValueError
+    return number
+
+
 def _whole_number(names: tuple[str, ...], text: str, metavar: str = "N") -> Argument:
     return Argument(names, text, metavar, int, "an integer")
 
+
+PREPARED = Place("OUT", "the folder of a prepared run")
+PART = Argument(("part",), "number of the part, from 0", "K", _count, "an integer of 0 or more")
 
 SETTINGS_SOURCE = Argument(
     ("--source",), "folder of the photographs, or one photograph: source.root=ROOT", "ROOT", completes="files"
@@ -516,6 +616,43 @@ VERBS: dict[str, Verb] = {
             (SETTINGS_SOURCE,),
             composes=True,
             resumes=True,
+        ),
+        Verb(
+            "prepare",
+            "freeze a run in parts, which separate jobs make",
+            run_prepare,
+            (
+                Argument(("parts",), "number of parts", "N", _positive, "an integer of 1 or more", required=True),
+                SETTINGS_SOURCE,
+            ),
+            composes=True,
+        ),
+        Verb(
+            "part",
+            "make part K of a prepared run; K from 0, or the number of the array job",
+            run_part,
+            (
+                _whole_number(("n_jobs",), "worker processes; -1: all cores; by default as prepared"),
+                Argument(
+                    ("--source", "source.root"), "folder of the photographs on this host", "ROOT", completes="folders"
+                ),
+            ),
+            PREPARED,
+            extra=PART,
+            resumes=True,
+        ),
+        Verb(
+            "status",
+            "show which parts of a prepared run are left",
+            run_status,
+            (Argument(("--left",), "print only the numbers of the parts that are left: 3,7-9"),),
+            PREPARED,
+        ),
+        Verb(
+            "merge",
+            "write manifest and dataset.json once all parts are made",
+            run_merge,
+            place=PREPARED,
         ),
         Verb(
             "plan",

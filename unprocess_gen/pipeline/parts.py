@@ -322,9 +322,7 @@ def _is_complete(out: str) -> bool:
 def _parts(storage: Storage, out: str) -> int:
     parts = _read_parts(storage, out)
     if parts is None:
-        raise ConfigError(
-            f"out={out}: has no parts; expected a folder that gen-dataset prepare has begun; prepare it"
-        )
+        raise ConfigError(f"out={out}: has no parts; expected a folder that gen-dataset prepare has begun; prepare it")
     return parts
 
 
