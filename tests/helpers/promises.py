@@ -63,6 +63,12 @@ PROMISES = (
         ("pytest -m slow tests/pipeline/test_faults.py",),
     ),
     Promise(
+        "parts",
+        "Parts made in any order, twice, or after any number of kills end with the bytes of one run.",
+        ("tests/pipeline/test_parts.py",),
+        ("pytest -m slow tests/pipeline/test_parts.py",),
+    ),
+    Promise(
         "disk-full",
         "A full disk ends the run with exit code 5; the next run completes the dataset to the same bytes.",
         ("tests/pipeline/test_faults.py",),

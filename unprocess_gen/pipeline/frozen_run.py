@@ -40,8 +40,8 @@ from unprocess_gen.sources.listing import Listing
 PACKAGE = "unprocess_gen"
 PLAN = f"{WORK}/plan.json"
 
-TRIED = 16
-"""Sources of which the first usable one becomes the canary; without one, only the self-test compares hosts."""
+TRIED = 64
+"""Sources of which the smallest usable one becomes the canary; without one, only the self-test compares hosts."""
 
 
 class CanaryError(MachineError):
@@ -153,7 +153,8 @@ def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenP
     record = read_record(workspace.storage, workspace.out)
     if record is None:  # version 0.1 began the dataset
         record = write_listing(workspace.storage, listing.sources)
-    canary = next(_canaries(config, listing.sources[:TRIED]), (None, ""))
+    smallest_first = sorted(listing.sources[:TRIED], key=lambda source: source.size_bytes or 0)
+    canary = next(_canaries(config, smallest_first), (None, ""))
     return FrozenPlan(
         version=version(PACKAGE),
         config_sha256=hashlib.sha256(workspace.config_yaml.encode()).hexdigest(),

@@ -276,8 +276,8 @@ def merge(out: str) -> tuple[Summary, int]:
         return summary_of(out, facts, started), 0
     if status.left:
         raise MachineError(
-            f"merge: {out}: parts {left_text(status.left)} of {status.parts} are left "
-            f"({status.shards - status.committed} of {status.shards} shards); make them with gen-dataset part"
+            f"merge: {out}: parts left: {left_text(status.left)} (of {status.parts}), "
+            f"{status.shards - status.committed} of {status.shards} shards; make them with gen-dataset part; nothing was written"
         )
     run = FrozenRun(out)
     with Workspace(out, run.storage.read("config.yaml")) as workspace:

@@ -1,0 +1,380 @@
+"""Runs in parts: the bytes of one run, whatever the order, repetition and death of parts; refusals before any write."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.commands import Cli, RunMain, messages
+from helpers.datasets import Make, TreeHash
+from helpers.photographs import fill
+from helpers.processes import imported_first, running, wait_for
+from helpers.promise_report import Figure
+
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import deaths, parts
+from unprocess_gen.pipeline.listing_record import PER_FILE
+from unprocess_gen.pipeline.parts import left_text, shards_of_part
+from unprocess_gen.pipeline.verify import verify
+
+COUNT = 12
+ONE = "output.pairs_per_shard=1"
+ROOT = "source.root=p"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Make the dataset of twelve photographs in one run, and return its hash."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    make(fill(folder / "p", COUNT), folder / "ds", ONE)
+    return tree_hash(folder / "ds")
+
+
+@pytest.fixture
+def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return fill(tmp_path / "p", COUNT)
+
+
+@pytest.fixture
+def ds(photographs: Path, run_main: RunMain, tmp_path: Path) -> Path:
+    """Prepare a dataset in six parts."""
+    done = run_main("prepare", "parts=6", ROOT, ONE, "n_jobs=1", "out=ds")
+    assert done.code == 0, done.err
+    return tmp_path / "ds"
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def edit_json(path: Path, **values: Any) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def replace_text(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(old, new))
+
+
+# Same bytes -----------------------------------------------------------------------------------------------------------
+
+
+def test_shuffled_and_doubled_parts_make_the_bytes_of_one_run(
+    ds: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, figure: Figure
+) -> None:
+    order = [*range(6), *range(6)]
+    random.Random(1).shuffle(order)
+    assert [run_main("part", "ds", part, "-q").code for part in order] == [0] * 12
+    done = run_main("merge", "ds")
+    assert (done.code, done.out.split(",")[0]) == (0, "ds: 12 pairs in 12 shards")
+    assert tree_hash(ds) == undisturbed
+    assert (verify(ds), sorted(os.listdir(ds))) == ([], ["config.yaml", "dataset.json", "manifest.csv", "shards"])
+    figure("parts", "same bytes from six parts in shuffled order, each made twice")
+
+
+@pytest.mark.parametrize(("first", "then"), [("run", "parts"), ("parts", "run")])
+def test_run_begun_one_way_is_finished_the_other(
+    first: str, then: str, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, make: Make,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+) -> None:  # fmt: skip
+    def by_parts(numbers: range) -> None:
+        assert run_main("prepare", "parts=6", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+        assert [run_main("part", "ds", part, "-q").code for part in numbers] == [0] * len(numbers)
+
+    if first == "parts":
+        by_parts(range(2, 5))
+        assert make(photographs, tmp_path / "ds", ONE).made == 6
+    else:
+        from unprocess_gen.pipeline import generate as runner
+
+        run_tasks = runner.run_tasks
+
+        def stopped(*given: Any) -> Any:
+            for number, report in enumerate(run_tasks(*given)):
+                if number == 4:
+                    raise KeyboardInterrupt
+                yield report
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(runner, "run_tasks", stopped)
+            make(photographs, tmp_path / "ds", ONE)
+        by_parts(range(6))
+        assert run_main("merge", "ds").code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+def test_two_writers_of_one_part_make_the_same_bytes(ds: Path, run_main: RunMain, undisturbed: str,
+                                                     tree_hash: TreeHash) -> None:  # fmt: skip
+    for part in (0, 3):
+        with running("part", "ds", part, cwd=ds.parent) as one, running("part", "ds", part, cwd=ds.parent) as other:
+            assert (one.wait(120), other.wait(120)) == (0, 0)
+    for part in (1, 2, 4, 5):
+        run_main("part", "ds", part, "-q")
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(ds) == undisturbed
+
+
+SLOW_SHARDS = """
+import time
+from unprocess_gen.pipeline import worker
+
+make_shard = worker.make_shard
+
+
+def slowly(*given):
+    time.sleep(0.3)
+    return make_shard(*given)
+
+
+worker.make_shard = slowly
+"""
+
+
+@pytest.mark.linux_only("kills a process by a signal")
+def test_killed_part_loses_at_most_one_shard(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    assert run_main("prepare", "parts=1", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    rows = tmp_path / "ds/.work/rows"
+    with running("part", "ds", "0", cwd=tmp_path, **imported_first(tmp_path, SLOW_SHARDS)) as process:
+        wait_for(lambda: rows.exists() and len(list(rows.iterdir())) >= 3)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    before = {path.name: path.stat().st_mtime_ns for path in rows.iterdir()}
+    assert len(before) >= 3
+    assert run_main("part", "ds", 0, "-q").code == 0
+    assert {path.name: path.stat().st_mtime_ns for path in rows.iterdir()}.items() >= before.items()
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+@pytest.mark.slow
+@pytest.mark.linux_only("kills processes by a signal")
+def test_parts_killed_at_random_moments_end_with_the_same_bytes(
+    ds: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, figure: Figure, tmp_path: Path
+) -> None:
+    moment, kills = random.Random(5), 0
+    env = imported_first(tmp_path, SLOW_SHARDS)
+    while kills < 20:
+        left = left_text(parts.parts_status("ds").left)
+        part = moment.choice(left.replace("-", ",").split(",")) if left else "0"
+        with running("part", "ds", part, cwd=tmp_path, **env) as process:
+            time.sleep(moment.uniform(0, 4))
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+    for part in range(6):
+        assert run_main("part", "ds", part, "-q").code == 0
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(ds) == undisturbed
+    figure("parts", f"same bytes after {kills} kills of parts")
+
+
+# What is left ---------------------------------------------------------------------------------------------------------
+
+
+def test_merge_names_the_parts_left_and_writes_nothing(ds: Path, run_main: RunMain) -> None:
+    for part in (1, 2, 5):
+        run_main("part", "ds", part, "-q")
+    before = files(ds)
+    done = run_main("merge", "ds")
+    assert (done.code, done.out) == (5, "")
+    assert messages(done.err) == [
+        "gen-dataset: merge: ds: parts left: 0,3-4 (of 6), 6 of 12 shards; make them with gen-dataset part; nothing "
+        "was written"
+    ]
+    assert files(ds) == before
+    assert run_main("status", "ds", "--left").out == "0,3-4\n"
+    assert run_main("status", "ds") == (0, "ds: 3 of 6 parts done, 6 of 12 shards committed; left: 0,3-4\n", "")
+
+
+@pytest.mark.parametrize("variable", ["SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDEX"])
+def test_batch_system_gives_the_number(
+    variable: str, ds: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, "4")
+    assert run_main("part", "ds").out.startswith("ds: part 4 of 6: 2 shards committed, 2 of them (2 rows)")
+
+
+def test_number_of_parts_never_comes_from_the_environment(
+    ds: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SLURM_ARRAY_TASK_COUNT", "2")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "0")
+    assert run_main("part", "ds").code == 0
+    assert run_main("status", "ds", "--left").out == "1-5\n"
+
+
+def test_finished_dataset_needs_no_part(photographs: Path, run_main: RunMain, make: Make, tmp_path: Path) -> None:
+    make(photographs, tmp_path / "ds", ONE)
+    before = files(tmp_path / "ds")
+    for arguments in (("part", "ds", 3), ("merge", "ds"), ("prepare", "parts=2", ROOT, ONE, "out=ds")):
+        done = run_main(*arguments)
+        assert (done.code, "nothing to do" in done.out) == (0, True), arguments
+    assert run_main("status", "ds").out == "ds is complete\n"
+    assert files(tmp_path / "ds") == before
+
+
+@pytest.mark.parametrize("shards", [1, 2, 7, 100, 101])
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_parts_cover_every_shard_once(count: int, shards: int) -> None:
+    ranges = [shards_of_part(part, count, shards) for part in range(count)]
+    assert [shard for some in ranges for shard in some] == list(range(shards))
+    assert max(map(len, ranges)) - min(map(len, ranges)) <= 1
+
+
+@pytest.mark.parametrize(("numbers", "text"), [([], ""), ([3], "3"), ([3, 7, 8, 9], "3,7-9"), ([0, 1, 3], "0-1,3")])
+def test_ranges_are_written_as_batch_systems_read_them(numbers: list[int], text: str) -> None:
+    assert left_text(numbers) == text
+
+
+def test_part_reads_only_the_listing_of_its_sources(
+    ds: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert COUNT < PER_FILE  # one file here: another part's sources are in no other file
+    (ds / ".work/sources/00001.json").write_text("never read")
+    assert run_main("part", "ds", 2).code == 0
+
+
+# Refusals -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("prepare", ROOT, ONE, "out=ds"), "prepare: parts is missing; expected the number of parts; give parts=…"),
+        (("prepare", "parts=0", ROOT, ONE, "out=ds"), "prepare: parts=0: expected an integer of 1 or more"),
+        (("prepare", "parts=5", ROOT, ONE, "n_jobs=1", "out=ds"),
+         "parts=5: ds was prepared with parts=6; expected that number; choose another out"),
+        (("prepare", "parts=13", ROOT, ONE, "n_jobs=1", "out=ds"),
+         "parts=13: this dataset has 12 shards; expected 1 to 12; lower parts or output.pairs_per_shard"),
+        (("prepare", "parts=6", ROOT, ONE, "seed=1", "out=ds"),
+         "out=ds: was begun with other settings: seed=1 (there: 0); choose another out, or remove it"),
+        (("part", "ds", "6"), "part 6: ds has 6 parts; expected 0 to 5"),
+        (("part", "ds", "-1"), "part: -1: no such flag; expected n_jobs, --source, source.root, --quiet, --verbose, "
+         "--log-file"),
+        (("part", "ds", "x"), "part: x: expected an integer of 0 or more"),
+        (("part", "ds"), "part: its number is missing; expected it after ds, or in one of SLURM_ARRAY_TASK_ID, "
+         "PBS_ARRAY_INDEX, JOB_COMPLETION_INDEX"),
+        (("part", "p", "0"), "out=p: contains no plan of a run in parts; expected one; run gen-dataset prepare first"),
+        (("merge", "p"), "out=p: contains no plan of a run in parts; expected one; run gen-dataset prepare first"),
+    ],
+)  # fmt: skip
+def test_wrong_calls_are_refused_with_2(arguments: tuple[str, ...], message: str, ds: Path, run_main: RunMain) -> None:
+    before = files(ds)
+    done = run_main(*arguments)
+    assert (done.code, messages(done.err)) == (2, [f"gen-dataset: {message}"])
+    assert files(ds) == before
+
+
+CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
+    ("version", lambda ds: edit_json(ds / ".work/plan.json", version="9.9"), "was begun by unprocess_gen 9.9, this is"),
+    ("settings", lambda ds: replace_text(ds / "config.yaml", "seed: 0", "seed: 1"),
+     "its config.yaml is not the one that was prepared; prepare another out"),
+    ("listing", lambda ds: edit_json(ds / ".work/listing.json", sources=11),
+     "its listing of sources is not the one that was prepared; prepare another out"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("what", "change", "message"), CHANGES, ids=[what for what, _, _ in CHANGES])
+@pytest.mark.parametrize("verb", ["part", "merge"])
+def test_other_version_settings_or_listing_is_refused_with_2(
+    verb: str, what: str, change: Callable[[Path], Any], message: str, ds: Path, run_main: RunMain
+) -> None:
+    if verb == "merge":
+        for part in range(6):
+            run_main("part", "ds", part, "-q")
+    change(ds)
+    before = files(ds)
+    done = run_main(*(("part", "ds", "0") if verb == "part" else ("merge", "ds")))
+    assert (done.code, len(messages(done.err)), message in done.err) == (2, 1, True), done.err
+    assert files(ds) == before
+
+
+def test_host_that_makes_another_canary_makes_no_shard(ds: Path, run_main: RunMain) -> None:
+    edit_json(ds / ".work/plan.json", canary_sha256="0" * 64)
+    done = run_main("part", "ds", 0)
+    assert (done.code, done.out) == (5, "")
+    assert "makes other bytes from source" in done.err and len(messages(done.err)) == 1
+    assert not (ds / ".work/rows").exists()
+
+
+def test_source_that_changed_ends_with_5_and_its_name(ds: Path, photographs: Path, run_main: RunMain) -> None:
+    (photographs / "007.png").write_bytes(b"shorter")
+    done = run_main("part", "ds", 3)
+    assert (done.code, "source 007.png changed since it was listed" in done.err) == (5, True)
+
+
+def test_photographs_may_be_elsewhere_on_another_host(
+    ds: Path, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash
+) -> None:
+    photographs.rename(photographs.with_name("elsewhere"))
+    for part in range(6):
+        assert run_main("part", "ds", part, "source.root=elsewhere", "-q").code == 0
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(ds) == undisturbed
+
+
+# Deaths ---------------------------------------------------------------------------------------------------------------
+
+POISON = """
+import hashlib, os, pathlib, signal
+
+killer, sha256 = pathlib.Path(os.environ["KILLER"]), hashlib.sha256
+
+
+def deadly(data=b"", **options):
+    if isinstance(data, bytes) and killer.exists() and data == killer.read_bytes():
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sha256(data, **options)
+
+
+hashlib.sha256 = deadly
+"""
+"""Module for `imported_first`: hashing one photograph kills its process."""
+
+
+@pytest.mark.linux_only("kills a process by a signal")
+def test_photograph_that_kills_its_part_gets_provisional_rows(
+    photographs: Path, run_main: RunMain, cli: Cli, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    killer = shutil.copy(photographs / "004.png", tmp_path / "killer.png")
+    assert run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    env = imported_first(tmp_path, POISON) | {"KILLER": str(killer)}
+    codes = [cli("part", "ds", 0, **env).returncode for _ in range(deaths.LIMIT)]
+    assert codes == [-signal.SIGKILL] * deaths.LIMIT
+    done = cli("part", "ds", 0, **env)
+    assert done.returncode == 0, done.stderr
+    assert "gen-dataset: part 0 of 2: 004.png: its worker died four times; rerun to retry it" in messages(done.stderr)
+    assert run_main("part", "ds", 1, "-q").code == 0
+    merged = run_main("merge", "ds")
+    assert merged.code == 3
+    reasons = [(row["source"], row["reason"]) for row in read_rows(tmp_path / "ds/manifest.csv") if row["reason"]]
+    assert reasons == [("004.png", "worker_died")]
+    Path(killer).unlink()
+    assert run_main("part", "ds", 0, "-q").code == 0
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+# A lock that does not work --------------------------------------------------------------------------------------------
+
+
+def test_two_coordinators_without_a_lock_make_one_dataset(
+    photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    unlocked = "from unprocess_gen.core import locks\nlocks.LockFile.acquire = lambda self, wait: None\n"
+    env = imported_first(tmp_path, unlocked + SLOW_SHARDS)
+    arguments = (ROOT, ONE, "n_jobs=1", "out=ds")
+    with running(*arguments, cwd=tmp_path, **env) as one, running(*arguments, cwd=tmp_path, **env) as other:
+        results = [(process.wait(180), process.stderr.read() if process.stderr else "") for process in (one, other)]
+    assert [code for code, _ in results] == [0, 0], results
+    assert tree_hash(tmp_path / "ds") == undisturbed
+    assert verify(tmp_path / "ds") == []
