@@ -117,6 +117,8 @@ def _prepare(config: Config, label: str = "", *, parts: int) -> tuple[int, None,
     from unprocess_gen.pipeline.parts import prepare
 
     prepared = prepare(config, parts)
+    for warning in prepared.warnings:
+        report(warning, logging.WARNING)
     out = shlex.quote(config.out)
     if prepared.complete:
         return DONE, None, [f"{config.out} is complete; nothing to do"]

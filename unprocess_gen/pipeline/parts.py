@@ -27,7 +27,7 @@ from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze, read_plan
 from unprocess_gen.pipeline.generate import Summary, dataset_json_facts, follow, shard_tasks, summary_of
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.sizes import check_free_space
+from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
@@ -38,12 +38,23 @@ PARTS = f"{WORK}/parts.json"
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """Describe a prepared run: its parts, shards and sources; ``complete`` if the dataset was finished before."""
+    """Describe a prepared run.
+
+    Attributes
+    ----------
+    parts, shards, sources : int
+        Their numbers.
+    complete : bool
+        Whether the dataset was finished before.
+    warnings : tuple of str
+        Sentences that a user should read.
+    """
 
     parts: int
     shards: int
     sources: int
     complete: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +146,7 @@ def prepare(config: Config, parts: int) -> Prepared:
         As `generate`.
     """
     listing = list_photographs(config.source)
+    config = with_pairs_per_shard(config, listing.sources, open_storage(config.out))
     tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
     if parts > len(tasks):
         raise ConfigError(
@@ -158,7 +170,8 @@ def prepare(config: Config, parts: int) -> Prepared:
         workspace.begin(listing.sources, len(tasks))
         freeze(workspace, config, listing)
         workspace.storage.create(PARTS, json.dumps({"parts": parts}) + "\n")
-    return Prepared(parts, len(tasks), len(listing.sources))
+    warnings = filter(None, (*listing.warnings, shards_warning(config, listing.sources)))
+    return Prepared(parts, len(tasks), len(listing.sources), warnings=tuple(warnings))
 
 
 def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None = None) -> PartMade | None:
@@ -277,7 +290,8 @@ def merge(out: str) -> tuple[Summary, int]:
     if status.left:
         raise MachineError(
             f"merge: {out}: parts left: {left_text(status.left)} (of {status.parts}), "
-            f"{status.shards - status.committed} of {status.shards} shards; make them with gen-dataset part; nothing was written"
+            f"{status.shards - status.committed} of {status.shards} shards; make them with gen-dataset part; "
+            "nothing was written"
         )
     run = FrozenRun(out)
     with Workspace(out, run.storage.read("config.yaml")) as workspace:
@@ -288,6 +302,7 @@ def merge(out: str) -> tuple[Summary, int]:
             lambda tally: dataset_json_facts(
                 run.config, run.plan.not_matched, run.plan.skipped_links, tally, {"parts": parts}
             ),
+            run.plan.parquet,
         )
     found = summary_of(out, facts, started)
     return replace(found, made=found.rows), run.plan.max_failed
