@@ -24,7 +24,7 @@ from unprocess_gen.config.settings import settings_of
 
 CANDIDATES = [
     ("gen-dataset ver", ["verify"]),
-    ("gen-dataset s", ["scene.", "scene=", "seed=", "self_test=", "sensor.", "sensor=", "source."]),
+    ("gen-dataset s", ["scene.", "scene=", "seed=", "self_test=", "sensor.", "sensor=", "source.", "status"]),
     ("gen-dataset camera=sony", ["camera=sony_a7r", "camera=sony_rx100"]),
     ("gen-dataset plan isp=", ["isp=gamma22", "isp=linear", "isp=smoothstep_gamma22", "isp=srgb"]),
     ("gen-dataset plan gains.r", ["gains.red="]),

@@ -70,8 +70,6 @@ class FrozenPlan:
         Settings of the run.
     self_test : str
         Setting of the run.
-    parquet : bool
-        Whether the end of the run writes ``manifest.parquet``.
     not_matched, skipped_links : int
         What the listing left out.
     canary_source : int or None
@@ -89,7 +87,6 @@ class FrozenPlan:
     max_failed: int
     n_jobs: int
     self_test: str
-    parquet: bool
     not_matched: int
     skipped_links: int
     canary_source: int | None
@@ -168,7 +165,6 @@ def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenP
         max_failed=config.source.max_failed,
         n_jobs=config.n_jobs,
         self_test=config.self_test,
-        parquet=config.output.parquet,
         not_matched=listing.not_matched,
         skipped_links=listing.skipped_links,
         canary_source=canary[0],

@@ -302,7 +302,7 @@ def merge(out: str) -> tuple[Summary, int]:
             lambda tally: dataset_json_facts(
                 run.config, run.plan.not_matched, run.plan.skipped_links, tally, {"parts": parts}
             ),
-            run.plan.parquet,
+            run.config.output.parquet,
         )
     found = summary_of(out, facts, started)
     return replace(found, made=found.rows), run.plan.max_failed
