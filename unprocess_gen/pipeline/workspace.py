@@ -21,9 +21,11 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import operator
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +54,13 @@ COUNTS = tuple(one.name for one in fields(Counts))
 
 SHOWN = 3
 """Differences named in an error; the others are counted."""
+
+
+RecordedFile = tuple[str, tuple[int | None, str | None]]
+"""Name of a source, its size in bytes, and its SHA-256 if it is known."""
+
+Digest = Callable[[Source, str | None], str | None]
+"""Function of a source and its known SHA-256 that returns the present SHA-256, None if it is not known."""
 
 
 class Workspace:
@@ -126,15 +135,9 @@ class Workspace:
         changed, another one can have another number among identical files, and so other noise.
         """
         self._check_same_settings()
-        known = dict(recorded_files(self.storage, self.out))
-        if known:
-            hashed = (
-                replace(source, sha256=content_sha256(root, source))
-                if root is not None and source.size_bytes and known.get(source.name, (0, None))[1]
-                else source
-                for source in sources
-            )
-            self._check_same_sources(known, hashed)
+        known = partial(recorded_files, self.storage, self.out)
+        if next(known(), None) is not None:
+            self._check_same_sources(known, sources, partial(_digest_if_recorded, root))
 
     def begin(self, sources: Sequence[Source], shards: int) -> None:
         """Start a dataset of some shards, or continue one that an earlier run began and `check_begun` has accepted.
@@ -172,9 +175,8 @@ class Workspace:
                 "--repair restores it"
             )
         self._check_same_settings()
-        rows = read_rows(self.storage.fetch("manifest.csv"))
-        known = {str(row["source"]): (row["source_bytes"], row["source_sha256"]) for row in rows}
-        self._check_same_sources(known, sources)
+        known = partial(_files_of_rows, self.storage.fetch("manifest.csv"))
+        self._check_same_sources(known, sources, lambda source, _: source.sha256)
         facts = self.facts()
         assert facts is not None
         sizes = self.storage.names("shards")
@@ -208,20 +210,36 @@ class Workspace:
                 f"out={self.out}: was begun with other settings: {_first(differing)}; choose another out, or remove it"
             )
 
-    def _check_same_sources(self, known: dict[str, Any], sources: Iterable[Source]) -> None:
-        found = {source.name: (source.size_bytes, source.sha256) for source in sources}
+    def _check_same_sources(
+        self, known: Callable[[], Iterator[RecordedFile]], sources: Sequence[Source], digest: Digest
+    ) -> None:
+        """Raise ConfigError if the sources are not those that are known; name the differences.
+
+        Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
+        0.4 GB.
+        """
+        pairs = itertools.zip_longest(
+            (next(of_file) for _, of_file in itertools.groupby(known(), key=operator.itemgetter(0))),
+            (next(of_file) for _, of_file in itertools.groupby(sources, key=operator.attrgetter("name"))),
+        )
+        if all(
+            file and source and file[0] == source.name and _is_same(file[1], source, digest) for file, source in pairs
+        ):
+            return
+        files, found = dict(known()), {source.name: source for source in sources}
+        both = [source for name, source in found.items() if name in files]
         differing = [
-            *(f"{name} is new" for name in found if name not in known),
-            *(f"{name} was deleted" for name in known if name not in found),
+            *(f"{name} is new" for name in found if name not in files),
+            *(f"{name} was deleted" for name in files if name not in found),
             *(
-                f"{name} has {found[name][0]} bytes, had {known[name][0]}"
-                for name in found
-                if name in known and found[name][0] != known[name][0]
+                f"{source.name} has {source.size_bytes} bytes, had {files[source.name][0]}"
+                for source in both
+                if source.size_bytes != files[source.name][0]
             ),
             *(
-                f"{name} has other bytes than it had"
-                for name, (size, sha256) in found.items()
-                if name in known and size == known[name][0] and sha256 and known[name][1] not in (None, "", sha256)
+                f"{source.name} has other bytes than it had"
+                for source in both
+                if source.size_bytes == files[source.name][0] and not _is_same(files[source.name], source, digest)
             ),
         ]
         if differing:
@@ -282,6 +300,24 @@ class Workspace:
             entry, rows = self.records.entry_and_rows(shard)
             entries.append(entry)
             yield from rows
+
+
+def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
+    """Return the digest of a source whose digest was recorded; hash the file if this listing did not."""
+    return content_sha256(root, source) if root is not None and source.size_bytes and recorded else source.sha256
+
+
+def _files_of_rows(manifest: Path) -> Iterator[RecordedFile]:
+    """Yield the file of every row."""
+    for row in read_rows(manifest):
+        size, sha256 = row["source_bytes"], row["source_sha256"]
+        yield str(row["source"]), (size if isinstance(size, int) else None, str(sha256))
+
+
+def _is_same(file: tuple[int | None, str | None], source: Source, digest: Digest) -> bool:
+    """Return whether a source has the known size, and the known digest if both are known."""
+    size, known = file
+    return source.size_bytes == size and (not known or digest(source, known) in (None, known))
 
 
 @dataclass(slots=True)
