@@ -37,13 +37,29 @@ def _composed(*overrides: str) -> Config:
         return _object(OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.to_container(node, resolve=True)))
     config = composed()
     for group, option in groups.items():
-        setattr(config, group, option)
+        setattr(config, group, copy.copy(option))
     for one in values:
         group, _, key = one.key_or_group.partition(".")
-        node = OmegaConf.structured(getattr(config, group))
-        OmegaConf.update(node, key, one.value())
-        setattr(config, group, _object(node))
+        _set(config, group, key, one.value())
     return config
+
+
+def _set(config: Config, group: str, key: str, value: Any) -> None:
+    """Set one value of a group, with the type that the schema states."""
+    before = getattr(config, group)
+    if "." in key or isinstance(value, dict) or "${" in str(value):
+        node = OmegaConf.structured(before)
+        OmegaConf.update(node, key, value)
+        setattr(config, group, _object(node))
+    else:  # a node of the complete group would take 50 ms for profiles with long tables
+        node = copy.deepcopy(_schema(type(before)))
+        OmegaConf.update(node, key, value)
+        setattr(before, key, OmegaConf.to_container(node)[key])
+
+
+@functools.cache
+def _schema(group: type) -> DictConfig:
+    return OmegaConf.structured(group)
 
 
 @functools.cache
