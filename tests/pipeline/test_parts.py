@@ -306,6 +306,15 @@ def test_host_that_makes_another_canary_makes_no_shard(ds: Path, run_main: RunMa
     assert not (ds / ".work/rows").exists()
 
 
+def test_canary_is_the_smallest_readable_photograph(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        (photographs / name).write_bytes(b"not a photograph")
+    done = run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds", "source.max_failed=2")
+    assert done.code == 0, done.err
+    smallest = min(range(COUNT), key=lambda index: (photographs / f"{index:03d}.png").stat().st_size)
+    assert json.loads((tmp_path / "ds/.work/plan.json").read_text())["canary_source"] == smallest
+
+
 def test_source_that_changed_ends_with_5_and_its_name(ds: Path, photographs: Path, run_main: RunMain) -> None:
     (photographs / "007.png").write_bytes(b"shorter")
     done = run_main("part", "ds", 3)

@@ -181,6 +181,7 @@ def _canaries(config: Config, sources: Sequence[Source]) -> Iterator[tuple[int, 
         for source in sources:
             with ShardWriter(path) as writer:
                 rows = make_image(context, 0, source, writer, ShardLog())
+            path.unlink()
             if rows[0]["status"] == "ok":
                 yield source.index, hashlib.sha256(row_json(rows)).hexdigest()
     finally:
