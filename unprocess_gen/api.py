@@ -35,6 +35,7 @@ from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.simulation import pair as _pair
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.reference import isp
+from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.loader import downscaled
 from unprocess_gen.sources.patches import crop_patch, list_patches
 
@@ -140,7 +141,7 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     True
     """
     pixels = _pixels_of(srgb)
-    return _planned(pixels, _identity(pixels, key), config, seed)
+    return _planned(pixels, _identity(pixels, key), config, seed)[0]
 
 
 def make_pair(
@@ -191,8 +192,11 @@ def make_pair(
     """
     pixels = _pixels_of(srgb)
     identity = _identity(pixels, key)
+    dark_folder: DarkFolder | None = None
     if not isinstance(config, Plan):
-        plan = _planned(pixels, identity, config, seed)
+        plan, dark_folder = _planned(pixels, identity, config, seed)
+    elif config.dark_frame:
+        raise ConfigError("make_pair: the plan names a dark frame, whose folder it lacks; expected a config")
     elif seed is None and key is None:
         plan = config
     else:
@@ -201,7 +205,7 @@ def make_pair(
         self_test.check(self_test.kernels(plan))
     recorded = _downscaled(pixels, plan.downscale)
     patch = _full_frame(recorded, plan.layout)
-    pair = _pair.make_pair(crop_patch(recorded, patch), plan)
+    pair = _pair.make_pair(crop_patch(recorded, patch), plan, dark_pixels=dark_folder)
     return RawPair(pair, plan, Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=identity), patch)
 
 
@@ -291,6 +295,7 @@ def replay(
     *,
     root: PathLike | None = None,
     to: PathLike | None = None,
+    dark_frames: PathLike | None = None,
 ) -> list[_replay.ReplayResult]:
     """Regenerate pairs from their manifest rows and sources, and compare them bit for bit.
 
@@ -304,6 +309,8 @@ def replay(
         Folder of the sources; by default the one that ``dataset.json`` records.
     to : path-like, optional
         Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
+    dark_frames : path-like, optional
+        Folder of the dark frames; by default the one that ``dataset.json`` records.
 
     Returns
     -------
@@ -333,7 +340,8 @@ def replay(
         keys = str(keys) if isinstance(keys, int) else ",".join(map(str, keys))
     rows = select_rows(manifest, None, keys)
     source_root = _replay.source_root(manifest, None if root is None else os.fspath(root))
-    return list(_replay.replay(rows, source_root, None if to is None else Path(to)))
+    dark_root = _replay.dark_root(manifest, None if dark_frames is None else os.fspath(dark_frames))
+    return list(_replay.replay(rows, source_root, None if to is None else Path(to), dark_root))
 
 
 def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
@@ -390,10 +398,11 @@ def _pixels_of(srgb: ArrayLike) -> Srgb:
     return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
 
 
-def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> Plan:
-    config = _config_for_arrays(config, seed)
+def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> tuple[Plan, DarkFolder | None]:
+    """Return the plan of an array, and access to the dark frames of the config."""
+    config, dark_frames, dark_folder = open_dark_frames(_config_for_arrays(config, seed))
     facts = facts_for(config, _downscaled(pixels, config.source.downscale))
-    return _plan.plan_pairs(config, identity, facts=facts)[0]
+    return _plan.plan_pairs(config, identity, facts=facts, dark_frames=dark_frames)[0], dark_folder
 
 
 def _identity(pixels: Srgb, key: str | int | None) -> str:

@@ -460,7 +460,7 @@ def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> N
     assert NOT_DATA == {
         "": ("out", "n_jobs", "self_test", "check_disk"),
         "source": ("root", "max_failed"),
-        "noise": ("provenance",),
+        "noise": ("dark_frames", "provenance"),
     }
     assert {"out", "n_jobs", "self_test", "check_disk"}.isdisjoint(loaded)
     assert {"root", "max_failed"}.isdisjoint(loaded["source"])

@@ -28,7 +28,13 @@ ONLY_IN = {
     "llvmlite": {"simulation.kernels.simd"},
     "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
-        *("sources.image.decode", "reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
+        *(
+            "sources.image.decode",
+            "sources.dark_frames",
+            "reports.dataset_page.page",
+            "reports.sheets.contact_sheet",
+            "reports.sheets.panels",
+        ),
         *(
             "reports.sheets.stages_sheet",
             "reports.benchmark.complete_runs",

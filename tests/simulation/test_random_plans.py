@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import xxhash
 from helpers.cases import slow_except
+from helpers.dark_frames import DarkPixelsInMemory
 from helpers.flats import IDENTITY, SILENT, plan_with
 from helpers.promise_report import Figure
 
@@ -30,6 +31,7 @@ from unprocess_gen.core.types import (
     PACKED,
     REFERENCE_METHOD,
     UINT16,
+    DarkPixels,
     Pair,
     Physics,
     Plan,
@@ -39,7 +41,7 @@ from unprocess_gen.planning.effect_selection import LATER_EFFECTS
 from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
-from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.noise import EFFECTS, REPLACED
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
 from unprocess_gen.sources.scenes import synthetic
@@ -52,6 +54,9 @@ patterns in the clean frame."""
 
 WITH_LATER_EFFECTS = ("later effects", "later effects averaged")
 """Kinds with the effects that version 0.1 did not have; `KINDS` keep the digests of its frames."""
+
+WITH_DARK_FRAMES = "dark frames"
+"""Kind of a physical profile whose read-out noise is sampled from dark frames."""
 
 SENSORS = (
     *((8, 0, 255), (10, 64, 1023), (12, 240, 4095), (12, 0, 4095), (14, 513, 15520), (14, 1024, 16383)),
@@ -105,6 +110,7 @@ class Case:
     srgb: Srgb
     plan: Plan
     origin: tuple[int, int]
+    dark_pixels: DarkPixels | None = None
 
 
 def case(kind: str, number: int, dtype: str = UINT16) -> Case:
@@ -137,7 +143,27 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
     srgb = drawn_image(dice, even=layout == PACKED)
     if kind in WITH_LATER_EFFECTS:
         plan = with_later_effects(plan, origin, (srgb.shape[0], srgb.shape[1]), Dice(f"later {kind} {dtype} {number}"))
+    if kind == WITH_DARK_FRAMES:
+        return with_dark_frame(Case(srgb, plan, origin), Dice(f"dark {dtype} {number}"))
     return Case(srgb, plan, origin)
+
+
+def with_dark_frame(one: Case, dice: Dice) -> Case:
+    """Replace the noise of the read-out with a dark frame that is smaller or larger than the image."""
+    shape = 2 * int(dice.power(0, 5)), 2 * int(dice.power(0, 7))
+    drawn = words(int(dice.random() * 2**53), "parameters", shape) >> np.uint32(dice.pick((16, 20, 24, 28)))
+    plan = replace(
+        one.plan,
+        effects=tuple("dark_frame" if on == "read" else on for on in one.plan.effects if on not in REPLACED),
+        dark_frame="d" * 64,
+        dark_shift=(2 * int(dice.random() * shape[0] / 2), 2 * int(dice.random() * shape[1] / 2)),
+        dark_black_dn=dice.pick((0.0, 7.0, 512.0, 100.5)),
+        dark_scale=dice.pick((1.0, 1.0, 0.25, 3855 / 15871, 4.0)),
+        dark_shading=dice.pick(("", "", "e" * 64)),
+    )
+    plan = plan if "dark_frame" in plan.effects else replace(plan, effects=("dark_frame", *plan.effects))
+    frames = {"d" * 64: drawn.astype(np.uint16), "f" * 64: np.full(shape, 600, dtype=np.uint16)}
+    return replace(one, plan=plan, dark_pixels=DarkPixelsInMemory(frames))
 
 
 def with_later_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
@@ -254,14 +280,14 @@ def scene() -> Srgb:
 
 
 def simulate(one: Case) -> Pair:
-    return make_pair(one.srgb, one.plan, one.origin)
+    return make_pair(one.srgb, one.plan, one.origin, one.dark_pixels)
 
 
 def simulate_reference(one: Case) -> Pair:
     """Simulate the reference: with its formulas for integer frames, with the exact curve for frames in float32."""
     if not one.plan.clean_normalised:
-        return reference_pair(one.srgb, one.plan, one.origin)
-    return make_pair(one.srgb, replace(one.plan, methods=(REFERENCE_METHOD,)), one.origin)
+        return reference_pair(one.srgb, one.plan, one.origin, one.dark_pixels)
+    return make_pair(one.srgb, replace(one.plan, methods=(REFERENCE_METHOD,)), one.origin, one.dark_pixels)
 
 
 def differences(found: Pair, expected: Pair) -> str:
@@ -292,7 +318,7 @@ COUNTS = [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)]
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
-@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS))
+@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS, WITH_DARK_FRAMES))
 def test_pairs_of_random_plans_equal_the_reference(kind: str, dtype: str, count: int, figure: Figure) -> None:
     failed = {}
     for number in range(count):
@@ -326,7 +352,7 @@ def mosaics(pair: Pair, one: Case) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("dtype", [UINT16, FLOAT32, FLOAT_CLEAN])
-@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS))
+@pytest.mark.parametrize("kind", (*KINDS, *WITH_LATER_EFFECTS, WITH_DARK_FRAMES))
 def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, count: int) -> None:
     failed = []
     for number in range(count):
@@ -336,7 +362,7 @@ def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, cou
         bottom, right = (at + 1 + int(dice.random() * (side - at)) for at, side in ((top, height), (left, width)))
         rows, columns = slice(top, bottom), slice(left, right)
         origin = one.origin[0] + top, one.origin[1] + left
-        crop = make_pair(one.srgb[rows, columns], replace(one.plan, layout=MOSAIC), origin)
+        crop = make_pair(one.srgb[rows, columns], replace(one.plan, layout=MOSAIC), origin, one.dark_pixels)
         for found, expected in zip((crop.clean, crop.noisy), mosaics(simulate(one), one), strict=True):
             if found.tobytes() != expected[rows, columns].tobytes():
                 failed.append(f"case({kind!r}, {number}, {dtype!r}): rows {top} to {bottom}, columns {left} to {right}")

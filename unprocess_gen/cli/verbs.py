@@ -215,12 +215,18 @@ def run_accuracy(call: Call) -> int:
 
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
+    from unprocess_gen.config.interpretation import uses_dark_frames
     from unprocess_gen.config.schema import NoiseConfig, SceneConfig, SensorConfig
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports import report_files
     from unprocess_gen.reports.benchmark import measure
     from unprocess_gen.reports.benchmark import report as benchmark_report
 
+    if uses_dark_frames(config.noise):
+        raise ConfigError(
+            f"accuracy: noise.dark_frames={config.noise.dark_frames}: tiers are measured with the noise of a profile; "
+            "expected null; leave it out"
+        )
     out = Path(config.out)
     report_files.check_report_folder(out, "accuracy")
     noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
@@ -286,7 +292,7 @@ def run_again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.config.serialization import read_dataset_yaml
     from unprocess_gen.config.validation import validate_config
-    from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_root
+    from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, dark_root, source_root
     from unprocess_gen.pipeline.verify import have_same_rows
 
     folder = _dataset("again", call)
@@ -309,6 +315,7 @@ def run_again(call: Call) -> int:
                 "that folder; give source.root=…"
             )
     config.out, config.source.root = call.values["out"], root
+    config.noise.dark_frames = dark_root(folder / "manifest.csv", call.values.get("dark_frames"))
     config.n_jobs = call.values.get("n_jobs", config.n_jobs)
     config.source.max_failed = call.values.get("max_failed", config.source.max_failed)
     validate_config(config)
@@ -363,16 +370,17 @@ def run_verify(call: Call) -> int:
 def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -> int:
     """Report the damage of a dataset; repair, regenerate and check the noise as the flags ask; return the exit code."""
     from unprocess_gen.pipeline.repair import repair
-    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
+    from unprocess_gen.pipeline.replay import dark_root, evenly_spaced_rows, replay, source_root
     from unprocess_gen.pipeline.verify import verify
 
     manifest, root = folder / "manifest.csv", call.values.get("source")
+    dark_frames = dark_root(manifest, call.values.get("dark_frames"))
     codes: list[int] = []
     damages = _reported(folder, found)
     if damages and "repair" in call.values:
         if not isinstance(folder, Path):
             raise ConfigError(f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset")
-        for step in repair(folder, source_root(manifest, root)):
+        for step in repair(folder, source_root(manifest, root), dark_frames):
             if step.repaired:
                 print_result(step)
             else:
@@ -381,7 +389,8 @@ def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -
         damages = _reported(folder, verify(folder))
     count, regenerated = call.values.get("regenerate", 0), 0
     if count and not damages:
-        replayed = list(replay(evenly_spaced_rows(manifest, count), source_root(manifest, root)))
+        rows = evenly_spaced_rows(manifest, count)
+        replayed = list(replay(rows, source_root(manifest, root), dark_frames=dark_frames))
         regenerated, codes = len(replayed), [result.exit_code for result in replayed]
         damages += _reported(folder, (_complaint(result) for result in replayed if result.complaint))
     if "noise" in call.values and not damages:
@@ -436,7 +445,7 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
 def run_replay(call: Call) -> int:
     """Regenerate rows of a manifest, and compare or write their arrays."""
     from unprocess_gen.dataset.selection import select_rows
-    from unprocess_gen.pipeline.replay import replay, source_root
+    from unprocess_gen.pipeline.replay import dark_root, replay, source_root
 
     if {"rows", "keys"} <= call.values.keys():
         raise ConfigError("replay: --rows and --keys exclude each other; expected one of them")
@@ -446,7 +455,8 @@ def run_replay(call: Call) -> int:
     skipped: list[Row] = []
     rows = select_rows(manifest, call.values.get("rows"), call.values.get("keys"), skipped)
     codes, written = [], False
-    for result in replay(rows, source_root(manifest, _root(call)), to):
+    dark_frames = dark_root(manifest, call.values.get("dark_frames"))
+    for result in replay(rows, source_root(manifest, _root(call)), to, dark_frames):
         codes.append(result.exit_code)
         written |= result.written
         if result.complaint:
@@ -579,6 +589,12 @@ def _dataset(verb: str, call: Call, *, files: bool = False, sweeps: bool = False
 
 # ------------------------------------------------------------------------------------------------------- the table
 
+DARK_FRAMES = Argument(
+    ("--dark-frames", "noise.dark_frames"),
+    "folder of the dark frames, if it is not the recorded one",
+    "FOLDER",
+    completes="folders",
+)
 DATASET = Place("DIR", "the folder of a dataset")
 KEYS = Argument(
     ("--keys",), "rows: source indices and ranges, full keys, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
@@ -683,6 +699,7 @@ VERBS: dict[str, Verb] = {
             run_verify,
             (
                 SOURCE,
+                DARK_FRAMES,
                 Argument(
                     ("--regenerate",), "regenerate N pairs and compare them", "N", _count, "an integer of 0 or more"
                 ),
@@ -698,6 +715,7 @@ VERBS: dict[str, Verb] = {
             run_replay,
             (
                 SOURCE,
+                DARK_FRAMES,
                 Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
                 KEYS,
                 Argument(("--to",), "write the arrays to FOLDER", "FOLDER", completes="folders"),
@@ -741,6 +759,7 @@ VERBS: dict[str, Verb] = {
             run_again,
             (
                 SOURCE,
+                DARK_FRAMES,
                 Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True),
                 _whole_number(("n_jobs",), "worker processes; -1: all cores"),
                 _whole_number(("source.max_failed",), "largest number of failed sources with exit code 0"),

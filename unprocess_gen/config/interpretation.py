@@ -292,6 +292,41 @@ def missing_number(noise: NoiseConfig, effect: str) -> str | None:
     return next((key for key in EFFECT_NUMBERS.get(effect, ()) if getattr(noise, key) is None), None)
 
 
+def uses_dark_frames(noise: NoiseConfig) -> bool:
+    """Return whether the noise of the read-out is sampled from dark frames.
+
+    Parameters
+    ----------
+    noise : NoiseConfig
+        The profile.
+
+    Returns
+    -------
+    bool
+        True if a folder of dark frames is given, or the digest of a recorded set.
+    """
+    return noise.dark_frames is not None or noise.dark_frames_sha256 is not None
+
+
+def without_dark_frames(config: Config) -> Config:
+    """Return a copy of a configuration with the noise of the profile in place of dark frames.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+
+    Returns
+    -------
+    Config
+        For measurements that need no real dark frames, such as times.
+    """
+    noise = dataclasses.replace(
+        config.noise, dark_frames=None, dark_frames_sha256=None, dark_frames_black_dn=None, dark_shading="keep"
+    )
+    return dataclasses.replace(config, noise=noise)
+
+
 def uses_assumed(config: Config) -> bool:
     """Return whether effects with assumed numbers are simulated like others.
 

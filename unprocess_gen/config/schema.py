@@ -342,6 +342,38 @@ class NoiseConfig:
         None, "noise levels of each clean frame", limits.LEVELS, null="one level, as the profile has it", section=CHOSEN
     )
     draws: int = key(1, "noisy frames at each level", Integers(1, limits.MAX_LEVELS), section=CHOSEN)
+    dark_frames: Optional[str] = key(
+        None,
+        "folder of dark frames of the camera at one ISO and exposure; the noise of the read-out is sampled from them",
+        Described("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"),
+        null="the noise of the profile",
+        decides_data=False,
+        section=CHOSEN,
+    )
+    dark_frames_sha256: Optional[str] = key(
+        None,
+        "SHA-256 of the set of dark frames, which a run records; frames of another set are refused",
+        Described("64 hexadecimal digits"),
+        null="any frames",
+        section=CHOSEN,
+        since="0.2",
+    )
+    dark_frames_black_dn: Optional[float] = key(
+        None,
+        "black level of the dark frames",
+        Numbers(0, 65535),
+        unit="DN of the profile",
+        null="the black level in the raw files, else the median of all pixels",
+        section=CHOSEN,
+        since="0.2",
+    )
+    dark_shading: str = key(
+        "keep",
+        "mean of the dark frames at each site (dark shading): keep adds it to the noisy frames, remove subtracts it",
+        Choice(("keep", "remove")),
+        section=CHOSEN,
+        since="0.2",
+    )
     branches: list[BranchConfig] = key(
         [],
         "numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters",

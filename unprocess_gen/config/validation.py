@@ -7,6 +7,7 @@ profiles: `noise_validation`.
 from __future__ import annotations
 
 import functools
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -22,15 +23,17 @@ from unprocess_gen.config.interpretation import (
     missing_number,
     noise_levels,
     patch_rule,
+    uses_dark_frames,
     uses_physics,
 )
-from unprocess_gen.config.limits import CAMERA_LAWS, SWITCH, Drawn, LevelRange
+from unprocess_gen.config.limits import CAMERA_LAWS, ISO, SWITCH, Drawn, LevelRange
 from unprocess_gen.config.noise_validation import check_noise, well_ends_first
 from unprocess_gen.config.schema import (
     PHYSICAL,
     CameraConfig,
     Config,
     EffectsConfig,
+    NoiseConfig,
     OutputConfig,
     SourceConfig,
     all_settings,
@@ -41,6 +44,7 @@ from unprocess_gen.config.values import one_of, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.reference import colour
+from unprocess_gen.simulation.reference.noise import REPLACED
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
 """Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
@@ -54,6 +58,8 @@ SWITCHES = tuple(
 """Effects that have a switch of their own."""
 
 SEED = settings_of(Config)["seed"].limit
+
+_DIGEST = re.compile("[0-9a-f]{64}")
 
 # --------------------------------------------------------------------------------------------------- public functions
 
@@ -77,6 +83,7 @@ def validate_config(config: Config) -> None:
         check_values(config)
     _check_environment(config.source)
     check_parquet(config.output)
+    _check_dark_folder(config.noise)
 
 
 @functools.lru_cache(maxsize=64)
@@ -111,6 +118,7 @@ def check_values(config: Config) -> None:
     for noise in noise_levels(config.noise):
         check_noise(noise, config.scene)
     _check_levels(config)
+    _check_dark_frames(config)
     _check_effects(config)
     choose_methods(
         accuracy_budget(config.accuracy), uses_physics(config.noise), is_normalised(config), has_float_clean(config)
@@ -217,6 +225,52 @@ def _check_levels(config: Config) -> None:
             "clean.includes_fixed_pattern=true: the fixed pattern depends on the ISO; expected one level; leave "
             "noise.levels out"
         )
+
+
+# ------------------------------------------------------------------------------------------------------ dark frames
+
+
+def _check_dark_frames(config: Config) -> None:
+    noise, name = config.noise, value_text(config.noise.dark_frames or config.noise.dark_frames_sha256)
+    if not uses_dark_frames(noise):
+        for key, default in (("dark_shading", "keep"), ("dark_frames_black_dn", None)):
+            if getattr(noise, key) != default:
+                value = value_text(getattr(noise, key))
+                raise ConfigError(f"noise.{key}={value}: there are no dark frames; give noise.dark_frames=FOLDER")
+        return
+    if noise.dark_frames_sha256 is not None and not _DIGEST.fullmatch(noise.dark_frames_sha256):
+        value = value_text(noise.dark_frames_sha256)[:80]
+        raise ConfigError(f"noise.dark_frames_sha256={value}: expected 64 hexadecimal digits, or null")
+    if not is_physical(noise):
+        raise ConfigError(
+            f"noise.dark_frames={name}: noise={noise.name} gives no DN per electron, from which shot noise follows; "
+            "expected a physical profile"
+        )
+    for level in noise_levels(noise):
+        iso = config.scene.iso if level.iso is None else level.iso
+        if parse_drawn("iso", iso, ISO).kind != "constant" or level.iso != noise.iso:
+            raise ConfigError(
+                f"noise.dark_frames={name}: the frames are of one ISO, and the run has several; expected one; set "
+                "noise.iso to that of the frames, and leave noise.levels out"
+            )
+    if config.clean.includes_fixed_pattern:
+        raise ConfigError(
+            "clean.includes_fixed_pattern=true: the fixed pattern of dark frames is not known apart from their noise; "
+            "expected false; noise.dark_shading=remove subtracts their mean"
+        )
+    for effect in REPLACED:
+        if getattr(config.effects, effect) and effect_switch(config.effects, effect) == "on":
+            raise ConfigError(f"effects.{effect}=on: the dark frames contain it; expected auto or off")
+    if config.effects.read and effect_switch(config.effects, "read") == "off":
+        raise ConfigError("effects.read=off: dark frames replace the read noise; expected auto, or no dark frames")
+
+
+def _check_dark_folder(noise: NoiseConfig) -> None:
+    """Raise ConfigError if the dark frames of a recorded config are not given, or the folder does not exist."""
+    if noise.dark_frames is None and noise.dark_frames_sha256 is not None:
+        raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
+    if noise.dark_frames is not None and not Path(noise.dark_frames).is_dir():
+        raise ConfigError(f"noise.dark_frames={noise.dark_frames}: no such folder; expected a folder of dark frames")
 
 
 # ------------------------------------------------------------------------------------------------ effects and output

@@ -41,6 +41,8 @@ STREAMS = {
     "patch": 11,
     "scatter": 12,
     "column_temporal": 13,
+    "dark_frame": 14,
+    "dark_dither": 15,
 }
 """Stream numbers by purpose. Every existing dataset depends on them: add new ones, never renumber."""
 
@@ -210,6 +212,24 @@ def patch_words(key: int, count: int) -> list[tuple[int, int]]:
     counter = (zero, np.arange(count, dtype=np.uint64), zero + np.uint64(purpose("patch")), zero)
     first, second, _, _ = philox4x32(counter, key)
     return list(zip(first.tolist(), second.tolist(), strict=True))
+
+
+def dark_frame_words(key: int) -> tuple[int, int, int]:
+    """Return the random words that choose a dark frame, its row and its column.
+
+    Parameters
+    ----------
+    key : int
+        Key from `stream_key`.
+
+    Returns
+    -------
+    tuple of int
+        Three 32-bit words: the output of counter (0, 0) of the stream ``dark_frame``.
+    """
+    counter = (0, 0, purpose("dark_frame"), 0)
+    chosen, row, column, _ = philox4x32(tuple(np.array([word], dtype=np.uint64) for word in counter), key)
+    return int(chosen[0]), int(row[0]), int(column[0])
 
 
 def parameter_uniforms(key: int, count: int, level: int = 0) -> list[float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +132,53 @@ class Patch:
     def origin(self) -> tuple[int, int]:
         """Row and column of the first pixel in the full frame."""
         return self.y, self.x
+
+
+class DarkPixels(Protocol):
+    """Give access to the pixels of dark frames."""
+
+    def frame(self, sha256: str) -> Raw:
+        """Return the mosaic of the dark frame whose file has this SHA-256, [H, W] with even sides."""
+
+    def mean(self, sha256: str) -> NDArray[np.float32]:
+        """Return the mean of all frames of the set with this SHA-256, [H, W]."""
+
+
+@dataclass(frozen=True, slots=True)
+class DarkFrame:
+    """Dark frame of a camera: SHA-256 of its file, and even height and width in pixels."""
+
+    sha256: str
+    height: int
+    width: int
+
+
+@dataclass(frozen=True, slots=True)
+class DarkFrames:
+    """Dark frames from which a run samples noise.
+
+    Attributes
+    ----------
+    frames : tuple of DarkFrame
+        The frames, in the order of their SHA-256.
+    sha256 : str
+        SHA-256 of the list of all their SHA-256, which identifies the set.
+    black_dn : float
+        Value that is subtracted from all frames, DN of the frames.
+    scale : float
+        DN of the sensor per DN of the frames.
+    variance_dn2 : float
+        Variance of their noise with dither, DN² of the sensor.
+    shading : bool
+        Whether the mean of all frames is subtracted at each site.
+    """
+
+    frames: tuple[DarkFrame, ...]
+    sha256: str
+    black_dn: float
+    scale: float
+    variance_dn2: float
+    shading: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,6 +341,14 @@ class Plan:
         Dtype of the clean frame if it differs from ``dtype``; empty if it does not.
     assumed : tuple of str
         Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
+    dark_frame : str
+        SHA-256 of the dark frame whose noise replaces that of the read-out; empty without one.
+    dark_shift : (int, int)
+        Even row and column of the dark frame at row 0, column 0 of the full frame.
+    dark_black_dn, dark_scale : float
+        Value that is subtracted from the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
+    dark_shading : str
+        SHA-256 of the set of dark frames whose mean is subtracted in place of ``dark_black_dn``; empty to keep it.
     """
 
     seed: int
@@ -334,6 +390,11 @@ class Plan:
     layout: str = MOSAIC
     assumed: tuple[str, ...] = ()
     clean_dtype: str = ""
+    dark_frame: str = ""
+    dark_shift: tuple[int, int] = (0, 0)
+    dark_black_dn: float = 0.0
+    dark_scale: float = 1.0
+    dark_shading: str = ""
 
     @property
     def normalised(self) -> bool:
@@ -375,7 +436,8 @@ class Plan:
         """Slope (DN) and intercept (DN²) of the noise variance above black, for the simulated effects."""
         if "heteroscedastic" in self.effects:
             return self.a_dn, self.b_dn2
-        return self.a_dn if "shot" in self.effects else 0.0, self.b_dn2 if "read" in self.effects else 0.0
+        has_read_noise = "read" in self.effects or "dark_frame" in self.effects
+        return self.a_dn if "shot" in self.effects else 0.0, self.b_dn2 if has_read_noise else 0.0
 
     @property
     def brightest_dn(self) -> float:

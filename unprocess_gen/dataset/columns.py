@@ -115,6 +115,8 @@ TYPE_NAMES: Mapping[Any, str] = {int: "integer", float: "number", str: "text", n
 FAILED = "the source failed"
 """Condition under which the cells of most columns are empty."""
 
+NO_DARK_FRAME = "there is no dark frame"
+
 NO_VIDEO = "the source failed, unless it is a frame of a video"
 
 
@@ -450,6 +452,29 @@ COLUMNS = (
         "source_noise_dn", float, "estimated noise of the source itself, in the green plane of the clean frame",
         NOT_NEGATIVE, unit="DN", since="0.2", in_json=False,
         empty_if="the source failed, is a built-in scene or an array, or no tile of 32 x 32 pixels is free of clipping",
+    ),
+    Column(
+        "dark_frame", str, "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256, Plan,
+        since="0.2", empty_if=NO_DARK_FRAME,
+    ),
+    *(
+        Column(
+            f"dark_frame_{axis}", int, f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
+            Plan, "dark_shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0",
+        )
+        for axis, side in (("y", "row"), ("x", "column"))
+    ),
+    Column(
+        "dark_black_dn", float, "black level of the dark frame", Range(0, 65535), Plan, unit="DN of the dark frame",
+        since="0.2", empty_if="there is no dark frame, or it is 0",
+    ),
+    Column(
+        "dark_scale", float, "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), Plan, since="0.2",
+        empty_if="there is no dark frame, or it is 1",
+    ),
+    Column(
+        "dark_shading", str, "SHA-256 of the set of dark frames whose mean is subtracted from the dark frame", HEX_256,
+        Plan, since="0.2", empty_if="the mean is kept",
     ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""

@@ -14,6 +14,7 @@ Shards are committed in any order; the finished dataset does not depend on it. D
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import time
@@ -32,6 +33,7 @@ from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Tally, Workspace
+from unprocess_gen.sources.dark_frames import open_dark_frames
 from unprocess_gen.sources.listing import ClipSizes
 from unprocess_gen.sources.loader import list_photographs
 from unprocess_gen.sources.video.decode import is_installed
@@ -115,6 +117,7 @@ def generate(config: Config, label: str = "") -> Summary:
     """
     started = time.monotonic()
     listing = list_photographs(config.source)
+    config, dark_frames, dark_folder = open_dark_frames(config)
     config = with_pairs_per_shard(config, listing.sources, open_storage(config.out))
     with Workspace(config.out, dataset_yaml(config)) as workspace:
         workspace.open()
@@ -128,7 +131,9 @@ def generate(config: Config, label: str = "") -> Summary:
             check_free_space(config, todo, Path(config.out))
         workspace.begin(listing.sources, len(tasks))
         n_jobs = effective_jobs(config.n_jobs, len(todo))
-        context = RunContext(config, str(workspace.storage.scratch), os.getpid(), core_to_spare=n_jobs < own_cores())
+        context = RunContext(
+            config, str(workspace.storage.scratch), os.getpid(), n_jobs < own_cores(), dark_frames, dark_folder
+        )
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)
         with Progress(len(listing.sources), images_done, label) as progress:
             progress.report_compiling(context.compiling_path)
@@ -210,6 +215,7 @@ def dataset_json_facts(
         "not_matched": not_matched,
         "skipped_links": skipped_links,
         "source": {"kind": source_kind(config), "root": _absolute(config.source.root)},
+        **_dark_facts(config),
         "run": run | machine(),
         "versions": {package: version(package) for package in PACKAGES},
     }
@@ -230,6 +236,22 @@ def machine() -> dict[str, Any]:
         ``host``, ``platform``, ``python``; for ``dataset.json``, where they decide no byte of the data.
     """
     return {"host": platform.node(), "platform": platform.platform(), "python": platform.python_version()}
+
+
+def _dark_facts(config: Config) -> dict[str, Any]:
+    """Return what ``dataset.json`` records about dark frames: their place, number, sizes and noise."""
+    _, dark_frames, _ = open_dark_frames(config)
+    if dark_frames is None:
+        return {}
+    return {
+        "dark_frames": {
+            "root": _absolute(config.noise.dark_frames),
+            "count": len(dark_frames.frames),
+            "sizes": sorted({f"{frame.width}x{frame.height}" for frame in dark_frames.frames}),
+            "black_dn": dark_frames.black_dn,
+            "std_dn": math.sqrt(dark_frames.variance_dn2),
+        }
+    }
 
 
 def _absolute(root: str | None) -> str | None:

@@ -62,6 +62,7 @@ from unprocess_gen.pipeline.workspace import (
     fingerprint,
     read_dataset,
 )
+from unprocess_gen.sources.dark_frames import open_dark_frames
 from unprocess_gen.sources.loader import list_photographs, load_source
 
 Facts = dict[str, Any]
@@ -94,7 +95,7 @@ class RepairStep:
         return f"{self.file}: {self.what}"
 
 
-def repair(folder: Path, root: str | None) -> Iterator[RepairStep]:
+def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
     """Restore every damaged file of a dataset.
 
     Parameters
@@ -103,6 +104,8 @@ def repair(folder: Path, root: str | None) -> Iterator[RepairStep]:
         Folder of the dataset.
     root : str or None
         Folder of the sources; None for built-in scenes, or if no source is needed.
+    dark_frames : str or None
+        Folder of the dark frames, if rows name any.
 
     Yields
     ------
@@ -125,23 +128,25 @@ def repair(folder: Path, root: str | None) -> Iterator[RepairStep]:
     storage = LocalStorage(folder)
     try:
         storage.hold()
-        yield from _repair(folder, root, storage.scratch)
+        yield from _repair(folder, root, storage.scratch, dark_frames)
     except OSError as error:
         raise machine_error(error, folder) from error
     finally:
         storage.close()
 
 
-def _repair(folder: Path, root: str | None, temporary: Path) -> Iterator[RepairStep]:
+def _repair(folder: Path, root: str | None, temporary: Path, dark_frames: str | None) -> Iterator[RepairStep]:
     facts = _intact_facts(folder)
     text, step = _settings(folder, facts, temporary)
     yield from step
     config = _config(folder / "config.yaml", root)
+    config.noise.dark_frames = dark_frames
+    regenerator = PairRegenerator(root, dark_frames)
     yield from _manifest(folder, facts, config, temporary)
     names = set()
     for number, rows in shard_rows(folder / "manifest.csv"):
         pairs = [row for row in rows if row["status"] == "ok"]
-        yield from _shard(folder, number, pairs, root, temporary)
+        yield from _shard(folder, number, pairs, regenerator, temporary)
         if pairs:
             names.add(shard_name(number))
     yield from _set_aside(folder, names)
@@ -330,7 +335,8 @@ def _rows_inside(folder: Path, entry: Facts) -> list[Row]:
 def _regenerated_rows(folder: Path, facts: Facts, config: Config, temporary: Path) -> Iterator[Row]:
     """Yield every row: read from intact shards, regenerated for damaged ones, which are replaced at the same time."""
     sources = list_photographs(_with_sources(config).source).sources
-    context = RunContext(config, str(temporary), os.getpid())
+    config, frames, dark_folder = open_dark_frames(config)
+    context = RunContext(config, str(temporary), os.getpid(), dark_frames=frames, dark_folder=dark_folder)
     for task, entry in zip(shard_tasks(sources, config.output.pairs_per_shard), facts["shards"], strict=False):
         if entry.get("provisional"):
             yield from (failed_row(source, None, task.shard, config.seed, "worker_died") for source in task.sources)
@@ -365,14 +371,16 @@ def _failure(config: Config, task: ShardTask, source: Source) -> Row:
 # ---------------------------------------------------------------------------------------------------------- shards
 
 
-def _shard(folder: Path, number: int, rows: Sequence[Row], root: str | None, temporary: Path) -> Iterator[RepairStep]:
+def _shard(
+    folder: Path, number: int, rows: Sequence[Row], regenerator: PairRegenerator, temporary: Path
+) -> Iterator[RepairStep]:
     """Repair a shard, pair by pair; an error becomes a step, so that other shards are repaired nevertheless."""
     path = folder / "shards" / shard_name(number)
     wanted = expected_samples(rows)
     if not rows or (path.is_file() and not any(check_members(path, wanted))):
         return
     part = temporary / path.name
-    kept, regenerator = 0, PairRegenerator(root)
+    kept = 0
     try:
         with ShardWriter(part) as writer:
             for sample, some, frames in zip(wanted, group_by_sample(rows), intact_frames(path, wanted), strict=True):

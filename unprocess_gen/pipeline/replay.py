@@ -19,12 +19,13 @@ from unprocess_gen.core.files import array_xxh3, machine_error
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Row, Source
+from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Plan, Row, Source
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, read_rows, rows_with_offsets
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources import listing
+from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
 
@@ -79,10 +80,31 @@ def source_root(manifest: AnyPath, root: str | None) -> str | None:
     str or None
         ``root``, or the root that ``dataset.json`` records; None for built-in scenes or without a record.
     """
-    if root is not None:
-        return root
+    return root if root is not None else _recorded_root(manifest, "source")
+
+
+def dark_root(manifest: AnyPath, folder: str | None) -> str | None:
+    """Return the folder of the dark frames.
+
+    Parameters
+    ----------
+    manifest : Path
+        The manifest, next to its ``dataset.json``.
+    folder : str or None
+        The folder that the user names; None for the recorded one.
+
+    Returns
+    -------
+    str or None
+        ``folder``, or the folder that ``dataset.json`` records; None without a record.
+    """
+    return folder if folder is not None else _recorded_root(manifest, "dark_frames")
+
+
+def _recorded_root(manifest: AnyPath, what: str) -> str | None:
+    """Return the folder that ``dataset.json`` records for ``source`` or ``dark_frames``."""
     try:
-        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))["source"]["root"]
+        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))[what]["root"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return None if recorded is None else str(recorded)
@@ -165,7 +187,9 @@ def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
     return (read_row(manifest, int(places[number])) for number in evenly_spaced(range(len(places)), count))
 
 
-def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Iterator[ReplayResult]:
+def replay(
+    rows: Iterable[Row], root: str | None, to: Path | None = None, dark_frames: str | None = None
+) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
     Parameters
@@ -176,6 +200,8 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
         Folder of the sources; None if all rows are of built-in scenes.
     to : Path, optional
         Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
+    dark_frames : str or None
+        Folder of the dark frames; None if no row names one.
 
     Yields
     ------
@@ -191,7 +217,7 @@ def replay(rows: Iterable[Row], root: str | None, to: Path | None = None) -> Ite
     """
     if to is not None:
         check_output_folder(to, f"--to {to}")
-    regenerator = PairRegenerator(root)
+    regenerator = PairRegenerator(root, dark_frames)
     for row in rows:
         if row["status"] == "ok":
             yield _replay(row, regenerator, to)
@@ -217,11 +243,12 @@ def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayRe
 class PairRegenerator:
     """Regenerate pairs from rows and the folder of their sources, ``root``; built-in scenes need none.
 
-    The last photograph stays decoded, because rows of one image are consecutive.
+    ``dark_frames`` is the folder of the dark frames that rows name. The last photograph stays decoded, because rows of
+    one image are consecutive.
     """
 
-    def __init__(self, root: str | None) -> None:
-        self._root = root
+    def __init__(self, root: str | None, dark_frames: str | None = None) -> None:
+        self._root, self._dark_frames = root, dark_frames
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
     def regenerate(self, row: Row) -> Pair:
@@ -247,7 +274,21 @@ class PairRegenerator:
                 f"its patch of {patch.width} x {patch.height} pixels at row {patch.y}, column {patch.x} "
                 f"exceeds its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]} pixels"
             )
-        return make_pair(pixels, plan, patch.origin)
+        return make_pair(pixels, plan, patch.origin, self._dark_pixels(plan))
+
+    def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
+        """Return access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
+        if not plan.dark_frame:
+            return None
+        if self._dark_frames is None:
+            raise SourceChangedError(
+                f"noise.dark_frames is missing: the row names the dark frame {plan.dark_frame}; expected the folder of "
+                "the dark frames; give noise.dark_frames=…"
+            )
+        try:
+            return dark_folder(self._dark_frames)
+        except ConfigError as error:
+            raise SourceChangedError(str(error)) from error
 
     def regenerate_exactly(self, row: Row) -> Pair:
         """Return the pair of a row; raise as `regenerate`, and DamageError if the pair has other digests."""

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import NO_CLIP, Row, Source, Value
+from unprocess_gen.core.types import NO_CLIP, DarkFrames, Row, Source, Value
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.shards import shard_name
+from unprocess_gen.sources.dark_frames import DarkFolder
 
 Item = TypeVar("Item")
 
@@ -83,6 +84,8 @@ class RunContext:
         Whether the deaths of workers at a shard are counted below ``out`` (`deaths`), because nothing else sees them.
     marker : str
         Name below ``out`` of the file that contains the index of the source in progress; empty without one.
+    dark_frames, dark_folder : DarkFrames, DarkFolder, or None
+        The dark frames of the config, if it uses any, and access to their pixels.
     """
 
     config: Config
@@ -91,6 +94,8 @@ class RunContext:
     core_to_spare: bool = False
     counts_deaths: bool = False
     marker: str = ""
+    dark_frames: DarkFrames | None = None
+    dark_folder: DarkFolder | None = None
 
     @property
     def compiling_path(self) -> Path:

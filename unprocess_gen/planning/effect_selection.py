@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from unprocess_gen.config.interpretation import (
     is_physical,
     missing_number,
     uses_assumed,
+    uses_dark_frames,
 )
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Facts, Physics, Srgb
@@ -36,7 +37,7 @@ from unprocess_gen.planning.effect_contributions import (
     SignalRange,
     ratio_to_noise,
 )
-from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.noise import EFFECTS, REPLACED
 
 LATER_EFFECTS = ("lens_shading", "gain_by_colour", "column_temporal")
 """Effects that version 0.1 did not have. Rows of profiles without their numbers do not name them."""
@@ -47,7 +48,7 @@ MIN_OUTLIERS = 0.1
 COST_NS = {
     "heteroscedastic": 1.8, "lens_shading": 15.1, "prnu": 3.3, "shot": 9.5, "dark_current": 15.5, "hot_pixels": 1.0,
     "full_well": 0.1, "gain_by_colour": 0.3, "read": 1.8, "row": 0.1, "column": 0.1, "column_temporal": 0.6,
-    "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3,
+    "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3, "dark_frame": 4.0,
 }  # fmt: skip
 """Cost of each effect, nanoseconds per pixel (``tests/benchmarks/bench_scenes.py``; AVX2, one thread).
 
@@ -144,6 +145,10 @@ NOT_ROUNDED = "float output is not rounded"  # recorded: decides bytes of datase
 """Reason for which float32 frames skip ``quantise``."""
 
 
+IN_DARK_FRAMES = "contained in the dark frames"  # recorded: decides bytes of datasets
+"""Reason for which effects of the read-out are skipped if their noise is sampled from dark frames."""
+
+
 @dataclass(frozen=True, slots=True)
 class ForcedDecision:
     """Hold whether the configuration turns an effect on or off, and why."""
@@ -155,6 +160,10 @@ class ForcedDecision:
 def _forced_decision(config: Config, effect: str) -> ForcedDecision | None:
     """Return the decision of the configuration about an effect; None if the image decides."""
     switch = effect_switch(config.effects, effect)
+    if uses_dark_frames(config.noise) and effect == "read":
+        return ForcedDecision(True, "sampled from dark frames")
+    if uses_dark_frames(config.noise) and effect in REPLACED:
+        return ForcedDecision(False, IN_DARK_FRAMES)
     if effect == "quantise":
         return (
             ForcedDecision(False, NOT_ROUNDED)
@@ -196,6 +205,8 @@ class EffectRules:
         Assumed numbers that each effect uses; empty with ``effects.assumed=off``.
     unnamed : frozenset of str
         Effects that rows do not name as skipped.
+    dark_frames : bool
+        Whether ``dark_frame`` takes the place of ``read``. Its variance is then the read variance of `Physics`.
     """
 
     forced: Mapping[str, ForcedDecision | None]
@@ -203,6 +214,7 @@ class EffectRules:
     black_level_dn: float
     assumed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     unnamed: frozenset[str] = frozenset()
+    dark_frames: bool = False
 
 
 def effect_rules(config: Config) -> EffectRules:
@@ -221,7 +233,8 @@ def effect_rules(config: Config) -> EffectRules:
     forced = {effect: _forced_decision(config, effect) for effect in EFFECTS}
     assumed = {effect: assumed_numbers(config.noise, effect) for effect in EFFECTS} if uses_assumed(config) else {}
     unnamed = frozenset(effect for effect in LATER_EFFECTS if missing_number(config.noise, effect) is not None)
-    return EffectRules(forced, config.effects.tolerance, float(config.sensor.black_level_dn), assumed, unnamed)
+    black_dn, dark_frames = float(config.sensor.black_level_dn), uses_dark_frames(config.noise)
+    return EffectRules(forced, config.effects.tolerance, black_dn, assumed, unnamed, dark_frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +258,8 @@ class Selection:
     @property
     def effects(self) -> tuple[str, ...]:
         """Return the simulated effects, in the order in which light meets them."""
-        return tuple(effect for effect in EFFECTS if effect in self.on)
+        on = (effect for effect in EFFECTS if effect in self.on)
+        return tuple("dark_frame" if self.rules.dark_frames and effect == "read" else effect for effect in on)
 
     @property
     def assumed(self) -> tuple[str, ...]:
@@ -260,15 +274,17 @@ class Selection:
         Effects that version 0.1 did not have are named only if the profile gives their numbers.
         """
         off = (effect for effect in EFFECTS if effect not in self.on and effect not in self.rules.unnamed)
-        return tuple(f"{effect}: {self._reason(effect)}" for effect in off)
+        replaced = (f"read: {IN_DARK_FRAMES}",) if self.rules.dark_frames else ()
+        return (*replaced, *(f"{effect}: {self._reason(effect)}" for effect in off))
 
     def _reason(self, effect: str) -> str:
         forced = self.rules.forced[effect]
         return forced.reason if forced is not None else self.prediction(effect).reason
 
     def prediction(self, effect: str) -> Prediction:
-        """Return the prediction of one effect."""
-        return _prediction(effect, self.frame, self.on, self.rules.forced[effect], self.rules.tolerance)
+        """Return the prediction of one effect; that of ``read`` is the one of dark frames if they replace it."""
+        found = _prediction(effect, self.frame, self.on, self.rules.forced[effect], self.rules.tolerance)
+        return replace(found, effect="dark_frame") if self.rules.dark_frames and effect == "read" else found
 
     def predictions(self) -> tuple[Prediction, ...]:
         """Return the prediction of each of `noise.EFFECTS`, in the order in which light meets them."""

@@ -7,7 +7,8 @@ A pair is a pure function of pixels and plan. Draws come from the stream ``param
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,13 +25,14 @@ from unprocess_gen.config.interpretation import (
     noise_distributions,
     noise_levels,
     saturated_as,
+    uses_dark_frames,
     uses_physics,
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.config.snapshot import restored, snapshot
-from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
-from unprocess_gen.core.types import FLOAT32, Facts, Plan
+from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, stream_key
+from unprocess_gen.core.types import FLOAT32, DarkFrames, Facts, Plan
 from unprocess_gen.planning.effect_contributions import signal_range
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
@@ -54,7 +56,13 @@ NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "colum
 """Parameters that every noise level draws separately."""
 
 
-def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None) -> Plan:
+def plan_image(
+    config: Config,
+    source_sha256: str,
+    occurrence: int = 0,
+    facts: Facts | None = None,
+    dark_frames: DarkFrames | None = None,
+) -> Plan:
     """Draw every parameter of one image, at the first noise level.
 
     All draws are functions of ``config.seed``, ``source_sha256`` and ``occurrence``.
@@ -69,6 +77,8 @@ def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: F
         Number of identical files before this one.
     facts : Facts or None
         `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
+    dark_frames : DarkFrames or None
+        Frames from which noise is sampled; needed with ``noise.dark_frames`` only.
 
     Returns
     -------
@@ -78,14 +88,19 @@ def plan_image(config: Config, source_sha256: str, occurrence: int = 0, facts: F
     Raises
     ------
     ValueError
-        If the noise profile is physical and ``facts`` is None.
+        If the noise profile is physical and ``facts`` is None, or the dark frames of the config are not given.
     """
-    plan, _ = next(_planner(config).levels(config.seed, source_sha256, occurrence, facts))
-    return plan
+    plan, _ = next(_planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames))
+    return plan if dark_frames is None or facts is None else with_dark_frame(plan, dark_frames, facts)
 
 
 def plan_pairs(
-    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None, frame: int = 0
+    config: Config,
+    source_sha256: str,
+    occurrence: int = 0,
+    facts: Facts | None = None,
+    frame: int = 0,
+    dark_frames: DarkFrames | None = None,
 ) -> tuple[Plan, ...]:
     """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level.
 
@@ -101,6 +116,8 @@ def plan_pairs(
         `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
     frame : int
         Number of the frame in its clip; each frame has its own noise. 0 for a photograph.
+    dark_frames : DarkFrames or None
+        Frames from which noise is sampled; needed with ``noise.dark_frames`` only.
 
     Returns
     -------
@@ -110,10 +127,11 @@ def plan_pairs(
     Raises
     ------
     ValueError
-        If the noise profile is physical and ``facts`` is None.
+        If the noise profile is physical and ``facts`` is None, or the dark frames of the config are not given.
     """
-    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts)
-    return with_draws(config, (plan for plan, _ in levels), frame)
+    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
+    plans = with_draws(config, (plan for plan, _ in levels), frame)
+    return plans if dark_frames is None or facts is None else with_dark_frames(plans, dark_frames, facts)
 
 
 def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
@@ -140,12 +158,80 @@ def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[
     )
 
 
+def with_dark_frames(plans: Sequence[Plan], dark_frames: DarkFrames, facts: Facts) -> tuple[Plan, ...]:
+    """Choose the dark frame of each pair of an image.
+
+    The first is chosen at random for each image, and the frames of a clip, the levels and the draws take the next ones
+    in turn. All use the same part of the frames, so that the fixed pattern of the camera does not move.
+
+    Parameters
+    ----------
+    plans : sequence of Plan
+        Plans of one image: every draw of every level.
+    dark_frames : DarkFrames
+        The frames.
+    facts : Facts
+        Size of the image.
+
+    Returns
+    -------
+    tuple of Plan
+        The plans with the columns of dark frames.
+    """
+    return tuple(
+        with_dark_frame(plan, dark_frames, facts, plan.frame * len(plans) + number) for number, plan in enumerate(plans)
+    )
+
+
+def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int = 0) -> Plan:
+    """Choose the dark frame of one pair.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan of the pair.
+    dark_frames : DarkFrames
+        The frames.
+    facts : Facts
+        Size of the image.
+    number : int
+        Number of the pair among those of its image or clip.
+
+    Returns
+    -------
+    Plan
+        The plan with the columns of dark frames. The part of the frame lies inside it if the image fits.
+    """
+    chosen, row, column = dark_frame_words(plan.stream_key)
+    count = len(dark_frames.frames)
+    frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
+    shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
+    return replace(
+        plan,
+        dark_frame=frame.sha256,
+        dark_shift=shift,
+        dark_black_dn=0.0 if dark_frames.shading else dark_frames.black_dn,
+        dark_scale=dark_frames.scale,
+        dark_shading=dark_frames.sha256 if dark_frames.shading else "",
+    )
+
+
+def _even_place(word: int, available: int, needed: int) -> int:
+    """Return an even place, drawn with a random word: any place at which a part of this length begins inside."""
+    places = (available - needed) // 2 + 1 if available >= needed else available // 2
+    return 2 * (word * places >> 32)
+
+
 PlanAndPredictions = tuple[Plan, tuple[Prediction, ...]]
 """A plan, and a prediction for every effect of a physical profile; no predictions for a profile with two numbers."""
 
 
 def plan_levels(
-    config: Config, source_sha256: str, occurrence: int = 0, facts: Facts | None = None
+    config: Config,
+    source_sha256: str,
+    occurrence: int = 0,
+    facts: Facts | None = None,
+    dark_frames: DarkFrames | None = None,
 ) -> tuple[PlanAndPredictions, ...]:
     """Draw the parameters of one image at every noise level, with the predictions behind the selected effects.
 
@@ -159,13 +245,15 @@ def plan_levels(
         Number of identical sources before this one.
     facts : Facts or None
         `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
+    dark_frames : DarkFrames or None
+        Frames from which noise is sampled; needed with ``noise.dark_frames`` only.
 
     Returns
     -------
     tuple of (Plan, tuple of Prediction)
         One for each noise level; no predictions for a profile with two numbers.
     """
-    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts)
+    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
     return tuple((plan, () if selection is None else selection.predictions()) for plan, selection in levels)
 
 
@@ -195,7 +283,7 @@ class Planner:
     """
 
     def __init__(self, config: Config) -> None:
-        self._camera = config.camera
+        self._camera, self._needs_dark_frames = config.camera, uses_dark_frames(config.noise)
         self._red, self._blue, self._inverse_rgb = gain_distributions(config.gains)
         self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
         levels = [replace(config, noise=noise) for noise in noise_levels(config.noise)]
@@ -229,7 +317,12 @@ class Planner:
         }
 
     def levels(
-        self, seed: int, source_sha256: str, occurrence: int = 0, facts: Facts | None = None
+        self,
+        seed: int,
+        source_sha256: str,
+        occurrence: int = 0,
+        facts: Facts | None = None,
+        dark_frames: DarkFrames | None = None,
     ) -> Iterator[tuple[Plan, Selection | None]]:
         """Yield the plan of one image at each noise level, and the selection of effects of a physical profile.
 
@@ -237,7 +330,7 @@ class Planner:
         ----------
         seed : int
             Seed of the dataset.
-        source_sha256, occurrence, facts : str, int, Facts or None
+        source_sha256, occurrence, facts, dark_frames : str, int, Facts or None, DarkFrames or None
             As for `plan_pairs`.
 
         Yields
@@ -250,8 +343,10 @@ class Planner:
         Raises
         ------
         ValueError
-            If the noise profile is physical and ``facts`` is None.
+            If the noise profile is physical and ``facts`` is None, or the dark frames of the config are not given.
         """
+        if self._needs_dark_frames and dark_frames is None:
+            raise ValueError("noise.dark_frames: the plan needs the dark frames")
         key = stream_key(seed, source_sha256, occurrence)
         uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
         clean = self._clean(seed, key, uniforms)
@@ -259,7 +354,7 @@ class Planner:
             if number:
                 at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), number), strict=True))
                 uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
-            yield level.plan(clean, number, uniforms, facts)
+            yield level.plan(clean, number, uniforms, facts, dark_frames)
 
     def _clean(self, seed: int, key: int, uniforms: Mapping[str, float]) -> Plan:
         """Return a plan without noise, which all levels of an image share."""
@@ -298,7 +393,12 @@ class TwoNumberLevel:
         self._distributions = noise_distributions(config.noise)
 
     def plan(
-        self, clean: Plan, level: int, uniforms: Mapping[str, float], facts: Facts | None
+        self,
+        clean: Plan,
+        level: int,
+        uniforms: Mapping[str, float],
+        facts: Facts | None,
+        dark_frames: DarkFrames | None = None,
     ) -> tuple[Plan, Selection | None]:
         """Complete a plan with the two numbers and the effects at this level."""
         a_dn, b_dn2 = self.draw(uniforms)
@@ -334,12 +434,20 @@ class PhysicalLevel:
         self._rules = effect_rules(config)
 
     def plan(
-        self, clean: Plan, level: int, uniforms: Mapping[str, float], facts: Facts | None
+        self,
+        clean: Plan,
+        level: int,
+        uniforms: Mapping[str, float],
+        facts: Facts | None,
+        dark_frames: DarkFrames | None = None,
     ) -> tuple[Plan, Selection | None]:
         """Complete a plan with the numbers of the sensor and the effects at this level."""
         if facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
         physics = self._noise.draw(uniforms, clean.stream_key, clean.seed)
+        if dark_frames is not None:
+            read_std_dn = math.sqrt(dark_frames.variance_dn2)
+            physics = replace(physics, read_law="gaussian", read_shape=0.0, read_std_dn=read_std_dn)
         if any(physics.lens_shading):
             physics = replace(physics, frame_size=(facts.height, facts.width))
         span_dn = float(clean.white_level_dn - clean.black_level_dn)

@@ -6,14 +6,15 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from unprocess_gen.config.interpretation import HEAT, assumed_numbers, is_physical, missing_number
+from unprocess_gen.config.interpretation import HEAT, assumed_numbers, is_physical, missing_number, uses_dark_frames
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config, NoiseConfig
 from unprocess_gen.config.yaml_files import read_yaml_mapping
-from unprocess_gen.core.types import Plan
+from unprocess_gen.core.types import DarkFrames, Plan
 from unprocess_gen.planning.effect_contributions import OUTLIERS
 from unprocess_gen.planning.effect_selection import COST_NS, MIN_OUTLIERS, Prediction
-from unprocess_gen.reports.formatting import short_number, value_range
+from unprocess_gen.reports.formatting import counted, short_number, value_range
+from unprocess_gen.simulation.reference.noise import REPLACED
 
 Predictions = Sequence[Sequence[Prediction]]
 """For each noise level of each image, the prediction of every effect."""
@@ -42,6 +43,8 @@ def effect_sentences(config: Config, predictions: Predictions) -> list[str]:
         for of_effect in zip(*predictions, strict=True)
         if of_effect[0].effect != "quantise"
     ]
+    sampled = [one.name for one in effects if one.sampled]
+    effects = [one for one in effects if not one.sampled]
     simulated = [one.simulated_text for one in effects if one.count]
     left_out = [one for one in effects if not one.count and not one.missing]
     small = [f"{one.name} ({one.size_text})" for one in left_out if not one.shows]
@@ -52,6 +55,8 @@ def effect_sentences(config: Config, predictions: Predictions) -> list[str]:
         f"Left out, too small to see: {_listed(small)}.",
         f"Left out though it would show: {_listed(visible)}.",
     ]
+    if sampled:
+        sentences.append(f"Contained in the dark frames: read, {_listed(sampled)}.")
     return [*sentences, f"Left out, as the profile gives no number: {_listed(missing)}."] if missing else sentences
 
 
@@ -85,6 +90,11 @@ class EffectOverview:
     def missing(self) -> str | None:
         """Return the number that the profile lacks; None if the effect could be simulated."""
         return missing_number(self.config.noise, self.name)
+
+    @property
+    def sampled(self) -> bool:
+        """Return whether dark frames contain the effect."""
+        return uses_dark_frames(self.config.noise) and self.name in REPLACED
 
     @property
     def shows(self) -> bool:
@@ -373,3 +383,27 @@ def source_noise_sentences(ratios: Sequence[float], downscale: int) -> list[str]
     )
     remedy = f"; it stays in the clean frame: source.downscale={2 * downscale} averages it" if noisy else ""
     return [text + remedy]
+
+
+def dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:
+    """Return what `plan` says about dark frames.
+
+    Parameters
+    ----------
+    config : Config
+        Config of the run.
+    dark_frames : DarkFrames
+        The frames.
+
+    Returns
+    -------
+    str
+        Number, sizes, black level, and standard deviation of the noise with dither, DN of the sensor.
+    """
+    sizes = sorted({f"{frame.width} x {frame.height}" for frame in dark_frames.frames})
+    shading = "their mean is subtracted" if dark_frames.shading else f"black level {dark_frames.black_dn:g} DN"
+    text = (
+        f"{counted(len(dark_frames.frames), 'dark frame')} in {config.noise.dark_frames}: {', '.join(sizes)} pixels, "
+        f"{shading}, standard deviation {math.sqrt(dark_frames.variance_dn2):.4g} DN"
+    )
+    return text if dark_frames.scale == 1 else f"{text} on this sensor (times {dark_frames.scale:.6g})"

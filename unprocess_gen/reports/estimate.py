@@ -18,20 +18,27 @@ from pathlib import Path
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import is_physical, noise_levels, patch_rule, provenance_at
+from unprocess_gen.config.interpretation import (
+    is_physical,
+    noise_levels,
+    patch_rule,
+    provenance_at,
+    without_dark_frames,
+)
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import Frame, Plan, Source
+from unprocess_gen.core.types import DarkFrames, Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.sizes import shards_warning, source_bytes, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
-from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_draws
+from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_dark_frames, with_draws
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.reports.benchmark.measure import measure_tier_times
 from unprocess_gen.reports.effect_summary import (
+    dark_frames_sentence,
     effect_sentences,
     effect_table,
     posterisation_warning,
@@ -44,6 +51,7 @@ from unprocess_gen.reports.empty_bands import EmptyBands, empty_bands, highlight
 from unprocess_gen.reports.formatting import byte_size, counted, value_range
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.listing import unmatched_sentence
 from unprocess_gen.sources.loader import list_photographs, load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches, pixels_in_none
@@ -138,6 +146,8 @@ class RunEstimate:
         Number of files that no pattern of ``source.include`` matches, by suffix.
     warnings : tuple of str
         Sentences about the listing, such as clips of different photographs, and about too many shards.
+    dark_frames : DarkFrames or None
+        The dark frames from which noise is sampled.
     """
 
     sources: int
@@ -154,6 +164,7 @@ class RunEstimate:
     tier_ns: dict[str, float]
     unmatched: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    dark_frames: DarkFrames | None = None
 
     @property
     def seconds(self) -> float:
@@ -194,6 +205,7 @@ def estimate_run(
         If the sources cannot be listed.
     """
     listing = list_photographs(config.source)
+    config, dark_frames, dark_folder = open_dark_frames(config)
     sources = listing.sources
     config = with_pairs_per_shard(config, sources, open_storage(config.out))
     too_many = shards_warning(config, sources)
@@ -201,8 +213,8 @@ def estimate_run(
     shards = -(-len(sources) // config.output.pairs_per_shard)
     n_jobs = min(n_jobs, shards)
     start_seconds = IMPORT_SECONDS * (1 if n_jobs == 1 else 2)  # workers start after the coordinator
-    start_seconds += _compile_kernels(config, (tiers or {}).values())
-    estimates = tuple(estimate_source(config, source) for source in chosen)
+    start_seconds += _compile_kernels(without_dark_frames(config), (tiers or {}).values())
+    estimates = tuple(estimate_source(config, source, dark_frames, dark_folder) for source in chosen)
     exact = len(chosen) == len(sources)
     size = _bytes_of_shards(estimates, len(sources), config.output.pairs_per_shard)
     return RunEstimate(
@@ -217,9 +229,10 @@ def estimate_run(
         n_jobs=n_jobs,
         free_bytes=free_bytes(Path(config.out)),
         source_estimates=estimates,
-        tier_ns=_tier_ns(config, estimates, tiers or {}),
+        tier_ns=_tier_ns(without_dark_frames(config), estimates, tiers or {}),
         unmatched=listing.unmatched,
         warnings=(*listing.warnings, *([too_many] if too_many else [])),
+        dark_frames=dark_frames,
     )
 
 
@@ -249,7 +262,12 @@ def _bytes_of_shards(estimates: tuple[SourceEstimate, ...], sources: int, per_sh
     return mean_total + -(-sources // per_shard) * shard_bytes([0])
 
 
-def estimate_source(config: Config, source: Source) -> SourceEstimate:
+def estimate_source(
+    config: Config,
+    source: Source,
+    dark_frames: DarkFrames | None = None,
+    dark_folder: DarkFolder | None = None,
+) -> SourceEstimate:
     """Make the pairs of one source, with the digests that a shard needs, and discard them."""
     started = time.perf_counter()
     try:
@@ -257,15 +275,17 @@ def estimate_source(config: Config, source: Source) -> SourceEstimate:
     except SourceError as error:
         return SourceEstimate(source, 0, time.perf_counter() - started, (), error.reason, detail=error.text)
     identity, facts = source.stream_identity(sha256), facts_for(config, photograph.srgb, source.frames)
-    planned = plan_levels(config, *identity, facts)
+    planned = plan_levels(config, *identity, facts, dark_frames)
     levels, predictions = tuple(plan for plan, _ in planned), tuple(of_level for _, of_level in planned)
     plans = with_draws(config, levels, source.frame)
+    if dark_frames is not None and facts is not None:
+        plans = with_dark_frames(plans, dark_frames, facts)
     height, width = photograph.srgb.shape[:2]
     output = config.output
     cuts = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, output.layout)
     clean: Frame | None = None
     for patch in cuts:
-        for number, pair in enumerate(make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin)):
+        for number, pair in enumerate(make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin, dark_folder)):
             clean = pair.clean if clean is None else clean
             for frame in (pair.clean, pair.noisy) if number == 0 else (pair.noisy,):
                 array_xxh3(frame)
@@ -364,7 +384,7 @@ def format_estimate(config: Config, estimate: RunEstimate) -> str:
         f"{format_duration(estimate.disk_seconds)}",
         *_failure_lines(config, estimate.source_estimates),
         *_accuracy_lines(config.accuracy, estimate.tier_ns),
-        *_noise_lines(config, estimate.source_estimates),
+        *_noise_lines(config, estimate.source_estimates, estimate.dark_frames),
     ]
     return "\n".join(lines)
 
@@ -415,7 +435,7 @@ def _failure_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> lis
     return lines
 
 
-def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[str]:
+def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...], dark_frames: DarkFrames | None) -> list[str]:
     plans = [plan for source in estimates for plan in source.levels]
     if not plans:
         return []
@@ -426,6 +446,7 @@ def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...]) -> list[
     if is_physical(config.noise):
         predictions = [of_level for source in estimates for of_level in source.predictions]
         lines += _physical_lines(config, plans)
+        lines += _labelled("dark", [] if dark_frames is None else [dark_frames_sentence(config, dark_frames)])
         lines += _labelled("effects", effect_sentences(config, predictions))
     else:
         lines += _two_number_lines(config, plans)

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import PACKED, Counts, Float, Frame, Pair, Plan, Srgb
+from unprocess_gen.core.types import PACKED, Counts, DarkPixels, Float, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.render import pass_key, render_pairs
 from unprocess_gen.simulation.reference import noise
 from unprocess_gen.simulation.reference.cfa import pack
@@ -24,7 +24,7 @@ from unprocess_gen.simulation.reference.sensor import noisy_limits, normalise, q
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
 
 
-def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
+def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None) -> Pair:
     """Simulate the clean and noisy raw frame of one image.
 
     The result depends only on the arguments, not on machine, worker, method or order.
@@ -37,6 +37,8 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
         All parameters of the pair.
     origin : (int, int)
         Row and column of ``srgb[0, 0]`` in the full frame. The pair of a crop is the crop of the full pair.
+    dark_pixels : DarkPixels, optional
+        Access to the dark frame that the plan names.
 
     Returns
     -------
@@ -48,12 +50,14 @@ def make_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
     ------
     ValueError
         If ``srgb`` has another dtype or shape, or an odd side with ``layout="packed"``, or if the plan has lens shading
-        and the image is not inside the plan's frame.
+        and the image is not inside the plan's frame, or if the plan names a dark frame and ``dark_pixels`` is None.
     """
-    return next(make_pairs(srgb, [plan], origin))
+    return next(make_pairs(srgb, [plan], origin, dark_pixels))
 
 
-def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> Iterator[Pair]:
+def make_pairs(
+    srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None
+) -> Iterator[Pair]:
     """Simulate several pairs of one image that share the clean frame.
 
     Each pair equals that of `make_pair`, but the image is unprocessed once for several pairs.
@@ -66,6 +70,8 @@ def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 
         Plans that differ in noise, level and draw only.
     origin : (int, int)
         Row and column of ``srgb[0, 0]`` in the full frame.
+    dark_pixels : DarkPixels, optional
+        Access to the dark frames that the plans name.
 
     Returns
     -------
@@ -83,10 +89,12 @@ def make_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 
         raise ValueError(
             "the clean frames of the plans differ; expected plans that differ in noise, level and draw only"
         )
-    return _pairs(srgb, plans, origin)
+    return _pairs(srgb, plans, origin, dark_pixels)
 
 
-def _pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterator[Pair]:
+def _pairs(
+    srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int], dark_pixels: DarkPixels | None
+) -> Iterator[Pair]:
     """Yield the pair of each plan, several from each pass over the image."""
     if not plans:
         return
@@ -95,9 +103,10 @@ def _pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int]) -> Iterat
     for some in _passes(plans):
         if some[0].uses_reference:
             for plan in some:
-                yield _arrange_pair(_reference_pair(srgb, plan, origin, _curve(srgb, plan)), plan, origin)
+                pair = _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
+                yield _arrange_pair(pair, plan, origin)
             continue
-        for pair in render_pairs(srgb, some, origin):
+        for pair in render_pairs(srgb, some, origin, dark_pixels):
             clean = pair.clean if clean is None else clean
             yield pair if clean is pair.clean else replace(pair, clean=clean)
 
@@ -126,6 +135,7 @@ def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
     without_noise = replace(
         plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
         effects=(), skipped=(), assumed=(), physics=None, level=0, draw=0, frame=0,
+        dark_frame="", dark_shift=(0, 0), dark_black_dn=0.0, dark_scale=1.0, dark_shading="",
     )  # fmt: skip
     physics = plan.physics
     shading = None
@@ -134,7 +144,9 @@ def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
     return without_noise, plan.brightest, shading, plan.averaged and (physics, plan.effects, plan.sensor_clip)
 
 
-def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Pair:
+def reference_pair(
+    srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None
+) -> Pair:
     """Simulate a pair with the NumPy reference: Algorithm 1, exposure of the scene, noise, rounding.
 
     Parameters
@@ -145,6 +157,8 @@ def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> 
         All parameters of the pair.
     origin : (int, int)
         Row and column of ``srgb[0, 0]`` in the full frame.
+    dark_pixels : DarkPixels, optional
+        As for `make_pair`.
 
     Returns
     -------
@@ -157,13 +171,20 @@ def reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> 
         As `make_pair`.
     """
     _check_image(srgb, plan, origin)
-    return _arrange_pair(_reference_pair(_dequantise(srgb, plan, origin), plan, origin), plan, origin)
+    pair = _reference_pair(_dequantise(srgb, plan, origin), plan, origin, dark_pixels=dark_pixels)
+    return _arrange_pair(pair, plan, origin)
 
 
-def _reference_pair(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None = None) -> Pair:
+def _reference_pair(
+    srgb: Srgb,
+    plan: Plan,
+    origin: tuple[int, int],
+    curve: Float | None = None,
+    dark_pixels: DarkPixels | None = None,
+) -> Pair:
     """Return the pair before packing; ``curve`` is the exact table of the tone curve, or None to use its formulas."""
     light = _scene_light(srgb, plan, origin, curve)
-    return _read_out(_clean_dn(light, plan), _count_clipped(light, plan), plan, origin)
+    return _read_out(_clean_dn(light, plan), _count_clipped(light, plan), plan, origin, dark_pixels)
 
 
 def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None) -> Float:
@@ -185,12 +206,18 @@ def _count_clipped(light: Float, plan: Plan) -> tuple[int, int]:
     return int((light < 0).sum()), int((light > plan.brightest).sum())
 
 
-def _read_out(clean_dn: Float, clipped: tuple[int, int], plan: Plan, origin: tuple[int, int]) -> Pair:
+def _read_out(
+    clean_dn: Float,
+    clipped: tuple[int, int],
+    plan: Plan,
+    origin: tuple[int, int],
+    dark_pixels: DarkPixels | None = None,
+) -> Pair:
     """Add noise to an unrounded clean frame, clip both frames, then round or normalise them.
 
     ``clipped`` is the result of `_count_clipped` for the clean frame.
     """
-    noisy_dn = noise.noisy(clean_dn, plan, origin)
+    noisy_dn = noise.noisy(clean_dn, plan, origin, dark_pixels)
     if plan.saturated == "pinned":
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
     averaged_dn = noise.average(clean_dn, plan, origin) if plan.averaged else clean_dn

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import inner
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.random_streams import BLOCK, LANES, ROUNDS, purpose, words
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.kernels.body import HOT, WITHOUT_PATTERNS, Body
 from unprocess_gen.simulation.kernels.gaussian import HETEROSCEDASTIC
 from unprocess_gen.simulation.kernels.normal import (
@@ -74,7 +74,9 @@ from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Works
 from unprocess_gen.simulation.reference import noise as reference_noise
 from unprocess_gen.simulation.reference.poisson import CORE_MARGIN, core_share, gaussian_from
 
-SHOT, DARK, READ, ROW = (np.uint64(purpose(stream)) for stream in ("shot", "dark_current", "read", "row"))
+SHOT, DARK, READ, ROW, DARK_DITHER = (
+    np.uint64(purpose(stream)) for stream in ("shot", "dark_current", "read", "row", "dark_dither")
+)
 
 FLOAT32_ERROR_DN = 2.0**-21
 """Error that float32 adds to an approximate DN, relative to the DN and to its summands."""
@@ -111,6 +113,8 @@ class Electrons(NamedTuple):
     fixed_columns_dn: Float  # [P]: without the part that is new in every frame
     errors_dn: Float  # [N, 2, 8]: black-level errors of the same sites
     base_dn: Float32  # [N, 2, P]: black level, column and black-level error
+    dark_frames_dn: Float32  # [N, H, P]: values of dark frames above black; [P] zeros without them
+    dark_frames_steps: tuple[int, int]  # elements from frame to frame and from row to row; 0 without dark frames
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
@@ -138,6 +142,7 @@ class _Numbers(NamedTuple):
 
 
 NUMBERS = len(_Numbers._fields)
+_ERROR_DN = _Numbers._fields.index("error_dn")
 
 
 # ----------------------------------------------------------------------------------------------------------- parameters
@@ -153,6 +158,27 @@ def electron_noise(
     if not any(map(_has_correlated_rows, plans)):
         return noise
     return noise._replace(rows_dn=_correlated_rows(plans, origin[0], shape[0]), rows_step=shape[0])
+
+
+def with_dark_frames(
+    noise: Electrons,
+    plans: Sequence[Plan],
+    dark_pixels: DarkPixels | None,
+    shape: tuple[int, int],
+    origin: tuple[int, int],
+) -> Electrons:
+    """Return the noise of frames whose plans name dark frames."""
+    first, pitch = origin[1] % BLOCK, noise.padded_width
+    dark_dn = np.zeros((len(plans), shape[0], pitch), dtype=np.float32)
+    numbers = noise.numbers.copy()
+    for of_frame, numbers_of_frame, plan in zip(dark_dn, numbers, plans, strict=True):
+        if plan.dark_frame:
+            inside = of_frame[:, first : first + shape[1]]
+            inside[:] = reference_noise.dark_frame_offsets(plan, dark_pixels, shape, origin)
+            farthest_dn = max(float(inside.max(initial=0.0)), -float(inside.min(initial=0.0)))
+            numbers_of_frame[_ERROR_DN] += 2 * FLOAT32_ERROR_DN * farthest_dn
+    steps = shape[0] * pitch, pitch
+    return noise._replace(numbers=numbers, dark_frames_dn=dark_dn.reshape(-1), dark_frames_steps=steps)
 
 
 _COLUMN_EFFECTS = frozenset({"column", "column_temporal"})
@@ -194,6 +220,8 @@ def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, in
         fixed_columns_dn=fixed,
         errors_dn=_stack([each.errors_dn for each in offsets]),
         base_dn=_stack([each.base_dn for each in offsets]),
+        dark_frames_dn=np.zeros(columns, dtype=np.float32),
+        dark_frames_steps=(0, 0),
         dark_ranks=_stack(ranks),
         padded_width=columns,
         black_dn=float(first.black_level_dn),
@@ -307,9 +335,13 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         offsets = _with_columns(offsets, reference_noise.column_temporal(plan, columns, origin[1]))
     dark_e = physics.dark_e if "dark_current" in on else 0.0
     removed_e = dark_e if physics.dark_offset == "removed" else 0.0
-    read_std_dn = physics.read_std_dn if "read" in on else 0.0
+    read_std_dn, purpose_of_read = physics.read_std_dn if "read" in on else 0.0, READ
     row_std_dn = physics.row_std_dn if "row" in on else 0.0
     quantiles = _read_quantiles(physics.read_law, physics.read_shape)
+    if plan.dark_frame:  # the dither takes the place of the read noise
+        read_std_dn, purpose_of_read = reference_noise.dither_std_dn(plan), DARK_DITHER
+        quantiles = _read_quantiles(reference_noise.DITHER_LAW, reference_noise.DITHER_SHAPE)
+        counts_all = True
     offset_dn = plan.black_level_dn + 6.4 * row_std_dn + offsets.farthest_dn
     counts_all = counts_all or "gain_by_colour" in on  # the limits between counts and normals hold for one gain
     most_dark_dn = _gains_of(plan, origin[0]).highest * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
@@ -332,7 +364,7 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         b_dn2=b_dn2,
     )
     dark_ranks = _NO_RANKS if ranks is None else np.resize(ranks, MAX_STEPS)
-    return numbers, READ, quantiles, offsets, dark_ranks
+    return numbers, purpose_of_read, quantiles, offsets, dark_ranks
 
 
 def _fixed_offsets(plan: Plan, columns: int, origin: tuple[int, int]) -> _Offsets:
@@ -415,17 +447,25 @@ def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspac
     per_e, full_well_e, std, margin = load(lanes, _0), load(lanes, _16), f(of.read_std_dn), f(of.error_dn)
     row_dn = f(workspace.row_dn[0])
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
+    dark_dn = _dark_frame_of(noise, n, strip)
     has_dark = of.dark_e > 0.0
     electrons = workspace.total_e if has_dark else workspace.electrons
     error_e = workspace.total_error_e if has_dark else workspace.error_e
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         dn = minimum(load(electrons, x), full_well_e) * per_e + (
-            load(workspace.normals, x) * std + (load(base, x) + row_dn)
+            load(workspace.normals, x) * std + (load(base, x) + load(dark_dn, x) + row_dn)
         )
         store(workspace.noise_dn, x, dn)
         store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (load(error_e, x) * per_e + margin))
     return workspace.zeros
+
+
+@inner
+def _dark_frame_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
+    """Return the values of the dark frame of frame ``n`` in a strip."""
+    of_frame, of_row = noise.dark_frames_steps
+    return pointer_to(noise.dark_frames_dn, n * of_frame + strip.y * of_row + strip.x + strip.lead)
 
 
 @inner
@@ -618,7 +658,8 @@ def _dn(
     dn = min(electrons, noise.gains[site + 8]) * noise.gains[site] + noise.black_dn
     dn = dn + of.read_std_dn * read
     offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
-    return float(dn + (offset_dn + noise.errors_dn[8 * row + (x & 1)]))
+    dn = dn + (offset_dn + noise.errors_dn[8 * row + (x & 1)])
+    return float(dn + np.float64(_dark_frame_of(noise, n, strip)[x]))
 
 
 @inner
@@ -635,13 +676,15 @@ def fill_exact_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, w
     gains, errors_dn = pointer_to(noise.gains, 16 * row), load(pointer_to(noise.errors_dn, 8 * row), _0)
     dn_per_e, full_well_e, row_dn = load(gains, _0), load(gains, _8), workspace.row_dn[0]
     columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + strip.x + strip.lead)
+    dark_frame_dn = _dark_frame_of(noise, n, strip)
     found = 0
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         read = exact_values(workspace.read_words, workspace.scratch, x, quadratics)
         electrons = to_float64(load(workspace.electrons, x)) + (to_float64(load(dark, x)) - of.removed_e)
         dn = minimum(electrons, full_well_e) * dn_per_e + noise.black_dn + read * of.read_std_dn
-        store(out, x, dn + ((load(columns_dn, x) + row_dn) + errors_dn))
+        dn = dn + ((load(columns_dn, x) + row_dn) + errors_dn)
+        store(out, x, dn + to_float64(load(dark_frame_dn, x)))
         found = list_lanes(less_than(_ZERO32, load(error_e, x)), x, found, workspace)
     found = list_defects(noise, strip, found, workspace)
     for m in range(found):

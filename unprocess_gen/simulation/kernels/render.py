@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import kernel
-from unprocess_gen.core.types import PACKED, Counts, Frame, Pair, Plan, Srgb
+from unprocess_gen.core.types import PACKED, Counts, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import body_of, clean_response, fixed_patterns
 from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene32_of, scene_of, with_response
-from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
+from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise, with_dark_frames
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
@@ -48,7 +49,9 @@ from unprocess_gen.simulation.kernels.strips import (
 )
 
 
-def render_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0)) -> list[Pair]:
+def render_pairs(
+    srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0, 0), dark_pixels: DarkPixels | None = None
+) -> list[Pair]:
     """Simulate pairs that share the clean frame, in one pass.
 
     Parameters
@@ -59,13 +62,15 @@ def render_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0
         Plans that differ only in noise, level, draw and frame.
     origin : (int, int)
         Row and column of ``srgb[0, 0]`` in the full frame.
+    dark_pixels : DarkPixels, optional
+        Access to the dark frames that the plans name.
 
     Returns
     -------
     list of Pair
         One pair per plan; all share the clean array.
     """
-    clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin)
+    clean, noisy, counts = _fill_frames(srgb, plans, len(plans), origin, dark_pixels)
     clean_low, clean_high, _, _, saturated, _ = counts[0]
     return [
         Pair(clean, frame, Counts(clean_low, clean_high, noisy_low, noisy_high, saturated, zero_variance))
@@ -75,11 +80,11 @@ def render_pairs(srgb: Srgb, plans: Sequence[Plan], origin: tuple[int, int] = (0
 
 def render_clean(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Frame:
     """Simulate the clean frame only, with the kernels of `render_pairs`; parameters as there."""
-    return _fill_frames(srgb, [plan], 0, origin)[0]
+    return _fill_frames(srgb, [replace(plan, dark_frame="")], 0, origin, None)[0]
 
 
 def _fill_frames(
-    srgb: Srgb, plans: Sequence[Plan], count: int, origin: tuple[int, int]
+    srgb: Srgb, plans: Sequence[Plan], count: int, origin: tuple[int, int], dark_pixels: DarkPixels | None
 ) -> tuple[Frame, Frame, list[list[int]]]:
     """Return the clean frame, the first ``count`` noisy frames, and their numbers of `Counts`.
 
@@ -91,6 +96,8 @@ def _fill_frames(
     noisy = np.empty((count, *frame_shape), dtype=np.float32 if first.normalised else np.uint16)
     counts = np.zeros((max(count, 1), 6), dtype=np.int64)
     scene, noise, readout = _records(tuple(plans), shape, 256 if srgb.itemsize == 1 else 65536, origin)
+    if isinstance(noise, Electrons) and any(plan.dark_frame for plan in plans):
+        noise = with_dark_frames(noise, plans, dark_pixels, shape, origin)
     scratch = scratch_of_thread(np.float32 if uses_scene32(first) else np.float64)
     # a view, a read-only array or a subclass would be another type, compiled again
     codes = srgb if type(srgb) is np.ndarray and srgb.flags.carray else np.array(srgb, order="C")

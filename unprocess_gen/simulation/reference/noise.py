@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.lookup_tables import SEGMENTS, exponential_levels, normal_table, quantile_table
 from unprocess_gen.core.random_streams import Words, words
-from unprocess_gen.core.types import Float, Physics, Plan
+from unprocess_gen.core.types import DarkPixels, Float, Physics, Plan
 from unprocess_gen.simulation.reference.poisson import poisson
 
 EFFECTS = (
@@ -28,6 +29,9 @@ EFFECTS = (
     *("gain_by_colour", "read", "row", "column", "column_temporal", "black_error", "dead_pixels", "quantise"),  # in DN
 )
 """Effects of a physical profile, in the order in which light meets them."""
+
+REPLACED = ("dark_current", "hot_pixels", "row", "column", "column_temporal", "black_error")
+"""Effects whose noise a dark frame contains; it takes the place of ``read`` as the effect ``dark_frame``."""
 
 Origin = tuple[int, int]
 Shape = tuple[int, ...]
@@ -77,7 +81,7 @@ def normals(uniforms: Words) -> Float:
     return by_inverse_cdf(uniforms, normal_table())
 
 
-def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
+def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), dark_pixels: DarkPixels | None = None) -> Float:
     """Add the plan's effects to the unrounded clean frame.
 
     Parameters
@@ -95,7 +99,7 @@ def noisy(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
         Noisy frame, DN, not clipped.
     """
     if plan.physics is not None:
-        return physical(clean_dn, plan, origin)
+        return physical(clean_dn, plan, origin, dark_pixels)
     return heteroscedastic(clean_dn, plan, origin) if "heteroscedastic" in plan.effects else clean_dn
 
 
@@ -165,7 +169,7 @@ def _body_words(physics: Physics, stream: str, shape: Shape, origin: Origin, dra
 # --------------------------------------------------------------------------------------------- physical effects
 
 
-def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
+def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0), dark_pixels: DarkPixels | None = None) -> Float:
     """Add the effects of a physical profile, in order, to the unrounded clean frame; [H, W] DN, not clipped."""
     physics = plan.physics
     assert physics is not None
@@ -185,7 +189,11 @@ def physical(clean_dn: Float, plan: Plan, origin: Origin = (0, 0)) -> Float:
     noisy_dn = electrons * gain + plan.black_level_dn
     if "read" in plan.effects:
         noisy_dn = noisy_dn + read(plan, noisy_dn, origin)
+    if plan.dark_frame:
+        noisy_dn = noisy_dn + dark_dither(plan, noisy_dn, origin)
     noisy_dn = noisy_dn + offsets(plan, noisy_dn.shape, origin)
+    if plan.dark_frame:
+        noisy_dn = noisy_dn + dark_frame_offsets(plan, dark_pixels, noisy_dn.shape, origin)
     if "dead_pixels" in plan.effects:
         noisy_dn = np.where(dead(physics, noisy_dn.shape, origin), 0.0, noisy_dn)
     return noisy_dn
@@ -360,6 +368,84 @@ def read_table(physics: Physics) -> Float:
         Table for standard deviation 1, as `lookup_tables.normal_table`.
     """
     return quantile_table(physics.read_law, physics.read_shape)
+
+
+DITHER_LAW, DITHER_SHAPE = "tukey_lambda", 1.0
+"""Uniform distribution, as Tukey's lambda distribution of shape 1."""
+
+
+def dither_std_dn(plan: Plan) -> float:
+    """Return the standard deviation of the dither of a dark frame, DN: uniform in ±½ DN of the dark frame."""
+    return plan.dark_scale / math.sqrt(12)
+
+
+def dark_dither(plan: Plan, like: Float, origin: Origin = (0, 0)) -> Float:
+    """Draw the dither of a dark frame, [H, W] DN.
+
+    A dark frame has integer values. Without dither, the sum of a constant signal and the frame is rounded at every site
+    alike, so fractions of a DN are lost from the mean (as SFRN, Zhang et al. 2021, which samples within the bins too).
+    """
+    uniform = by_inverse_cdf(_words(plan, "dark_dither", like, origin), quantile_table(DITHER_LAW, DITHER_SHAPE))
+    return dither_std_dn(plan) * uniform
+
+
+def dark_frame_offsets(
+    plan: Plan, dark_pixels: DarkPixels | None, shape: Shape, origin: Origin = (0, 0)
+) -> NDArray[np.float32]:
+    """Return what a plan's dark frame adds to each pixel.
+
+    Frames smaller than the image are repeated: rows and columns count modulo the size of the frame, which is even.
+
+    Parameters
+    ----------
+    plan : Plan
+        Parameters of a pair with a dark frame.
+    dark_pixels : DarkPixels or None
+        Access to the pixels of the frame.
+    shape : (int, int)
+        Height and width.
+    origin : (int, int)
+        Row and column of the first pixel in the full frame.
+
+    Returns
+    -------
+    ndarray of float32, [H, W]
+        Value of the dark frame above its black level, or above the mean of all frames, DN of the sensor.
+
+    Raises
+    ------
+    ValueError
+        If ``dark_pixels`` is None.
+    """
+    if dark_pixels is None:
+        raise ValueError(f"dark_pixels=None: the plan needs the dark frame {plan.dark_frame}; expected access to it")
+    corner = origin[0] + plan.dark_shift[0], origin[1] + plan.dark_shift[1]
+    dark = _repeated(dark_pixels.frame(plan.dark_frame), shape, corner).astype(np.float32)
+    if plan.dark_shading:
+        dark -= _repeated(dark_pixels.mean(plan.dark_shading), shape, corner)
+    else:
+        dark -= np.float32(plan.dark_black_dn)
+    dark *= np.float32(plan.dark_scale)
+    return dark
+
+
+def _repeated(frame: NDArray[Any], shape: Shape, corner: Origin) -> NDArray[Any]:
+    """Return the part of a periodically repeated frame that begins at a row and column, [H, W]."""
+    out = np.empty((shape[0], shape[1]), dtype=frame.dtype)
+    for y, from_y, rows in _runs(corner[0], shape[0], frame.shape[0]):
+        for x, from_x, columns in _runs(corner[1], shape[1], frame.shape[1]):
+            out[y : y + rows, x : x + columns] = frame[from_y : from_y + rows, from_x : from_x + columns]
+    return out
+
+
+def _runs(start: int, count: int, period: int) -> Iterator[tuple[int, int, int]]:
+    """Yield runs of a periodic sequence: first index in the result, first index in the period, and length."""
+    done = 0
+    while done < count:
+        place = (start + done) % period
+        length = min(period - place, count - done)
+        yield done, place, length
+        done += length
 
 
 def offsets(plan: Plan, shape: Shape, origin: Origin = (0, 0), fixed_only: bool = False) -> Float:

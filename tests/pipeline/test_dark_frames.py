@@ -1,0 +1,408 @@
+"""Noise from dark frames: datasets name each frame, keep every promise, and refuse frames that do not fit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.commands import RunMain
+from helpers.dark_frames import banded, save_frames
+from helpers.datasets import Make, Settings, TreeHash
+from helpers.photographs import pixels
+from PIL import Image
+
+import unprocess_gen as ug
+from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.dataset.reader import RawPairs
+from unprocess_gen.dataset.shards import json_inside
+from unprocess_gen.pipeline.replay import PairRegenerator
+from unprocess_gen.sources.dark_frames import open_dark_frames
+
+NOISE = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "camera=identity", "gains=unity")
+SCALE = (16383 - 1024) / (16300 - 512)
+EMVA = next(
+    (folder for parent in Path(__file__).parents if (folder := parent / "shared/data/emva1288_ccd/images").is_dir()),
+    None,
+)
+"""Real dark frames (EMVA 1288 reference set 001, CC BY-SA 3.0), which are not part of the project."""
+
+
+@pytest.fixture(scope="module")
+def darks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("darks") / "iso1600"
+    save_frames(folder, 3)
+    (folder / "notes.txt").write_text("not a frame")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return photographs that fit into a dark frame, and one that is larger."""
+    folder = tmp_path_factory.mktemp("pictures") / "p"
+    folder.mkdir()
+    for number, (height, width) in enumerate(((40, 50), (69, 90), (101, 213))):
+        Image.fromarray(pixels(number, height, width)).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(pictures: Path, darks: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("made") / "ds"
+    make(pictures, out, *NOISE, f"noise.dark_frames={darks}", "noise.draws=2", "output.pairs_per_shard=2")
+    return out
+
+
+def rows(folder: Path) -> list[dict[str, object]]:
+    return [dict(row) for row in read_rows(folder / "manifest.csv")]
+
+
+def test_rows_name_the_dark_frame_and_its_place(made: Path, darks: Path) -> None:
+    digests = set(open_frames(darks))
+    for row in rows(made):
+        assert row["dark_frame"] in digests
+        assert (int(row["dark_frame_y"] or 0) % 2, int(row["dark_frame_x"] or 0) % 2) == (0, 0)
+        assert row["dark_black_dn"] == 512
+        assert row["dark_scale"] == SCALE
+        assert "dark_frame" in str(row["effects"]).split(";")
+        assert "row: contained in the dark frames" in str(row["skipped"]).split(";")
+
+
+def open_frames(folder: Path) -> dict[str, np.ndarray]:
+    """Return the dark frames of a folder by their SHA-256."""
+    config = ug.load_config([*NOISE, f"noise.dark_frames={folder}"])
+    _, frames, access = open_dark_frames(config)
+    assert frames is not None and access is not None
+    return {one.sha256: access.frame(one.sha256) for one in frames.frames}
+
+
+def test_draws_use_different_frames_at_the_same_place(made: Path) -> None:
+    for first, second in zip(rows(made)[::2], rows(made)[1::2], strict=True):
+        assert first["dark_frame"] != second["dark_frame"]
+        assert [first[f"dark_frame_{axis}"] for axis in "yx"] == [second[f"dark_frame_{axis}"] for axis in "yx"]
+
+
+def test_frame_that_contains_the_image_is_not_repeated(made: Path) -> None:
+    for row in rows(made)[:4]:
+        assert int(row["dark_frame_y"] or 0) + int(row["height"]) <= 70  # type: ignore[call-overload]
+        assert int(row["dark_frame_x"] or 0) + int(row["width"]) <= 90  # type: ignore[call-overload]
+
+
+def test_noise_without_light_is_the_dark_frame(darks: Path) -> None:
+    config = ug.load_config([*NOISE[:2], "sensor.black_level_dn=512", "sensor.bits=14", "sensor.white_level_dn=16300",
+                             f"noise.dark_frames={darks}"])  # fmt: skip
+    pair = ug.make_pair(np.zeros((150, 200, 3), np.uint8), config)
+    frame = open_frames(darks)[pair.plan.dark_frame]
+    y, x = pair.plan.dark_shift
+    expected = np.tile(frame, (5, 5))[y : y + 150, x : x + 200]
+    np.testing.assert_array_equal(pair.noisy, expected)
+
+
+def test_dither_keeps_the_mean_of_fractions(tmp_path: Path) -> None:
+    """Without dither a signal of 0.3 DN would vanish in constant frames."""
+    np.save(tmp_path / "a.npy", np.full((64, 64), 512, np.uint16))
+    config = ug.load_config(["noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "effects.shot=off",
+                             "effects.prnu=off", "effects.dead_pixels=off", "scene.exposure_ratio=200",
+                             f"noise.dark_frames={tmp_path}", "output.clean_dtype=float32"])  # fmt: skip
+    pair = ug.make_pair(np.full((256, 256, 3), 128, np.uint8), config)
+    expected_dn = 1024 + pair.clean.astype(np.float64) * (16383 - 1024)
+    for site in (np.s_[::2, ::2], np.s_[::2, 1::2], np.s_[1::2, 1::2]):
+        mean_dn = expected_dn[site].mean()
+        assert pair.noisy[site].mean() == pytest.approx(mean_dn, abs=5 * 0.6 / 128)
+
+
+def test_variance_is_that_of_shot_noise_and_dark_frames(tmp_path: Path) -> None:
+    save_frames(tmp_path, 6, shape=(512, 512), std=20.0)
+    config = ug.load_config([*NOISE, f"noise.dark_frames={tmp_path}", "effects.prnu=off", "effects.dead_pixels=off"])
+    pair = ug.make_pair(np.full((512, 512, 3), 60, np.uint8), config)
+    residual = pair.noisy.astype(float) - pair.clean
+    expected = pair.plan.a_dn * (float(pair.clean.mean()) - 1024) + pair.plan.b_dn2 + 1 / 6
+    assert residual.var() == pytest.approx(expected, rel=0.05)
+
+
+def test_jobs_and_file_names_change_no_byte(
+    made: Path, pictures: Path, darks: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    renamed = tmp_path / "renamed"
+    renamed.mkdir()
+    for number, path in enumerate(sorted(darks.glob("*.npy"), reverse=True)):
+        shutil.copy(path, renamed / f"{number}.npy")
+    overrides = (*NOISE, f"noise.dark_frames={renamed}", "noise.draws=2", "output.pairs_per_shard=2")
+    make(pictures, tmp_path / "ds", *overrides, n_jobs=2)
+    assert tree_hash(tmp_path / "ds") == tree_hash(made)
+    assert str(tmp_path) not in (tmp_path / "ds/config.yaml").read_text()
+
+
+def test_rows_and_dark_frames_replay(made: Path, darks: Path, run_main: RunMain, tmp_path: Path) -> None:
+    moved = Path(shutil.copytree(darks, tmp_path / "moved"))
+    for argument in (f"noise.dark_frames={moved}", "--dark-frames", ""):
+        words = [argument, *([str(moved)] if argument == "--dark-frames" else [])] if argument else []
+        done = run_main("replay", made, *words)
+        assert (done.code, done.out.split(";")[0]) == (0, "6 pairs are the same, bit for bit"), done.err
+
+
+def test_replay_without_the_frame_names_it(made: Path, run_main: RunMain, tmp_path: Path) -> None:
+    save_frames(tmp_path / "others", 1, black=600)
+    done = run_main("replay", made, f"noise.dark_frames={tmp_path}/others", "--keys", "0")
+    assert done.code == 5
+    assert str(rows(made)[0]["dark_frame"]) in done.err
+    assert "no file has the SHA-256" in done.err
+
+
+def test_replay_needs_the_folder_of_dark_frames(made: Path, tmp_path: Path, run_main: RunMain, pictures: Path) -> None:
+    shutil.copy(made / "manifest.csv", tmp_path)
+    done = run_main("replay", tmp_path / "manifest.csv", f"source.root={pictures}", "--rows", "0:1")
+    assert done.code == 5
+    assert "noise.dark_frames is missing" in done.err
+
+
+def test_dataset_is_regenerated_from_its_config(made: Path, run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main("again", made, f"out={tmp_path}/again")
+    assert done.code == 0, done.err
+    assert "the same as" in done.out
+
+
+def test_other_frames_are_refused_by_again(made: Path, run_main: RunMain, tmp_path: Path) -> None:
+    save_frames(tmp_path / "others", 2)
+    done = run_main("again", made, f"out={tmp_path}/again", f"noise.dark_frames={tmp_path}/others")
+    assert done.code == 5
+    assert "the set of frames has the SHA-256" in done.err
+    assert not (tmp_path / "again").exists()
+
+
+def test_damaged_pair_is_repaired(made: Path, run_main: RunMain, tmp_path: Path, tree_hash: TreeHash) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "ds"))
+    shard = copy / "shards/shard-00000.tar"
+    content = bytearray(shard.read_bytes())
+    content[content.index(b".noisy") + 1200] ^= 1
+    shard.write_bytes(content)
+    done = run_main("verify", copy, "--repair")
+    assert done.code == 0, done.err
+    assert tree_hash(copy) == tree_hash(made)
+    assert run_main("verify", copy, "--regenerate", "2").code == 0
+
+
+def test_resume_refuses_changed_frames(pictures: Path, make: Make, tmp_path: Path) -> None:
+    save_frames(tmp_path / "d", 2)
+    make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={tmp_path}/d")
+    save_frames(tmp_path / "d", 3)
+    with pytest.raises(ConfigError, match=r"begun with other settings: noise\.dark_frames_sha256"):
+        make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={tmp_path}/d")
+
+
+def test_frame_that_changes_during_a_run_stops_it(tmp_path: Path) -> None:
+    (digest, *_) = save_frames(tmp_path, 1)
+    _, _, access = open_dark_frames(ug.load_config([*NOISE, f"noise.dark_frames={tmp_path}"]))
+    assert access is not None
+    np.save(tmp_path / "dark0.npy", banded(9))
+    changed = type(access)(access.folder, {"0" * 64: "dark0.npy"})
+    with pytest.raises(MachineError, match="expected 0000"):
+        changed.frame("0" * 64)
+    assert digest != "0" * 64
+
+
+def test_json_has_the_dark_frame(made: Path) -> None:
+    first = json.loads(json_inside(made / "shards/shard-00000.tar")[0])
+    assert first["dark_frame"] == rows(made)[0]["dark_frame"]
+
+
+def test_dataset_json_describes_the_frames(made: Path, darks: Path) -> None:
+    facts = json.loads((made / "dataset.json").read_text())["dark_frames"]
+    assert facts["root"] == str(darks)
+    assert (facts["count"], facts["sizes"], facts["black_dn"]) == (3, ["90x70"], 512)
+    assert facts["std_dn"] == pytest.approx(SCALE * 3 * (1 + 1 / 4 + 1 / 9) ** 0.5, rel=0.1)
+
+
+def test_pairs_of_patches_are_crops(pictures: Path, darks: Path, make: Make, made: Path, tmp_path: Path) -> None:
+    make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={darks}", "source.patch=[grid, 32]")
+    full = {str(row["source"]): pair for pair in RawPairs(made) for row in [pair.row] if row["draw"] == 0}
+    for sample in RawPairs(tmp_path / "ds"):
+        y, x = int(sample.row["patch_y"] or 0), int(sample.row["patch_x"] or 0)
+        complete = full[str(sample.row["source"])].noisy
+        np.testing.assert_array_equal(sample.noisy, complete[y : y + 32, x : x + 32])
+
+
+def test_plan_describes_frames_and_what_they_contain(run_main: RunMain, darks: Path, pictures: Path) -> None:
+    done = run_main("plan", *NOISE, f"noise.dark_frames={darks}", f"source.root={pictures}")
+    text = " ".join(done.out.split())
+    assert done.code == 0, done.err
+    assert f"3 dark frames in {darks}: 90 x 70 pixels, black level 512 DN, standard deviation 3." in text
+    assert "dark_frame" in text.partition("Simulated:")[2].partition("Left out")[0]
+    assert "Contained in the dark frames: read, dark_current, hot_pixels, row, column" in text
+
+
+def test_noise_of_dark_frames_is_not_checked(made: Path, run_main: RunMain) -> None:
+    done = run_main("verify", made, "--noise")
+    assert done.code == 0, done.err
+
+
+# Dark shading ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shaded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return frames with a strong gradient, which is their dark shading."""
+    folder = tmp_path_factory.mktemp("shaded")
+    gradient = np.linspace(0, 40, 128)[None, :]
+    for number in range(8):
+        noise = np.random.default_rng(number).normal(0, 2, (96, 128))
+        np.save(folder / f"{number}.npy", np.rint(512 + gradient + noise).astype(np.uint16))
+    return folder
+
+
+def test_removed_shading_leaves_the_temporal_noise(shaded: Path) -> None:
+    residuals = {}
+    for shading in ("keep", "remove"):
+        config = ug.load_config(
+            [*NOISE, f"noise.dark_frames={shaded}", f"noise.dark_shading={shading}", "effects.dead_pixels=off"]
+        )
+        pair = ug.make_pair(np.zeros((96, 128, 3), np.uint8), config)
+        residuals[shading] = pair.noisy.astype(float) - pair.clean
+        assert pair.row["dark_shading"] == (config_digest(shaded) if shading == "remove" else "")
+        assert residuals[shading].var() == pytest.approx(pair.plan.b_dn2 + 1 / 12, rel=0.1)
+    assert np.ptp(residuals["keep"].mean(axis=0)[[2, -2]]) > 30
+    assert np.abs(residuals["remove"].mean(axis=0)).max() < 1.5
+
+
+def config_digest(folder: Path) -> str:
+    config, _, _ = open_dark_frames(ug.load_config([*NOISE, f"noise.dark_frames={folder}"]))
+    return str(config.noise.dark_frames_sha256)
+
+
+def test_removed_shading_replays_with_the_same_set_only(
+    shaded: Path, pictures: Path, make: Make, tmp_path: Path
+) -> None:
+    make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={shaded}", "noise.dark_shading=remove")
+    row = rows(tmp_path / "ds")[0]
+    PairRegenerator(str(pictures), str(shaded)).regenerate_exactly(row)  # type: ignore[arg-type]
+    less = Path(shutil.copytree(shaded, tmp_path / "less"))
+    other = next(path for path in less.iterdir() if path.name not in frame_names(less, str(row["dark_frame"])))
+    other.unlink()
+    with pytest.raises(MachineError, match="whose mean was subtracted"):
+        PairRegenerator(str(pictures), str(less)).regenerate_exactly(row)  # type: ignore[arg-type]
+
+
+def frame_names(folder: Path, digest: str) -> list[str]:
+    _, _, access = open_dark_frames(ug.load_config([*NOISE, f"noise.dark_frames={folder}"]))
+    assert access is not None
+    return [access.files[digest]]
+
+
+# Files and refusals ---------------------------------------------------------------------------------------------------
+
+
+def test_formats_give_the_same_pixels(tmp_path: Path) -> None:
+    frame = banded(5)
+    cv2.imwrite(str(tmp_path / "a.png"), frame)
+    cv2.imwrite(str(tmp_path / "b.TIFF"), frame)
+    np.save(tmp_path / "c.npy", frame)
+    frames = open_frames(tmp_path)
+    assert len(frames) == 3
+    for found in frames.values():
+        np.testing.assert_array_equal(found, frame)
+
+
+def test_raw_files_state_black_level_and_pattern(tmp_path: Path, run_main: RunMain, make: Make) -> None:
+    pytest.importorskip("rawpy")
+    make(None, tmp_path / "ds", "source.limit=1", "scene.exposure_ratio=10000", "sensor=generic_14bit", *NOISE[:2])
+    assert run_main("dng", tmp_path / "ds", "--keys", "0", "--clean", "--to", tmp_path / "raw").code == 0
+    _, frames, _ = open_dark_frames(ug.load_config([*NOISE, f"noise.dark_frames={tmp_path}/raw"]))
+    assert frames is not None
+    assert frames.black_dn == 1024
+    with pytest.raises(ConfigError, match=r"has the CFA pattern RGGB; expected sensor\.pattern=GBRG"):
+        open_dark_frames(ug.load_config([*NOISE, "sensor.pattern=GBRG", f"noise.dark_frames={tmp_path}/raw"]))
+
+
+def as_array(shape: tuple[int, ...], value: int = 512, dtype: str = "uint16") -> np.ndarray:
+    return np.full(shape, value, dtype=dtype)
+
+
+@pytest.mark.parametrize(
+    ("array", "sentence"),
+    [
+        (as_array((62, 90)), "has 90 x 62 pixels; expected 64 x 64 or more"),
+        (as_array((70, 90, 3)), r"is uint16 \[70, 90, 3\]; expected a mosaic \[H, W\] of uint16"),
+        (as_array((70, 90), dtype="float32"), "is float32"),
+        (as_array((70, 90), 16384), "values up to 16384 DN; expected DN of the profile, which has 14 bits"),
+    ],
+    ids=["small", "colours", "float", "bits"],
+)
+def test_frame_that_does_not_fit_is_refused(array: np.ndarray, sentence: str, tmp_path: Path) -> None:
+    save_frames(tmp_path, 1)
+    np.save(tmp_path / "odd.npy", array)
+    with pytest.raises(ConfigError, match=sentence):
+        open_frames(tmp_path)
+
+
+def test_frames_with_light_are_refused(tmp_path: Path) -> None:
+    save_frames(tmp_path, 1, black=3000)
+    config = [*NOISE, f"noise.dark_frames={tmp_path}", "noise.dark_frames_black_dn=512"]
+    with pytest.raises(ConfigError, match="the median of the frames is 3000 DN, and black is 512 DN; expected frames"):
+        open_dark_frames(ug.load_config(config))
+
+
+def test_file_that_is_no_picture_is_refused(tmp_path: Path) -> None:
+    for name in ("a.npy", "a.png", "a.tif", "a.dng"):
+        (tmp_path / name).write_bytes(b"not a frame")
+        with pytest.raises(ConfigError, match="cannot be decoded"):
+            open_frames(tmp_path)
+        (tmp_path / name).unlink()
+
+
+REFUSED = [
+    (["noise=imx385_iso3200"], "gives no DN per electron"),
+    ([*NOISE[:1], "scene=night", "noise.iso=[choice, 800, 1600]"], "the frames are of one ISO"),
+    ([*NOISE, "noise.levels=[800, 1600]"], "the frames are of one ISO"),
+    ([*NOISE, "clean.includes_fixed_pattern=true"], "clean.includes_fixed_pattern=true"),
+    ([*NOISE, "effects.row=on"], "effects.row=on: the dark frames contain it"),
+    ([*NOISE, "effects.read=off"], "effects.read=off: dark frames replace the read noise"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "sentence"), REFUSED)
+def test_settings_that_contradict_dark_frames_are_refused(
+    overrides: list[str], sentence: str, darks: Path, run_main: RunMain
+) -> None:
+    done = run_main(*overrides, f"noise.dark_frames={darks}", "source.limit=1")
+    assert done.code == 2
+    assert sentence in done.err
+    assert done.err.count("\n") == 1
+
+
+def test_other_keys_need_dark_frames(run_main: RunMain) -> None:
+    done = run_main(*NOISE, "noise.dark_shading=remove", "source.limit=1")
+    assert (done.code, "there are no dark frames; give noise.dark_frames=FOLDER" in done.err) == (2, True)
+
+
+def test_missing_folder_is_refused(run_main: RunMain, tmp_path: Path) -> None:
+    done = run_main(*NOISE, f"noise.dark_frames={tmp_path}/none", "source.limit=1")
+    assert (done.code, "no such folder" in done.err) == (2, True)
+    (tmp_path / "empty").mkdir()
+    done = run_main(*NOISE, f"noise.dark_frames={tmp_path}/empty", "source.limit=1")
+    assert (done.code, "contains no dark frame" in done.err) == (2, True)
+
+
+# Real frames ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(EMVA is None, reason="needs the frames of the EMVA 1288 reference set 001")
+def test_noise_of_a_real_camera_has_its_variance_and_its_bands(settings: Settings, tmp_path: Path) -> None:
+    """The CCD has row noise of 0.5 DN; the noise of the profile without rows lacks it."""
+    assert EMVA is not None
+    names = sorted(EMVA.glob("d_s_000*.png"))
+    for path in names:
+        shutil.copy(path, tmp_path / path.name)
+    config = settings("noise=sony_a7s2", "noise.iso=1600", "sensor=imx385_12bit", f"noise.dark_frames={tmp_path}")
+    config.noise.bits, config.noise.black_level_dn, config.noise.white_level_dn = 12, 0, 4095
+    config.sensor.black_level_dn, config.sensor.white_level_dn = 100, 4095
+    pair = ug.make_pair(np.zeros((480, 640, 3), np.uint8), config)
+    real = cv2.imread(str(names[0]), cv2.IMREAD_UNCHANGED).astype(float)
+    noise = pair.noisy.astype(float) - 100
+    scale = pair.plan.dark_scale
+    assert noise.var() == pytest.approx(scale**2 * real.var(), rel=0.15)
+    assert noise.mean(axis=1).var() == pytest.approx(scale**2 * real.mean(axis=1).var(), rel=0.4)
+    assert noise.mean(axis=1).var() > 2 * noise.var() / 640
