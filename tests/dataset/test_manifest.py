@@ -37,9 +37,9 @@ from unprocess_gen.dataset.manifest import (
     write_rows,
 )
 from unprocess_gen.planning.effect_contributions import STATISTICS
-from unprocess_gen.planning.effect_selection import LATER_EFFECTS
+from unprocess_gen.planning.effect_selection import IN_DARK_FRAMES, LATER_EFFECTS
 from unprocess_gen.planning.plan import plan_image, plan_levels
-from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.reference.noise import EFFECTS, REPLACED
 
 CONTRACT = [
     "key",
@@ -543,9 +543,10 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     skipped = tuple(f"{effect}: {reason}" for effect, reason in longest_reasons(settings).items())
     physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics, assumed=ASSUMABLE)
     pair = Pair(PAIR.clean, PAIR.noisy, Counts(*[2**40] * 6))
+    sampled = {effect: f"{effect}: {IN_DARK_FRAMES}" for effect in (*REPLACED, "read")}
     dark = dataclasses.replace(
         physical, effects=tuple("dark_frame" if effect == "read" else effect for effect in EFFECTS),
-        skipped=(*skipped, "read: contained in the dark frames"), dark_frame="f" * 64, dark_shift=(2**32 - 2,) * 2,
+        skipped=tuple(sampled.get(one.partition(": ")[0], one) for one in skipped), dark_frame="f" * 64, dark_shift=(2**32 - 2,) * 2,
         dark_black_dn=LONGEST, dark_scale=LONGEST, dark_shading="f" * 64,
     )  # fmt: skip
     for one in (plan, physical, dark):
