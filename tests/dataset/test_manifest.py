@@ -546,8 +546,8 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     sampled = {effect: f"{effect}: {IN_DARK_FRAMES}" for effect in (*REPLACED, "read")}
     dark = dataclasses.replace(
         physical, effects=tuple("dark_frame" if effect == "read" else effect for effect in EFFECTS),
-        skipped=tuple(sampled.get(one.partition(": ")[0], one) for one in skipped), dark_frame="f" * 64, dark_shift=(2**32 - 2,) * 2,
-        dark_black_dn=LONGEST, dark_scale=LONGEST, dark_shading="f" * 64,
+        skipped=tuple(sampled.get(one.partition(": ")[0], one) for one in skipped), dark_frame="f" * 64,
+        dark_shift=(2**32 - 2,) * 2, dark_black_dn=LONGEST, dark_scale=LONGEST, dark_shading="f" * 64,
     )  # fmt: skip
     for one in (plan, physical, dark):
         source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)
