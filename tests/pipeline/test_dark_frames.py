@@ -238,6 +238,7 @@ def test_plan_describes_frames_and_what_they_contain(run_main: RunMain, darks: P
 def test_noise_of_dark_frames_is_not_checked(made: Path, run_main: RunMain) -> None:
     done = run_main("verify", made, "--noise")
     assert done.code == 0, done.err
+    assert "no number of the row describes, such as that of dark frames" in done.out
 
 
 # Dark shading ---------------------------------------------------------------------------------------------------------

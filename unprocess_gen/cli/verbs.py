@@ -414,7 +414,10 @@ def _check_noise(folder: AnyPath, to: str | None) -> list[str]:
     found = photon_transfer.examine_dataset(folder)
     checks = found.checks
     if not checks.count:
-        print_result(f"{folder}: no pair has enough sites to check its noise")
+        print_result(
+            f"{folder}: no pair can be checked: too few usable sites, or noise that no number of the row describes, such "
+            "as that of dark frames"
+        )
         return []
     if found.worst is not None:
         print_result(

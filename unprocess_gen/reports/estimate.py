@@ -23,6 +23,7 @@ from unprocess_gen.config.interpretation import (
     noise_levels,
     patch_rule,
     provenance_at,
+    uses_dark_frames,
     without_dark_frames,
 )
 from unprocess_gen.config.schema import AccuracyConfig, Config
@@ -497,6 +498,8 @@ def _physical_lines(config: Config, plans: list[Plan]) -> list[str]:
     assert noise.white_level_dn is not None and noise.black_level_dn is not None
     physics = [plan.physics for plan in plans if plan.physics is not None]
     distributions = sorted({"Gaussian" if one.read_law == "gaussian" else "Tukey lambda" for one in physics})
+    if uses_dark_frames(config.noise):
+        distributions = ["dark frames"]
     scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
     lines = [
         f"noise     {noise.name}: in DN of black {noise.black_level_dn}, white {noise.white_level_dn}; "
