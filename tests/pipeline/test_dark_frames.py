@@ -137,6 +137,18 @@ def test_jobs_and_file_names_change_no_byte(
     assert str(tmp_path) not in (tmp_path / "ds/config.yaml").read_text()
 
 
+def test_parts_give_the_same_bytes(
+    made: Path, pictures: Path, darks: Path, run_main: RunMain, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    overrides = (*NOISE, f"noise.dark_frames={darks}", "noise.draws=2", "output.pairs_per_shard=2")
+    assert run_main("prepare", "parts=2", f"source.root={pictures}", *overrides, f"out={tmp_path}/ds").code == 0
+    for part in (1, 0):
+        done = run_main("part", tmp_path / "ds", part)
+        assert done.code == 0, done.err
+    assert run_main("merge", tmp_path / "ds").code == 0
+    assert tree_hash(tmp_path / "ds") == tree_hash(made)
+
+
 def test_rows_and_dark_frames_replay(made: Path, darks: Path, run_main: RunMain, tmp_path: Path) -> None:
     moved = Path(shutil.copytree(darks, tmp_path / "moved"))
     for argument in (f"noise.dark_frames={moved}", "--dark-frames", ""):

@@ -415,8 +415,8 @@ def _check_noise(folder: AnyPath, to: str | None) -> list[str]:
     checks = found.checks
     if not checks.count:
         print_result(
-            f"{folder}: no pair can be checked: too few usable sites, or noise that no number of the row describes, such "
-            "as that of dark frames"
+            f"{folder}: no pair can be checked: too few usable sites, or noise that no number of the row describes, "
+            "such as that of dark frames"
         )
         return []
     if found.worst is not None:

@@ -76,6 +76,8 @@ class FrozenPlan:
         Index of the source that every process makes first.
     canary_sha256 : str
         Digest of its rows.
+    dark_frames : str or None
+        Absolute place of the dark frames; None without them.
     """
 
     version: str
@@ -91,6 +93,7 @@ class FrozenPlan:
     skipped_links: int
     canary_source: int | None
     canary_sha256: str
+    dark_frames: str | None = None
 
     @property
     def shards(self) -> int:
@@ -169,6 +172,7 @@ def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenP
         skipped_links=listing.skipped_links,
         canary_source=canary[0],
         canary_sha256=canary[1],
+        dark_frames=None if config.noise.dark_frames is None else os.path.abspath(config.noise.dark_frames),
     )
 
 
@@ -304,6 +308,7 @@ class FrozenRun:
         except (ValueError, ConfigError) as error:
             raise DamageError(f"{self.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
         config.out, config.source.root = self.out, root or plan.root
+        config.noise.dark_frames = plan.dark_frames
         config.source.max_failed, config.n_jobs, config.self_test = plan.max_failed, plan.n_jobs, plan.self_test
         return config
 

@@ -26,6 +26,7 @@ from typing import Any
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
+from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.progress import Progress
@@ -132,7 +133,12 @@ def generate(config: Config, label: str = "") -> Summary:
         workspace.begin(listing.sources, len(tasks))
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         context = RunContext(
-            config, str(workspace.storage.scratch), os.getpid(), n_jobs < own_cores(), dark_frames, dark_folder
+            config,
+            str(workspace.storage.scratch),
+            os.getpid(),
+            core_to_spare=n_jobs < own_cores(),
+            dark_frames=dark_frames,
+            dark_folder=dark_folder,
         )
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)
         with Progress(len(listing.sources), images_done, label) as progress:
@@ -240,12 +246,17 @@ def machine() -> dict[str, Any]:
 
 def _dark_facts(config: Config) -> dict[str, Any]:
     """Return what ``dataset.json`` records about dark frames: their place, number, sizes and noise."""
-    _, dark_frames, _ = open_dark_frames(config)
-    if dark_frames is None:
+    root = _absolute(config.noise.dark_frames)
+    if root is None:
         return {}
+    try:
+        _, dark_frames, _ = open_dark_frames(config)
+    except (ConfigError, MachineError):  # parts of a run may be merged where the frames are not
+        return {"dark_frames": {"root": root}}
+    assert dark_frames is not None
     return {
         "dark_frames": {
-            "root": _absolute(config.noise.dark_frames),
+            "root": root,
             "count": len(dark_frames.frames),
             "sizes": sorted({f"{frame.width}x{frame.height}" for frame in dark_frames.frames}),
             "black_dn": dark_frames.black_dn,

@@ -31,6 +31,7 @@ from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_
 from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
+from unprocess_gen.sources.dark_frames import open_dark_frames
 from unprocess_gen.sources.loader import list_photographs
 
 PARTS = f"{WORK}/parts.json"
@@ -146,6 +147,7 @@ def prepare(config: Config, parts: int) -> Prepared:
         As `generate`.
     """
     listing = list_photographs(config.source)
+    config, _, _ = open_dark_frames(config)
     config = with_pairs_per_shard(config, listing.sources, open_storage(config.out))
     tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
     if parts > len(tasks):

@@ -13,7 +13,7 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import NO_CLIP, DarkFrames, Row, Source, Value
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.shards import shard_name
-from unprocess_gen.sources.dark_frames import DarkFolder
+from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 
 Item = TypeVar("Item")
 
@@ -85,7 +85,7 @@ class RunContext:
     marker : str
         Name below ``out`` of the file that contains the index of the source in progress; empty without one.
     dark_frames, dark_folder : DarkFrames, DarkFolder, or None
-        The dark frames of the config, if it uses any, and access to their pixels.
+        The dark frames of the config, and access to their pixels; None if it uses none, or a worker is to read them.
     """
 
     config: Config
@@ -96,6 +96,12 @@ class RunContext:
     marker: str = ""
     dark_frames: DarkFrames | None = None
     dark_folder: DarkFolder | None = None
+
+    def dark(self) -> tuple[DarkFrames | None, DarkFolder | None]:
+        """Return the dark frames of the config, and access to their pixels; this process reads them if it has to."""
+        if self.dark_folder is None:
+            return open_dark_frames(self.config)[1:]
+        return self.dark_frames, self.dark_folder
 
     @property
     def compiling_path(self) -> Path:

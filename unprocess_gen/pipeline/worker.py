@@ -180,9 +180,10 @@ def make_image(context: RunContext, shard: int, source: Source, writer: ShardWri
             ) from error
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text)]
     rule = patch_rule(config.source)
+    dark_frames, dark_folder = context.dark()
     with log.times.simulating():
         facts = facts_for(config, photograph.srgb, source.frames)
-        plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, context.dark_frames)
+        plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, dark_frames)
         noise_dn = None if config.source.root is None else source_noise_dn(photograph.srgb, plans[0])
     log.failures.update(dict.fromkeys(_self_test(context, plans)))
     rows: list[Row] = []
@@ -191,7 +192,7 @@ def make_image(context: RunContext, shard: int, source: Source, writer: ShardWri
         key = patch_key(source.index, patch, several=rule is not None)
         sample: list[Row] = []
         with log.times.simulating():
-            pairs = make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin, context.dark_folder)
+            pairs = make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin, dark_folder)
         for plan, pair, digests in _add_frames(writer, key, plans, log.times.each_simulated(pairs)):
             row_key = pair_key(key, plan, several=len(plans) > 1)
             row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
