@@ -201,7 +201,7 @@ def effect_table(config: Config, predictions: Predictions) -> list[str]:
     return lines
 
 
-_TABLE_LINE = "{:13}{:>13}  {:14}{:>11}{:>10}  {:9}{:>9}  {}"
+_TABLE_LINE = "{:16}{:>13}  {:14}{:>11}{:>10}  {:9}{:>9}  {}"
 
 
 def _decision(overview: EffectOverview) -> str:
