@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from unprocess_gen.core.types import Plan
     from unprocess_gen.dataset.reader import RawPairs, Sample
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Config",
