@@ -283,18 +283,22 @@ class Bench:
         assert len(plans) == LEVELS
         return self.warm(Work(lambda: [lambda: [None for _ in make_pairs(self.srgb, plans)]], self.sites))
 
-    def patches(self, settings: str, new_body: bool = True) -> Work:
-        """Return the work of `PATCHES` patches; ``new_body`` gives each patch and repetition another camera body."""
+    def patches(self, settings: str, new_place: bool = False) -> Work:
+        """Return the work of `PATCHES` patches; ``new_place`` moves each repetition on the sensor, as random patches.
+
+        Fixed patterns are kept by place.
+        """
         (plan,) = self.plans(settings)
         side = self.patch_side
         corners = [*itertools.product(*(np.linspace(0, full - side, 4).astype(int) for full in self.srgb.shape[:2]))]
         assert len(corners) == PATCHES
         cut_outs = [(self.srgb[y : y + side, x : x + side], (int(y), int(x))) for y, x in corners]
+        repetitions = itertools.count(1)
 
         def prepare() -> list[Call]:
+            moved = 2 * next(repetitions) if new_place else 0
             return [
-                functools.partial(make_pair, patch, self.with_new_body(plan) if new_body else plan, origin)
-                for patch, origin in cut_outs
+                functools.partial(make_pair, patch, plan, (y + moved, x + moved % 4096)) for patch, (y, x) in cut_outs
             ]
 
         return self.warm(Work(prepare, PATCHES * side * side))
@@ -369,8 +373,8 @@ class Bench:
         for settings, goal in ((TWO_NUMBERS, 1.5), (daylight, 2.0)):
             yield Row(name, settings, self.patches(settings), self.pair(settings), goal)
         settings = f"{daylight} {GIVEN}"
-        for what, new_body in (("new body", True), ("same body", False)):
-            patches, full = self.patches(settings, new_body), self.pair(settings, new_body)
+        for what, is_new in (("new places", True), ("places seen before", False)):
+            patches, full = self.patches(settings, is_new), self.pair(settings, is_new)
             yield Row(f"{name}, {what}", settings, patches, full, 2.0)
 
 
