@@ -204,6 +204,22 @@ def test_crop_has_the_shading_of_its_place() -> None:
     assert (crop.noisy == complete.noisy[100:160, 150:250]).all()
 
 
+def test_average_has_the_product_of_shading_and_pixel_gains() -> None:
+    numbers = {"lens_shading": (-0.5, 0.1, 0.0), "frame_size": (200, 300), "prnu_std": 0.05}
+    plan = plan_with("prnu", "lens_shading", fixed_pattern_in_clean=True, **numbers)
+    image = flat(9000, 60, 100)
+    for _ in range(2):  # the second pair finds the patterns of the first
+        assert_same(image, plan, (100, 153))
+
+
+@pytest.mark.parametrize("origin", [(3, 1000), (1, 2047), (0, 1024), (2, 990)])
+def test_columns_of_a_crop_are_those_of_the_body(origin: tuple[int, int]) -> None:
+    """Normals of columns are computed 1024 at a time."""
+    plan, image = plan_with("column", column_std_dn=3.0), flat(9000, 5, 1100)
+    assert_same(image, plan, origin)
+    assert len(np.unique(make_pair(image, plan, origin).noisy[0])) > 10
+
+
 # Dark current ---------------------------------------------------------------------------------------------------------
 
 
