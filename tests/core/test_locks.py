@@ -104,6 +104,14 @@ def test_process_that_was_not_waited_for_has_ended() -> None:
     process.wait()
 
 
+@pytest.mark.linux_only("reads the process table")
+def test_hidden_process_is_judged_by_its_heartbeat(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locks, "process_start", lambda pid: None)
+    path.write_text(json.dumps({"host": locks.host(), "pid": 1, "start": "1", "mark": "0"}))
+    assert has_ended(path) is None
+    assert is_held(path)
+
+
 def test_lock_of_another_host_is_held_while_it_is_renewed(path: Path) -> None:
     of_another_host(path, age_s=STALE_S - 30)
     assert has_ended(path) is None

@@ -7,17 +7,19 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import Cli, RunMain, messages
+from helpers.commands import COMMAND, Cli, RunMain, environment, messages
 from helpers.datasets import Make, TreeHash
-from helpers.photographs import fill
+from helpers.photographs import fill, pixels
 from helpers.processes import imported_first, running, wait_for
 from helpers.promise_report import Figure
+from PIL import Image
 
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import deaths, parts
@@ -329,6 +331,23 @@ def test_photographs_may_be_elsewhere_on_another_host(
         assert run_main("part", "ds", part, "source.root=elsewhere", "-q").code == 0
     assert run_main("merge", "ds").code == 0
     assert tree_hash(ds) == undisturbed
+
+
+def test_full_disk_ends_a_part_with_5_and_keeps_its_shards(
+    photographs: Path, run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    """A limit on the size of files acts as a full disk: the last photograph is too large for it."""
+    Image.fromarray(pixels(5, 300, 300)).save(photographs / "large.png")
+    make(photographs, tmp_path / "undisturbed", ONE)
+    assert run_main("prepare", "parts=1", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    command = f"ulimit -f 300; exec {COMMAND} part ds 0"
+    done = subprocess.run(["bash", "-c", command], env=environment(), capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (5, ""), done.stderr
+    assert ["File too large" in line for line in messages(done.stderr)] == [True]
+    assert run_main("status", "ds").out.startswith("ds: 0 of 1 part done, 12 of 13 shards committed")
+    assert run_main("part", "ds", 0, "-q").code == 0
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")
 
 
 # Deaths ---------------------------------------------------------------------------------------------------------------

@@ -191,8 +191,11 @@ def has_ended(path: Path) -> bool | None:
         owner = json.loads(path.read_text(encoding="utf-8"))
         if owner["host"] == host() and owner["pid"] == os.getpid() and owner["mark"] in _HELD:
             return False
-        if owner["host"] == host() and owner["start"] is not None:
-            return owner["pid"] == os.getpid() or bool(process_start(int(owner["pid"])) != owner["start"])
+        if owner["host"] == host() and owner["pid"] == os.getpid():
+            return True
+        start = process_start(int(owner["pid"])) if owner["host"] == host() else None
+        if start is not None and owner["start"] is not None:
+            return bool(start != owner["start"])
     except (OSError, ValueError, KeyError, TypeError):
         pass  # its owner has created the file and not yet written it, or has deleted it
     return None
@@ -237,15 +240,26 @@ def process_start(pid: int) -> str | None:
     Returns
     -------
     str or None
-        Empty if no such process runs; None if this system does not report it.
+        Empty if no such process runs; None if this system does not report it, or hides the process from this user.
     """
     if platform.system() == "Linux":
         try:
             state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         except OSError:
-            return ""
+            return None if _exists(pid) else ""
         return "" if state in "ZX" else fields[18]  # proc(5): field 22 is the start in clock ticks since boot
     if platform.system() == "Darwin":
         listed = subprocess.run(["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False)
         return listed.stdout.strip()
     return None
+
+
+def _exists(pid: int) -> bool:
+    """Return whether a process exists, also one of another user in a ``/proc`` mounted with ``hidepid``."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
