@@ -247,6 +247,14 @@ def test_plan_describes_frames_and_what_they_contain(run_main: RunMain, darks: P
     assert "Contained in the dark frames: read, dark_current, hot_pixels, row, column" in text
 
 
+def test_report_describes_the_frames(made: Path, run_main: RunMain, tmp_path: Path, darks: Path) -> None:
+    done = run_main("report", made, "--to", tmp_path / "page.html")
+    assert done.code == 0, done.err
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert f"3 in {darks}, 90x70 pixels, black level 512 DN, standard deviation 3." in page
+    assert "dark_frame" in page
+
+
 def test_noise_of_dark_frames_is_not_checked(made: Path, run_main: RunMain) -> None:
     done = run_main("verify", made, "--noise")
     assert done.code == 0, done.err

@@ -204,6 +204,17 @@ def _contents(facts: Mapping[str, Any], statistics: ManifestStatistics) -> dict[
         "generated on": f"{run['host']}, {run['platform']}, Python {run['python']}; "
         f"{run['n_jobs']} workers, {run['seconds']:,} s for the last {run['shards_made']:,} shards",
         "self-test": str(facts["self_test"]),
+        **_dark_frames(facts.get("dark_frames") or {}),
+    }
+
+
+def _dark_frames(facts: Mapping[str, Any]) -> dict[str, str]:
+    """Return what the page says about dark frames; nothing without them, or if the run could not read them."""
+    if "count" not in facts:
+        return {}
+    return {
+        "dark frames": f"{facts['count']:,} in {facts['root']}, {', '.join(facts['sizes'])} pixels, black level "
+        f"{facts['black_dn']:g} DN, standard deviation {facts['std_dn']:.4g} DN of the sensor"
     }
 
 

@@ -174,7 +174,7 @@ def with_dark_frames(
     for of_frame, numbers_of_frame, plan in zip(dark_dn, numbers, plans, strict=True):
         if plan.dark_frame:
             inside = of_frame[:, first : first + shape[1]]
-            inside[:] = reference_noise.dark_frame_offsets(plan, dark_pixels, shape, origin)
+            reference_noise.dark_frame_offsets(plan, dark_pixels, shape, origin, out=inside)
             farthest_dn = max(float(inside.max(initial=0.0)), -float(inside.min(initial=0.0)))
             numbers_of_frame[_ERROR_DN] += 2 * FLOAT32_ERROR_DN * farthest_dn
     steps = shape[0] * pitch, pitch

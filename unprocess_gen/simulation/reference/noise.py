@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -390,7 +389,11 @@ def dark_dither(plan: Plan, like: Float, origin: Origin = (0, 0)) -> Float:
 
 
 def dark_frame_offsets(
-    plan: Plan, dark_pixels: DarkPixels | None, shape: Shape, origin: Origin = (0, 0)
+    plan: Plan,
+    dark_pixels: DarkPixels | None,
+    shape: Shape,
+    origin: Origin = (0, 0),
+    out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Return what a plan's dark frame adds to each pixel.
 
@@ -406,6 +409,8 @@ def dark_frame_offsets(
         Height and width.
     origin : (int, int)
         Row and column of the first pixel in the full frame.
+    out : ndarray of float32, [H, W], optional
+        Where the result is written.
 
     Returns
     -------
@@ -419,22 +424,19 @@ def dark_frame_offsets(
     """
     if dark_pixels is None:
         raise ValueError(f"dark_pixels=None: the plan needs the dark frame {plan.dark_frame}; expected access to it")
-    corner = origin[0] + plan.dark_shift[0], origin[1] + plan.dark_shift[1]
-    dark = _repeated(dark_pixels.frame(plan.dark_frame), shape, corner).astype(np.float32)
-    if plan.dark_shading:
-        dark -= _repeated(dark_pixels.mean(plan.dark_shading), shape, corner)
-    else:
-        dark -= np.float32(plan.dark_black_dn)
-    dark *= np.float32(plan.dark_scale)
-    return dark
-
-
-def _repeated(frame: NDArray[Any], shape: Shape, corner: Origin) -> NDArray[Any]:
-    """Return the part of a periodically repeated frame that begins at a row and column, [H, W]."""
-    out = np.empty((shape[0], shape[1]), dtype=frame.dtype)
-    for y, from_y, rows in _runs(corner[0], shape[0], frame.shape[0]):
-        for x, from_x, columns in _runs(corner[1], shape[1], frame.shape[1]):
-            out[y : y + rows, x : x + columns] = frame[from_y : from_y + rows, from_x : from_x + columns]
+    out = np.empty((shape[0], shape[1]), dtype=np.float32) if out is None else out
+    frame, black, scale = (
+        dark_pixels.frame(plan.dark_frame),
+        np.float32(plan.dark_black_dn),
+        np.float32(plan.dark_scale),
+    )
+    mean = dark_pixels.mean(plan.dark_shading) if plan.dark_shading else None
+    for y, from_y, rows in _runs(origin[0] + plan.dark_shift[0], shape[0], frame.shape[0]):
+        for x, from_x, columns in _runs(origin[1] + plan.dark_shift[1], shape[1], frame.shape[1]):
+            part, source = out[y : y + rows, x : x + columns], np.s_[from_y : from_y + rows, from_x : from_x + columns]
+            np.subtract(frame[source], black if mean is None else mean[source], out=part, dtype=np.float32)
+            if scale != 1:
+                part *= scale
     return out
 
 
