@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -27,7 +27,34 @@ import unprocess_gen as ug
 from unprocess_gen.sources.loader import list_photographs
 sources = list_photographs(ug.load_config([f"source.root={sys.argv[1]}"]).source).sources
 assert len(sources) == 1_000_000
-assert sum(source.occurrence for source in sources) == 100_000
+assert sum(source.occurrence for source in sources) == 99_999
+"""
+
+PREPARE = """
+import sys
+import unprocess_gen as ug
+from unprocess_gen.pipeline.parts import prepare
+root, out, parts, *overrides = sys.argv[1:]
+config = ug.load_config([f"source.root={root}", f"out={out}", "n_jobs=1", "check_disk=false", *overrides])
+assert prepare(config, int(parts)).sources >= 1000
+"""
+
+PART = """
+import sys
+from unprocess_gen.pipeline.parts import make_part
+made = make_part(sys.argv[1], int(sys.argv[2]))
+assert made.made == made.shards > 0
+"""
+
+MERGE = """
+import os, sys
+from pathlib import Path
+from unprocess_gen.pipeline.parts import merge
+out, shards = Path(sys.argv[1]), int(sys.argv[2])
+records = out / ".work" / "rows"
+for shard in range(10, shards):
+    os.link(records / "00001.json", records / f"{shard:05d}.json")
+assert merge(str(out))[0].rows == 100 * shards
 """
 
 
@@ -112,16 +139,48 @@ def test_verify_of_100_000_rows_takes_less_than_300_megabytes(original: Path, tm
     assert many < few + 30
 
 
-@pytest.mark.slow
-def test_listing_of_a_million_files_takes_less_than_1500_megabytes(tmp_path: Path) -> None:
-    """The files are empty except for a hole; a fifth of them share size and content with another one."""
-    for number in range(1_000_000):
-        folder = tmp_path / f"{number // 1000:03d}"
+@pytest.fixture(scope="module")
+def million(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Make a folder of a small photograph and 999,999 files that are empty except for a hole.
+
+    A fifth of the files share size and content with another one.
+    """
+    root = fill(tmp_path_factory.mktemp("million") / "p", 1)
+    for number in range(999_999):
+        folder = root / f"{number // 1000:03d}"
         if number % 1000 == 0:
             folder.mkdir()
         with (folder / f"photograph_{number:08d}.jpg").open("wb") as file:
             file.truncate(1 + number % 900_000)
-    peak = peak_megabytes(LIST, tmp_path)
-    shutil.rmtree(tmp_path)
+    yield root
+    shutil.rmtree(root)
+
+
+@pytest.mark.slow
+def test_listing_of_a_million_files_takes_less_than_1500_megabytes(million: Path) -> None:
+    peak = peak_megabytes(LIST, million)
     print(f"listing: {peak:.0f} MB for a million files")
     assert peak < 1500
+
+
+@pytest.mark.slow
+def test_parts_of_a_million_files_take_bounded_memory(million: Path, tmp_path: Path) -> None:
+    out = tmp_path / "ds"
+    prepared = peak_megabytes(PREPARE, million, out, 1000, "output.pairs_per_shard=8")
+    made = peak_megabytes(PART, out, 0)
+    print(f"prepare: {prepared:.0f} MB; part: {made:.0f} MB")
+    assert prepared < 1500
+    assert made < 300
+
+
+@pytest.mark.slow
+def test_merge_takes_memory_that_is_flat_in_rows(million: Path, tmp_path: Path) -> None:
+    """The records of all shards but the first ten are copies of one with a hundred failed sources."""
+    peaks = []
+    for sources in (1_000, 1_000_000):
+        out = tmp_path / str(sources)
+        peak_megabytes(PREPARE, million, out, sources // 1000, "output.pairs_per_shard=100", f"source.limit={sources}")
+        peak_megabytes(PART, out, 0)
+        peaks.append(peak_megabytes(MERGE, out, sources // 100))
+    print(f"merge: {peaks[0]:.0f} MB for 1,000 rows, {peaks[1]:.0f} MB for a million")
+    assert peaks[1] < peaks[0] + 50
