@@ -12,6 +12,7 @@ from helpers.commands import RunMain
 from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill
 
+from unprocess_gen import load_config
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline import sizes
 from unprocess_gen.pipeline.generate import shard_tasks
@@ -207,6 +208,6 @@ def test_too_many_shards_are_warned_of(
 
 
 @pytest.mark.parametrize("text", ["${oc.env:PER_SHARD}", "'8'"])
-def test_text_of_a_number_is_a_number(text: str, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_text_of_a_number_is_a_number(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PER_SHARD", "8")
-    assert settings(f"output.pairs_per_shard={text}").output.pairs_per_shard == 8
+    assert load_config([f"output.pairs_per_shard={text}"]).output.pairs_per_shard == 8
