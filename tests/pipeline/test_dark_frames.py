@@ -21,6 +21,8 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.dataset.shards import json_inside
 from unprocess_gen.pipeline.replay import PairRegenerator
+from unprocess_gen.planning.effect_selection import facts_of
+from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.sources.dark_frames import open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "camera=identity", "gains=unity")
@@ -84,6 +86,36 @@ def test_draws_use_different_frames_at_the_same_place(made: Path) -> None:
     for first, second in zip(rows(made)[::2], rows(made)[1::2], strict=True):
         assert first["dark_frame"] != second["dark_frame"]
         assert [first[f"dark_frame_{axis}"] for axis in "yx"] == [second[f"dark_frame_{axis}"] for axis in "yx"]
+
+
+def test_frames_of_a_clip_take_turns_at_one_place(darks: Path) -> None:
+    config = ug.load_config([*NOISE, f"noise.dark_frames={darks}", "noise.draws=2"])
+    config, frames, _ = open_dark_frames(config)
+    assert frames is not None
+    facts = facts_of(pixels(1, 40, 50))
+    plans = [
+        plan for frame in range(3) for plan in plan_pairs(config, "a" * 64, 0, facts, frame=frame, dark_frames=frames)
+    ]
+    digests = [one.sha256 for one in frames.frames]
+    first = digests.index(plans[0].dark_frame)
+    assert [plan.dark_frame for plan in plans] == [digests[(first + number) % 3] for number in range(6)]
+    assert len({plan.dark_shift for plan in plans}) == 1
+
+
+def test_effects_are_judged_against_the_noise_of_the_frames(tmp_path: Path) -> None:
+    """PRNU of half a percent is visible next to weak noise, and hidden by strong noise."""
+    simulated = {}
+    for std in (2.0, 200.0):
+        folder = tmp_path / str(std)
+        save_frames(folder, 2, black=2000, std=std)
+        pair = ug.make_pair(
+            np.full((64, 64, 3), 120, np.uint8),
+            ug.load_config([*NOISE, f"noise.dark_frames={folder}", "effects.tolerance=0.12"]),
+        )
+        simulated[std] = pair.plan.effects
+        assert pair.plan.b_dn2 == pytest.approx((SCALE * std) ** 2 * (1 + 1 / 4 + 1 / 9), rel=0.2)
+    assert "prnu" in simulated[2.0]
+    assert "prnu" not in simulated[200.0]
 
 
 def test_frame_that_contains_the_image_is_not_repeated(made: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from importlib.util import find_spec
@@ -50,6 +50,8 @@ noise by 0.3 %."""
 STEPS_PER_DN = 16
 """Steps in which differences from the mean of the frames are counted."""
 FARTHEST_STEPS = 2**18
+
+BLOCK_SITES = 2**20
 
 Counts = NDArray[np.int64]
 
@@ -259,7 +261,8 @@ def _described(folder: DarkFolder, rules: _Rules) -> DarkFrames:
         blacks.add(mosaic.black_dn)
         pixels = folder.frame(sha256)
         frames.append(DarkFrame(sha256, *pixels.shape))
-        counts += np.bincount(pixels.reshape(-1), minlength=2**16)
+        for rows in _blocks(pixels.shape):
+            counts += np.bincount(pixels[rows].reshape(-1), minlength=2**16)
     median_dn = _median(counts)
     black_dn = rules.black_dn if rules.black_dn is not None else _black_level(folder, blacks, median_dn)
     if abs(median_dn - black_dn) > BRIGHTEST_MEDIAN * rules.span_dn:
@@ -345,11 +348,16 @@ def read_mosaic(path: Path) -> Mosaic:
         raise ConfigError(f"noise.dark_frames: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
     if pixels is None:
         raise ConfigError(f"noise.dark_frames: {path} cannot be decoded; expected {suffix[1:].upper()}")
+    _check_mosaic(path, pixels)
+    return Mosaic(np.ascontiguousarray(pixels, dtype=np.uint16))
+
+
+def _check_mosaic(path: Path, pixels: NDArray[Any]) -> None:
+    """Raise ConfigError unless an array is a mosaic of 16-bit integers."""
     if pixels.dtype != np.uint16 or pixels.ndim != 2:
         raise ConfigError(
             f"noise.dark_frames: {path} is {pixels.dtype} {list(pixels.shape)}; expected a mosaic [H, W] of uint16"
         )
-    return Mosaic(np.ascontiguousarray(pixels, dtype=np.uint16))
 
 
 def _read_raw(path: Path, content: bytes) -> Mosaic:
@@ -383,7 +391,11 @@ def _read_raw(path: Path, content: bytes) -> Mosaic:
 def _mapped(path: str, sha256: str) -> Raw:
     """Return the array of an NPY file, mapped into memory."""
     _check_digest(path, sha256)
-    pixels: Raw = np.load(path, mmap_mode="r", allow_pickle=False)
+    try:
+        pixels: Raw = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError) as error:  # an edited row can name any file of the folder
+        raise ConfigError(f"noise.dark_frames: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
+    _check_mosaic(Path(path), pixels)
     return pixels
 
 
@@ -406,11 +418,11 @@ def _check_digest(path: str, sha256: str) -> None:
 @functools.lru_cache(maxsize=1)
 def _mean(folder: str, digests: tuple[str, ...], frames: DarkFolder) -> NDArray[np.float32]:
     """Return the mean of the frames with these digests: an exact sum, divided once."""
-    total: NDArray[np.uint64] | None = None
+    total: NDArray[np.uint32] | None = None
     for sha256 in digests:
         pixels = frames.frame(sha256)
         if total is None:
-            total = np.zeros(pixels.shape, dtype=np.uint64)
+            total = np.zeros(pixels.shape, dtype=np.uint32)  # 65,537 frames fit
         if pixels.shape != total.shape:
             raise ConfigError(
                 f"noise.dark_shading=remove: the dark frames of {folder} have several sizes; expected one; set "
@@ -418,10 +430,19 @@ def _mean(folder: str, digests: tuple[str, ...], frames: DarkFolder) -> NDArray[
             )
         total += pixels
     assert total is not None
-    return (total / np.float64(len(digests))).astype(np.float32)
+    mean = np.empty(total.shape, dtype=np.float32)
+    for rows in _blocks(total.shape):
+        mean[rows] = total[rows] / np.float64(len(digests))
+    return mean
 
 
 # --------------------------------------------------------------------------------------------------------- statistics
+
+
+def _blocks(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Yield the rows of blocks of about `BLOCK_SITES`, so that wider types take little memory."""
+    step = max(1, BLOCK_SITES // shape[1])
+    return (slice(top, top + step) for top in range(0, shape[0], step))
 
 
 def _median(counts: Counts) -> int:
@@ -448,9 +469,9 @@ def _variance_around_mean(folder: DarkFolder, frames: Sequence[DarkFrame]) -> fl
     mean = folder.mean(folder.sha256)
     counts = np.zeros(2 * FARTHEST_STEPS + 1, dtype=np.int64)
     for frame in frames:
-        steps = np.rint((folder.frame(frame.sha256) - mean) * np.float32(STEPS_PER_DN)).astype(np.int64)
-        counts += np.bincount(
-            (np.clip(steps, -FARTHEST_STEPS, FARTHEST_STEPS) + FARTHEST_STEPS).reshape(-1),
-            minlength=2 * FARTHEST_STEPS + 1,
-        )
+        pixels = folder.frame(frame.sha256)
+        for rows in _blocks(mean.shape):
+            steps = np.rint((pixels[rows] - mean[rows]) * np.float32(STEPS_PER_DN)).astype(np.int64)
+            places = np.clip(steps, -FARTHEST_STEPS, FARTHEST_STEPS) + FARTHEST_STEPS
+            counts += np.bincount(places.reshape(-1), minlength=counts.size)
     return _trimmed_variance(counts, STEPS_PER_DN)
