@@ -547,11 +547,11 @@ def _folder_to(verb: str, call: Call) -> Path:
 
 def _root(call: Call) -> str | None:
     """Return the root that the user gives; ConfigError if it is no folder or photograph, None if none is given."""
-    from unprocess_gen.sources.listing import root_status
+    from unprocess_gen.sources.listing import check_root
 
     root: str | None = call.values.get("source")
     if root is not None:
-        root_status(root)
+        check_root(root)
     return root
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import re
 from importlib.util import find_spec
-from pathlib import Path
 
 from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn
@@ -42,6 +41,7 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.config.values import one_of, value_text
 from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.object_store import StoreAccessError, any_path
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.noise import REPLACED
@@ -165,10 +165,17 @@ def _check_settings(config: Config) -> None:
 # ---------------------------------------------------------------------------------------- source, camera and sensor
 
 
+def _exists(root: str) -> bool:
+    try:
+        return any_path(root).exists()
+    except StoreAccessError as error:
+        raise ConfigError(f"source.root={error}") from None
+
+
 def _check_environment(source: SourceConfig) -> None:
     if source.root == "":
         raise ConfigError("source.root='': expected a folder or file; null selects the built-in scenes")
-    if source.root is not None and not Path(source.root).exists():
+    if source.root is not None and not _exists(source.root):
         raise ConfigError(
             f"source.root={source.root}: no such folder or file; expected photographs, or null for the built-in scenes"
         )

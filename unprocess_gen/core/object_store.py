@@ -151,9 +151,22 @@ class ObjectPath:
         Yields
         ------
         ObjectFacts
-            In the order of the store. Empty objects whose key ends with a slash, by which consoles show folders, are
-            omitted.
+            In the order of the store. Empty objects ``FOLDER/``, by which consoles show folders, are omitted if they
+            are followed by objects below them; obstore lists them without the slash.
         """
+        held: ObjectFacts | None = None
+        for found in self._listed(recursive):
+            if held is not None and not found.key.startswith(f"{held.key}/"):
+                yield held
+            held = None
+            if found.size:
+                yield found
+            else:
+                held = found
+        if held is not None:
+            yield held
+
+    def _listed(self, recursive: bool) -> Iterator[ObjectFacts]:
         prefix = f"{self.key}/" if self.key else ""
         with _request(self) as (obstore, store):
             if recursive:
@@ -162,7 +175,8 @@ class ObjectPath:
                 chunks = iter([obstore.list_with_delimiter(store, self.key or None)["objects"]])
             for chunk in chunks:
                 for found in chunk:
-                    yield ObjectFacts(found["path"].removeprefix(prefix), found["size"], found["e_tag"])
+                    if found["path"] != self.key:
+                        yield ObjectFacts(found["path"].removeprefix(prefix), found["size"], found["e_tag"])
 
     def iterdir(self) -> Iterator[ObjectPath]:
         """Yield the objects and prefixes one level below this one."""
@@ -203,11 +217,26 @@ class ObjectPath:
             raise FileNotFoundError(2, "no such object", str(self))
         return ObjectStat(facts.size)
 
-    def open(self, mode: str = "rb") -> io.BufferedReader:
-        """Open the object as a seekable binary file; it is read in pieces that grow while reading is sequential."""
+    def open(self, mode: str = "rb", etag: str | None = None, first_piece: int = MIN_PIECE) -> io.BufferedReader:
+        """Open the object as a seekable binary file.
+
+        Parameters
+        ----------
+        mode : {"rb"}
+            Objects are opened for reading only.
+        etag : str, optional
+            The ETag that the object must have.
+        first_piece : int
+            Bytes of the first request; later ones grow to `MAX_PIECE` while reading is sequential.
+
+        Returns
+        -------
+        binary file
+            Its methods raise as `read_bytes`. The first read is the first request.
+        """
         if mode != "rb":
             raise ValueError(f"mode={mode}: objects are opened for reading only")
-        return io.BufferedReader(_RangeReader(self))
+        return io.BufferedReader(_RangeReader(self, etag, min(first_piece, MAX_PIECE)))
 
     def read_bytes(self, etag: str | None = None) -> bytes:
         """Return the content of the object.
@@ -231,8 +260,7 @@ class ObjectPath:
         MachineError
             If the store does not answer.
         """
-        reader = _RangeReader(self, etag, first_piece=MAX_PIECE)
-        with io.BufferedReader(reader, MAX_PIECE) as stream:
+        with self.open("rb", etag, MAX_PIECE) as stream:
             return stream.read()
 
     def read_text(self, encoding: str = "utf-8") -> str:
@@ -403,17 +431,27 @@ class _RangeReader(io.RawIOBase):
         view = memoryview(buffer).cast("B")
         if not view:
             return 0
+        piece = self._at_position(len(view))[: len(view)]
+        view[: len(piece)] = piece
+        self._position += len(piece)
+        return len(piece)
+
+    def readall(self) -> bytes:
+        pieces = []
+        while piece := self._at_position(MIN_PIECE):
+            pieces.append(piece)
+            self._position += len(piece)
+        return b"".join(pieces)
+
+    def _at_position(self, wanted: int) -> memoryview:
+        """Return bytes from the position on, fetched if necessary; none only at the end of the object."""
         end = self._start + len(self._piece)
         if not self._start <= self._position < end:
             sequential = self._position == end and end > 0
             self._piece_size = min(2 * self._piece_size, MAX_PIECE) if sequential else self._first_piece
-            size = max(self._piece_size, min(len(view), MAX_PIECE))
+            size = max(self._piece_size, min(wanted, MAX_PIECE))
             self._piece, self._start = memoryview(self._fetch(self._position, size)), self._position
-        at = self._position - self._start
-        count = min(len(view), len(self._piece) - at)
-        view[:count] = self._piece[at : at + count]
-        self._position += count
-        return count
+        return self._piece[self._position - self._start :]
 
     def _known_size(self) -> int:
         if self._size < 0:

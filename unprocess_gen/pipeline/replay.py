@@ -16,7 +16,7 @@ import numpy as np
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error
-from unprocess_gen.core.object_store import AnyPath
+from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, is_url
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Plan, Row, Source
@@ -118,7 +118,7 @@ def check_source_sizes(manifest: AnyPath, root: str) -> None:
     manifest : Path or ObjectPath
         The manifest.
     root : str
-        Folder of the sources, or the single photograph; it exists.
+        Folder of the sources, or the single photograph, or the URL of either; it exists.
 
     Raises
     ------
@@ -128,14 +128,17 @@ def check_source_sizes(manifest: AnyPath, root: str) -> None:
         If the manifest cannot be read.
     """
     last = ""
+    # one listing instead of a request for each object
+    sizes = {found.key: found.size for found in ObjectPath(root).objects()} if is_url(root) else None
     for row in read_rows(manifest):
         name, recorded = str(row["source"]), row["source_bytes"]
         if name == last or not recorded:  # built-in scenes and unreadable files have no size
             continue
         last = name
+        path = listing.decode_name(name)
         try:
-            size = Path(listing.source_file(root, listing.decode_name(name))).stat().st_size
-        except (OSError, ValueError, SourceError):
+            size = sizes[path] if sizes else any_path(listing.source_file(root, path)).stat().st_size
+        except (OSError, ValueError, KeyError, SourceError):
             raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
         if size != recorded:
             raise SourceChangedError(

@@ -1,4 +1,4 @@
-"""List the source images of a folder, write their names for the manifest, and read their bytes.
+"""List the source images of a folder or bucket, write their names for the manifest, and read their bytes.
 
 Listing opens no file, so a pipe, a device or a terabyte file costs one ``stat``. Reading opens without blocking and
 checks what was opened before the first byte. A folder that cannot be read stops the run, because photographs that go
@@ -7,6 +7,9 @@ missing silently change a dataset; ``os.walk`` ignores such folders.
 Only links that lead back to a folder that contains them are skipped. A photograph reached through two links is two
 sources; `number_twins` numbers them. Folders that link to each other are walked along every path without a
 repetition, which grows quickly with their number: link to files, not between folders.
+
+``source.root`` may be the URL of an object store. Its objects have the names and the order that files of a folder with
+these paths have, so that the same photographs give the same dataset.
 """
 
 from __future__ import annotations
@@ -29,7 +32,9 @@ import xxhash
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import leads_outside
+from unprocess_gen.core.object_store import ObjectChangedError, ObjectPath, StoreAccessError, is_url
 from unprocess_gen.core.types import Source
+from unprocess_gen.sources.read_ahead import in_order
 
 _Result = TypeVar("_Result")
 
@@ -100,11 +105,12 @@ class Listing:
 
 
 class _Found(NamedTuple):
-    """A file or other entry that a glob matches: path below the root, and size or reason as in `Source`."""
+    """A file or other entry that a glob matches: path below the root, and size, reason and ETag as in `Source`."""
 
     path: str
     size_bytes: int | None
     reason: str | None
+    etag: str | None = None
 
 
 def list_folder(
@@ -115,7 +121,7 @@ def list_folder(
     Parameters
     ----------
     root : str
-        A folder, or a single file, which is listed whatever the globs are.
+        A folder, or a single file, which is listed whatever the globs are; or the URL of a prefix or of an object.
     include : sequence of str
         Globs, case-insensitive. A glob with ``/`` is matched against the relative path, others against the file name.
     recursive : bool
@@ -135,10 +141,10 @@ def list_folder(
     ConfigError
         If the root does not exist, a sub-folder cannot be read, or no file matches.
     """
-    status = root_status(root)
-    if stat.S_ISREG(status.st_mode):
-        return Listing((_as_source(0, _found(Path(root).name, status)),))
-    walk = _Walk(root, matcher(include), matcher(video))
+    single = _single_file(root)
+    if single is not None:
+        return Listing((_as_source(0, single),))
+    walk = (_BucketWalk if is_url(root) else _Walk)(root, matcher(include), matcher(video))
     matched = sorted(walk.matched(recursive), key=lambda found: os.fsencode(found.path))
     if not matched:
         advice = (
@@ -235,7 +241,7 @@ def source_file(root: str, path: str) -> str:
     Returns
     -------
     str
-        Path to open.
+        Path to open, or URL to read.
 
     Raises
     ------
@@ -245,6 +251,9 @@ def source_file(root: str, path: str) -> str:
     """
     if leads_outside(path):
         raise SourceError("unreadable", f"{encode_name(path)} leads outside source.root")
+    if is_url(root):
+        prefix = ObjectPath(root)
+        return str(prefix if prefix.name == path and not prefix.is_dir() else prefix / path)
     if Path(root).name == path and not Path(root).is_dir():
         return root
     return os.path.join(root, path)
@@ -275,7 +284,7 @@ def read_bytes(root: str, source: Source) -> bytes:
     """
     with _opened(root, source) as file:
         # files below /proc have size 0 and grow while they are read
-        if source.size_bytes == 0 and os.fstat(file.fileno()).st_size == 0:
+        if source.size_bytes == 0 and (is_url(root) or os.fstat(file.fileno()).st_size == 0):
             raise SourceError("empty", f"{source.name} has 0 bytes")
         data = _reading(source, file.read)
     _check_size(source, len(data), "while it was read")
@@ -337,15 +346,24 @@ def number_twins(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
     for place, source in enumerate(sources):
         if source.size_bytes is not None and sharing[source.size_bytes] > 1:
             by_size.setdefault(source.size_bytes, []).append(place)
-    numbered = list(sources)
-    for places in by_size.values():
-        tails = [_tail_digest(root, sources[place]) for place in places]
-        alike = Counter(tails)
-        seen: Counter[str] = Counter()
-        for place, tail in zip(places, tails, strict=True):
-            if tail is not None and alike[tail] > 1:
-                numbered[place] = _number(root, sources[place], seen)
+    numbered, seen = list(sources), Counter[str]()
+    candidates = list(_sharing_tails(root, sources, by_size.values()))
+    digests = in_order(root, _complete_digest, (sources[place] for place in candidates))
+    for place, digest in zip(candidates, digests, strict=True):
+        if digest is not None:
+            numbered[place] = replace(sources[place], occurrence=seen[digest], sha256=digest)
+            seen[digest] += 1
     return tuple(numbered)
+
+
+def _sharing_tails(root: str, sources: Sequence[Source], groups: Iterable[Sequence[int]]) -> Iterator[int]:
+    """Yield the places of sources whose last bytes equal those of another source of their group, group by group."""
+    groups = list(groups)
+    tails = in_order(root, _tail_digest, (sources[place] for places in groups for place in places))
+    for places in groups:
+        of_group = list(itertools.islice(tails, len(places)))
+        alike = Counter(of_group)
+        yield from (place for place, tail in zip(places, of_group, strict=True) if tail is not None and alike[tail] > 1)
 
 
 def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
@@ -436,24 +454,41 @@ def content_sha256(root: str, source: Source) -> str:
         return hashlib.sha256(source.name.encode()).hexdigest()
 
 
-def root_status(root: str) -> os.stat_result:
-    """Return the status of a source root.
+def check_root(root: str) -> None:
+    """Check that a source root exists.
 
     Parameters
     ----------
     root : str
         Value of ``source.root``.
 
-    Returns
-    -------
-    os.stat_result
-        Status of the folder or regular file.
-
     Raises
     ------
     ConfigError
-        If nothing is there, or something else than a folder or a regular file.
+        If nothing is there, or something else than a folder or a regular file; for a URL also if access is refused.
     """
+    _single_file(root)
+
+
+def _single_file(root: str) -> _Found | None:
+    """Return the file or object that a root is, or None if it is a folder or prefix."""
+    if not is_url(root):
+        status = _root_status(root)
+        return _found(Path(root).name, status) if stat.S_ISREG(status.st_mode) else None
+    path = ObjectPath(root)
+    try:
+        if path.is_dir():
+            return None
+        facts = path.facts()
+    except StoreAccessError as error:
+        raise ConfigError(f"source.root={error}") from None
+    if facts is None:
+        raise ConfigError(f"source.root={root}: no such object or prefix; expected existing photographs")
+    return _Found(facts.key, facts.size, None, facts.etag)
+
+
+def _root_status(root: str) -> os.stat_result:
+    """Return the status of a folder or regular file; ConfigError if there is none."""
     try:
         status = Path(root).stat()
     except (OSError, ValueError) as error:
@@ -527,6 +562,18 @@ class _Walk:
         self.has_video = self.has_video or self._is_video(path)
 
 
+class _BucketWalk(_Walk):
+    """List the objects below a URL once; objects have no links and no folders that cannot be read."""
+
+    def matched(self, recursive: bool) -> Iterator[_Found]:
+        """Yield the objects that a glob matches, in the order of the store."""
+        for path, size_bytes, etag in ObjectPath(self._root).objects(recursive):
+            if self._matches(path):
+                yield _Found(path, size_bytes, None, etag)
+            else:
+                self._count_unmatched(path)
+
+
 def _scan(root: str, folder: str) -> Iterator[tuple[str, os.stat_result | None, OSError | None]]:
     """Yield path, status and error of each entry of a folder; the status is None if ``stat`` failed with the error."""
     prefix = folder + "/" if folder else ""
@@ -573,7 +620,8 @@ def _found(path: str, status: os.stat_result | None) -> _Found:
 
 
 def _as_source(index: int, found: _Found) -> Source:
-    return Source(index, encode_name(found.path), *found)
+    path, size_bytes, reason, etag = found
+    return Source(index, encode_name(path), path, size_bytes, reason, etag=etag)
 
 
 def _percent(text: str) -> str:
@@ -585,6 +633,10 @@ def _opened(root: str, source: Source, max_bytes: int | None = MAX_FILE_BYTES) -
     """Open a source, unless it is not, or no longer, the regular file that was listed."""
     if source.reason is not None:
         raise SourceError(source.reason, f"{source.name} was not a readable file when the folder was listed")
+    if is_url(root):
+        with _opened_object(root, source, max_bytes) as stream:
+            yield stream
+        return
     path = source_file(root, source.path)
     descriptor = _reading(source, lambda: os.open(path, _OPEN_FLAGS))
     try:
@@ -596,11 +648,30 @@ def _opened(root: str, source: Source, max_bytes: int | None = MAX_FILE_BYTES) -
         os.close(descriptor)
 
 
+@contextmanager
+def _opened_object(root: str, source: Source, max_bytes: int | None) -> Iterator[BinaryIO]:
+    """Open a source of an object store; the first read compares its ETag with the listed one."""
+    size = source.size_bytes or 0
+    _check_readable_size(source, size, max_bytes)
+    try:
+        with ObjectPath(source_file(root, source.path)).open("rb", source.etag, max(size, 1)) as stream:
+            yield stream
+    except ObjectChangedError:
+        raise MachineError(
+            f"source {source.name} changed since it was listed: its ETag differs; rerun when nothing writes to "
+            "source.root"
+        ) from None
+
+
 def _check_regular(source: Source, status: os.stat_result, max_bytes: int | None) -> None:
     if not stat.S_ISREG(status.st_mode):
         raise SourceError("not_a_file", f"{source.name} is {stat.filemode(status.st_mode)}, not a regular file")
-    if max_bytes is not None and status.st_size > max_bytes:
-        raise SourceError("too_large", f"{source.name} has {status.st_size} bytes, more than {max_bytes}")
+    _check_readable_size(source, status.st_size, max_bytes)
+
+
+def _check_readable_size(source: Source, size_bytes: int, max_bytes: int | None) -> None:
+    if max_bytes is not None and size_bytes > max_bytes:
+        raise SourceError("too_large", f"{source.name} has {size_bytes} bytes, more than {max_bytes}")
 
 
 def _check_size(source: Source, size_bytes: int, when: str) -> None:
@@ -630,11 +701,10 @@ def _tail_digest(root: str, source: Source) -> int | None:
         return None
 
 
-def _number(root: str, source: Source, seen: Counter[str]) -> Source:
+def _complete_digest(root: str, source: Source) -> str | None:
+    """Return the SHA-256 of a file, None if it cannot be read."""
     try:
         with _opened(root, source) as file:
-            digest = _reading(source, lambda: hashlib.file_digest(file, "sha256").hexdigest())  # type: ignore[arg-type]
+            return _reading(source, lambda: hashlib.file_digest(file, "sha256").hexdigest())  # type: ignore[arg-type]
     except SourceError:
-        return source
-    seen[digest] += 1
-    return replace(source, occurrence=seen[digest] - 1, sha256=digest)
+        return None

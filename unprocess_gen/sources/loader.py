@@ -13,9 +13,11 @@ import numpy as np
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
 from unprocess_gen.sources import listing
 from unprocess_gen.sources.image import decode
+from unprocess_gen.sources.read_ahead import Read
 from unprocess_gen.sources.scenes import synthetic
 from unprocess_gen.sources.video.decode import Video, is_installed
 
@@ -53,6 +55,7 @@ def list_photographs(config: SourceConfig) -> listing.Listing:
     listed = listing.list_folder(config.root, include, config.recursive, config.limit, video)
     numbered = listing.number_twins(config.root, listed.sources)
     if config.clips:
+        _refuse_remote_videos(config, numbered)
         framed = itertools.islice(_framed(config, numbered), config.limit)
         numbered = listing.number_clips(
             config.root, [replace(source, index=index) for index, source in enumerate(framed)]
@@ -61,7 +64,9 @@ def list_photographs(config: SourceConfig) -> listing.Listing:
     return replace(listed, sources=numbered, warnings=warnings)
 
 
-def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> tuple[str, Photograph]:
+def load_source(
+    config: SourceConfig, source: Source, layout: str = MOSAIC, read: Read = listing.read_bytes
+) -> tuple[str, Photograph]:
     """Read, decode and downscale one source.
 
     Parameters
@@ -72,6 +77,8 @@ def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> t
         One entry of the listing.
     layout : {"mosaic", "packed"}
         Layout of the frames; packed planes need at least one 2 x 2 tile.
+    read : callable
+        Reads a photograph; `read_ahead.reading_ahead` provides one that has read ahead.
 
     Returns
     -------
@@ -87,7 +94,7 @@ def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> t
     MachineError
         If the file is not the one that was listed.
     """
-    digest, photograph = _full_frame(config, source)
+    digest, photograph = _full_frame(config, source, read)
     height, width = photograph.srgb.shape[:2]
     rule = patch_rule(config)
     if rule is not None and min(height, width) < rule.side:
@@ -99,8 +106,8 @@ def load_source(config: SourceConfig, source: Source, layout: str = MOSAIC) -> t
     return digest, photograph
 
 
-def _full_frame(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
-    digest, photograph = _decoded(config, source)
+def _full_frame(config: SourceConfig, source: Source, read: Read) -> tuple[str, Photograph]:
+    digest, photograph = _decoded(config, source, read)
     if config.downscale == 1:
         return digest, photograph
     height, width = photograph.srgb.shape[:2]
@@ -132,7 +139,7 @@ def downscaled(srgb: Srgb, side: int) -> Srgb:
     return np.asarray((sums + count) // (np.uint64(2) * count), dtype=np.uint16)
 
 
-def _decoded(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
+def _decoded(config: SourceConfig, source: Source, read: Read) -> tuple[str, Photograph]:
     if config.root is None:
         try:
             pixels = synthetic.scene(source.path)
@@ -141,7 +148,7 @@ def _decoded(config: SourceConfig, source: Source) -> tuple[str, Photograph]:
         return hashlib.sha256(pixels.data).hexdigest(), Photograph(pixels, orientation=1)
     if source.is_video:
         return _frame(config, config.root, source)
-    content = listing.read_bytes(config.root, source)
+    content = read(config.root, source)
     digest = hashlib.sha256(content).hexdigest()
     _check_digest(source, digest)
     try:
@@ -159,6 +166,17 @@ def _check_digest(source: Source, digest: str) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------ videos
+
+
+def _refuse_remote_videos(config: SourceConfig, found: tuple[Source, ...]) -> None:
+    """Refuse videos in an object store: each worker would download every video once."""
+    is_video = listing.matcher(config.video)
+    video = next((source for source in found if is_url(config.root) and is_video(source.path)), None)
+    if video is not None:
+        raise ConfigError(
+            f"source.root={config.root}: {video.name} is a video in an object store; expected folders of frames; copy "
+            "the videos to a local folder, or omit them with source.video=[]"
+        )
 
 
 def _framed(config: SourceConfig, found: tuple[Source, ...]) -> Iterator[Source]:

@@ -1,0 +1,222 @@
+"""Photographs in an object store: the same listing, pairs and refusals as for a folder."""
+
+from __future__ import annotations
+
+import shutil
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers import object_store as servers
+from helpers.configs import composed
+from helpers.datasets import Make, TreeHash
+
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
+from unprocess_gen.core.object_store import ObjectPath
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.generate import generate
+from unprocess_gen.sources import listing, read_ahead
+from unprocess_gen.sources.listing import list_folder, number_twins, read_bytes
+from unprocess_gen.sources.loader import list_photographs
+
+
+@pytest.fixture
+def remote(photos: Path, bucket: ObjectPath) -> ObjectPath:
+    """Return the URL of a copy of `photos`."""
+    servers.upload(photos, bucket / "photos")
+    return bucket / "photos"
+
+
+def listed(root: object, **options: object) -> listing.Listing:
+    """List photographs as a run does."""
+    config = composed(*(f"source.{key}={value}" for key, value in options.items()))
+    config.source.root = str(root)
+    return list_photographs(config.source)
+
+
+def without_etag(found: listing.Listing) -> listing.Listing:
+    return replace(found, sources=tuple(replace(source, etag=None) for source in found.sources))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"recursive": False}, {"limit": 3}, {"include": "[*.PNG]"}, {"include": "[sub/*]"}, {"clips": True}],
+    ids=str,
+)
+def test_bucket_is_listed_like_the_folder(options: dict[str, object], photos: Path, remote: ObjectPath) -> None:
+    found = listed(remote, **options)
+    assert without_etag(found) == listed(photos, **options)
+    assert all(source.etag for source in found.sources)
+
+
+def test_hostile_names_are_listed_like_files(tmp_path: Path, bucket: ObjectPath) -> None:
+    for name in ("%41.png", "=a.png", "a b.png", "é.png", "z/#?.png", "-.png", "b\\c.png", "\u202eb.png", "A.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(name.encode() * 9)
+    servers.upload(tmp_path, bucket)
+    found = listed(bucket)
+    assert without_etag(found) == listed(tmp_path)
+    for source in found.sources:
+        assert read_bytes(str(bucket), source) == source.path.encode() * 9
+
+
+def test_single_object_is_a_source(photos: Path, remote: ObjectPath) -> None:
+    assert without_etag(listed(remote / "deep.png")) == listed(photos / "deep.png")
+    (source,) = listed(remote / "deep.png").sources
+    assert read_bytes(str(remote / "deep.png"), source) == (photos / "deep.png").read_bytes()
+
+
+def test_folder_markers_are_no_sources(remote: ObjectPath, s3: str) -> None:
+    before = listed(remote, include="[*]")
+    for marker in ("photos/", "photos/sub/"):
+        request = urllib.request.Request(f"{s3}/{remote.bucket}/{marker}", data=b"", method="PUT")
+        urllib.request.urlopen(request).close()
+    assert listed(remote, include="[*]") == before
+    (remote / "zero").write_bytes(b"")
+    assert listed(remote, include="[*]").sources[-1].path == "zero"
+
+
+def test_twins_are_numbered_like_files(tmp_path: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(read_ahead, "THREADS", 3)
+    tail = b"t" * 5000
+    contents = {"a": b"1" + tail, "b": b"2" + tail, "c": b"1" + tail, "d": tail, "e": b"3" * 5001, "f": b"1" + tail}
+    for name, content in contents.items():
+        (tmp_path / f"{name}.png").write_bytes(content)
+    servers.upload(tmp_path, bucket)
+    numbered = {source.path: source.occurrence for source in listed(bucket).sources}
+    assert numbered == {"a.png": 0, "b.png": 0, "c.png": 1, "d.png": 0, "e.png": 0, "f.png": 2}
+    assert without_etag(listed(bucket)) == listed(tmp_path)
+
+
+def test_only_candidates_are_read_completely(
+    s3: str, tmp_path: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(20):
+        (tmp_path / f"{number:02d}.png").write_bytes(bytes(9000) + bytes([number % 19]) * 4096)
+    servers.upload(tmp_path, bucket)
+    found = list_folder(str(bucket), ["*"], True, None).sources
+    with servers.proxy(s3) as proxy:
+        servers.use(monkeypatch, proxy.endpoint)
+        numbered = number_twins(str(bucket), found)
+        assert proxy.count("GET") == 20 + 2
+    assert [source.occurrence for source in numbered] == [0] * 19 + [1]
+
+
+def test_changed_object_ends_the_run_with_its_name(remote: ObjectPath) -> None:
+    source = listed(remote).sources[0]
+    (remote / source.path).write_bytes(bytes(source.size_bytes or 0))
+    with pytest.raises(MachineError, match=r"source 50%25\.png changed since it was listed: its ETag differs"):
+        read_bytes(str(remote), source)
+
+
+def test_deleted_object_is_unreadable(remote: ObjectPath) -> None:
+    source = listed(remote).sources[0]
+    (remote / source.path).delete()
+    with pytest.raises(SourceError, match=r"unreadable: 50%25\.png: no such object"):
+        read_bytes(str(remote), source)
+
+
+def test_empty_and_too_large_objects_fail(bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bucket / "empty.png").write_bytes(b"")
+    (bucket / "large.png").write_bytes(bytes(100))
+    monkeypatch.setattr(listing, "MAX_FILE_BYTES", 99)
+    monkeypatch.setattr(listing._opened.__wrapped__, "__defaults__", (99,))
+    for source, reason in zip(listed(bucket).sources, ("empty", "too_large"), strict=True):
+        with pytest.raises(SourceError, match=reason):
+            read_bytes(str(bucket), source)
+
+
+def test_path_of_an_edited_row_cannot_leave_the_prefix(remote: ObjectPath) -> None:
+    with pytest.raises(SourceError, match=r"leads outside source\.root"):
+        read_bytes(str(remote), Source(0, "../x", "../x", 1))
+
+
+@pytest.mark.parametrize(
+    ("root", "text"),
+    [
+        ("s3://no-such-bucket/photos", r"source\.root=s3://no-such-bucket/photos: access was refused .*NoSuchBucket"),
+        ("{}/none", r"source\.root={}/none: no such folder or file; expected photographs"),
+        ("{}/sub/notes", r"source\.root={}/sub/notes: no such folder or file"),
+        ("s3://", r"s3://: not the URL of an object store"),
+    ],
+)
+def test_wrong_root_is_refused_in_one_line(root: str, text: str, remote: ObjectPath) -> None:
+    config = composed()
+    config.source.root = root.format(remote)
+    with pytest.raises(ConfigError, match=text.format(remote)) as error:
+        validate_config(config)
+    assert "\n" not in str(error.value)
+
+
+def test_no_match_names_the_globs(remote: ObjectPath) -> None:
+    with pytest.raises(ConfigError, match=r"no file matches source\.include=\['\*\.none'\] \(with sub-folders\)"):
+        listed(remote, include="[*.none]")
+
+
+def test_videos_of_a_bucket_are_refused(bucket: ObjectPath) -> None:
+    (bucket / "clip.mp4").write_bytes(b"video")
+    with pytest.raises(ConfigError, match=r"clip\.mp4 is a video in an object store; .*copy the videos"):
+        listed(bucket, clips=True)
+
+
+def test_reads_run_ahead_in_order(s3: str, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources = [Source(index, f"{index:02d}", f"{index:02d}", 2) for index in range(24)]
+    for source in sources:
+        (bucket / source.path).write_bytes(source.path.encode())
+    with servers.proxy(s3) as proxy:
+        servers.use(monkeypatch, proxy.endpoint)
+        proxy.delay_s = 0.02
+        with read_ahead.reading_ahead(str(bucket), read_bytes, sources) as read:
+            assert [read(str(bucket), source) for source in sources] == [source.path.encode() for source in sources]
+        assert 2 < proxy.most_at_once <= read_ahead.AHEAD
+        assert len(proxy.requests) == len(sources)
+
+
+def test_reading_ahead_is_bounded_in_bytes(bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(read_ahead, "AHEAD_BYTES", 25)
+    sources = [Source(index, str(index), str(index), 10) for index in range(9)]
+    started: list[int] = []
+
+    def read(root: str, source: Source) -> bytes:
+        started.append(source.index)
+        return bytes(10)
+
+    with read_ahead.reading_ahead(str(bucket), read, sources) as ahead:
+        ahead(str(bucket), sources[0])
+        assert max(started) <= 2
+        assert ahead(str(bucket), sources[0]) == bytes(10)  # a second time
+        assert ahead(str(bucket), sources[5]) == bytes(10)  # out of order
+        for source in sources[6:]:
+            ahead(str(bucket), source)
+    assert set(range(5, 9)) <= set(started)
+
+
+def test_failed_read_is_raised_for_its_source(remote: ObjectPath) -> None:
+    sources = listed(remote).sources
+    (remote / sources[1].path).delete()
+    with read_ahead.reading_ahead(str(remote), read_bytes, sources) as read:
+        read(str(remote), sources[0])
+        with pytest.raises(SourceError):
+            read(str(remote), sources[1])
+        read(str(remote), sources[2])
+
+
+def test_local_files_are_not_read_ahead(photos: Path) -> None:
+    with read_ahead.reading_ahead(str(photos), read_bytes, ()) as read:
+        assert read is read_bytes
+
+
+def test_bucket_gives_the_dataset_of_the_folder(
+    photos: Path, remote: ObjectPath, tmp_path: Path, make: Make, tree_hash: TreeHash
+) -> None:
+    shutil.copytree(photos, tmp_path / "photos")
+    shutil.copy(tmp_path / "photos" / "deep.png", tmp_path / "photos" / "twin.png")
+    (remote / "twin.png").put_file(photos / "deep.png")
+    make(tmp_path / "photos", tmp_path / "local", "output.pairs_per_shard=5")
+    config = composed("output.pairs_per_shard=5", "n_jobs=2")
+    config.source.root, config.out = str(remote), str(tmp_path / "remote")
+    validate_config(config)
+    generate(config)
+    assert tree_hash(tmp_path / "remote") == tree_hash(tmp_path / "local")
