@@ -13,6 +13,7 @@ from helpers.configs import composed
 from helpers.datasets import Make, TreeHash
 
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.types import Source
@@ -79,7 +80,7 @@ def test_folder_markers_are_no_sources(remote: ObjectPath, s3: str) -> None:
 
 
 def test_twins_are_numbered_like_files(tmp_path: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(read_ahead, "THREADS", 3)
+    monkeypatch.setattr(object_store, "THREADS", 3)
     tail = b"t" * 5000
     contents = {"a": b"1" + tail, "b": b"2" + tail, "c": b"1" + tail, "d": tail, "e": b"3" * 5001, "f": b"1" + tail}
     for name, content in contents.items():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from unprocess_gen.cli.hydra_request import Request, Task, parse_arguments, run_hydra
 from unprocess_gen.cli.messages import print_result, print_results, report_error
 from unprocess_gen.cli.signals import SIGNALS
-from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, worst, write_table
+from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, sweep_out, worst, write_table
 from unprocess_gen.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _run_job(
         node = compose_node(job.overrides, folders)
         check_job(node, job)
         config = validated_config(node, job.overrides)
-        out = Path(config.out)
+        out = sweep_out(config.out)
         config.out = str(out / folder)
         code, result, texts = task(config, f"{place} {folder}")
     except Exception as error:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.locks import LockFile
+from unprocess_gen.core.object_store import is_url
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -34,6 +35,16 @@ SHARES = ("clean_clipped_low", "clean_clipped_high", "noisy_clipped_low", "noisy
 FIRST_COLUMNS = ("folder", "overrides")
 LAST_COLUMNS = ("rows", "failed", *(f"{name}_share" for name in SHARES), "seconds", "bytes", "exit")
 """Columns of ``sweep.csv`` before and after those of the swept keys."""
+
+
+def sweep_out(out: str) -> Path:
+    """Return the folder of a sweep; raise ConfigError for the URL of an object store."""
+    if is_url(out):
+        raise ConfigError(
+            f"out={out}: a sweep cannot write to an object store; expected a local folder; run its jobs one by one, or "
+            "copy its datasets afterwards"
+        )
+    return Path(out)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from unprocess_gen.cli.hydra_request import Request, Task, run_hydra
 from unprocess_gen.cli.messages import checked_streams, print_results, report_error
 from unprocess_gen.cli.signals import SIGNALS
-from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, worst, write_table
+from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, sweep_out, worst, write_table
 from unprocess_gen.config.composition import validated_config
 from unprocess_gen.config.sweep_expansion import Expansion
 from unprocess_gen.core.errors import MachineError
@@ -59,7 +59,7 @@ class PluginJob:
         texts: list[str] = []
         try:
             config = validated_config(node, overrides)
-            config.out = str(Path(config.out) / folder)
+            config.out = str(sweep_out(config.out) / folder)
             code, result, texts = self.task(config, f"{settings.job.num + 1} {folder}")
         except Exception as error:
             if SIGNALS.received is not None:  # libraries may fail in their own way when they are interrupted
@@ -99,7 +99,7 @@ def run_with_plugins(request: Request, expansion: Expansion, task: Task) -> int:
     MachineError
         If no job returned a result.
     """
-    out = Path(os.path.abspath(expansion.out))
+    out = Path(os.path.abspath(sweep_out(expansion.out)))
     hydra_folder = out / HYDRA_FOLDER
     rows_folder = hydra_folder / f"rows-{uuid.uuid4().hex}"
     job = PluginJob(task, expansion.described_by, expansion.fixed, str(rows_folder))

@@ -23,7 +23,7 @@ from unprocess_gen.cli.messages import print_result, print_results, report, repo
 from unprocess_gen.cli.sweep import plan_totals, worst
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.core.errors import ConfigError, DamageError, SourceChangedError, UnprocessGenError
-from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path
+from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, is_url
 from unprocess_gen.core.output_paths import DATASET_ENTRIES
 from unprocess_gen.reports.formatting import counted
 
@@ -227,7 +227,7 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
             f"accuracy: noise.dark_frames={config.noise.dark_frames}: tiers are measured with the noise of a profile; "
             "expected null; leave it out"
         )
-    out = Path(config.out)
+    out = _local_out(config)
     report_files.check_report_folder(out, "accuracy")
     noise, sensor = conf_dir() / "noise", conf_dir() / "sensor"
     profiles = measure.BenchmarkProfiles(
@@ -272,12 +272,18 @@ def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, Non
     from unprocess_gen.reports import report_files
     from unprocess_gen.reports.paper import figures as paper_figures
 
-    out = Path(config.out)
+    out = _local_out(config)
     report_files.check_report_folder(out, "figures")
     gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_figures.GAINS}
     authors = read_option(conf_dir() / "noise" / f"{paper_figures.AUTHORS_NOISE}.yaml", NoiseConfig)
     drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
     return 0, None, [f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}"]
+
+
+def _local_out(config: Config) -> Path:
+    if is_url(config.out):
+        raise ConfigError(f"out={config.out}: a report is written to a local folder; expected a path")
+    return Path(config.out)
 
 
 def _with_out(overrides: list[str], out: str) -> list[str]:

@@ -12,15 +12,18 @@ get a 5xx or 429 answer, with a growing delay, until `RETRY_TIMEOUT_S`. Measurem
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from unprocess_gen.core.errors import ConfigError, MachineError
 
@@ -42,6 +45,15 @@ RETRY_TIMEOUT_S = 90
 
 MIN_PIECE, MAX_PIECE = 2**16, 2**23
 """Bytes of a range request: the first one, and the most that sequential reading grows to."""
+
+DELETED_AT_ONCE = 1000
+"""Objects that one request deletes, the most that S3 allows."""
+
+THREADS = 32
+"""Requests at a time of `in_threads`."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _URL = re.compile(rf"({'|'.join(SCHEMES)})://([^/]*)/*(.*?)/*", re.DOTALL)
 _started_by: set[int] = set()
@@ -180,10 +192,15 @@ class ObjectPath:
 
     def iterdir(self) -> Iterator[ObjectPath]:
         """Yield the objects and prefixes one level below this one."""
+        return (self / name for name in self.entries())
+
+    def entries(self) -> dict[str, int]:
+        """Return what is one level below this prefix: names and sizes of objects, and -1 for the names of prefixes."""
         with _request(self) as (obstore, store):
             found = obstore.list_with_delimiter(store, self.key or None)
-        names = [*found["common_prefixes"], *(facts["path"] for facts in found["objects"])]
-        return (ObjectPath(f"{self.scheme}://{self.bucket}/{name}") for name in names)
+        sizes = {facts["path"]: facts["size"] for facts in found["objects"] if facts["path"] != self.key}
+        sizes |= dict.fromkeys(found["common_prefixes"], -1)
+        return {name.rstrip("/").rpartition("/")[2]: size for name, size in sizes.items()}
 
     def is_dir(self) -> bool:
         """Return whether any object is below this prefix."""
@@ -307,6 +324,14 @@ class ObjectPath:
         with suppress(FileNotFoundError), _request(self) as (obstore, store):
             obstore.delete(store, self.key)
 
+    def delete_all(self) -> None:
+        """Delete all objects below this prefix."""
+        prefix = f"{self.key}/" if self.key else ""
+        found = self.objects()
+        while keys := [prefix + facts.key for facts in itertools.islice(found, DELETED_AT_ONCE)]:
+            with suppress(FileNotFoundError), _request(self) as (obstore, store):
+                obstore.delete(store, keys)
+
 
 AnyPath = Path | ObjectPath
 """A local path, or the URL of an object or prefix."""
@@ -360,6 +385,35 @@ def folder_name(path: AnyPath) -> str:
         Its last part.
     """
     return path.name if isinstance(path, ObjectPath) else path.name or path.resolve().name
+
+
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Apply a function that waits for a store to many items.
+
+    Parameters
+    ----------
+    function : callable
+        Takes an item; `THREADS` calls run at a time.
+    items : iterable
+        Any number; they are taken as results are used.
+
+    Yields
+    ------
+    object
+        Results in the order of the items.
+    """
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(THREADS, "requests") as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) >= THREADS:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 @contextmanager

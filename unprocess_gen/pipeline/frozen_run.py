@@ -35,7 +35,7 @@ from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
 from unprocess_gen.pipeline.worker import ShardLog, make_and_commit, make_image
 from unprocess_gen.pipeline.workspace import Workspace
-from unprocess_gen.sources.listing import Listing
+from unprocess_gen.sources.listing import Listing, absolute_root
 
 PACKAGE = "unprocess_gen"
 PLAN = f"{WORK}/plan.json"
@@ -155,7 +155,7 @@ def freeze(workspace: Workspace, config: Config, listing: Listing) -> FrozenPlan
 def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenPlan:
     record = read_record(workspace.storage, workspace.out)
     if record is None:  # version 0.1 began the dataset
-        record = write_listing(workspace.storage, listing.sources)
+        record = write_listing(workspace.storage, workspace.out, listing.sources)
     smallest_first = sorted(listing.sources[:TRIED], key=lambda source: source.size_bytes or 0)
     canary = next(_canaries(config, smallest_first), (None, ""))
     return FrozenPlan(
@@ -164,7 +164,7 @@ def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenP
         sources=record.sources,
         listing_sha256=record.sha256,
         pairs_per_shard=config.output.pairs_per_shard,
-        root=None if config.source.root is None else os.path.abspath(config.source.root),
+        root=absolute_root(config.source.root),
         max_failed=config.source.max_failed,
         n_jobs=config.n_jobs,
         self_test=config.self_test,

@@ -21,12 +21,12 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.errors import ConfigError, MachineError
+from unprocess_gen.core.object_store import AnyPath, any_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.progress import Progress
@@ -35,7 +35,7 @@ from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Tally, Workspace
 from unprocess_gen.sources.dark_frames import open_dark_frames
-from unprocess_gen.sources.listing import ClipSizes
+from unprocess_gen.sources.listing import ClipSizes, absolute_root
 from unprocess_gen.sources.loader import list_photographs
 from unprocess_gen.sources.video.decode import is_installed
 
@@ -52,7 +52,7 @@ class Summary:
 
     Attributes
     ----------
-    out : Path
+    out : Path or ObjectPath
         Folder of the dataset.
     pairs : int
         Rows with status ``ok``.
@@ -72,7 +72,7 @@ class Summary:
         Processor time of the stages in all workers of this run.
     """
 
-    out: Path
+    out: AnyPath
     pairs: int
     failed: dict[str, int]
     sites: dict[str, int]
@@ -129,7 +129,7 @@ def generate(config: Config, label: str = "") -> Summary:
         done = workspace.records.committed(range(len(tasks)))
         todo = [task for task in tasks if task.shard not in done]
         if config.check_disk:
-            check_free_space(config, todo, Path(config.out))
+            check_free_space(config, todo, any_path(config.out))
         workspace.begin(listing.sources, len(tasks))
         n_jobs = effective_jobs(config.n_jobs, len(todo))
         context = RunContext(
@@ -220,7 +220,7 @@ def dataset_json_facts(
         **tally.facts(),
         "not_matched": not_matched,
         "skipped_links": skipped_links,
-        "source": {"kind": source_kind(config), "root": _absolute(config.source.root)},
+        "source": {"kind": source_kind(config), "root": absolute_root(config.source.root)},
         **_dark_facts(config),
         "run": run | machine(),
         "versions": {package: version(package) for package in PACKAGES},
@@ -246,7 +246,7 @@ def machine() -> dict[str, Any]:
 
 def _dark_facts(config: Config) -> dict[str, Any]:
     """Return what ``dataset.json`` records about dark frames: their place, number, sizes and noise."""
-    root = _absolute(config.noise.dark_frames)
+    root = absolute_root(config.noise.dark_frames)
     if root is None:
         return {}
     try:
@@ -263,10 +263,6 @@ def _dark_facts(config: Config) -> dict[str, Any]:
             "std_dn": math.sqrt(dark_frames.variance_dn2),
         }
     }
-
-
-def _absolute(root: str | None) -> str | None:
-    return None if root is None else os.path.abspath(root)
 
 
 def summary_of(out: str, facts: dict[str, Any], started: float, unmatched: dict[str, int] | None = None) -> Summary:
@@ -289,7 +285,7 @@ def summary_of(out: str, facts: dict[str, Any], started: float, unmatched: dict[
         With ``made`` 0.
     """
     return Summary(
-        out=Path(out),
+        out=any_path(out),
         pairs=facts["pairs"],
         failed=facts["failed"],
         sites=facts["sites"],

@@ -13,9 +13,10 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import DamageError
+from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.storage import Storage
 
@@ -29,6 +30,14 @@ OLD_RECORD = ".work/sources.json"
 _FIELDS = tuple(field.name for field in fields(Source))
 
 
+class RecordedFile(NamedTuple):
+    """Hold what identifies the content of a source, as in `Source`; the digest is empty for a failed source."""
+
+    size_bytes: int | None
+    sha256: str | None
+    etag: str | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class ListingRecord:
     """Hold the number of recorded sources, and the SHA-256 of each file of the record."""
@@ -37,19 +46,29 @@ class ListingRecord:
     sha256: tuple[str, ...]
 
 
-def write_listing(storage: Storage, sources: Sequence[Source]) -> ListingRecord:
-    """Record the sources of a run, unless they are recorded; return what identifies the record."""
+def write_listing(storage: Storage, place: str, sources: Sequence[Source]) -> ListingRecord:
+    """Record the sources of a run; return what identifies the record.
+
+    Raises ConfigError if another process has begun to record other sources: files of the record are never replaced.
+    """
     texts = (_text(sources[first : first + PER_FILE]) for first in range(0, len(sources), PER_FILE))
     digests: list[str] = []
     for number, text in enumerate(texts):
         digests.append(_sha256(text))
-        storage.write(f"{FOLDER}/{number:05d}.json", text)
-    storage.write(INDEX, json.dumps({"sources": len(sources), "sha256": digests}))
+        _create(storage, place, f"{FOLDER}/{number:05d}.json", text)
+    _create(storage, place, INDEX, json.dumps({"sources": len(sources), "sha256": digests}))
     return ListingRecord(len(sources), tuple(digests))
 
 
 def _sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _create(storage: Storage, place: str, name: str, text: str) -> None:
+    if not storage.create(name, text) and storage.read(name) != text:
+        raise ConfigError(
+            f"out={place}: was begun with other sources ({name} differs); choose another out, or remove it"
+        )
 
 
 def _text(sources: Iterable[Source]) -> str:
@@ -102,8 +121,8 @@ class RecordedListing:
         return self._last[1]
 
 
-def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, tuple[int | None, str | None]]]:
-    """Yield name, and (size, digest) of every recorded source; nothing if there is no record.
+def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, RecordedFile]]:
+    """Yield name, and size, digest and ETag of every recorded source; nothing if there is no record.
 
     Raises DamageError if the record is damaged.
     """
@@ -112,11 +131,11 @@ def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, tuple[in
         listing = RecordedListing(storage, place, record)
         for first in range(0, record.sources, PER_FILE):
             for source in listing.sources(first, min(first + PER_FILE, record.sources)):
-                yield source.name, (source.size_bytes, source.sha256)
+                yield source.name, RecordedFile(source.size_bytes, source.sha256, source.etag)
         return
     try:
         for name, size, sha256 in json.loads(storage.read(OLD_RECORD)):
-            yield name, (size, sha256)
+            yield name, RecordedFile(size, sha256)
     except FileNotFoundError:
         return
     except (ValueError, TypeError) as error:

@@ -15,13 +15,13 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import RESUME, machine_error
+from unprocess_gen.core.object_store import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze, read_plan
 from unprocess_gen.pipeline.generate import Summary, dataset_json_facts, follow, shard_tasks, summary_of
@@ -168,7 +168,7 @@ def prepare(config: Config, parts: int) -> Prepared:
             )
         done = workspace.records.committed(range(len(tasks)))
         if config.check_disk:
-            check_free_space(config, [task for task in tasks if task.shard not in done], Path(config.out))
+            check_free_space(config, [task for task in tasks if task.shard not in done], any_path(config.out))
         workspace.begin(listing.sources, len(tasks))
         freeze(workspace, config, listing)
         workspace.storage.create(PARTS, json.dumps({"parts": parts}) + "\n")
@@ -223,7 +223,7 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
             progress.report_compiling(context.compiling_path)
             rows, _ = follow(run_tasks(context, todo, jobs), progress)
     except OSError as error:
-        raise machine_error(error, Path(out), RESUME) from error
+        raise machine_error(error, any_path(out), RESUME) from error
     finally:
         run.storage.close()
     return PartMade(part, parts, len(wanted), len(todo), rows, time.monotonic() - started)

@@ -53,12 +53,12 @@ class ShardRecords:
 
     def committed(self, shards: Iterable[int]) -> set[int]:
         """Return which of some shards are committed: their record is readable, not provisional, and fits the file."""
-        recorded, sizes = self._storage.names(ROWS), self._storage.names("shards")
-        return {
-            shard
-            for shard in shards
-            if Path(record_name(shard)).name in recorded and self._is_committed(shard, sizes.get(shard_name(shard)))
-        }
+        sizes = self._storage.names("shards")
+        candidates = sorted(self.recorded(shards))
+        are_committed = self._storage.each(
+            lambda shard: self._is_committed(shard, sizes.get(shard_name(shard))), candidates
+        )
+        return {shard for shard, is_committed in zip(candidates, are_committed, strict=True) if is_committed}
 
     def recorded(self, shards: Iterable[int]) -> set[int]:
         """Return which of some shards have a record, provisional ones included."""

@@ -6,6 +6,7 @@ disk.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,16 +16,19 @@ from unprocess_gen.config.schema import AUTO, Config, OutputConfig
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import free_bytes
+from unprocess_gen.core.object_store import AnyPath, ObjectPath
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import PACKED, Source
 from unprocess_gen.dataset.manifest import json_size
 from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes
+from unprocess_gen.pipeline.executors.local import effective_jobs
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.listing import read_bytes
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import list_patches
+from unprocess_gen.sources.read_ahead import Read, reading_ahead
 from unprocess_gen.sources.scenes import synthetic
 
 SAMPLE = 32
@@ -87,7 +91,9 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:
     if not sources:
         return SizeEstimate(0, 0)
     film: dict[str, int] = {}
-    sizes = [_header_bytes(config, source, film) for source in evenly_spaced(sources, SAMPLE)]
+    sample = evenly_spaced(sources, SAMPLE)
+    with reading_ahead(config.source.root, read_bytes, sample) as read:
+        sizes = [_header_bytes(config, source, film, read) for source in sample]
     if len(sizes) < len(sources):
         mean = sum(sizes) // len(sizes)
         largest = max(len(task.sources) for task in tasks)
@@ -151,7 +157,9 @@ def fitting_pairs_per_shard(config: Config, sources: Sequence[Source]) -> int:
         default if none can be read.
     """
     film: dict[str, int] = {}
-    sizes = [size for source in evenly_spaced(sources, SAMPLE) if (size := _header_bytes(config, source, film))]
+    sample = evenly_spaced(sources, SAMPLE)
+    with reading_ahead(config.source.root, read_bytes, sample) as read:
+        sizes = [size for source in sample if (size := _header_bytes(config, source, film, read))]
     if not sizes:
         return int(OutputConfig().pairs_per_shard)
     return min(max(1, SHARD_BYTES * len(sizes) // sum(sizes)), MAX_PAIRS_PER_SHARD)
@@ -181,10 +189,15 @@ def shards_warning(config: Config, sources: Sequence[Source]) -> str:
     return f"output.pairs_per_shard={per_shard}: {shards:,} shards; expected at most {MAX_SHARDS:,}{advice}"
 
 
-def check_free_space(config: Config, tasks: Sequence[ShardTask], out: Path) -> None:
-    """Raise MachineError if the shards of ``tasks`` do not fit the free space of ``out``."""
-    needed, free = estimate_shards(config, tasks), free_bytes(out)
-    if needed.total > free:
+def check_free_space(config: Config, tasks: Sequence[ShardTask], out: AnyPath) -> None:
+    """Raise MachineError if the shards of ``tasks`` do not fit the free space of ``out``.
+
+    Shards of an object store are in local temporary space until they are put, one for each worker.
+    """
+    needed = estimate_shards(config, tasks)
+    if isinstance(out, ObjectPath):
+        _check_temporary_space(needed.largest_shard * effective_jobs(config.n_jobs, len(tasks)), out)
+    elif needed.total > (free := free_bytes(out)):
         raise MachineError(
             f"out={out}: not enough disk space for {len(tasks)} shards; expected about {needed.total} free bytes "
             f"({needed.largest_shard} for the largest shard), found {free}; free space, choose another out, or set "
@@ -192,22 +205,31 @@ def check_free_space(config: Config, tasks: Sequence[ShardTask], out: Path) -> N
         )
 
 
-def _header_bytes(config: Config, source: Source, film: dict[str, int]) -> int:
+def _check_temporary_space(needed: int, out: ObjectPath) -> None:
+    folder = Path(tempfile.gettempdir())
+    if needed > (free := free_bytes(folder)):
+        raise MachineError(
+            f"out={out}: not enough temporary disk space in {folder}; expected about {needed} free bytes, one shard "
+            f"for each worker, found {free}; free space, set TMPDIR, or set check_disk=false to start anyway"
+        )
+
+
+def _header_bytes(config: Config, source: Source, film: dict[str, int], read: Read) -> int:
     """Return the bytes of a source in its shard, 0 if it will fail; ``film`` keeps the size of a video's frames.
 
     Frames of all videos are taken to be as large as those of the first one, because opening a video reads all of it.
     """
     try:
         if not source.is_video:
-            return _size_in_shard(config, source)
+            return _size_in_shard(config, source, read)
         if not film:
-            film[""] = _size_in_shard(config, replace(source, frame=0))
+            film[""] = _size_in_shard(config, replace(source, frame=0), read)
         return film[""]
     except (SourceError, MachineError):
         return 0
 
 
-def _size_in_shard(config: Config, source: Source) -> int:
+def _size_in_shard(config: Config, source: Source, read: Read) -> int:
     side = config.source.downscale
     if config.source.root is None:
         height, width = synthetic.SIZES.get(source.path, synthetic.DEFAULT_SIZE)
@@ -215,7 +237,7 @@ def _size_in_shard(config: Config, source: Source) -> int:
         height, width = load_source(config.source, source)[1].srgb.shape[:2]
         side = 1
     else:
-        header = probe(read_bytes(config.source.root, source))
+        header = probe(read(config.source.root, source))
         if header.missing or header.width * header.height > config.source.max_pixels:
             return 0
         height, width = header.height, header.width

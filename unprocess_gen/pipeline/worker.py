@@ -22,6 +22,7 @@ from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import MachineError, SourceError
 from unprocess_gen.core.files import RESUME, array_xxh3, machine_error
+from unprocess_gen.core.object_store import any_path
 from unprocess_gen.core.types import Pair, Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
@@ -35,9 +36,10 @@ from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
-from unprocess_gen.sources.listing import source_file
+from unprocess_gen.sources.listing import read_bytes, source_file
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch, list_patches
+from unprocess_gen.sources.read_ahead import Read, reading_ahead
 
 PARENT_POLL_S = 0.5
 WATCHDOG = "unprocess_gen watchdog"
@@ -64,7 +66,7 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
                 report = _make_and_commit(replace(context, marker=marker if deaths.count else ""), task)
         deaths.forget()
     except OSError as error:
-        raise machine_error(error, Path(context.config.out), RESUME) from error
+        raise machine_error(error, any_path(context.config.out), RESUME) from error
     return report
 
 
@@ -104,7 +106,7 @@ def commit_provisional(context: RunContext, task: ShardTask, source: Source, dea
     try:
         commit_shard(open_storage(context.config.out), result)
     except OSError as error:
-        raise machine_error(error, Path(context.config.out), RESUME) from error
+        raise machine_error(error, any_path(context.config.out), RESUME) from error
     return result.report()
 
 
@@ -159,19 +161,22 @@ def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
 
 
 def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, log: ShardLog) -> Iterator[Row]:
-    for source in task.sources:
-        task.busy_path(context).write_text(str(source.index))
-        if context.marker:
-            open_storage(context.config.out).write(context.marker, str(source.index))
-        yield from make_image(context, task.shard, source, writer, log)
+    with reading_ahead(context.config.source.root, read_bytes, task.sources) as read:
+        for source in task.sources:
+            task.busy_path(context).write_text(str(source.index))
+            if context.marker:
+                open_storage(context.config.out).write(context.marker, str(source.index))
+            yield from make_image(context, task.shard, source, writer, log, read)
 
 
-def make_image(context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog) -> list[Row]:
+def make_image(
+    context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog, read: Read = read_bytes
+) -> list[Row]:
     """Append one image, or its patches, to a shard and return the rows; add failures and times to ``log``."""
     config = context.config
     try:
         with log.times.decoding():
-            sha256, photograph = load_source(config.source, source, config.output.layout)
+            sha256, photograph = load_source(config.source, source, config.output.layout, read)
     except SourceError as error:
         if error.reason == "unreadable" and source.reason is None and not _exists(config, source):
             raise MachineError(
@@ -216,7 +221,7 @@ def _add_frames(
 
 
 def _exists(config: Config, source: Source) -> bool:
-    return Path(source_file(config.source.root or "", source.path)).exists()
+    return any_path(source_file(config.source.root or "", source.path)).exists()
 
 
 def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:

@@ -35,12 +35,12 @@ from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import RESUME, file_sha256, machine_error
-from unprocess_gen.core.object_store import AnyPath
+from unprocess_gen.core.object_store import AnyPath, any_path
 from unprocess_gen.core.types import Counts, Row, Source
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import MAX_BYTES, PARQUET_SHA256, check_dataset_json
 from unprocess_gen.dataset.manifest import read_rows, write_rows
-from unprocess_gen.pipeline.listing_record import read_record, recorded_files, write_listing
+from unprocess_gen.pipeline.listing_record import RecordedFile, read_record, recorded_files, write_listing
 from unprocess_gen.pipeline.shard_records import ShardRecords
 from unprocess_gen.pipeline.storage import WORK, open_storage
 from unprocess_gen.pipeline.storage.local import cannot_write
@@ -56,8 +56,8 @@ SHOWN = 3
 """Differences named in an error; the others are counted."""
 
 
-RecordedFile = tuple[str, tuple[int | None, str | None]]
-"""Name of a source, its size in bytes, and its SHA-256 if it is known."""
+KnownFile = tuple[str, RecordedFile]
+"""Name of a source, and what identifies its content."""
 
 Digest = Callable[[Source, str | None], str | None]
 """Function of a source and its known SHA-256 that returns the present SHA-256, None if it is not known."""
@@ -145,10 +145,10 @@ class Workspace:
         Raises ConfigError if the folder cannot be written; MachineError if the disk is full.
         """
         try:
-            if read_record(self.storage, self.out) is None:
-                write_listing(self.storage, sources)
             if not self.storage.create("config.yaml", self.config_yaml):
                 self._check_same_settings()
+            if read_record(self.storage, self.out) is None:
+                write_listing(self.storage, self.out, sources)
             self.storage.begin()  # after config.yaml, by which a later run recognises the folder
             self._refuse_foreign_shards(shards)
             _ = self.storage.scratch
@@ -211,7 +211,7 @@ class Workspace:
             )
 
     def _check_same_sources(
-        self, known: Callable[[], Iterator[RecordedFile]], sources: Sequence[Source], digest: Digest
+        self, known: Callable[[], Iterator[KnownFile]], sources: Sequence[Source], digest: Digest
     ) -> None:
         """Raise ConfigError if the sources are not those that are known; name the differences.
 
@@ -283,7 +283,7 @@ class Workspace:
             self.storage.write("dataset.json", dataset_text(dataset))
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
         except OSError as error:
-            raise machine_error(error, Path(self.out), RESUME) from error
+            raise machine_error(error, any_path(self.out), RESUME) from error
         return dataset
 
     def _write_parquet(self, manifest: Path) -> dict[str, Any]:
@@ -296,28 +296,34 @@ class Workspace:
 
     def _rows(self, shards: int, entries: list[dict[str, Any]]) -> Iterator[Row]:
         """Yield every row of the dataset in source order, and append the entry of each shard."""
-        for shard in range(shards):
-            entry, rows = self.records.entry_and_rows(shard)
+        for entry, rows in self.storage.each(self.records.entry_and_rows, range(shards)):
             entries.append(entry)
             yield from rows
 
 
 def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
-    """Return the digest of a source whose digest was recorded; hash the file if this listing did not."""
-    return content_sha256(root, source) if root is not None and source.size_bytes and recorded else source.sha256
+    """Return the digest of a source whose digest was recorded; hash the file if this listing did not.
+
+    An object of a store is not hashed, because its ETag is compared.
+    """
+    if root is None or not source.size_bytes or not recorded or source.etag:
+        return source.sha256
+    return content_sha256(root, source)
 
 
-def _files_of_rows(manifest: Path) -> Iterator[RecordedFile]:
+def _files_of_rows(manifest: Path) -> Iterator[KnownFile]:
     """Yield the file of every row."""
     for row in read_rows(manifest):
         size, sha256 = row["source_bytes"], row["source_sha256"]
-        yield str(row["source"]), (size if isinstance(size, int) else None, str(sha256))
+        yield str(row["source"]), RecordedFile(size if isinstance(size, int) else None, str(sha256))
 
 
-def _is_same(file: tuple[int | None, str | None], source: Source, digest: Digest) -> bool:
-    """Return whether a source has the known size, and the known digest if both are known."""
-    size, known = file
-    return source.size_bytes == size and (not known or digest(source, known) in (None, known))
+def _is_same(file: RecordedFile, source: Source, digest: Digest) -> bool:
+    """Return whether a source has the known size, and digest and ETag if both are known."""
+    size, known, etag = file
+    if source.size_bytes != size or (etag and source.etag not in (None, etag)):
+        return False
+    return not known or digest(source, known) in (None, known)
 
 
 @dataclass(slots=True)

@@ -29,6 +29,7 @@ from unprocess_gen.config.interpretation import (
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
+from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import DarkFrames, Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
@@ -226,15 +227,20 @@ def estimate_run(
         exact=exact,
         pair_seconds=sum(source.seconds for source in estimates) / len(estimates) * len(sources) / n_jobs,
         start_seconds=start_seconds,
-        disk_seconds=shards * COMMIT_SECONDS + size * _seconds_per_byte(Path(config.out)),
+        disk_seconds=shards * COMMIT_SECONDS + size * _seconds_per_byte(_local_folder(config.out)),
         n_jobs=n_jobs,
-        free_bytes=free_bytes(Path(config.out)),
+        free_bytes=free_bytes(_local_folder(config.out)),
         source_estimates=estimates,
         tier_ns=_tier_ns(without_dark_frames(config), estimates, tiers or {}),
         unmatched=listing.unmatched,
         warnings=(*listing.warnings, *([too_many] if too_many else [])),
         dark_frames=dark_frames,
     )
+
+
+def _local_folder(out: str) -> Path:
+    """Return the folder in which shards are written: the temporary one if ``out`` is in an object store."""
+    return Path(tempfile.gettempdir() if is_url(out) else out)
 
 
 def _seconds_per_byte(out: Path) -> float:

@@ -259,6 +259,22 @@ def source_file(root: str, path: str) -> str:
     return os.path.join(root, path)
 
 
+def absolute_root(root: str | None) -> str | None:
+    """Return a source root that does not depend on the current folder.
+
+    Parameters
+    ----------
+    root : str or None
+        Value of ``source.root``.
+
+    Returns
+    -------
+    str or None
+        Absolute path; a URL and None are returned as they are.
+    """
+    return root if root is None or is_url(root) else os.path.abspath(root)
+
+
 def read_bytes(root: str, source: Source) -> bytes:
     """Read one photograph completely.
 

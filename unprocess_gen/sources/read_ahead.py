@@ -10,13 +10,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from functools import partial
 
-from unprocess_gen.core.object_store import is_url
+from unprocess_gen.core.object_store import Result, in_threads, is_url
 from unprocess_gen.core.types import Source
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 Read = Callable[[str, Source], bytes]
 """Function that returns the bytes of a source below a root: `listing.read_bytes`, or one that has read ahead."""
@@ -26,9 +23,6 @@ AHEAD = 8
 
 AHEAD_BYTES = 2**28
 """Bytes of photographs that a worker holds ahead; the next one is always read, whatever its size."""
-
-THREADS = 32
-"""Requests at a time while identical objects are searched."""
 
 
 def in_order(root: str, function: Callable[[str, Source], Result], sources: Iterable[Source]) -> Iterator[Result]:
@@ -41,7 +35,7 @@ def in_order(root: str, function: Callable[[str, Source], Result], sources: Iter
     function : callable
         Takes the root and a source.
     sources : iterable of Source
-        Any number; at most `THREADS` results wait.
+        Any number.
 
     Yields
     ------
@@ -51,18 +45,7 @@ def in_order(root: str, function: Callable[[str, Source], Result], sources: Iter
     if not is_url(root):
         yield from (function(root, source) for source in sources)
         return
-    with ThreadPoolExecutor(THREADS, "requests") as pool:
-        waiting: deque[Future[Result]] = deque()
-        try:
-            for source in sources:
-                waiting.append(pool.submit(function, root, source))
-                if len(waiting) >= THREADS:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
+    yield from in_threads(partial(function, root), sources)
 
 
 @contextmanager

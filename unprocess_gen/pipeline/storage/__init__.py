@@ -1,15 +1,21 @@
 """Write the files of a dataset, and the records of its run, to the place that ``out`` names.
 
-`Storage` is what a run needs of a place; `local` writes to a folder.
+`Storage` is what a run needs of a place; `local` writes to a folder, `remote` to an object store.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
 
+from unprocess_gen.core.object_store import Item, ObjectPath, Result, any_path
+
 WORK = ".work"
 """Folder below ``out`` for what a run needs until the dataset is finished."""
+OWNER = "owner"
+"""Lock file in the folder of a writer, by which others see whether the writer still runs."""
+
 TMP = f"{WORK}/tmp"
 """Folder of unfinished files: one folder for each writer."""
 
@@ -53,6 +59,12 @@ class Storage(Protocol):
     def remove(self, name: str) -> None:
         """Remove a file; ignore one that does not exist."""
 
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Apply a function that reads files to items; yield the results in order.
+
+        A store that takes long to answer calls the function in threads.
+        """
+
     def begin(self) -> None:
         """Create the folder of shards; remove unfinished files of processes of this host that have ended."""
 
@@ -73,13 +85,18 @@ def open_storage(out: str) -> Storage:
     Parameters
     ----------
     out : str
-        Folder of the dataset.
+        Folder or URL of the dataset.
 
     Returns
     -------
     Storage
         Nothing is created before it is opened or written to.
     """
+    path = any_path(out)
+    if isinstance(path, ObjectPath):
+        from unprocess_gen.pipeline.storage.remote import RemoteStorage
+
+        return RemoteStorage(path)
     from unprocess_gen.pipeline.storage.local import LocalStorage
 
-    return LocalStorage(Path(out))
+    return LocalStorage(path)

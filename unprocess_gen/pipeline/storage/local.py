@@ -10,16 +10,15 @@ import re
 import shutil
 import sys
 import uuid
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from unprocess_gen.core.errors import ConfigError, LockedError, UnprocessGenError
 from unprocess_gen.core.files import RESUME, commit_file, machine_error, sync
 from unprocess_gen.core.locks import LockFile, has_ended, is_held
+from unprocess_gen.core.object_store import Item, Result, any_path
 from unprocess_gen.core.output_paths import enclosing_dataset
-from unprocess_gen.pipeline.storage import TMP, WORK
-
-OWNER = "owner"
-"""Lock file in the folder of a writer, by which others see whether the writer still runs."""
+from unprocess_gen.pipeline.storage import OWNER, TMP, WORK
 
 
 class LocalStorage:
@@ -137,6 +136,10 @@ class LocalStorage:
         """Move a finished file to a name, durably; replace a file of that name."""
         commit_file(file, self._out / name)
 
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Apply a function to items, one at a time."""
+        return map(function, items)
+
     @property
     def scratch(self) -> Path:
         """Folder for unfinished files, named after host and process for people who look at a run."""
@@ -177,5 +180,5 @@ class LocalStorage:
 def cannot_write(error: OSError, out: str) -> UnprocessGenError:
     """Return the error of a place that cannot be begun: MachineError for a full disk, else ConfigError."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return machine_error(error, Path(out), RESUME)
+        return machine_error(error, any_path(out), RESUME)
     return ConfigError(f"out={out}: cannot be written ({error.strerror})")
