@@ -1,0 +1,364 @@
+"""Datasets written to an object store: same bytes, kills, races, failures of the store."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import object_store as servers
+from helpers.commands import RunMain
+from helpers.configs import composed
+from helpers.datasets import Make
+from helpers.object_store import Proxy
+from helpers.photographs import fill
+from helpers.processes import ONE, kill_group, running, wait_for
+
+import unprocess_gen as ug
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.validation import validate_config
+from unprocess_gen.core import object_store
+from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
+from unprocess_gen.core.object_store import ObjectPath
+from unprocess_gen.core.types import Source
+from unprocess_gen.dataset.shards import ShardWriter
+from unprocess_gen.pipeline import workspace as workspaces
+from unprocess_gen.pipeline.generate import Summary, generate
+from unprocess_gen.pipeline.listing_record import write_listing
+from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.storage.remote import PREFIX
+
+
+@pytest.fixture(autouse=True)
+def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of temporary files, so that a test sees all of them."""
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    return folder
+
+
+@pytest.fixture
+def proxy(s3: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+    """Return a proxy that this process and those that it starts use."""
+    with servers.proxy(s3) as state:
+        servers.use(monkeypatch, state.endpoint)
+        yield state
+    object_store._store.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def twelve(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fill(tmp_path_factory.mktemp("twelve") / "p", 12)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(twelve: Path, make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a local dataset of `twelve`, one pair in a shard."""
+    out = tmp_path_factory.mktemp("undisturbed") / "ds"
+    make(twelve, out, ONE)
+    return out
+
+
+def config_of(root: object, out: object, *overrides: str) -> Config:
+    config = composed(ONE, "n_jobs=1", *overrides)
+    config.source.root, config.out = str(root), str(out)
+    validate_config(config)
+    return config
+
+
+def assert_same(remote: ObjectPath, local: Path) -> None:
+    """Check that a URL has exactly the objects of a local dataset, with the same bytes; apart from run facts."""
+    names = {path.relative_to(local).as_posix() for path in local.rglob("*") if path.is_file()}
+    assert {found.key for found in remote.objects()} == names
+    for name in names - {"dataset.json"}:
+        assert (remote / name).read_bytes() == (local / name).read_bytes(), name
+    facts, others = (
+        json.loads((remote / "dataset.json").read_bytes()),
+        json.loads((local / "dataset.json").read_bytes()),
+    )
+    for key in ("fingerprint", "shards", "pairs", "failed", "sites"):
+        assert facts[key] == others[key]
+
+
+def test_url_gets_the_bytes_of_a_folder(
+    twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, run_main: RunMain
+) -> None:
+    out = bucket / "made" / "ds"
+    arguments = (f"source.root={twelve}", f"out={out}", ONE, "n_jobs=1")
+    done = run_main(*arguments)
+    assert (done.code, done.out.partition(";")[0]) == (0, f"{out}: 12 pairs in 12 shards, 0.1 MB, 0 failed")
+    assert_same(out, undisturbed)
+    assert not list(scratch.iterdir())
+    again = run_main(*arguments)
+    assert (again.code, again.out.partition(":")[0]) == (0, f"{out} is complete".partition(":")[0])
+    np.testing.assert_array_equal(ug.RawPairs(str(out))[3].noisy, ug.RawPairs(undisturbed)[3].noisy)
+    assert ug.verify(str(out)) == []
+
+
+def test_bucket_to_bucket_records_both_urls(
+    twelve: Path, bucket: ObjectPath, undisturbed: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    servers.upload(twelve, bucket / "photos")
+    generate(config_of(bucket / "photos", bucket / "ds"))
+    assert_same(bucket / "ds", undisturbed)
+    assert json.loads((bucket / "ds/dataset.json").read_bytes())["source"]["root"] == str(bucket / "photos")
+    done = run_main("again", str(bucket / "ds"), f"out={bucket}/again", "n_jobs=1")
+    assert (done.code, done.out.splitlines()[-1]) == (0, f"the same as {bucket}/ds, bit for bit")
+    done = run_main("again", str(bucket / "ds"), f"out={bucket}/ds")
+    assert done.code == 2 and "is the dataset itself" in done.err
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_killed_run_ends_as_if_undisturbed(
+    kills: int, twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, proxy: Proxy, tmp_path: Path
+) -> None:
+    """Each kill comes a few random milliseconds after the next request that writes; no shard is ever incomplete."""
+    moment = random.Random(18)
+    out = bucket / "ds"
+    arguments = (f"source.root={twelve}", f"out={out}", ONE, "n_jobs=2")
+    sizes = {path.name: path.stat().st_size for path in (undisturbed / "shards").iterdir()}
+    proxy.delay_s = 0.02
+    for kill in range(kills):
+        wanted = proxy.count("PUT") + kill % 3
+        with running(*arguments, cwd=tmp_path) as process:
+            wait_for(lambda n=wanted: proxy.count("PUT") > n or process.poll() is not None)
+            time.sleep(moment.uniform(0, 0.05))
+            kill_group(process)
+        assert (out / "shards").entries().items() <= sizes.items()
+    proxy.delay_s = 0
+    with running(*arguments, cwd=tmp_path) as process:
+        assert process.wait() == 0, process.communicate()
+    assert_same(out, undisturbed)
+    assert not list(scratch.glob(f"{PREFIX}*"))
+
+
+def test_committed_shards_are_not_made_twice(
+    twelve: Path, bucket: ObjectPath, undisturbed: Path, proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = config_of(twelve, bucket / "ds")
+
+    def fail_at_seventh(method: str, path: str) -> int:
+        return 403 if method == "PUT" and path.endswith("00007.tar") else 0
+
+    proxy.answer = fail_at_seventh
+    with pytest.raises(MachineError, match=r"shard-00007\.tar: access was refused"):
+        generate(config)
+    assert len((bucket / "ds/.work/rows").entries()) == len((bucket / "ds/shards").entries()) == 7
+    proxy.answer = lambda *_: 0
+    proxy.requests.clear()
+    assert generate(config).made == 5
+    written = [path for method, path in proxy.requests if method == "PUT" and "/shards/" in path]
+    assert len(written) == 5
+    assert_same(bucket / "ds", undisturbed)
+
+
+def test_failing_answers_during_a_run_are_repeated(
+    twelve: Path, bucket: ObjectPath, undisturbed: Path, proxy: Proxy
+) -> None:
+    servers.upload(twelve, bucket / "photos")
+    moment = random.Random(5)
+    proxy.answer = lambda *_: moment.choice((0, 0, 0, 0, 0, 0, 0, 503))
+    generate(config_of(bucket / "photos", bucket / "ds"))
+    proxy.answer = lambda *_: 0
+    assert_same(bucket / "ds", undisturbed)
+
+
+def test_two_runs_at_once_write_one_dataset(twelve: Path, bucket: ObjectPath, undisturbed: Path) -> None:
+    outcomes: list[Summary | Exception] = []
+
+    def run() -> None:
+        try:
+            outcomes.append(generate(config_of(twelve, bucket / "ds")))
+        except Exception as error:
+            outcomes.append(error)
+
+    threads = [threading.Thread(target=run) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert any(isinstance(outcome, Summary) for outcome in outcomes), outcomes
+    assert all(isinstance(outcome, Summary | MachineError | DamageError) for outcome in outcomes), outcomes
+    assert generate(config_of(twelve, bucket / "ds")).made == 0
+    assert_same(bucket / "ds", undisturbed)
+
+
+def test_run_with_other_settings_loses_the_race(
+    twelve: Path, bucket: ObjectPath, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked = workspaces.Workspace.check_begun
+
+    def begun_by_another(workspace: workspaces.Workspace, *arguments: object) -> None:
+        checked(workspace, *arguments)  # type: ignore[arg-type]
+        monkeypatch.setattr(workspaces.Workspace, "check_begun", checked)
+        generate(config_of(twelve, bucket / "ds"))
+
+    monkeypatch.setattr(workspaces.Workspace, "check_begun", begun_by_another)
+    with pytest.raises(ConfigError, match=r"was begun with other settings: seed=4 \(there: 0\)"):
+        generate(config_of(twelve, bucket / "ds", "seed=4"))
+    assert_same(bucket / "ds", undisturbed)
+
+
+def test_record_of_sources_is_never_replaced(bucket: ObjectPath) -> None:
+    storage = open_storage(str(bucket / "ds"))
+    sources = [Source(0, "a", "a", 1, etag="1")]
+    assert write_listing(storage, "ds", sources) == write_listing(storage, "ds", sources)
+    with pytest.raises(ConfigError, match="out=ds: was begun with other sources"):
+        write_listing(storage, "ds", [replace(sources[0], etag="2")])
+
+
+def test_writer_that_fails_leaves_no_object(
+    twelve: Path, bucket: ObjectPath, scratch: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ShardWriter, "add_rows", fail)
+    with pytest.raises(MachineError, match="No space left on device"):
+        generate(config_of(twelve, bucket / "ds"))
+    assert (bucket / "ds/shards").entries() == {}
+    assert (bucket / "ds/.work/rows").entries() == {}
+    assert not list(scratch.iterdir())
+
+
+def test_interrupted_upload_leaves_no_object(bucket: ObjectPath, proxy: Proxy, tmp_path: Path) -> None:
+    (tmp_path / "shard").write_bytes(bytes(3 * object_store.MAX_PIECE))
+    proxy.answer = lambda method, path: 403 if "partNumber=2" in path else 0
+    with pytest.raises(MachineError):
+        (bucket / "shard").put_file(tmp_path / "shard")
+    proxy.answer = lambda *_: 0
+    assert not (bucket / "shard").exists()
+
+
+def test_object_changed_between_runs_is_refused(twelve: Path, bucket: ObjectPath, proxy: Proxy) -> None:
+    servers.upload(twelve, bucket / "photos")
+    config = config_of(bucket / "photos", bucket / "ds")
+    proxy.answer = lambda method, path: 403 if path.endswith("00007.tar") else 0
+    with pytest.raises(MachineError):
+        generate(config)
+    proxy.answer = lambda *_: 0
+    changed = next((bucket / "photos").objects())
+    content = bytearray((bucket / "photos" / changed.key).read_bytes())
+    content[-1] ^= 1
+    (bucket / "photos" / changed.key).write_bytes(bytes(content))
+    with pytest.raises(ConfigError, match=f"was begun with other sources: {changed.key} has other bytes than it had"):
+        generate(config)
+
+
+def test_object_changed_during_a_run_ends_with_5(
+    twelve: Path, bucket: ObjectPath, proxy: Proxy, run_main: RunMain
+) -> None:
+    servers.upload(twelve, bucket / "photos")
+    last = sorted(found.key for found in (bucket / "photos").objects())[-1]
+
+    def change(method: str, path: str) -> int:
+        if method == "PUT" and path.endswith("00000.tar"):
+            proxy.answer = lambda *_: 0
+            content = (twelve / last).read_bytes()
+            servers.put(proxy.target, bucket / "photos" / last, content[:-1] + bytes([content[-1] ^ 1]))
+        return 0
+
+    proxy.answer = change
+    done = run_main(f"source.root={bucket}/photos", f"out={bucket}/ds", ONE, "n_jobs=1", "check_disk=false")
+    assert done.code == 5
+    assert f"source {last} changed since it was listed" in done.err and "Traceback" not in done.err
+
+
+def test_deleted_object_ends_with_5(twelve: Path, bucket: ObjectPath, proxy: Proxy, run_main: RunMain) -> None:
+    servers.upload(twelve, bucket / "photos")
+    last = sorted(found.key for found in (bucket / "photos").objects())[-1]
+    proxy.answer = lambda method, path: 404 if method in ("GET", "HEAD") and path.endswith(last) else 0
+    done = run_main(f"source.root={bucket}/photos", f"out={bucket}/ds", ONE, "n_jobs=1", "check_disk=false")
+    assert done.code == 5
+    assert f"{last} was deleted or moved after listing" in done.err
+
+
+def test_provisional_rows_keep_the_records(twelve: Path, bucket: ObjectPath) -> None:
+    storage = open_storage(str(bucket / "ds"))
+    storage.write(".work/rows/00000.json", "{}")
+    storage.remove_work(keep_records=True)
+    assert storage.read(".work/rows/00000.json") == "{}"
+    storage.remove_work(keep_records=False)
+    assert storage.names("") == {}
+    with pytest.raises(FileNotFoundError):
+        storage.read(".work/rows/00000.json")
+
+
+def test_finished_dataset_with_a_missing_shard_is_damage(twelve: Path, bucket: ObjectPath) -> None:
+    config = config_of(twelve, bucket / "ds")
+    generate(config)
+    (bucket / "ds/shards/shard-00003.tar").delete()
+    with pytest.raises(DamageError, match=r"shard-00003\.tar: is missing"):
+        generate(config)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (
+            ("out=s3://no-such-bucket/ds",),
+            "out=s3://no-such-bucket/ds: access was refused (404 Not Found, NoSuchBucket",
+        ),
+        (("out={}/ds/inner",), "out={}/ds/inner: is inside the dataset {}/ds"),
+        (("out={}/foreign",), "out={}/foreign: contains notes.txt, but no config.yaml"),
+        (("out={}/ds", "seed=1"), "out={}/ds: was begun with other settings: seed=1 (there: 0)"),
+        (("-m", "out={}/sweep", "seed=1,2"), "out={}/sweep: a sweep cannot write to an object store"),
+        (("accuracy", "out={}/report"), "out={}/report: a report is written to a local folder"),
+    ],
+    ids=["bucket", "inner", "foreign", "settings", "sweep", "report"],
+)
+def test_wrong_out_is_refused_before_anything_is_written(
+    arguments: tuple[str, ...], error: str, bucket: ObjectPath, run_main: RunMain
+) -> None:
+    generate(config_of_scenes(bucket / "ds"))
+    (bucket / "foreign/notes.txt").write_bytes(b"mine")
+    before = sorted(bucket.objects())
+    done = run_main(*(word.format(bucket) for word in arguments), "source.limit=1", "n_jobs=1")
+    assert done.code == 2
+    assert error.format(bucket, bucket) in done.err and "Traceback" not in done.err
+    assert sorted(bucket.objects()) == before
+
+
+def config_of_scenes(out: ObjectPath) -> Config:
+    config = composed("source.limit=1", "n_jobs=1")
+    config.out = str(out)
+    validate_config(config)
+    return config
+
+
+def test_plan_of_a_url_writes_nothing(bucket: ObjectPath, run_main: RunMain, twelve: Path) -> None:
+    done = run_main("plan", f"source.root={twelve}", f"out={bucket}/ds")
+    assert done.code == 0 and f"out       {bucket}/ds" in done.out
+    assert list(bucket.objects()) == []
+
+
+def test_too_little_temporary_space_is_refused(
+    twelve: Path, bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from unprocess_gen.pipeline import sizes
+
+    monkeypatch.setattr(sizes, "free_bytes", lambda path: 100)
+    with pytest.raises(MachineError, match=r"out=s3://.*: not enough temporary disk space .* set TMPDIR"):
+        generate(config_of(twelve, bucket / "ds"))
+    assert list(bucket.objects()) == []
+
+
+def test_signal_ends_a_run_without_leftovers(
+    twelve: Path, bucket: ObjectPath, proxy: Proxy, scratch: Path, tmp_path: Path
+) -> None:
+    proxy.delay_s = 0.05
+    with running(f"source.root={twelve}", f"out={bucket}/ds", ONE, "n_jobs=1", cwd=tmp_path) as process:
+        wait_for(lambda: any("shard-00001.tar" in path for _, path in proxy.requests))
+        process.send_signal(signal.SIGTERM)
+        assert process.wait() == 143
+    assert not list(scratch.glob(f"{PREFIX}*"))
