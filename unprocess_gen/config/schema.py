@@ -37,8 +37,8 @@ class SourceConfig:
 
     root: Optional[str] = key(
         None,
-        "folder of photographs, or one photograph",
-        Described("a folder, a file, or null"),
+        "folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://",
+        Described("a folder, a file, a URL, or null"),
         null="the built-in synthetic scenes",
         decides_data=False,
     )
@@ -659,7 +659,7 @@ class Config:
     seed: int = key(0, "seed of all random streams", Integers(0, 2**63 - 1))
     out: str = key(
         "ds",
-        "folder of the dataset; in a sweep, the folder that contains the datasets",
+        "folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the datasets",
         Text("the name of a folder"),
         decides_data=False,
     )

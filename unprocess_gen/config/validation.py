@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import re
 from importlib.util import find_spec
+from pathlib import Path
 
 from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn

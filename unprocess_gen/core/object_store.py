@@ -583,7 +583,7 @@ def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
         reason = _reason(error)
         if reason.startswith("416"):
             raise _EndOfObjectError from None
-        if "NoSuchBucket" in reason:
+        if "NoSuchBucket" in reason or reason.startswith(("401", "403")):  # the latter from a service of credentials
             raise _no_access(path, reason) from None
         raise MachineError(f"{path}: the object store failed ({reason}); rerun when it answers") from None
 
