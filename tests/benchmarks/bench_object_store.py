@@ -66,7 +66,8 @@ def main() -> None:
             load_source(config, source)
         decoding = time.process_time() - started - client
         print(f"{len(sources)} photographs, {size / len(sources) / 1e6:.2f} MB on average")
-        print(f"client {1e3 * client / len(sources):.2f} ms of CPU time per object, decoding {decoding / len(sources) * 1e3:.1f} ms")
+        client_ms, decoding_ms = (1e3 * seconds / len(sources) for seconds in (client, decoding))
+        print(f"client {client_ms:.2f} ms of CPU time per object, decoding {decoding_ms:.1f} ms")
         small = [Source(i, f"{i}", f"{i}", 1000) for i in range(100)]
         for source in small:
             (ObjectPath(f"{bucket}/small") / source.path).write_bytes(bytes(1000))
@@ -88,7 +89,9 @@ def main() -> None:
                         load_source(config, source, read=read)
                 walls.append((time.perf_counter() - started, time.thread_time() - busy))
             wall, busy = min(walls)
-            print(f"{ahead:2} ahead, {latency_ms:g} ms: {wall:.2f} s, the thread that decodes is busy {busy / wall:.0%}")
+            print(
+                f"{ahead:2} ahead, {latency_ms:g} ms: {wall:.2f} s, the thread that decodes is busy {busy / wall:.0%}"
+            )
         here.send(None)
         process.join()
 

@@ -156,18 +156,20 @@ def test_every_rename_of_a_run_is_tested(make: Make, tmp_path: Path, monkeypatch
 def test_files_are_synced_before_their_rename(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a loss of power no file may have its final name without its contents; its folder is synced next."""
     seen: list[tuple[str, str]] = []
-    replace = os.replace
 
     def path_of(handle: int) -> str:
         return str(Path(f"/proc/self/fd/{handle}").readlink())
 
+    def placed(place: Any, old: Any, new: Any) -> None:
+        seen.append((f"rename {old}", str(new)))
+        place(old, new)
+
     monkeypatch.setattr(os, "fsync", lambda handle: seen.append(("sync", path_of(handle))))
-    monkeypatch.setattr(
-        os, "replace", lambda old, new: (seen.append((f"rename {old}", str(new))), replace(old, new))[1]
-    )
+    for name in ("replace", "link"):
+        monkeypatch.setattr(os, name, partial(placed, getattr(os, name)))
     make(fill(tmp_path / "p", 2), tmp_path / "ds", ONE)
     renames = [i for i, (what, _) in enumerate(seen) if what != "sync"]
-    assert len(renames) == 8
+    assert len(renames) == 9
     for i in renames:
         old, new = seen[i][0].removeprefix("rename "), seen[i][1]
         assert ("sync", old) in seen[:i], old

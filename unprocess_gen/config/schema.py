@@ -659,7 +659,8 @@ class Config:
     seed: int = key(0, "seed of all random streams", Integers(0, 2**63 - 1))
     out: str = key(
         "ds",
-        "folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the datasets",
+        "folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the "
+        "datasets",
         Text("the name of a folder"),
         decides_data=False,
     )

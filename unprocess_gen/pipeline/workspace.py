@@ -145,10 +145,10 @@ class Workspace:
         Raises ConfigError if the folder cannot be written; MachineError if the disk is full.
         """
         try:
-            if not self.storage.create("config.yaml", self.config_yaml):
-                self._check_same_settings()
             if read_record(self.storage, self.out) is None:
                 write_listing(self.storage, self.out, sources)
+            if not self.storage.create("config.yaml", self.config_yaml):
+                self._check_same_settings()
             self.storage.begin()  # after config.yaml, by which a later run recognises the folder
             self._refuse_foreign_shards(shards)
             _ = self.storage.scratch
