@@ -145,6 +145,7 @@ class Workspace:
         Raises ConfigError if the folder cannot be written; MachineError if the disk is full.
         """
         try:
+            self._check_same_settings()  # another run may have begun since `check_begun`, where there are no locks
             if read_record(self.storage, self.out) is None:
                 write_listing(self.storage, self.out, sources)
             if not self.storage.create("config.yaml", self.config_yaml):
