@@ -7,6 +7,7 @@ import os
 import stat
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.tasks import ShardResult
 from unprocess_gen.sources import listing as sources
 from unprocess_gen.sources.listing import (
     ClipSizes,
@@ -145,13 +147,18 @@ def test_several_clips_or_one_photograph_give_no_warning(tmp_path: Path) -> None
 
 
 def test_frames_of_different_sizes_in_a_clip_give_one_warning() -> None:
-    def row(clip: str, width: int, height: int, **others: object) -> dict:
-        return {"status": "ok", "clip": clip, "width": width, "height": height, "patch": 0} | others
+    def row(clip: str, width: int, height: int, **others: Any) -> dict[str, Any]:
+        empty = {"key": "00000000", "source_noise_dn": None, "status": "ok", "patch": 0}
+        return empty | {"clip": clip, "width": width, "height": height} | others
+
+    def frame_sizes(*rows: dict[str, Any]) -> tuple[tuple[str, int, int], ...]:
+        return ShardResult(0, None, 0, None, rows).report().frame_sizes
 
     sizes = ClipSizes()
-    assert sizes.warnings([row("a", 4, 3), row("b", 8, 6), row("a", 4, 3), row("none", 1, 1)]) == ()
-    assert sizes.warnings([row("a", 2, 2, patch=1), row("a", 5, 5, status="failed")]) == ()
-    (warning,) = sizes.warnings([row("a", 3, 4), row("a", 5, 5)])
+    alike = frame_sizes(row("a", 4, 3), row("b", 8, 6), row("a", 4, 3), row("none", 1, 1))
+    assert sizes.warnings(alike) == ()
+    assert sizes.warnings(frame_sizes(row("a", 2, 2, patch=1), row("a", 5, 5, status="failed"))) == ()
+    (warning,) = sizes.warnings(frame_sizes(row("a", 3, 4), row("a", 5, 5)))
     assert "clip a has frames of 4 x 3 and of 3 x 4 pixels" in warning
 
 
