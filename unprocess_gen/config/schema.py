@@ -642,6 +642,50 @@ class OutputConfig:
 
 @documented
 @dataclass
+class ExecutorConfig:
+    """Choose what runs the workers; no byte of a dataset depends on it."""
+
+    kind: str = key(
+        "local",
+        "what runs the workers: local is processes of this machine, dask a Dask cluster (extra dask)",
+        Choice(("local", "dask")),
+        decides_data=False,
+    )
+    address: Optional[str] = key(
+        None,
+        "address of a running Dask scheduler, such as tcp://10.0.0.1:8786, used if kind is dask",
+        Text("the address of a Dask scheduler"),
+        null="start a scheduler and n_jobs workers on this machine",
+        decides_data=False,
+    )
+    chunk_s: float = key(
+        30.0,
+        "work that a Dask task holds; the first tasks hold less, because the time of a shard is measured",
+        Numbers(0, 86400, open_low=True),
+        unit="seconds",
+        decides_data=False,
+    )
+    window: int = key(
+        2, "Dask tasks that are submitted for each worker at a time", Integers(1, 1000), decides_data=False
+    )
+    no_workers_s: float = key(
+        300.0,
+        "time without any Dask worker after which the run ends with exit code 5",
+        Numbers(0, 86400, open_low=True),
+        unit="seconds",
+        decides_data=False,
+    )
+    lost_worker_s: float = key(
+        60.0,
+        "time without progress after which the shards of a Dask worker are given to another one",
+        Numbers(1, 86400),
+        unit="seconds",
+        decides_data=False,
+    )
+
+
+@documented
+@dataclass
 class Config:
     """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level."""
 
@@ -656,6 +700,7 @@ class Config:
     clean: CleanConfig = field(default_factory=CleanConfig)
     accuracy: AccuracyConfig = field(default_factory=AccuracyConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
+    executor: ExecutorConfig = field(default_factory=ExecutorConfig)
     seed: int = key(0, "seed of all random streams", Integers(0, 2**63 - 1))
     out: str = key(
         "ds",

@@ -15,7 +15,7 @@ import yaml
 
 from unprocess_gen.config.interpretation import canonical_patch, has_float_clean, saturated_as, uses_assumed
 from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
-from unprocess_gen.config.schema import Config, all_settings
+from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
@@ -37,6 +37,13 @@ def _keys(chosen: Callable[[Setting], bool]) -> dict[str, tuple[str, ...]]:
 
 NOT_DATA = _keys(lambda setting: not setting.decides_data)
 """Keys that do not decide the bytes of a dataset, by group; ``config.yaml`` omits them."""
+
+NOT_RECORDED = tuple(
+    group
+    for group, kind in GROUPS.items()
+    if {one.name for one in dataclasses.fields(kind)} == set(NOT_DATA.get(group, ()))
+)
+"""Groups of which no key decides data; ``config.yaml`` omits them."""
 
 NUMBER_KEYS = _keys(
     lambda setting: (
@@ -102,7 +109,10 @@ def _recorded(group: Any) -> Any:
     recorded: dict[str, Any] = {}
     for one in dataclasses.fields(group):
         setting, value = settings.get(one.name), getattr(group, one.name)
-        omitted = setting is not None and (not setting.decides_data or (setting.since and value == _default(one)))
+        if setting is None:
+            omitted = one.name in NOT_RECORDED
+        else:
+            omitted = not setting.decides_data or bool(setting.since and value == _default(one))
         if not omitted:
             recorded[one.name] = _recorded(value)
     return recorded
@@ -189,7 +199,7 @@ def _build(group: type[Any], loaded: Any, prefix: str) -> Any:
     """Return a dataclass of the schema from a mapping; ``prefix`` is its dotted path, with a dot at the end."""
     if not isinstance(loaded, dict):
         raise ConfigError(f"{prefix[:-1]}={value_text(loaded)[:60]}: expected a mapping")
-    omitted = NOT_DATA.get(prefix[:-1], ())
+    omitted = NOT_DATA.get(prefix[:-1], ()) if prefix else (*NOT_DATA[""], *NOT_RECORDED)
     fields = {one.name: one for one in dataclasses.fields(group) if one.name not in omitted}
     later = {name for name, setting in settings_of(group).items() if setting.since}
     missing, unknown = fields.keys() - loaded.keys() - later, loaded.keys() - fields.keys()

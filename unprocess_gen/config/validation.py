@@ -33,6 +33,7 @@ from unprocess_gen.config.schema import (
     CameraConfig,
     Config,
     EffectsConfig,
+    ExecutorConfig,
     NoiseConfig,
     OutputConfig,
     SourceConfig,
@@ -82,7 +83,7 @@ def validate_config(config: Config) -> None:
     content = snapshot(config)
     if content is None or not SEED.allows(config.seed) or not _has_allowed_values(content):
         check_values(config)
-    _check_environment(config.source)
+    _check_environment(config)
     check_parquet(config.output)
     _check_dark_folder(config.noise)
 
@@ -125,6 +126,7 @@ def check_values(config: Config) -> None:
         accuracy_budget(config.accuracy), uses_physics(config.noise), is_normalised(config), has_float_clean(config)
     )
     _check_output(config)
+    _check_executor(config.executor)
 
 
 def check_parquet(output: OutputConfig) -> None:
@@ -173,7 +175,8 @@ def _exists(root: str) -> bool:
         raise ConfigError(f"source.root={error}") from None
 
 
-def _check_environment(source: SourceConfig) -> None:
+def _check_environment(config: Config) -> None:
+    source = config.source
     if source.root == "":
         raise ConfigError("source.root='': expected a folder or file; null selects the built-in scenes")
     if source.root is not None and not _exists(source.root):
@@ -186,6 +189,10 @@ def _check_environment(source: SourceConfig) -> None:
         )
     if source.icc == "refuse" and find_spec("PIL") is None:
         raise ConfigError("source.icc=refuse: needs Pillow to read colour profiles; pip install pillow")
+    if config.executor.kind == "dask" and find_spec("distributed") is None:
+        raise ConfigError(
+            "executor.kind=dask: needs Dask; in the source folder, run: pip install '.[dask]', or set executor=local"
+        )
 
 
 def _check_source(source: SourceConfig) -> None:
@@ -300,6 +307,13 @@ def _check_switched_on(config: Config, effect: str) -> None:
     if number is not None:
         raise ConfigError(
             f"effects.{effect}=on: noise={noise.name} gives no {number}; set noise.{number}, or leave it off"
+        )
+
+
+def _check_executor(executor: ExecutorConfig) -> None:
+    if executor.address is not None and executor.kind != "dask":
+        raise ConfigError(
+            f"executor.address={executor.address}: executor={executor.kind} connects to no scheduler; set executor=dask"
         )
 
 
