@@ -69,6 +69,12 @@ PROMISES = (
         ("pytest -m slow tests/pipeline/test_parts.py",),
     ),
     Promise(
+        "dask",
+        "A run on a Dask cluster ends with the bytes of a local run, whichever process dies, freezes or is slow.",
+        ("tests/pipeline/test_dask.py",),
+        ("pytest -m slow tests/pipeline/test_dask.py",),
+    ),
+    Promise(
         "disk-full",
         "A full disk ends the run with exit code 5; the next run completes the dataset to the same bytes.",
         ("tests/pipeline/test_faults.py",),

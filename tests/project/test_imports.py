@@ -47,6 +47,8 @@ ONLY_IN = {
     "tarfile": {"dataset.shards"},
     "tifffile": {"dataset.dng"},
     "pyarrow": {"dataset.parquet"},
+    "dask": {"pipeline.executors.dask"},
+    "distributed": {"pipeline.executors.dask"},
 }
 """The modules that may import a library."""
 

@@ -62,3 +62,15 @@ class Deaths:
         """Remove the files of earlier attempts."""
         for name in self._names:
             self._storage.remove(name)
+
+
+def forget_deaths(storage: Storage) -> None:
+    """Remove the files of all shards.
+
+    Parameters
+    ----------
+    storage : Storage
+        Where the dataset is written.
+    """
+    for name in storage.names(FOLDER):
+        storage.remove(f"{FOLDER}/{name}")

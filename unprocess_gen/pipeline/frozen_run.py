@@ -355,7 +355,7 @@ class FrozenRun:
             yield report
 
 
-def open_run(out: str, plan_sha256: str) -> FrozenRun:
+def open_run(out: str, plan_sha256: str, root: str | None = None) -> FrozenRun:
     """Return a frozen run for this process, after the self-test and the canary.
 
     Parameters
@@ -364,6 +364,8 @@ def open_run(out: str, plan_sha256: str) -> FrozenRun:
         Folder of the dataset.
     plan_sha256 : str
         Digest of the plan (`FrozenPlan.sha256`), so that a later run in the same folder is another one.
+    root : str, optional
+        Place of the sources, if they were moved since the run was frozen.
 
     Returns
     -------
@@ -378,15 +380,15 @@ def open_run(out: str, plan_sha256: str) -> FrozenRun:
         As `check_canary`.
     """
     with _OPENING:
-        return _open_run(out, plan_sha256)
+        return _open_run(out, plan_sha256, root)
 
 
 _OPENING = threading.Lock()
 
 
 @lru_cache(maxsize=2)
-def _open_run(out: str, plan_sha256: str) -> FrozenRun:
-    run = FrozenRun(out)
+def _open_run(out: str, plan_sha256: str, root: str | None) -> FrozenRun:
+    run = FrozenRun(out, root)
     if run.plan.sha256 != plan_sha256:
         raise ConfigError(f"out={out}: its plan is not that of this run; prepare another out")
     run.check_host()

@@ -4,6 +4,7 @@ A shard is the unit of work, retry and commit:
 
 * `tasks`: the records that travel between coordinator and workers.
 * `executors.local`: starts worker processes; its docstring says what happens when one dies.
+* `executors.dask`: gives shards to the workers of a Dask cluster.
 * `worker`: makes one shard in a temporary file, commits it and reports counts.
 * `shard_records`, `listing_record`: what a run keeps until it is finished.
 * `workspace`: checks and locks the output folder; writes ``manifest.csv`` and ``dataset.json``.
@@ -18,7 +19,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
@@ -29,13 +30,14 @@ from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.core.object_store import AnyPath, any_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
+from unprocess_gen.pipeline.frozen_run import freeze
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Tally, Workspace
 from unprocess_gen.sources.dark_frames import open_dark_frames
-from unprocess_gen.sources.listing import ClipSizes, absolute_root
+from unprocess_gen.sources.listing import ClipSizes, Listing, absolute_root
 from unprocess_gen.sources.loader import list_photographs
 from unprocess_gen.sources.video.decode import is_installed
 
@@ -131,26 +133,25 @@ def generate(config: Config, label: str = "") -> Summary:
         if config.check_disk:
             check_free_space(config, todo, any_path(config.out))
         workspace.begin(listing.sources, len(tasks))
-        n_jobs = effective_jobs(config.n_jobs, len(todo))
         context = RunContext(
             config,
             str(workspace.storage.scratch),
             os.getpid(),
-            core_to_spare=n_jobs < own_cores(),
             dark_frames=dark_frames,
             dark_folder=dark_folder,
         )
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)
         with Progress(len(listing.sources), images_done, label) as progress:
-            progress.report_compiling(context.compiling_path)
             for warning in filter(None, (*listing.warnings, shards_warning(config, listing.sources))):
                 progress.warn(warning)
-            rows_made, times = follow(run_tasks(context, todo, n_jobs), progress)
+            execute = EXECUTORS[config.executor.kind] if todo else execute_locally
+            rows_made, times, n_jobs = execute(Assignment(workspace, listing, todo, context), progress)
         if workspace.is_complete():  # another run was not kept out by the lock, and has finished the dataset
             return summary_of(config.out, workspace.check_complete(listing.sources), started, listing.unmatched)
         run = {
             "seconds": round(time.monotonic() - started, 3),
             **{stage: round(stage_s, 3) for stage, stage_s in asdict(times).items()},
+            "executor": config.executor.kind,
             "n_jobs": n_jobs,
             "shards_made": len(todo),
         }
@@ -161,6 +162,58 @@ def generate(config: Config, label: str = "") -> Summary:
             config.output.parquet,
         )
     return replace(summary_of(config.out, facts, started, listing.unmatched), made=rows_made, times=times)
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Hold the shards that an executor makes.
+
+    Attributes
+    ----------
+    workspace : Workspace
+        The begun dataset.
+    listing : Listing
+        All sources.
+    tasks : list of ShardTask
+        Shards that are not committed.
+    context : RunContext
+        What workers on this machine share.
+    """
+
+    workspace: Workspace
+    listing: Listing
+    tasks: list[ShardTask]
+    context: RunContext
+
+
+def execute_locally(work: Assignment, progress: Progress) -> tuple[int, StageTimes, int]:
+    """Make shards in worker processes of this machine; return number of rows, times and number of workers."""
+    n_jobs = effective_jobs(work.context.config.n_jobs, len(work.tasks))
+    context = replace(work.context, core_to_spare=n_jobs < own_cores())
+    progress.report_compiling(context.compiling_path)
+    return *follow(run_tasks(context, work.tasks, n_jobs), progress), n_jobs
+
+
+def execute_on_dask(work: Assignment, progress: Progress) -> tuple[int, StageTimes, int]:
+    """Make shards on a Dask cluster; return number of rows, times and the largest number of workers at a time."""
+    from unprocess_gen.pipeline.executors.dask import ChunkRequest, DaskRun, connected
+
+    config, workspace = work.context.config, work.workspace
+    out, root = absolute_root(config.out), absolute_root(config.source.root)
+    assert out is not None
+    with connected(config.executor, effective_jobs(config.n_jobs, len(work.tasks)), workspace.storage) as client:
+        plan = freeze(workspace, config, work.listing)
+        request = ChunkRequest(out, root, plan.sha256)
+        shards = [task.shard for task in work.tasks]
+        run = DaskRun(client, config.executor, request, workspace.records, shards)
+        return *follow(run.reports(), progress), run.workers.most
+
+
+EXECUTORS: dict[str, Callable[[Assignment, Progress], tuple[int, StageTimes, int]]] = {
+    "local": execute_locally,
+    "dask": execute_on_dask,
+}
+"""What each value of ``executor.kind`` runs."""
 
 
 def follow(reports: Iterable[ShardReport], progress: Progress) -> tuple[int, StageTimes]:

@@ -18,7 +18,7 @@ from unprocess_gen.dataset.columns import NAMES
 from unprocess_gen.dataset.manifest import row_of_values
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.storage import Storage
-from unprocess_gen.pipeline.tasks import ShardResult
+from unprocess_gen.pipeline.tasks import ShardReport, ShardResult
 
 ROWS = ".work/rows"
 """Folder of the records below ``out``."""
@@ -94,6 +94,11 @@ class ShardRecords:
                 f"{self._place}/{record_name(shard)}: cannot be read ({error_in_one_line(error)}); delete the file and "
                 "rerun to make its shard"
             ) from error
+
+    def report(self, shard: int) -> ShardReport:
+        """Return the report of a committed shard, without times; raise DamageError if its record cannot be read."""
+        _, rows = self.entry_and_rows(shard)
+        return ShardResult(shard, None, 0, None, tuple(rows)).report()
 
     def _read(self, shard: int) -> dict[str, Any]:
         record: dict[str, Any] = json.loads(self._storage.read(record_name(shard)))

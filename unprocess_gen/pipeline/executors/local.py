@@ -100,14 +100,14 @@ def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> I
     parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # tasks cancelled by an interrupt
-        with _interrupts_ignored(), _tracker_silenced():
+        with interrupts_ignored(), _tracker_silenced():
             results = parallel(delayed(make_and_commit)(context, task) for task in tasks)
         with closing(results):
             yield from results
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def interrupts_ignored() -> Iterator[None]:
     """Ignore SIGINT and SIGHUP while workers and loky's tracker start.
 
     The new processes inherit this, so that only the coordinator answers Ctrl-C and the loss of its terminal. Blocking

@@ -1,0 +1,427 @@
+"""Runs on a Dask cluster: the bytes of a local run, whatever process dies, freezes or is slow.
+
+The scheduler, the workers and their nannies are real processes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from helpers.commands import RunMain, messages
+from helpers.dask_cluster import DaskCluster, dask_cluster, with_signal
+from helpers.datasets import Make, TreeHash
+from helpers.photographs import fill
+from helpers.processes import assert_complete, imported_first, running, session, wait_for
+from helpers.promise_report import Figure
+
+from unprocess_gen.dataset.manifest import read_rows
+from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.verify import verify
+
+pytest.importorskip("distributed")
+
+COUNT = 12
+ONE = "output.pairs_per_shard=1"
+ROOT = "source.root=p"
+SMALL = "executor.chunk_s=1"
+
+SLOW_SHARDS = """
+import time
+from unprocess_gen.pipeline import worker
+
+make_shard = worker.make_shard
+
+
+def slow(context, task):
+    time.sleep(SECONDS)
+    return make_shard(context, task)
+
+
+worker.make_shard = slow
+"""
+"""Module for `imported_first`: a shard takes SECONDS longer."""
+
+
+def slow_shards(seconds: float) -> str:
+    return SLOW_SHARDS.replace("SECONDS", str(seconds))
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
+    with dask_cluster(tmp_path_factory.mktemp("cluster")) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Make the dataset of twelve photographs locally, and return its hash."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    make(fill(folder / "p", COUNT), folder / "ds", ONE)
+    return tree_hash(folder / "ds")
+
+
+@pytest.fixture
+def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return fill(tmp_path / "p", COUNT)
+
+
+def committed(out: Path) -> dict[str, tuple[int, int]]:
+    """Return inode and time of each shard that has a record."""
+    return {
+        path.name: (path.stat().st_ino, path.stat().st_mtime_ns)
+        for path in (out / "shards").glob("*.tar")
+        if (out / ".work/rows" / f"{path.stem.removeprefix('shard-')}.json").exists()
+    }
+
+
+# Same bytes -----------------------------------------------------------------------------------------------------------
+
+
+def test_cluster_makes_the_bytes_of_a_local_run(
+    cluster: DaskCluster, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+    assert (done.code, done.out.split(",")[0]) == (0, "ds: 12 pairs in 12 shards"), done.err
+    assert "12/12 images" in done.err
+    assert tree_hash(tmp_path / "ds") == undisturbed
+    assert verify(tmp_path / "ds") == []
+    assert_complete(tmp_path / "ds")
+    run = json.loads((tmp_path / "ds/dataset.json").read_text())["run"]
+    assert (run["executor"], run["n_jobs"], run["shards_made"]) == ("dask", 2, 12)
+    assert run["decode_s"] > 0
+    again = run_main(ROOT, ONE, "out=ds", *cluster.overrides)
+    assert (again.code, "nothing to do" in again.out) == (0, True)
+
+
+def test_run_that_a_local_one_began_is_finished_by_dask(
+    cluster: DaskCluster, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    assert run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    assert run_main("part", "ds", 0, "-q").code == 0
+    before = committed(tmp_path / "ds")
+    done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+    assert (done.code, len(before)) == (0, 6), done.err
+    assert tree_hash(tmp_path / "ds") == undisturbed
+    assert {path.name: path.stat().st_ino for path in (tmp_path / "ds/shards").iterdir()}.items() >= {
+        name: inode for name, (inode, _) in before.items()
+    }.items()
+
+
+def test_run_that_dask_began_is_finished_locally(
+    cluster: DaskCluster,
+    photographs: Path,
+    run_main: RunMain,
+    undisturbed: str,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(reports: Iterator[object], progress: object) -> None:
+        next(iter(reports))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "follow", interrupted)
+        done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+    assert (done.code, len(committed(tmp_path / "ds")) > 0) == (130, True)
+    assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+def test_moved_sources_are_read_from_their_new_folder(
+    cluster: DaskCluster, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    assert run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    photographs.rename(tmp_path / "moved")
+    done = run_main("source.root=moved", ONE, SMALL, "out=ds", *cluster.overrides)
+    assert done.code == 0, done.err
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+# Refusals -------------------------------------------------------------------------------------------------------------
+
+
+def test_no_scheduler_at_the_address_ends_with_one_line(photographs: Path, run_main: RunMain) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{unused.getsockname()[1]}"
+        done = run_main(ROOT, "executor=dask", f"executor.address={address}", "executor.no_workers_s=1", "out=ds")
+    expected = f"gen-dataset: executor.address={address}: no Dask scheduler answers; start one with dask scheduler, "
+    assert (done.code, done.err) == (5, f"{expected}then rerun\n")
+
+
+@pytest.mark.parametrize("address", ["nowhere", "xyz://127.0.0.1:1"])
+def test_unusable_address_is_refused(address: str, photographs: Path, run_main: RunMain) -> None:
+    done = run_main(ROOT, "executor=dask", f"executor.address={address}", "executor.no_workers_s=1", "out=ds")
+    assert done.code == 2
+    assert f"executor.address={address}: cannot be used" in done.err
+    assert len(done.err.splitlines()) == 1
+
+
+def test_scheduler_without_workers_ends_the_run(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
+    with dask_cluster(tmp_path / "cluster", workers=0) as empty:
+        started = time.monotonic()
+        done = run_main(ROOT, ONE, "out=ds", *empty.overrides, "executor.no_workers_s=2")
+        seconds = time.monotonic() - started
+    expected = (
+        "gen-dataset: executor.no_workers_s=2: no Dask worker responded for this time; start workers, then rerun; "
+    )
+    assert (done.code, messages(done.err)) == (5, [f"{expected}finished shards are kept"])
+    assert 2 <= seconds <= 7
+
+
+# Faults ---------------------------------------------------------------------------------------------------------------
+
+
+POISON = """
+import hashlib, os, pathlib, signal
+
+killer, sha256 = pathlib.Path(os.environ["KILLER"]), hashlib.sha256
+
+
+def deadly(data=b"", **options):
+    if isinstance(data, bytes) and killer.exists() and data == killer.read_bytes():
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sha256(data, **options)
+
+
+hashlib.sha256 = deadly
+"""
+"""Module for `imported_first`: hashing one photograph kills its process."""
+
+
+@pytest.mark.slow
+@pytest.mark.linux_only("kills a process by a signal")
+def test_photograph_that_kills_its_workers_gets_provisional_rows(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, figure: Figure, tmp_path: Path
+) -> None:
+    killer = shutil.copy(photographs / "004.png", tmp_path / "killer.png")
+    env = imported_first(tmp_path, POISON) | {"KILLER": str(killer)}
+    with dask_cluster(tmp_path / "cluster", env=env) as cluster:
+        started = time.monotonic()
+        done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+        seconds = time.monotonic() - started
+        assert done.code == 3, done.err
+        warnings = messages(done.err)
+        assert warnings == ["gen-dataset: 004.png: its worker died four times; rerun to retry it"]
+        reasons = [(row["source"], row["reason"]) for row in read_rows(tmp_path / "ds/manifest.csv") if row["reason"]]
+        assert reasons == [("004.png", "worker_died")]
+        assert seconds < 60
+        Path(killer).unlink()
+        assert run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides).code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+    figure("dask", f"photograph that kills its worker: {seconds:.0f} s")
+
+
+@pytest.mark.slow
+@pytest.mark.linux_only("stops a process by a signal")
+def test_stopped_worker_loses_its_shards_and_changes_nothing_when_it_continues(
+    photographs: Path, undisturbed: str, tree_hash: TreeHash, figure: Figure, tmp_path: Path
+) -> None:
+    env = imported_first(tmp_path, slow_shards(0.5))
+    with dask_cluster(tmp_path / "cluster", env=env) as cluster:
+        wait_for(lambda: len(cluster.makers()) == 2)
+        overrides = (*cluster.overrides, "executor.lost_worker_s=10", SMALL)
+        with running(ROOT, ONE, "out=ds", *overrides, cwd=tmp_path) as process:
+            wait_for(lambda: len(committed(tmp_path / "ds")) >= 2)
+            stopped = cluster.makers()[0]
+            os.kill(stopped, signal.SIGSTOP)
+            started = time.monotonic()
+            assert process.wait(60) == 0
+            seconds = time.monotonic() - started
+        before = {path: path.read_bytes() for path in sorted((tmp_path / "ds/shards").iterdir())}
+        assert tree_hash(tmp_path / "ds") == undisturbed
+        os.kill(stopped, signal.SIGCONT)
+        time.sleep(3)
+        assert {path: path.read_bytes() for path in sorted((tmp_path / "ds/shards").iterdir())} == before
+        wait_for(
+            lambda: sorted(os.listdir(tmp_path / "ds")) == ["config.yaml", "dataset.json", "manifest.csv", "shards"]
+        )
+    assert verify(tmp_path / "ds") == []
+    figure("dask", f"stopped worker: run ended {seconds:.0f} s later")
+
+
+@pytest.mark.slow
+@pytest.mark.linux_only("kills a process by a signal")
+def test_dead_scheduler_ends_the_run_with_one_line(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    env = imported_first(tmp_path, slow_shards(0.5))
+    with dask_cluster(tmp_path / "cluster", env=env) as cluster:
+        with running(ROOT, ONE, SMALL, "out=ds", *cluster.overrides, cwd=tmp_path) as process:
+            wait_for(lambda: len(committed(tmp_path / "ds")) >= 2)
+            cluster.scheduler.kill()
+            assert process.wait(10) == 5
+            assert process.stderr is not None
+            lines = messages(process.stderr.read())
+        assert lines == [
+            f"gen-dataset: executor.address={cluster.address}: the Dask scheduler ended or cannot be reached; "
+            "finished shards are kept; rerun to resume"
+        ]
+    assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+@pytest.mark.slow
+@pytest.mark.linux_only("sends signals")
+@pytest.mark.parametrize("own", [True, False])
+def test_interrupt_ends_the_run_in_a_second(own: bool, photographs: Path, cluster: DaskCluster, tmp_path: Path) -> None:
+    executor = ("executor=dask", "n_jobs=2") if own else cluster.overrides
+    env = imported_first(tmp_path, slow_shards(0.5))
+    with running(ROOT, ONE, SMALL, "out=ds", *executor, cwd=tmp_path, **env) as process:
+        wait_for(lambda: len(committed(tmp_path / "ds")) >= 1)
+        os.killpg(process.pid, signal.SIGINT)
+        started = time.monotonic()
+        code = process.wait(20)
+        seconds = time.monotonic() - started
+        assert process.stderr is not None
+        lines = messages(process.stderr.read())
+        assert (code, lines) == (130, ["gen-dataset: interrupted; finished shards are kept; rerun to resume"])
+        wait_for(lambda: not session(process.pid), 10)
+    assert seconds < 2.5
+
+
+UNFIT = """
+from unprocess_gen.pipeline import frozen_run
+from unprocess_gen.core.errors import MachineError
+
+
+def failing(*arguments):
+    raise frozen_run.CanaryError("makes other bytes")
+
+
+frozen_run.check_canary = failing
+"""
+
+
+@pytest.mark.slow
+def test_worker_with_other_results_is_retired(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
+        unfit = cluster.add_worker(**imported_first(tmp_path, UNFIT))
+        done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+        assert (done.code, len(messages(done.err))) == (5, 1)
+        assert "Dask worker tcp://" in done.err
+        assert "makes other bytes" in done.err
+        assert unfit.wait(20) is not None
+        cluster.add_worker()
+        cluster.add_worker(**imported_first(tmp_path / "cluster", UNFIT))
+        assert run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides).code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+OTHER_VERSION = """
+import importlib.metadata
+
+version = importlib.metadata.version
+importlib.metadata.version = lambda name: "9.9" if name == "unprocess_gen" else version(name)
+"""
+
+
+@pytest.mark.slow
+def test_worker_of_another_version_is_refused(photographs: Path, run_main: RunMain, tmp_path: Path) -> None:
+    with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
+        cluster.add_worker(**imported_first(tmp_path, OTHER_VERSION))
+        done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+    assert (done.code, len(messages(done.err))) == (2, 1)
+    assert "Dask worker tcp://" in done.err
+    assert "this is 9.9" in done.err
+
+
+@pytest.mark.slow
+def test_slow_worker_does_not_delay_the_others(
+    photographs: Path, run_main: RunMain, figure: Figure, tmp_path: Path
+) -> None:
+    """The ideal time of 40 shards with workers of 0.2 and 2 s a shard is 40 / (1 / 0.2 + 1 / 2) = 7.3 s."""
+    fill(photographs, 40)
+    with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
+        cluster.add_worker(**imported_first(tmp_path, slow_shards(0.2)))
+        cluster.add_worker(**imported_first(tmp_path / "cluster", slow_shards(2)))
+        wait_for(lambda: len(cluster.makers()) == 2)
+        assert run_main(ROOT, ONE, "source.limit=4", "out=warm", *cluster.overrides).code == 0
+        started = time.monotonic()
+        assert run_main(ROOT, ONE, "executor.chunk_s=5", "out=ds", *cluster.overrides).code == 0
+        seconds = time.monotonic() - started
+    figure("dask", f"one of two workers ten times slower: {seconds / 7.3:.2f} of the ideal time")
+    assert seconds < 2 * 7.3
+
+
+class CommittedShards:
+    """Watch the committed shards of a run, and count those that are written again."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._marks, self.repeated = out, dict[str, tuple[int, int]](), 0
+
+    def look(self) -> int:
+        """Return how many shards are committed."""
+        now = committed(self._out)
+        self.repeated += sum(mark != now.get(name, mark) for name, mark in self._marks.items())
+        self._marks |= now
+        return len(self._marks)
+
+    def watch(self, process: subprocess.Popen[str], count: int, seconds: float) -> None:
+        """Look until the process has ended, until ``count`` shards are committed, and for ``seconds`` more."""
+        until = None
+        while process.poll() is None and (until is None or time.monotonic() < until):
+            if self.look() >= count and until is None:
+                until = time.monotonic() + seconds
+            time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.linux_only("kills processes by a signal")
+def test_random_kills_end_with_the_same_bytes_and_repeat_only_shards_in_progress(
+    tmp_path: Path, make: Make, tree_hash: TreeHash, figure: Figure
+) -> None:
+    draw, out, kills = random.Random(18), tmp_path / "ds", 0
+    make(fill(tmp_path / "p", 80), tmp_path / "local", ONE)
+    env = imported_first(tmp_path, slow_shards(0.4))
+    shards = CommittedShards(out)
+    with ExitStack() as stack:
+        cluster = stack.enter_context(dask_cluster(tmp_path / "cluster", env=env))
+        for attempt in range(60):
+            if cluster.scheduler.poll() is not None:
+                cluster = stack.enter_context(dask_cluster(tmp_path / f"cluster{attempt}", env=env))
+            arguments = (f"source.root={tmp_path / 'p'}", ONE, SMALL, f"out={out}", *cluster.overrides)
+            with running(*arguments, "executor.no_workers_s=60", cwd=tmp_path) as process:
+                while process.poll() is None:
+                    shards.watch(process, shards.look() + 1 if kills < 20 else 1000, draw.uniform(0, 1.5))
+                    if process.poll() is None:
+                        kill_one(
+                            draw.choice(("worker", "worker", "nanny", "client", "scheduler")), cluster, process, draw
+                        )
+                        kills += 1
+                code = process.wait()
+            assert code in (0, 3, 5, -signal.SIGKILL)
+            if code == 0:
+                break
+    assert (code, kills) == (0, 20)
+    assert tree_hash(out) == tree_hash(tmp_path / "local")
+    assert verify(out) == []
+    figure("dask", f"same bytes after {kills} kills; {shards.repeated} of 80 committed shards made again")
+    assert shards.repeated <= kills
+
+
+def kill_one(kind: str, cluster: DaskCluster, process: subprocess.Popen[str], draw: random.Random) -> None:
+    """Kill the client, the scheduler, a worker that its nanny then replaces, or a nanny, which is replaced here."""
+    if kind in ("client", "scheduler"):
+        (process if kind == "client" else cluster.scheduler).kill()
+        process.wait(60)
+    elif kind == "worker":
+        with_signal(draw.choice(cluster.makers() or cluster.processes()), signal.SIGKILL)
+    else:
+        with_signal(draw.choice([worker.pid for worker in cluster.workers if worker.poll() is None]), signal.SIGKILL)
+        cluster.add_worker()
