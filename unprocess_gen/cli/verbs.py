@@ -28,7 +28,7 @@ from unprocess_gen.core.output_paths import DATASET_ENTRIES
 from unprocess_gen.reports.formatting import counted
 
 if TYPE_CHECKING:
-    from unprocess_gen.config.schema import AccuracyConfig, Config
+    from unprocess_gen.config.schema import AccuracyConfig, Config, ExecutorConfig
     from unprocess_gen.core.types import Row
     from unprocess_gen.pipeline.generate import Summary
     from unprocess_gen.pipeline.replay import ReplayResult
@@ -294,6 +294,20 @@ def _with_out(overrides: list[str], out: str) -> list[str]:
 # ------------------------------------------------------------------------------------------ verbs that take a dataset
 
 
+def _executor(call: Call) -> ExecutorConfig:
+    """Return the settings of the executor that a call names, those of ``executor=local`` without one."""
+    from unprocess_gen.config.option_files import group_options
+    from unprocess_gen.config.schema import ExecutorConfig
+    from unprocess_gen.config.serialization import read_option
+    from unprocess_gen.config.values import one_of
+
+    name = call.values.get("executor", "local")
+    one_of("executor", name, tuple(group_options("executor")))
+    executor = read_option(conf_dir() / "executor" / f"{name}.yaml", ExecutorConfig)
+    executor.address = call.values.get("address")
+    return executor
+
+
 def run_again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.config.serialization import read_dataset_yaml
@@ -324,6 +338,7 @@ def run_again(call: Call) -> int:
     config.noise.dark_frames = dark_root(folder / "manifest.csv", call.values.get("dark_frames"))
     config.n_jobs = call.values.get("n_jobs", config.n_jobs)
     config.source.max_failed = call.values.get("max_failed", config.source.max_failed)
+    config.executor = _executor(call)
     validate_config(config)
     old, new = folder / "manifest.csv", any_path(config.out) / "manifest.csv"
     if root is not None and any_path(root).exists() and old.exists():
@@ -771,6 +786,8 @@ VERBS: dict[str, Verb] = {
                 DARK_FRAMES,
                 Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True),
                 _whole_number(("n_jobs",), "worker processes; -1: all cores"),
+                Argument(("executor",), "what runs the workers: local or dask", "NAME"),
+                Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
                 _whole_number(("source.max_failed",), "largest number of failed sources with exit code 0"),
             ),
             DATASET,
