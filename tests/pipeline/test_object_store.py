@@ -125,18 +125,18 @@ def test_killed_run_ends_as_if_undisturbed(
     """Each kill comes a few random milliseconds after the next request that writes; no shard is ever incomplete."""
     moment = random.Random(18)
     out = bucket / "ds"
-    arguments = (f"source.root={twelve}", f"out={out}", ONE, "n_jobs=2")
+    arguments = (f"source.root={twelve}", f"out={out}", ONE)
     sizes = {path.name: path.stat().st_size for path in (undisturbed / "shards").iterdir()}
     proxy.delay_s = 0.02
     for kill in range(kills):
         wanted = proxy.count("PUT") + kill % 3
-        with running(*arguments, cwd=tmp_path) as process:
+        with running(*arguments, f"n_jobs={1 + kill % 2}", cwd=tmp_path) as process:
             wait_for(lambda n=wanted: proxy.count("PUT") > n or process.poll() is not None)
             time.sleep(moment.uniform(0, 0.05))
             kill_group(process)
         assert (out / "shards").entries().items() <= sizes.items()
     proxy.delay_s = 0
-    with running(*arguments, cwd=tmp_path) as process:
+    with running(*arguments, "n_jobs=1", cwd=tmp_path) as process:
         assert process.wait() == 0, process.communicate()
     assert_same(out, undisturbed)
     assert not list(scratch.glob(f"{PREFIX}*"))
@@ -283,6 +283,24 @@ def test_deleted_object_ends_with_5(twelve: Path, bucket: ObjectPath, proxy: Pro
     assert f"{last} was deleted or moved after listing" in done.err
 
 
+def test_run_in_parts_writes_the_same_bytes(
+    twelve: Path, bucket: ObjectPath, undisturbed: Path, scratch: Path, run_main: RunMain
+) -> None:
+    out = bucket / "ds"
+    servers.upload(twelve, bucket / "photos")
+    prepared = run_main("prepare", "parts=3", f"source.root={bucket}/photos", f"out={out}", ONE, "n_jobs=1")
+    assert (prepared.code, prepared.out.partition(";")[0]) == (0, f"{out}: 12 sources, 12 shards, 3 parts")
+    for part in (2, 0, 2):
+        assert run_main("part", str(out), str(part)).code == 0
+    early = run_main("merge", str(out))
+    assert early.code == 5 and not (out / "dataset.json").exists()
+    assert run_main("status", str(out), "--left").out == "1\n"
+    assert run_main("part", str(out), "1").code == 0
+    assert run_main("merge", str(out)).code == 0
+    assert_same(out, undisturbed)
+    assert not list(scratch.iterdir())
+
+
 def test_provisional_rows_keep_the_records(twelve: Path, bucket: ObjectPath) -> None:
     storage = open_storage(str(bucket / "ds"))
     storage.write(".work/rows/00000.json", "{}")
@@ -318,22 +336,15 @@ def test_finished_dataset_with_a_missing_shard_is_damage(twelve: Path, bucket: O
     ids=["bucket", "inner", "foreign", "settings", "sweep", "report"],
 )
 def test_wrong_out_is_refused_before_anything_is_written(
-    arguments: tuple[str, ...], error: str, bucket: ObjectPath, run_main: RunMain
+    arguments: tuple[str, ...], error: str, twelve: Path, bucket: ObjectPath, run_main: RunMain
 ) -> None:
-    generate(config_of_scenes(bucket / "ds"))
+    generate(config_of(twelve, bucket / "ds", "source.limit=1"))
     (bucket / "foreign/notes.txt").write_bytes(b"mine")
     before = sorted(bucket.objects())
-    done = run_main(*(word.format(bucket) for word in arguments), "source.limit=1", "n_jobs=1")
+    done = run_main(*(word.format(bucket) for word in arguments), f"source.root={twelve}", "source.limit=1", ONE)
     assert done.code == 2
     assert error.format(bucket, bucket) in done.err and "Traceback" not in done.err
     assert sorted(bucket.objects()) == before
-
-
-def config_of_scenes(out: ObjectPath) -> Config:
-    config = composed("source.limit=1", "n_jobs=1")
-    config.out = str(out)
-    validate_config(config)
-    return config
 
 
 def test_plan_of_a_url_writes_nothing(bucket: ObjectPath, run_main: RunMain, twelve: Path) -> None:

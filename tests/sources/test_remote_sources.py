@@ -216,7 +216,7 @@ def test_bucket_gives_the_dataset_of_the_folder(
     shutil.copy(tmp_path / "photos" / "deep.png", tmp_path / "photos" / "twin.png")
     (remote / "twin.png").put_file(photos / "deep.png")
     make(tmp_path / "photos", tmp_path / "local", "output.pairs_per_shard=5")
-    config = composed("output.pairs_per_shard=5", "n_jobs=2")
+    config = composed("output.pairs_per_shard=5", "n_jobs=1")
     config.source.root, config.out = str(remote), str(tmp_path / "remote")
     validate_config(config)
     generate(config)
