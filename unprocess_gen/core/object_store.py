@@ -46,6 +46,9 @@ RETRY_TIMEOUT_S = 90
 MIN_PIECE, MAX_PIECE = 2**16, 2**23
 """Bytes of a range request: the first one, and the most that sequential reading grows to."""
 
+UPLOADS = 4
+"""Pieces of `MAX_PIECE` bytes of one file that are uploaded at a time and are in memory."""
+
 DELETED_AT_ONCE = 1000
 """Objects that one request deletes, the most that S3 allows."""
 
@@ -317,7 +320,7 @@ class ObjectPath:
 
     def _put(self, content: bytes | Path, mode: Any) -> None:
         with _request(self) as (obstore, store):
-            obstore.put(store, self.key, content, mode=mode, chunk_size=MAX_PIECE)
+            obstore.put(store, self.key, content, mode=mode, chunk_size=MAX_PIECE, max_concurrency=UPLOADS)
 
     def delete(self) -> None:
         """Delete the object; an object that does not exist is no error."""
