@@ -237,7 +237,8 @@ def _fill_approximate(
             buffers.rates[n] = rates[start + min(n, length - 1)]
             highest = max(highest, buffers.rates[n])
         has_high = highest >= LOW_RATE
-        fill_counts(SIZE, buffers.words, buffers.rates, has_high, of, buffers, buffers.electrons, buffers.error_e)
+        outputs = buffers.electrons, buffers.error_e
+        fill_counts(SIZE, buffers.words, buffers.rates, has_high, np.float32(np.inf), of, buffers, *outputs)
         for n in range(length):
             out[start + n], error[start + n] = buffers.electrons[n], buffers.error_e[n]
 

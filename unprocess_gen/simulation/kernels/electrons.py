@@ -92,7 +92,7 @@ MAX_STEPS = 64
 """Most thresholds of `poisson.count_thresholds`."""
 
 _0, _8, _16, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint64(16), np.uint32(0x7F800000)
-_ZERO32, _FLOAT32_ERROR32 = np.float32(0), np.float32(FLOAT32_ERROR_DN)
+_ZERO32, _INFINITY32, _FLOAT32_ERROR32 = np.float32(0), np.float32(np.inf), np.float32(FLOAT32_ERROR_DN)
 _LOW_RATE32, _EVERY_LANE = np.float32(LOW_RATE), np.uint32(2**VECTOR_WIDTH - 1)
 _RATE_ERROR32, _NORMAL_ERROR32 = np.float32(FLOAT32_RATE), np.float32(2.0**-19)
 _LANES = np.uint64(LANES)
@@ -489,12 +489,15 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, work
         words, out, error = workspace.words, workspace.electrons, workspace.error_e
         if not is_shot:
             words, out, error = workspace.dark_words, workspace.dark, workspace.dark_error_e
-        fill_counts(strip.total, words, workspace.rates, has_high, tables, workspace, out, error)
+        limit = _first_not_counted(of) if is_shot else _INFINITY32
+        fill_counts(strip.total, words, workspace.rates, has_high, limit, tables, workspace, out, error)
         if is_shot:
             if of.shot == 0.0:
                 _keep_means(strip.total, workspace)
             elif of.lowest_root > 0.0 or of.highest_root < np.inf:
-                _replace_by_normals(strip.total, of, tables, workspace)
+                if not has_high:
+                    fill_values_by_lines(strip.total, words, tables.lines, workspace.lines, workspace.normals)
+                _replace_by_normals(strip.total, of, workspace)
     if of.dark_e > 0.0:
         if of.dark_steps >= 0.0:
             ranks = pointer_to(noise.dark_ranks, n * MAX_STEPS)
@@ -560,12 +563,17 @@ def _keep_means(count: int, workspace: Workspace) -> None:
 
 
 @inner
-def _replace_by_normals(count: int, of: _Numbers, tables: CountTables, workspace: Workspace) -> None:
+def _first_not_counted(of: _Numbers) -> np.float32:
+    """Return the rate from which a normal replaces every count, in spite of the error of float32."""
+    return np.float32(of.highest_root * of.highest_root * (1 + 4 * FLOAT32_RATE))
+
+
+@inner
+def _replace_by_normals(count: int, of: _Numbers, workspace: Workspace) -> None:
     """Replace counts where a normal is near enough; sites at the limits, within the error of float32, are uncertain."""
     low, high = of.lowest_root * of.lowest_root, of.highest_root * of.highest_root
     f, more, less = np.float32, 1 + 4 * FLOAT32_RATE, 1 - 4 * FLOAT32_RATE
-    low_less, low_more, high_less, high_more = f(low * less), f(low * more), f(high * less), f(high * more)
-    fill_values_by_lines(count, workspace.words, tables.lines, workspace.lines, workspace.normals)
+    low_less, low_more, high_less, high_more = f(low * less), f(low * more), f(high * less), _first_not_counted(of)
     for v in range(count // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         rate = load(workspace.rates, x)

@@ -174,6 +174,7 @@ def fill_counts(
     words: Pointer,
     rates: Pointer,
     has_high: bool,
+    limit: np.float32,
     tables: CountTables,
     workspace: Workspace,
     out: Pointer,
@@ -183,7 +184,8 @@ def fill_counts(
 
     ``error`` (float32) receives 0 where the count is certain, else a bound of its error, which may be infinite.
     ``rates`` (float32) may differ from the true rates by `FLOAT32_RATE`. ``has_high`` states whether any of them is
-    `LOW_RATE` or more.
+    `LOW_RATE` or more; if so, ``normals`` of the workspace receives the normals of all words. Blocks are not filled if
+    all of their rates are ``limit`` or more.
     """
     if has_high:
         fill_values_by_lines(count, words, tables.lines, workspace.lines, workspace.normals)
@@ -196,7 +198,7 @@ def fill_counts(
         has_low = movemask(less_than(lowest, _LOW)) != 0
         if has_low:
             _count_low_rates(first, vectors, words, rates, workspace, out, error)
-        if movemask(less_than(highest, _LOW)) != _EVERY_LANE:
+        if movemask(less_than(highest, _LOW)) != _EVERY_LANE and movemask(less_than(lowest, limit)) != 0:
             _count_high_rates(first, vectors, has_low, rates, workspace.normals, out, error)
 
 
