@@ -179,6 +179,14 @@ def test_parts_killed_at_random_moments_end_with_the_same_bytes(
     figure("parts", f"same bytes after {kills} kills of parts")
 
 
+def test_report_names_the_parts_of_a_dataset(ds: Path, run_main: RunMain) -> None:
+    for part in range(6):
+        run_main("part", "ds", part, "-q")
+    run_main("merge", "ds")
+    assert run_main("report", "ds").code == 0
+    assert "merged from 6 parts" in (ds / "report.html").read_text()
+
+
 # What is left ---------------------------------------------------------------------------------------------------------
 
 

@@ -201,11 +201,17 @@ def _contents(facts: Mapping[str, Any], statistics: ManifestStatistics) -> dict[
         "width × height": statistics.sizes.summary() if statistics.first_pair else "no pair",
         "files that no pattern of source.include matched": f"{facts['not_matched']:,}",
         "symbolic links not followed": f"{facts['skipped_links']:,}",
-        "generated on": f"{run['host']}, {run['platform']}, Python {run['python']}; "
-        f"{run['n_jobs']} workers, {run['seconds']:,} s for the last {run['shards_made']:,} shards",
+        "generated on": f"{run['host']}, {run['platform']}, Python {run['python']}; {_work(run)}",
         "self-test": str(facts["self_test"]),
         **_dark_frames(facts.get("dark_frames") or {}),
     }
+
+
+def _work(run: Mapping[str, Any]) -> str:
+    """Return who made the shards; a run in parts records no time, because its parts run on different hosts."""
+    if "parts" in run:
+        return f"merged from {run['parts']:,} parts"
+    return f"{run['n_jobs']} workers, {run['seconds']:,} s for the last {run['shards_made']:,} shards"
 
 
 def _dark_frames(facts: Mapping[str, Any]) -> dict[str, str]:
