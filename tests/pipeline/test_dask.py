@@ -398,7 +398,7 @@ def test_slow_worker_does_not_delay_the_others(
 
 
 class CommittedShards:
-    """Watch the committed shards of a run, and count those that are written again."""
+    """Watch the committed shards of a run, and count those that are written twice."""
 
     def __init__(self, out: Path) -> None:
         self._out, self._marks, self.repeated = out, dict[str, tuple[int, int]](), 0
@@ -449,7 +449,7 @@ def test_random_kills_end_with_the_same_bytes_and_repeat_only_shards_in_progress
     assert (code, kills) == (0, 20)
     assert tree_hash(out) == tree_hash(tmp_path / "local")
     assert verify(out) == []
-    figure("dask", f"same bytes after {kills} kills; {shards.repeated} of 80 committed shards made again")
+    figure("dask", f"same bytes after {kills} kills; {shards.repeated} of 80 committed shards were made twice")
     assert shards.repeated <= kills
 
 

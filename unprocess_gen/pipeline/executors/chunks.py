@@ -83,7 +83,7 @@ class ChunkQueue:
 
     @property
     def waits(self) -> bool:
-        """Whether a shard is in no chunk."""
+        """Return whether a shard is in no chunk."""
         return bool(self._waiting)
 
     def take(self, workers: int, now_s: float) -> Chunk | None:

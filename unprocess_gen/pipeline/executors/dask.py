@@ -76,6 +76,9 @@ CLOSE_S = 2.0
 RESULT_S = 10.0
 """Longest time to fetch the result of a finished task, whose worker may have died meanwhile."""
 
+UNFIT_S = 10.0
+"""Time to wait for another worker after the last one was retired."""
+
 FAILURES = 20
 """Tasks that may fail one after the other without a finished shard before the run ends."""
 
@@ -300,6 +303,7 @@ class DaskRun:
         self._running: dict[Key, tuple[Future[ChunkResult], Chunk]] = {}
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._failures, self._tries = 0, 0
+        self._unfit: UnprocessGenError | None = None
         self._over = threading.Event()
         self._worked_s = self._answered_s = time.monotonic()
         self.workers = Workers(executor.lost_worker_s)
@@ -452,6 +456,8 @@ class DaskRun:
             raise MachineError(f"{self._place}: the Dask scheduler has not answered for {limit:g} s; {RESUME}")
         if self.workers.live(now):
             self._worked_s = now
+        elif self._unfit is not None and now - self._worked_s > min(limit, UNFIT_S):
+            raise self._unfit
         elif now - self._worked_s > limit:
             raise MachineError(
                 f"executor.no_workers_s={limit:g}: no Dask worker responded for this time; start workers, then rerun; "
@@ -470,9 +476,8 @@ class DaskRun:
             return
         error = type(result.error)(f"{result.place}: {result.error}")
         if result.unusable:
+            self._unfit = error
             self._retire(result.worker)
-            if not self.workers.live(time.monotonic()):
-                raise error
             return
         self._tries += 1
         if self._tries >= TRIES or not isinstance(error, MachineError) or isinstance(error, SourceChangedError):
@@ -483,8 +488,9 @@ class DaskRun:
         self.workers.retired.add(address)
 
         def retire() -> None:
-            with suppress(Exception):
-                self._client.retire_workers([address], close_workers=True)
+            with suppress(Exception):  # the client has lost the scheduler; `_check` reports it
+                while not self._over.is_set() and not self._client.retire_workers([address], close_workers=True):
+                    time.sleep(TICK_S)  # until the scheduler has released the result of its last task
 
         threading.Thread(target=retire, daemon=True).start()
 
