@@ -18,7 +18,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from helpers.commands import RunMain, messages
+from helpers.commands import Cli, RunMain, messages
 from helpers.dask_cluster import DaskCluster, dask_cluster, with_signal
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
@@ -149,6 +149,17 @@ def test_moved_sources_are_read_from_their_new_folder(
     done = run_main("source.root=moved", ONE, SMALL, "out=ds", *cluster.overrides)
     assert done.code == 0, done.err
     assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+def test_again_on_a_cluster_makes_the_same_bytes(
+    cluster: DaskCluster, photographs: Path, run_main: RunMain, make: Make, tmp_path: Path
+) -> None:
+    make(photographs, tmp_path / "ds", ONE)
+    done = run_main("again", "ds", "source.root=p", "out=new", *cluster.overrides)
+    assert (done.code, done.out.splitlines()[-1]) == (0, "the same as ds, bit for bit"), done.err
+    assert json.loads((tmp_path / "new/dataset.json").read_text())["run"]["executor"] == "dask"
+    refused = run_main("again", "ds", "source.root=p", "out=other", "executor=ray")
+    assert (refused.code, refused.err) == (2, "gen-dataset: executor=ray: expected one of dask, local\n")
 
 
 # Refusals -------------------------------------------------------------------------------------------------------------
@@ -314,7 +325,15 @@ def test_cluster_writes_to_an_object_store(
 @pytest.mark.slow
 @pytest.mark.linux_only("sends signals")
 @pytest.mark.parametrize("own", [True, False])
-def test_interrupt_ends_the_run_in_a_second(own: bool, photographs: Path, cluster: DaskCluster, tmp_path: Path) -> None:
+def test_interrupt_ends_the_run_in_a_second(
+    own: bool,
+    photographs: Path,
+    cluster: DaskCluster,
+    cli: Cli,
+    undisturbed: str,
+    tree_hash: TreeHash,
+    tmp_path: Path,
+) -> None:
     executor = ("executor=dask", "n_jobs=2") if own else cluster.overrides
     env = imported_first(tmp_path, slow_shards(0.5))
     with running(ROOT, ONE, SMALL, "out=ds", *executor, cwd=tmp_path, **env) as process:
@@ -328,6 +347,10 @@ def test_interrupt_ends_the_run_in_a_second(own: bool, photographs: Path, cluste
         assert (code, lines) == (130, ["gen-dataset: interrupted; finished shards are kept; rerun to resume"])
         wait_for(lambda: not session(process.pid), 10)
     assert seconds < 2.5
+    done = cli(ROOT, ONE, SMALL, "out=ds", *executor)
+    assert (done.returncode, messages(done.stderr)) == (0, [])
+    assert tree_hash(tmp_path / "ds") == undisturbed
+    assert_complete(tmp_path / "ds")
 
 
 UNFIT = """
