@@ -9,7 +9,22 @@ from unprocess_gen.core.errors import ConfigError
 
 
 def one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
-    """Raise ConfigError unless the value is one of the allowed strings."""
+    """Check that a value is one of a few words.
+
+    Parameters
+    ----------
+    key : str
+        Full name of the setting, for the message.
+    value : Any
+        Its value.
+    allowed : tuple of str
+        The words.
+
+    Raises
+    ------
+    ConfigError
+        If it is none of them.
+    """
     if value not in allowed:
         raise ConfigError(f"{key}={value_text(value)}: expected one of {', '.join(allowed)}")
 
