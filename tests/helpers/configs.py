@@ -47,7 +47,8 @@ def _composed(*overrides: str) -> Config:
 def _set(config: Config, group: str, key: str, value: Any) -> None:
     """Set one value of a group, with the type that the schema states."""
     before = getattr(config, group)
-    if "." in key or isinstance(value, dict) or "${" in str(value):
+    holds_mapping = isinstance(value, dict) or (isinstance(value, list) and any(isinstance(one, dict) for one in value))
+    if "." in key or holds_mapping or "${" in str(value):
         node = OmegaConf.structured(before)
         OmegaConf.update(node, key, value)
         setattr(config, group, _object(node))
