@@ -74,16 +74,21 @@ def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, lis
 
 
 def _summary_line(summary: Summary, max_failed: int) -> str:
+    facts = _counts_text(summary, max_failed)
+    if not summary.made:
+        return f"{summary.out} is complete: {facts}; nothing to do"
+    rows = f"{summary.made} of {counted(summary.rows, 'row')} generated in this run"
+    return f"{summary.out}: {facts}; {rows}, {summary.seconds:.1f} s"
+
+
+def _counts_text(summary: Summary, max_failed: int) -> str:
+    """Return the pairs, shards, bytes and failures of a dataset."""
     count, failed = sum(summary.failed.values()), ", ".join(f"{n} {reason}" for reason, n in summary.failed.items())
     facts = (
         f"{counted(summary.pairs, 'pair')} in {counted(summary.shards, 'shard')}, {summary.bytes / 1e6:,.1f} MB, "
         + (f"{count} failed ({failed}; see {summary.out}/manifest.csv)" if failed else "0 failed")
     )
-    facts += f", more than source.max_failed={max_failed}" if count > max_failed else ""
-    if not summary.made:
-        return f"{summary.out} is complete: {facts}; nothing to do"
-    rows = f"{summary.made} of {counted(summary.rows, 'row')} generated in this run"
-    return f"{summary.out}: {facts}; {rows}, {summary.seconds:.1f} s"
+    return facts + (f", more than source.max_failed={max_failed}" if count > max_failed else "")
 
 
 def _clipping_line(sites: dict[str, int]) -> str:
@@ -181,10 +186,13 @@ def run_merge(call: Call) -> int:
     from unprocess_gen.pipeline.parts import merge
 
     summary, max_failed = merge(str(call.path))
-    print_result(_summary_line(summary, max_failed))
-    if summary.made and summary.sites["all"]:
+    if not summary.made:
+        print_result(_summary_line(summary, max_failed))
+        return DONE
+    print_result(f"{summary.out}: {_counts_text(summary, max_failed)}; merged in {summary.seconds:.1f} s")
+    if summary.sites["all"]:
         print_result(_clipping_line(summary.sites))
-    return TOO_MANY_FAILED if summary.made and sum(summary.failed.values()) > max_failed else DONE
+    return TOO_MANY_FAILED if sum(summary.failed.values()) > max_failed else DONE
 
 
 # ---------------------------------------------------------------------------------------------- reports of settings
