@@ -33,7 +33,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.executors import local
-from unprocess_gen.pipeline.workspace import COUNTS
+from unprocess_gen.pipeline.tally import COUNTS
 
 SHARDS_OF_5 = "output.pairs_per_shard=5"
 

@@ -251,8 +251,9 @@ def test_unfinished_01_run_is_resumed(
     (tmp_path / "ds/.work/rows/00003.json").unlink()
     for path in (tmp_path / "ds/.work/rows").iterdir():
         record = json.loads(path.read_text())
-        record["rows"] = [values[: len(HEADERS[0])] for values in record["rows"]]
-        path.write_text(json.dumps(record))
+        rows = [row for row in read_rows(made / "ds/manifest.csv") if row["shard"] == int(path.stem)]
+        old = {"entry": record["entry"], "rows": [[row[name] for name in HEADERS[0]] for row in rows]}
+        path.write_text(json.dumps(old))
     assert make(made / "p", tmp_path / "ds", ONE).made == 1
     assert tree_hash(tmp_path / "ds") == tree_hash(made / "ds")
 

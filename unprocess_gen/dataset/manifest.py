@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -369,6 +370,65 @@ def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = NAMES
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(names)
     writer.writerows([_cell(row[name]) for name in names] for row in rows)
+
+
+def rows_text(rows: Iterable[Row]) -> str:
+    """Return the lines that `write_rows` writes for some rows, without the header.
+
+    Parameters
+    ----------
+    rows : iterable of Row
+        Rows in source order.
+
+    Returns
+    -------
+    str
+        One line for each row.
+    """
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in NAMES] for row in rows)
+    return stream.getvalue()
+
+
+def header_text() -> str:
+    """Return the first line of a manifest.
+
+    Returns
+    -------
+    str
+        The names of all columns.
+    """
+    return ",".join(NAMES) + "\n"
+
+
+def current_text(text: str, columns: int) -> str:
+    """Return lines of `rows_text` with an empty cell for each column that was added later.
+
+    Parameters
+    ----------
+    text : str
+        Lines that any version wrote.
+    columns : int
+        Number of columns of that version.
+
+    Returns
+    -------
+    str
+        The text itself if this version has no other columns.
+
+    Raises
+    ------
+    ValueError
+        If no version has as many columns.
+    """
+    if columns == len(NAMES):
+        return text
+    if columns not in map(len, HEADERS):
+        raise ValueError(f"rows of {columns} columns; expected those of a known version")
+    stream = io.StringIO()
+    rows = csv.reader(io.StringIO(text, newline=""))
+    csv.writer(stream, lineterminator="\n").writerows([*row, *[""] * (len(NAMES) - columns)] for row in rows)
+    return stream.getvalue()
 
 
 def _cell(value: Value) -> str:

@@ -34,8 +34,9 @@ from unprocess_gen.pipeline.frozen_run import freeze
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
-from unprocess_gen.pipeline.workspace import Tally, Workspace
+from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.dark_frames import open_dark_frames
 from unprocess_gen.sources.listing import ClipSizes, Listing, absolute_root
 from unprocess_gen.sources.loader import list_photographs
@@ -61,7 +62,7 @@ class Summary:
     failed : dict of str to int
         Failed rows by reason.
     sites : dict of str to int
-        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`workspace.COUNTS`).
+        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`tally.COUNTS`).
     shards, bytes : int
         Number of shards and the sum of their sizes.
     made : int

@@ -52,11 +52,11 @@ from unprocess_gen.dataset.shards import (
 from unprocess_gen.pipeline.generate import shard_tasks
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
 from unprocess_gen.pipeline.storage.local import LocalStorage
+from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.pipeline.tasks import RunContext, ShardResult, ShardTask
 from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, shard_rows
 from unprocess_gen.pipeline.worker import make_shard
 from unprocess_gen.pipeline.workspace import (
-    Tally,
     dataset_facts,
     dataset_text,
     fingerprint,
@@ -459,9 +459,7 @@ def _dataset(folder: Path, text: str, config: Config, temporary: Path) -> Repair
     path = folder / "dataset.json"
     old = _readable(path)
     manifest = folder / "manifest.csv"
-    tally = Tally()
-    for row in read_rows(manifest):
-        tally.add(row)
+    tally = Tally.of(read_rows(manifest))
     known = dataset_facts(
         text,
         file_sha256(manifest),

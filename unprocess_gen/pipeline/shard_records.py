@@ -7,17 +7,18 @@ complete. Any number of writers may commit the same shard, because all of them m
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.columns import NAMES
-from unprocess_gen.dataset.manifest import row_of_values
+from unprocess_gen.dataset.manifest import current_text, row_of_values, rows_text
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.pipeline.tasks import ShardReport, ShardResult
 
 ROWS = ".work/rows"
@@ -25,11 +26,43 @@ ROWS = ".work/rows"
 
 
 def commit_shard(storage: Storage, result: ShardResult) -> None:
-    """Put a finished shard in place, then its record; raise OSError if the storage fails."""
+    """Put a finished shard in place, then its record; raise OSError if the storage fails.
+
+    The record holds the lines of the manifest, so that the end of a run only joins them.
+    """
     if result.path is not None:
         storage.commit(Path(result.path), f"shards/{shard_name(result.shard)}")
-    record = {"entry": result.entry(), "rows": [[row[name] for name in NAMES] for row in result.rows]}
+    report = result.report()
+    record = {
+        "entry": result.entry(),
+        "report": [report.images, report.failed, report.rows, report.frame_sizes],
+        "tally": Tally.of(result.rows).facts(),
+        "columns": len(NAMES),
+        "csv": rows_text(result.rows),
+    }
     storage.write(record_name(result.shard), json.dumps(record, separators=(",", ":")))
+
+
+@dataclass(frozen=True, slots=True)
+class ShardRecord:
+    """Hold the record of a committed shard.
+
+    Attributes
+    ----------
+    entry : dict
+        Entry in ``dataset.json``.
+    report : ShardReport
+        Without times.
+    tally : Tally
+        Counts of the rows.
+    csv : str
+        Lines of the manifest.
+    """
+
+    entry: dict[str, Any]
+    report: ShardReport
+    tally: Tally
+    csv: str
 
 
 def record_name(shard: int) -> str:
@@ -76,30 +109,29 @@ class ShardRecords:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return False
 
-    def entry(self, shard: int) -> dict[str, Any]:
-        """Return the entry of a shard in ``dataset.json``."""
-        return dict(self._read(shard)["entry"])
-
-    def rows(self, shard: int) -> Iterator[Row]:
-        """Yield the rows of a shard."""
-        return map(row_of_values, self._read(shard)["rows"])
-
-    def entry_and_rows(self, shard: int) -> tuple[dict[str, Any], list[Row]]:
-        """Return entry and rows of a shard; raise DamageError if its record cannot be read."""
+    def record(self, shard: int) -> ShardRecord:
+        """Return the record of a shard; raise DamageError if it cannot be read."""
         try:
-            record = self._read(shard)
-            return dict(record["entry"]), [row_of_values(values) for values in record["rows"]]
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            found = self._read(shard)
+            if "rows" in found:
+                return _old_record(shard, found)
+            images, failed, rows, sizes = found["report"]
+            report = ShardReport(shard, images, failed, rows, tuple((clip, int(w), int(h)) for clip, w, h in sizes))
+            text = current_text(found["csv"], found["columns"])
+            return ShardRecord(dict(found["entry"]), report, Tally(**found["tally"]), text)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DamageError(
                 f"{self._place}/{record_name(shard)}: cannot be read ({error_in_one_line(error)}); delete the file and "
                 "rerun to make its shard"
             ) from error
 
-    def report(self, shard: int) -> ShardReport:
-        """Return the report of a committed shard, without times; raise DamageError if its record cannot be read."""
-        _, rows = self.entry_and_rows(shard)
-        return ShardResult(shard, None, 0, None, tuple(rows)).report()
-
     def _read(self, shard: int) -> dict[str, Any]:
         record: dict[str, Any] = json.loads(self._storage.read(record_name(shard)))
         return record
+
+
+def _old_record(shard: int, found: dict[str, Any]) -> ShardRecord:
+    """Return the record of a shard that version 0.1 committed, with values of rows instead of lines."""
+    rows = tuple(row_of_values(values) for values in found["rows"])
+    report = ShardResult(shard, None, 0, None, rows).report()
+    return ShardRecord(dict(found["entry"]), report, Tally.of(rows), rows_text(rows))

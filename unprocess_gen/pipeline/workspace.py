@@ -23,8 +23,7 @@ import itertools
 import json
 import operator
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,21 +35,19 @@ from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import RESUME, file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath, any_path
-from unprocess_gen.core.types import Counts, Row, Source
+from unprocess_gen.core.types import Source
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import MAX_BYTES, PARQUET_SHA256, check_dataset_json
-from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.manifest import header_text, read_rows
 from unprocess_gen.pipeline.listing_record import RecordedFile, read_record, recorded_files, write_listing
 from unprocess_gen.pipeline.shard_records import ShardRecords
 from unprocess_gen.pipeline.storage import WORK, open_storage
 from unprocess_gen.pipeline.storage.local import cannot_write
+from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.sources.listing import content_sha256
 
 REPORT = "report.html"
 """The page of a dataset, the one file in its folder that is not part of the dataset."""
-
-COUNTS = tuple(one.name for one in fields(Counts))
-"""Columns of the manifest that count sites."""
 
 SHOWN = 3
 """Differences named in an error; the others are counted."""
@@ -275,9 +272,12 @@ class Workspace:
         tally = Tally()
         try:
             manifest = self.storage.scratch / "manifest.csv"
-            with manifest.open("w", encoding="utf-8", newline="") as stream:
-                write_rows(stream, tally.counted(self._rows(shards, entries)))
-            manifest_sha256 = file_sha256(manifest)
+            digest = hashlib.sha256()
+            with manifest.open("wb") as stream:
+                for text in self._manifest(shards, entries, tally):
+                    digest.update(text)
+                    stream.write(text)
+            manifest_sha256 = digest.hexdigest()
             derived = self._write_parquet(manifest) if with_parquet else {}
             self.storage.commit(manifest, "manifest.csv")
             dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, derived | facts_of(tally))
@@ -295,11 +295,13 @@ class Workspace:
         self.storage.commit(path, parquet.NAME)
         return {PARQUET_SHA256: sha256}
 
-    def _rows(self, shards: int, entries: list[dict[str, Any]]) -> Iterator[Row]:
-        """Yield every row of the dataset in source order, and append the entry of each shard."""
-        for entry, rows in self.storage.each(self.records.entry_and_rows, range(shards)):
-            entries.append(entry)
-            yield from rows
+    def _manifest(self, shards: int, entries: list[dict[str, Any]], tally: Tally) -> Iterator[bytes]:
+        """Yield the text of the manifest; append the entry of each shard, and add its counts."""
+        yield header_text().encode()
+        for record in self.storage.each(self.records.record, range(shards)):
+            entries.append(record.entry)
+            tally.add(record.tally)
+            yield record.csv.encode()
 
 
 def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:
@@ -327,45 +329,6 @@ def _is_same(file: RecordedFile, source: Source, digest: Digest) -> bool:
     return not known or digest(source, known) in (None, known)
 
 
-@dataclass(slots=True)
-class Tally:
-    """Count the rows of a dataset.
-
-    Attributes
-    ----------
-    pairs : int
-        Rows with status ``ok``.
-    reasons : dict of str to int
-        Failed rows by reason.
-    sites : dict of str to int
-        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
-    """
-
-    pairs: int = 0
-    reasons: dict[str, int] = field(default_factory=dict)
-    sites: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", *COUNTS), 0))
-
-    def counted(self, rows: Iterable[Row]) -> Iterator[Row]:
-        """Yield the rows, and count them."""
-        for row in rows:
-            self.add(row)
-            yield row
-
-    def add(self, row: Row) -> None:
-        """Count one row."""
-        if row["status"] != "ok":
-            self.reasons[str(row["reason"])] = self.reasons.get(str(row["reason"]), 0) + 1
-            return
-        self.pairs += 1
-        self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
-        for name in COUNTS:
-            self.sites[name] += int(row[name] or 0)
-
-    def facts(self) -> dict[str, Any]:
-        """Return the counts as ``dataset.json`` holds them."""
-        return {"pairs": self.pairs, "failed": dict(sorted(self.reasons.items())), "sites": dict(self.sites)}
-
-
 def dataset_facts(
     config_yaml: str, manifest_sha256: str, entries: list[dict[str, Any]], facts: dict[str, Any]
 ) -> dict[str, Any]:
@@ -389,7 +352,8 @@ def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
 
 def dataset_text(facts: dict[str, Any]) -> str:
     """Return the text of ``dataset.json``: the facts and, as the last key, the SHA-256 of the text without it."""
-    return _text(facts | {"dataset_sha256": hashlib.sha256(_text(facts).encode()).hexdigest()})
+    text = _text(facts)
+    return f'{text[: -len(_END)]},\n "dataset_sha256": "{hashlib.sha256(text.encode()).hexdigest()}"{_END}'
 
 
 def read_dataset(path: AnyPath) -> dict[str, Any]:
@@ -432,6 +396,10 @@ def parse_dataset(text: str, place: str) -> dict[str, Any]:
     if not intact:
         raise DamageError(f"{place}: was changed: its SHA-256 differs from dataset_sha256")
     return dict(facts)
+
+
+_END = "\n}\n"
+"""End of the text of a mapping. A digest is inserted there: serializing twice takes a fifth of a merge."""
 
 
 def _text(facts: dict[str, Any]) -> str:

@@ -442,7 +442,7 @@ class DaskRun:
         """Yield reports of committed shards of a chunk whose reports were lost with a worker."""
         for shard in chunk.shards:
             if shard in self._chunks.left and self._records.is_committed(shard):
-                yield self._records.report(shard)
+                yield self._records.record(shard).report
 
     # ---------------------------------------------------------------------------------------------------------- checks
 
