@@ -76,17 +76,22 @@ class LockFile:
         mark = uuid.uuid4().hex
         owner = {"host": host(), "pid": os.getpid(), "start": process_start(os.getpid()), "mark": mark}
         self._text = json.dumps(owner)
-        while not self._create():
-            found = self._holder()
-            if found is None:
-                continue
-            if not self._is_held():
-                self._remove(found)
-            elif not wait:
-                raise BlockingIOError("is locked by another process")
-            else:
-                time.sleep(POLL_S)
-        _HELD.add(mark)
+        _HELD.add(mark)  # before the file exists: another thread would take it for one that could not be deleted
+        try:
+            while not self._create():
+                found = self._holder()
+                if found is None:
+                    continue
+                if not self._is_held():
+                    self._remove(found)
+                elif not wait:
+                    raise BlockingIOError("is locked by another process")
+                else:
+                    time.sleep(POLL_S)
+        except BaseException:
+            _HELD.discard(mark)
+            self._text = ""
+            raise
         self._released.clear()
         threading.Thread(target=self._renew, args=(self._released,), daemon=True).start()
 
@@ -140,16 +145,24 @@ class LockFile:
             return False
 
     def _remove(self, found: str) -> None:
-        """Remove the file of an owner that has ended; put back the file of a process that was quicker."""
-        aside = self._path.with_name(f"{self._path.name}.{uuid.uuid4().hex}")
+        """Remove the file of an owner that has ended, unless another process has replaced it meanwhile.
+
+        One process at a time may compare and remove, which a second file decides; otherwise a slow process could remove
+        the file of a quicker one.
+        """
+        guard = self._path.with_name(f"{self._path.name}.takeover")
         try:
-            self._path.rename(aside)
-        except (FileNotFoundError, PermissionError):
+            os.close(os.open(guard, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        except FileExistsError:
+            if _age_s(guard) > STALE_S:  # its process was killed between the next lines
+                guard.unlink(missing_ok=True)
+            time.sleep(POLL_S)
             return
-        if aside.read_text(encoding="utf-8", errors="replace") != found:
-            with suppress(OSError):
-                os.link(aside, self._path)
-        aside.unlink()
+        try:
+            if self._holder() == found:
+                self._path.unlink(missing_ok=True)
+        finally:
+            guard.unlink(missing_ok=True)
 
     def _renew(self, released: threading.Event) -> None:
         while not released.wait(HEARTBEAT_S):
@@ -203,7 +216,10 @@ def has_ended(path: Path) -> bool | None:
 
 def _age_s(path: Path) -> float:
     """Return the time since a file was renewed by the clock of its file system, which may be another machine's."""
-    renewed = (path if path.exists() else path.parent).stat().st_mtime
+    try:
+        renewed = path.stat().st_mtime
+    except FileNotFoundError:
+        renewed = path.parent.stat().st_mtime
     probe = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
     try:
         probe.touch()

@@ -599,7 +599,7 @@ def _kill(nanny: Nanny) -> None:
     pid = nanny.pid
     if pid is not None:
         with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+            os.kill(pid, getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows ends processes by SIGTERM
 
 
 @contextmanager
