@@ -37,6 +37,7 @@ from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask, StageTimes
 from unprocess_gen.pipeline.workspace import Workspace
+from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.sources.dark_frames import open_dark_frames
 from unprocess_gen.sources.listing import ClipSizes, Listing, absolute_root
 from unprocess_gen.sources.loader import list_photographs
@@ -143,7 +144,7 @@ def generate(config: Config, label: str = "") -> Summary:
         )
         images_done = sum(len(task.sources) for task in tasks if task.shard in done)
         with Progress(len(listing.sources), images_done, label) as progress:
-            for warning in filter(None, (*listing.warnings, shards_warning(config, listing.sources))):
+            for warning in warnings_before(config, listing):
                 progress.warn(warning)
             execute = EXECUTORS[config.executor.kind] if todo else execute_locally
             rows_made, times, n_jobs = execute(Assignment(workspace, listing, todo, context), progress)
@@ -163,6 +164,25 @@ def generate(config: Config, label: str = "") -> Summary:
             config.output.parquet,
         )
     return replace(summary_of(config.out, facts, started, listing.unmatched), made=rows_made, times=times)
+
+
+def warnings_before(config: Config, listing: Listing) -> tuple[str, ...]:
+    """Return what the user should know before a run begins: warnings on sources, shards and a dark scene.
+
+    Parameters
+    ----------
+    config : Config
+        Validated config.
+    listing : Listing
+        Sources of the run.
+
+    Returns
+    -------
+    tuple of str
+        One sentence each.
+    """
+    warnings = *listing.warnings, shards_warning(config, listing.sources), dark_scene_warning(config)
+    return tuple(filter(None, warnings))
 
 
 @dataclass(frozen=True, slots=True)

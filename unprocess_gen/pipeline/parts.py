@@ -24,10 +24,17 @@ from unprocess_gen.core.files import RESUME, machine_error
 from unprocess_gen.core.object_store import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze, read_plan
-from unprocess_gen.pipeline.generate import Summary, dataset_json_facts, follow, shard_tasks, summary_of
+from unprocess_gen.pipeline.generate import (
+    Summary,
+    dataset_json_facts,
+    follow,
+    shard_tasks,
+    summary_of,
+    warnings_before,
+)
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.sizes import check_free_space, shards_warning, with_pairs_per_shard
+from unprocess_gen.pipeline.sizes import check_free_space, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
@@ -172,8 +179,7 @@ def prepare(config: Config, parts: int) -> Prepared:
         workspace.begin(listing.sources, len(tasks))
         freeze(workspace, config, listing)
         workspace.storage.create(PARTS, json.dumps({"parts": parts}) + "\n")
-    warnings = filter(None, (*listing.warnings, shards_warning(config, listing.sources)))
-    return Prepared(parts, len(tasks), len(listing.sources), warnings=tuple(warnings))
+    return Prepared(parts, len(tasks), len(listing.sources), warnings=warnings_before(config, listing))
 
 
 def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None = None) -> PartMade | None:

@@ -6,10 +6,8 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from unprocess_gen.config.interpretation import HEAT, assumed_numbers, is_physical, missing_number, uses_dark_frames
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.interpretation import HEAT, assumed_numbers, missing_number, uses_dark_frames
 from unprocess_gen.config.schema import Config, NoiseConfig
-from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.types import DarkFrames, Plan
 from unprocess_gen.planning.effect_contributions import OUTLIERS
 from unprocess_gen.planning.effect_selection import COST_NS, MIN_OUTLIERS, Prediction
@@ -261,46 +259,6 @@ def _written(value: object) -> str:
         numbers = [f"{one:g}" for one in value if isinstance(one, int | float)]
         return " to ".join(numbers) if value and value[0] == "uniform" else ", ".join(numbers)
     return f"{value:g}" if isinstance(value, int | float) else str(value)
-
-
-def scene_warning(config: Config, plans: Sequence[Plan], levels: Sequence[int]) -> str | None:
-    """Return a warning if a dark scene meets a profile with two numbers, which ignores its ISO.
-
-    Parameters
-    ----------
-    config : Config
-        Config of the run.
-    plans : sequence of Plan
-        Plans of the images that were read.
-    levels : sequence of int
-        Distinct DN in their clean frames; empty for float32.
-
-    Returns
-    -------
-    str or None
-        One sentence that names the physical profiles.
-    """
-    ratios = [plan.exposure_ratio for plan in plans]
-    if is_physical(config.noise) or max(ratios) <= 1:
-        return None
-    left = f", which leaves {value_range(levels)} distinct DN in a clean frame" if levels else ""
-    return (
-        f"scene={config.scene.name}: light is divided by {value_range(ratios, 3)}{left}, but noise={config.noise.name} "
-        f"is the noise of one ISO, not of ISO {_written(config.scene.iso)}; physical profiles follow the scene: "
-        f"{', '.join(physical_profiles())}"
-    )
-
-
-def physical_profiles() -> list[str]:
-    """Return the names of the built-in physical noise profiles.
-
-    Returns
-    -------
-    list of str
-        Options of the group ``noise``.
-    """
-    folder = conf_dir() / "noise"
-    return [name for name in group_options("noise") if "branches" in read_yaml_mapping(folder / f"{name}.yaml")]
 
 
 POSTERISED_BELOW = 256

@@ -35,6 +35,7 @@ from unprocess_gen.core.types import DarkFrames, Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
 from unprocess_gen.pipeline.sizes import shards_warning, source_bytes, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs, with_dark_frames, with_draws
 from unprocess_gen.planning.source_noise import noise_ratio
@@ -45,7 +46,6 @@ from unprocess_gen.reports.effect_summary import (
     effect_table,
     posterisation_warning,
     scene_sentence,
-    scene_warning,
     source_noise_sentences,
 )
 from unprocess_gen.reports.empty_bands import NONE as NO_BANDS
@@ -447,7 +447,8 @@ def _noise_lines(config: Config, estimates: tuple[SourceEstimate, ...], dark_fra
     if not plans:
         return []
     levels = [source.clean_levels for source in estimates if source.clean_levels]
-    warnings = scene_warning(config, plans, levels), posterisation_warning(plans, levels)
+    exposure_ratios = [plan.exposure_ratio for plan in plans]
+    warnings = dark_scene_warning(config, exposure_ratios, levels), posterisation_warning(plans, levels)
     highlights = highlight_sentence([source.bands for source in estimates if source.levels])
     lines = _labelled("scene", [scene_sentence(config, plans)])
     if is_physical(config.noise):

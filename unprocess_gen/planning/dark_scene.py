@@ -1,0 +1,62 @@
+"""Warn about dark scenes whose noise profile cannot follow them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from unprocess_gen.config.distributions import highest, lowest, parse_drawn
+from unprocess_gen.config.interpretation import is_physical
+from unprocess_gen.config.limits import EXPOSURE_RATIO, ISO
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.schema import Config
+from unprocess_gen.config.yaml_files import read_yaml_mapping
+
+
+def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Sequence[int] = ()) -> str:
+    """Return a warning if a dark scene meets a profile with two numbers, which ignores its ISO; else an empty text.
+
+    Parameters
+    ----------
+    config : Config
+        Validated config of the run.
+    ratios : sequence of float
+        Exposure ratios of the images that were read; by default, the limits of those that can be drawn.
+    levels : sequence of int
+        Distinct DN in the clean frames of these images; empty if they are not known.
+
+    Returns
+    -------
+    str
+        One sentence that names the physical profiles.
+    """
+    if is_physical(config.noise):
+        return ""
+    if not ratios:
+        drawn = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
+        ratios = lowest(drawn), highest(drawn)
+    if max(ratios) <= 1:
+        return ""
+    iso = parse_drawn("scene.iso", config.scene.iso, ISO)
+    left = f", which leaves {_span(levels)} distinct DN in a clean frame" if levels else ""
+    return (
+        f"scene={config.scene.name}: light is divided by {_span(ratios)}{left}, but noise={config.noise.name} "
+        f"ignores ISO {_span((lowest(iso), highest(iso)))}; physical profiles follow the scene: "
+        f"{', '.join(physical_profiles())}"
+    )
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = (f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def physical_profiles() -> list[str]:
+    """Return the names of the built-in physical noise profiles.
+
+    Returns
+    -------
+    list of str
+        Options of the group ``noise``.
+    """
+    folder = conf_dir() / "noise"
+    return [name for name in group_options("noise") if "branches" in read_yaml_mapping(folder / f"{name}.yaml")]
