@@ -12,10 +12,10 @@ from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config, NoiseConfig, SceneConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.types import Facts
+from unprocess_gen.planning.dark_scene import physical_profiles
 from unprocess_gen.planning.effect_contributions import OUTLIERS
 from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
-from unprocess_gen.reports.effect_summary import physical_profiles
 from unprocess_gen.reports.formatting import short_number
 
 FACTS = Facts(width=6000, height=4000, codes=256, dark_code=0, bright_code=255)
