@@ -84,6 +84,13 @@ def test_unmatched_files_are_counted_by_suffix(tmp_path: Path) -> None:
     assert listing.not_matched == 4
 
 
+def test_folder_of_other_files_is_refused_with_their_suffixes(tmp_path: Path) -> None:
+    for name in ("a.cr2", "b.dng", "c.dng"):
+        (tmp_path / name).touch()
+    with pytest.raises(ConfigError, match=r"\(2 \.dng, 1 \.cr2\); convert \.cr2, \.dng to JPEG, PNG or TIFF; choose"):
+        list_folder(str(tmp_path), ["*.jpg"], True, None)
+
+
 def test_unmatched_sentence_names_suffixes_and_what_to_do() -> None:
     assert unmatched_sentence({}) == ""
     assert unmatched_sentence({".heic": 1}) == (

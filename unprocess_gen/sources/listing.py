@@ -146,18 +146,19 @@ def list_folder(
         return Listing((_as_source(0, single),))
     walk = (_BucketWalk if is_url(root) else _Walk)(root, matcher(include), matcher(video))
     matched = sorted(walk.matched(recursive), key=lambda found: os.fsencode(found.path))
+    unmatched = dict(sorted(walk.unmatched.items(), key=lambda item: (-item[1], item[0])))
     if not matched:
-        advice = (
-            "set source.clips=true to read videos as clips"
-            if walk.has_video
-            else "choose a folder of photographs or other globs"
-        )
+        advice = "choose a folder of photographs or other globs"
+        if walk.has_video:
+            advice = "set source.clips=true to read videos as clips"
+        elif unmatched:
+            advice = f"{unmatched_sentence(unmatched)}; {advice}"
         raise ConfigError(
             f"source.root={root}: no file matches source.include={list(include)} "
             f"({'with' if recursive else 'without'} sub-folders); {advice}"
         )
     sources = tuple(_as_source(index, found) for index, found in enumerate(itertools.islice(matched, limit)))
-    return Listing(sources, walk.skipped, dict(sorted(walk.unmatched.items(), key=lambda item: (-item[1], item[0]))))
+    return Listing(sources, walk.skipped, unmatched)
 
 
 def unmatched_sentence(unmatched: dict[str, int]) -> str:
