@@ -345,7 +345,7 @@ def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     """Slope times s, intercept times s², s = 15359/3855; two conversions would give s² and s⁴."""
     config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
     s = Fraction(15359, 3855)
-    a, b = TwoNumberLevel(config).draw(named())
+    a, b = TwoNumberLevel(config).two_numbers(named())
     assert abs(Fraction(a) / (Fraction(6.955588) * s) - 1) <= Fraction(21, 10) / 2**53
     assert abs(Fraction(b) / (Fraction(38.117816) * s * s) - 1) <= Fraction(41, 10) / 2**53
     plan = plan_image(config, SHA)
@@ -437,6 +437,7 @@ def test_plans_have_the_digits_of_decimal(
     plans = [plan_pairs(config, f"{image:064x}", facts=facts) for image in range(count)]
     monkeypatch.setattr(distributions, "FIXED_POINT", {})
     monkeypatch.setattr(fixed_point, "nearest_log_linear", lambda *numbers: None)
+    noise_profile._number_of_line.cache_clear()
     for image, plan in enumerate(plans):
         assert plan_pairs(config, f"{image:064x}", facts=facts) == plan
 
@@ -446,7 +447,8 @@ def test_plans_do_not_depend_on_the_decimal_context(settings: Settings, iso: int
     """At these ISOs a row of the table of black-level errors begins, so the last digits of logarithms matter."""
     config = settings("noise=canon_5d4", f"noise.iso={iso}", "noise.assumed=[]")
     facts, narrow = Facts(128, 128, 256, 3, 250), plan_image(config, SHA, facts=Facts(128, 128, 256, 3, 250))
-    for function in (noise_profile._place, noise_profile._number_of_iso, noise_profile._tukey_std):
+    known = noise_profile._place, noise_profile._number_of_iso, noise_profile._number_of_line, noise_profile._tukey_std
+    for function in known:
         function.cache_clear()  # type: ignore[attr-defined]
     with decimal.localcontext(prec=60):
         assert plan_image(config, SHA, facts=facts) == narrow

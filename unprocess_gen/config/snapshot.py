@@ -7,11 +7,16 @@ content as its key, which is immutable. Taking it costs 10 µs; checking and int
 from __future__ import annotations
 
 import pickle
+from operator import attrgetter
 
-from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.schema import GROUPS, BranchConfig, Config, ProvenanceConfig
 
 CLASSES = list(GROUPS.values())
 TOP_LEVEL = tuple(name for name in Config.__dataclass_fields__ if name not in (*GROUPS, "seed"))
+_groups_of, _others_of = attrgetter(*GROUPS), attrgetter(*TOP_LEVEL)
+
+PARTS = {"branches": BranchConfig, "provenance": ProvenanceConfig}
+"""Lists of the noise profile, and the class of their items. Their fields alone are pickled in half the time."""
 
 
 def snapshot(config: Config) -> bytes | None:
@@ -25,15 +30,20 @@ def snapshot(config: Config) -> bytes | None:
     Returns
     -------
     bytes or None
-        Configs with equal bytes have equal content. None if a group is not of the class of the schema, or a value
-        cannot be pickled; no valid config has such values.
+        Configs with equal bytes have equal content. None if a group or a part of the noise profile is not of the class
+        of the schema, or a value cannot be pickled; no valid config has such values.
     """
-    groups = [getattr(config, name) for name in GROUPS]
-    if [type(group) for group in groups] != CLASSES:
+    groups = _groups_of(config)
+    if [*map(type, groups)] != CLASSES:
         return None
-    values = [*map(vars, groups), *(getattr(config, name) for name in TOP_LEVEL)]
+    values = {name: dict(vars(group)) for name, group in zip(GROUPS, groups, strict=True)}
+    noise = values["noise"]
     try:
-        return pickle.dumps(values, pickle.HIGHEST_PROTOCOL)
+        for name, kind in PARTS.items():
+            if {*map(type, noise[name])} - {kind}:
+                return None
+            noise[name] = [*map(vars, noise[name])]
+        return pickle.dumps((values, _others_of(config)), pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError):
         return None
 
@@ -51,6 +61,8 @@ def restored(content: bytes) -> Config:
     Config
         A new config.
     """
-    values = pickle.loads(content)
-    groups = {name: kind(**fields) for (name, kind), fields in zip(GROUPS.items(), values, strict=False)}
-    return Config(**groups, **dict(zip(TOP_LEVEL, values[len(GROUPS) :], strict=True)))
+    values, others = pickle.loads(content)
+    for name, kind in PARTS.items():
+        values["noise"][name] = [kind(**fields) for fields in values["noise"][name]]
+    groups = {name: kind(**values[name]) for name, kind in GROUPS.items()}
+    return Config(**groups, **dict(zip(TOP_LEVEL, others, strict=True)))

@@ -160,12 +160,15 @@ def nearest_exp(exponent: int, error: int, factor: int = ONE) -> float | None:
     return low if low == high else None
 
 
+@functools.lru_cache(maxsize=256)
 def logarithm(x: float) -> tuple[int, int]:
     """Return the natural logarithm of a positive float and its error, fixed-point.
 
     x is 2**q · m with ½ ≤ m < 1, and ln m is ln(step / 256) + 2·artanh(r) with r = (m - step / 256) / (m + step / 256),
     0 ≤ r < 2**-8. The series lacks less than r**17 / 8, one unit. The quotient, the series and the table add less than
     7 units, and each unit of q one of ln 2.
+
+    Most draws take the logarithms of constants: limits of a distribution, or the gain at one ISO.
     """
     fraction, doublings = math.frexp(x)
     mantissa = int(fraction * 2.0**53)

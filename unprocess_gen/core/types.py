@@ -282,6 +282,22 @@ MOSAIC, PACKED = "mosaic", "packed"
 """Layouts of frames: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`cfa.pack`)."""
 
 
+def inverse_gains(red_gain: float, blue_gain: float, inverse_rgb_gain: float) -> tuple[float, float, float]:
+    """Return the factors of the red, green and blue channels (Brooks et al. 2019, random_gains()).
+
+    Parameters
+    ----------
+    red_gain, blue_gain, inverse_rgb_gain : float
+        White-balance gains, and inverse of the brightness gain.
+
+    Returns
+    -------
+    tuple of float
+        Factors of the linear channels.
+    """
+    return inverse_rgb_gain / red_gain, inverse_rgb_gain, inverse_rgb_gain / blue_gain
+
+
 @dataclass(frozen=True, slots=True)
 class Plan:
     """All parameters of a pair; with the pixels it determines the pair completely.
@@ -455,11 +471,7 @@ class Plan:
     @property
     def inverse_gains(self) -> tuple[float, float, float]:
         """Factors of the red, green and blue channels (Brooks et al. 2019, random_gains())."""
-        return (
-            self.inverse_rgb_gain / self.red_gain,
-            self.inverse_rgb_gain,
-            self.inverse_rgb_gain / self.blue_gain,
-        )
+        return inverse_gains(self.red_gain, self.blue_gain, self.inverse_rgb_gain)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from functools import cached_property
 from operator import add, mul
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,57 +118,54 @@ PerStatistic = Sequence[float]
 """One value for each of `STATISTICS`, or for the first half of them if there is one frame."""
 
 
-@dataclass(frozen=True, slots=True)
-class Contribution:
+class Contribution(NamedTuple):
     """Hold what an effect contributes: a variance in each statistic, DN², and an offset of all pixels, DN."""
 
     variances: PerStatistic
     offset_dn: float = 0.0
 
 
-@dataclass(frozen=True)
 class FrameModel:
-    """Hold what predictions depend on: numbers of the sensor, size and signal range of the frame, black level.
+    """Hold what predictions depend on, and results that several predictions share.
 
     All frames of a photograph are one, so its statistics are the first half of `STATISTICS`; the other half would have
-    the same values. Results that several predictions share are computed once for each frame.
+    the same values.
+
+    Parameters
+    ----------
+    physics : Physics
+        Numbers of the sensor.
+    facts : Facts
+        Size and number of frames.
+    signals : SignalRange
+        Signal range of the image.
+    black_level_dn : float
+        Black level of the sensor, DN.
+
+    Attributes
+    ----------
+    per_frame, counts : PerStatistic
+        Number of sites that each statistic is a mean of, in one frame and in all frames of the clip.
+    roots : PerStatistic
+        Square root of each of ``counts``.
     """
 
-    physics: Physics
-    facts: Facts
-    signals: SignalRange
-    black_level_dn: float
-    _known: dict[tuple[str, float, float], _Ratios] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _known_variances: dict[float, list[tuple[str, float]]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    def __init__(self, physics: Physics, facts: Facts, signals: SignalRange, black_level_dn: float) -> None:
+        self.physics, self.facts, self.black_level_dn = physics, facts, black_level_dn
+        width, height, frames = facts.width, facts.height, float(facts.frames)
+        sites = 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
+        self.per_frame: PerStatistic = sites if facts.frames == 1 else (*sites, *sites)
+        self.counts: PerStatistic = (*sites, *(count * frames for count in self.per_frame[4:]))
+        self.roots: PerStatistic = tuple(map(math.sqrt, self.counts))
+        full_dn = physics.full_well_e * physics.dn_per_e
+        self._levels = signals.dark_dn, signals.bright_dn
+        self._levels_in_well = min(signals.dark_dn, full_dn), min(signals.bright_dn, full_dn)
+        self._known: dict[tuple[str, float, float], _Ratios] = {}
+        self._known_variances: dict[float, list[tuple[str, float]]] = {}
 
     def levels(self, on: frozenset[str]) -> tuple[float, float]:
         """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
-        return self._levels_in_well if "full_well" in on else (self.signals.dark_dn, self.signals.bright_dn)
-
-    @cached_property
-    def _levels_in_well(self) -> tuple[float, float]:
-        full_dn = self.physics.full_well_e * self.physics.dn_per_e
-        return min(self.signals.dark_dn, full_dn), min(self.signals.bright_dn, full_dn)
-
-    @cached_property
-    def per_frame(self) -> PerStatistic:
-        """Return the number of sites of one frame that each statistic is a mean of."""
-        width, height = self.facts.width, self.facts.height
-        counts = 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
-        return counts if self.facts.frames == 1 else (*counts, *counts)
-
-    @cached_property
-    def counts(self) -> PerStatistic:
-        """Return the number of sites that each statistic is a mean of, those of all frames of a clip included."""
-        frames = float(self.facts.frames)
-        return (*self.per_frame[:4], *(count * frames for count in self.per_frame[4:]))
-
-    @cached_property
-    def roots(self) -> PerStatistic:
-        """Return the square root of each of `counts`."""
-        return tuple(map(math.sqrt, self.counts))
+        return self._levels_in_well if "full_well" in on else self._levels
 
     def masking_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
         """Return the variance of a pixel at a signal due to all random effects in ``on`` except ``effect``, DN²."""
@@ -176,15 +173,17 @@ class FrameModel:
         if effect in FIXED_PATTERNS and self.physics.fixed_pattern_in_clean:
             return rounding
         variance = 0.0
-        for name, of_effect in self._known_variances.get(level_dn) or self._variances(level_dn):
+        for name, of_effect in self._variances(level_dn):
             if name in on and name != effect:
                 variance += of_effect
         return rounding + variance
 
     def _variances(self, level_dn: float) -> list[tuple[str, float]]:
         """Return the variance of a pixel due to each of `VARIANCES` at a signal, DN²."""
-        found = [(name, of_physics(self.physics, level_dn)) for name, of_physics in VARIANCES.items()]
-        self._known_variances[level_dn] = found
+        found = self._known_variances.get(level_dn)
+        if found is None:
+            found = [(name, of_physics(self.physics, level_dn)) for name, of_physics in VARIANCES.items()]
+            self._known_variances[level_dn] = found
         return found
 
     def _ratios_of(self, effect: str, level_dn: float, masking: float) -> _Ratios:
@@ -239,7 +238,7 @@ class FrameModel:
         At a signal that fills the well the upper half of the distribution is cut, which lowers the mean of a normal
         distribution by σ/√(2π).
         """
-        if CONTRIBUTIONS["full_well"](self, level_dn, 0.0).offset_dn == 0:
+        if self.contribution("full_well", level_dn, 0.0).offset_dn == 0:
             return 0.0
         other = 0.0
         for name, of_effect in self._variances(level_dn):
@@ -260,8 +259,7 @@ class FrameModel:
         return self.facts.width * self.facts.height * max(shares)
 
 
-@dataclass(frozen=True, slots=True)
-class _Ratios:
+class _Ratios(NamedTuple):
     """Hold a contribution, and its ratios to the masking noise in each statistic.
 
     ``squares``: of its variances; ``offsets``: of its offset, None without one.
@@ -344,7 +342,7 @@ def _full_well(frame: FrameModel, level_dn: float, masking: float) -> Contributi
     if physics.full_well_e == 0:
         return _independent(frame, 0.0)
     signal_e = level_dn / physics.dn_per_e * (1 + FARTHEST_NORMAL * physics.prnu_std)
-    reach_e = sum(_reach(mean_e) for mean_e in (signal_e, physics.dark_e, FARTHEST_HOT * physics.hot_pixel_e))
+    reach_e = _reach(signal_e) + _reach(physics.dark_e) + _reach(FARTHEST_HOT * physics.hot_pixel_e)
     return _independent(frame, 0.0, max(reach_e - physics.full_well_e, 0.0) * physics.dn_per_e)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from unprocess_gen.config.accuracy import choose_methods, is_steep
@@ -32,8 +32,8 @@ from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, stream_key
-from unprocess_gen.core.types import FLOAT32, DarkFrames, Facts, Plan
-from unprocess_gen.planning.effect_contributions import signal_range
+from unprocess_gen.core.types import FLOAT32, DarkFrames, Facts, Plan, inverse_gains
+from unprocess_gen.planning.effect_contributions import SignalRange, signal_range
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
     Prediction,
@@ -287,7 +287,8 @@ class Planner:
         self._red, self._blue, self._inverse_rgb = gain_distributions(config.gains)
         self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
         levels = [replace(config, noise=noise) for noise in noise_levels(config.noise)]
-        self._levels = [PhysicalLevel(one) if is_physical(one.noise) else TwoNumberLevel(one) for one in levels]
+        self._is_physical = is_physical(config.noise)
+        self._levels = [PhysicalLevel(one) if self._is_physical else TwoNumberLevel(one) for one in levels]
         budget, counts_electrons = accuracy_budget(config.accuracy), uses_physics(config.noise)
         self._methods, self._steep_methods = (
             choose_methods(budget, counts_electrons, is_normalised(config), steep or has_float_clean(config))
@@ -347,36 +348,73 @@ class Planner:
         """
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
+        if self._is_physical and facts is None:
+            raise ValueError("a physical profile needs the facts of the pixels")
         key = stream_key(seed, source_sha256, occurrence)
         uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
-        clean = self._clean(seed, key, uniforms)
+        clean = self._clean(uniforms)
+        image = Image(seed, key, facts, _signals(clean, facts) if self._is_physical and facts else None, dark_frames)
         for number, level in enumerate(self._levels):
             if number:
                 at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), number), strict=True))
                 uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
-            yield level.plan(clean, number, uniforms, facts, dark_frames)
+            noise, selection = level.draw(image, uniforms)
+            plan = Plan(seed=seed, stream_key=key, methods=self._methods, level=number, **clean, **noise)
+            if self._steep_methods != self._methods and is_steep(plan):
+                plan = replace(plan, methods=self._steep_methods)
+            yield plan, selection
 
-    def _clean(self, seed: int, key: int, uniforms: Mapping[str, float]) -> Plan:
-        """Return a plan without noise, which all levels of an image share."""
+    def _clean(self, uniforms: Mapping[str, float]) -> dict[str, Any]:
+        """Return the fields of a plan that all noise levels of an image share."""
         camera, weights, rgb2cam = plan_camera(self._camera, uniforms)
-        plan = Plan(
-            seed=seed,
-            stream_key=key,
-            exposure_ratio=draw_parameter(self._exposure_ratio, uniforms["exposure_ratio"]),
-            camera=camera,
-            weights=weights,
-            rgb2cam=rgb2cam,
-            red_gain=draw_parameter(self._red, uniforms["red"]),
-            blue_gain=draw_parameter(self._blue, uniforms["blue"]),
-            inverse_rgb_gain=draw_parameter(self._inverse_rgb, uniforms["inverse_rgb"]),
-            a_dn=0.0,
-            b_dn2=0.0,
-            effects=(),
-            skipped=(),
-            methods=self._methods,
+        return {
+            "exposure_ratio": draw_parameter(self._exposure_ratio, uniforms["exposure_ratio"]),
+            "camera": camera,
+            "weights": weights,
+            "rgb2cam": rgb2cam,
+            "red_gain": draw_parameter(self._red, uniforms["red"]),
+            "blue_gain": draw_parameter(self._blue, uniforms["blue"]),
+            "inverse_rgb_gain": draw_parameter(self._inverse_rgb, uniforms["inverse_rgb"]),
             **self._recorded,
-        )
-        return replace(plan, methods=self._steep_methods) if is_steep(plan) else plan
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """Hold what noise levels of an image depend on, in addition to its uniforms.
+
+    Attributes
+    ----------
+    seed, stream_key : int
+        Seed of the dataset, and key of the image's random streams.
+    facts, signals : Facts or None, SignalRange or None
+        Facts about the pixels, and the signal range; needed by physical profiles only.
+    dark_frames : DarkFrames or None
+        Frames from which noise is sampled.
+    """
+
+    seed: int
+    stream_key: int
+    facts: Facts | None
+    signals: SignalRange | None
+    dark_frames: DarkFrames | None
+
+
+def _signals(clean: Mapping[str, Any], facts: Facts) -> SignalRange:
+    """Return the signal range of an image, from the fields of its plan."""
+    return signal_range(
+        facts,
+        clean["tone"],
+        clean["gamma"],
+        inverse_gains(clean["red_gain"], clean["blue_gain"], clean["inverse_rgb_gain"]),
+        1 / clean["exposure_ratio"],
+        float(clean["white_level_dn"] - clean["black_level_dn"]),
+        clean["rgb2cam"],
+    )
+
+
+LevelFields = tuple[dict[str, Any], Selection | None]
+"""Fields of a plan that depend on the noise level, and the selection of effects of a physical profile."""
 
 
 class TwoNumberLevel:
@@ -391,21 +429,15 @@ class TwoNumberLevel:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._distributions = noise_distributions(config.noise)
+        self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
 
-    def plan(
-        self,
-        clean: Plan,
-        level: int,
-        uniforms: Mapping[str, float],
-        facts: Facts | None,
-        dark_frames: DarkFrames | None = None,
-    ) -> tuple[Plan, Selection | None]:
-        """Complete a plan with the two numbers and the effects at this level."""
-        a_dn, b_dn2 = self.draw(uniforms)
-        effects, skipped = plan_effects(self._config, a_dn, b_dn2, clean.white_level_dn - clean.black_level_dn)
-        return replace(clean, a_dn=a_dn, b_dn2=b_dn2, effects=effects, skipped=skipped, level=level), None
+    def draw(self, image: Image, uniforms: Mapping[str, float]) -> LevelFields:
+        """Draw the two numbers and select the effects of an image at this level."""
+        a_dn, b_dn2 = self.two_numbers(uniforms)
+        effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
+        return {"a_dn": a_dn, "b_dn2": b_dn2, "effects": effects, "skipped": skipped}, None
 
-    def draw(self, uniforms: Mapping[str, float]) -> tuple[float, float]:
+    def two_numbers(self, uniforms: Mapping[str, float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
         noise, sensor = self._config.noise, self._config.sensor
         a = draw_parameter(self._distributions[0], uniforms["a"])
@@ -433,39 +465,25 @@ class PhysicalLevel:
         self._noise = PhysicalNoise(config)
         self._rules = effect_rules(config)
 
-    def plan(
-        self,
-        clean: Plan,
-        level: int,
-        uniforms: Mapping[str, float],
-        facts: Facts | None,
-        dark_frames: DarkFrames | None = None,
-    ) -> tuple[Plan, Selection | None]:
-        """Complete a plan with the numbers of the sensor and the effects at this level."""
-        if facts is None:
-            raise ValueError("a physical profile needs the facts of the pixels")
-        physics = self._noise.draw(uniforms, clean.stream_key, clean.seed)
-        if dark_frames is not None:
-            read_std_dn = math.sqrt(dark_frames.variance_dn2)
+    def draw(self, image: Image, uniforms: Mapping[str, float]) -> LevelFields:
+        """Draw the numbers of the sensor and select the effects of an image at this level."""
+        assert image.facts is not None and image.signals is not None
+        physics = self._noise.draw(uniforms, image.stream_key, image.seed)
+        if image.dark_frames is not None:
+            read_std_dn = math.sqrt(image.dark_frames.variance_dn2)
             physics = replace(physics, read_law="gaussian", read_shape=0.0, read_std_dn=read_std_dn)
         if any(physics.lens_shading):
-            physics = replace(physics, frame_size=(facts.height, facts.width))
-        span_dn = float(clean.white_level_dn - clean.black_level_dn)
-        signals = signal_range(
-            facts, clean.tone, clean.gamma, clean.inverse_gains, clean.exposure, span_dn, clean.rgb2cam
-        )
-        selection = select_effects(self._rules, physics, facts, signals)
-        plan = replace(
-            clean,
-            level=level,
-            physics=physics,
-            a_dn=physics.dn_per_e,
-            b_dn2=physics.read_std_dn * physics.read_std_dn,
-            effects=selection.effects,
-            skipped=selection.skipped,
-            assumed=selection.assumed,
-        )
-        return plan, selection
+            physics = replace(physics, frame_size=(image.facts.height, image.facts.width))
+        selection = select_effects(self._rules, physics, image.facts, image.signals)
+        fields = {
+            "physics": physics,
+            "a_dn": physics.dn_per_e,
+            "b_dn2": physics.read_std_dn * physics.read_std_dn,
+            "effects": selection.effects,
+            "skipped": selection.skipped,
+            "assumed": selection.assumed,
+        }
+        return fields, selection
 
 
 # ---------------------------------------------------------------------------------------------------------- camera

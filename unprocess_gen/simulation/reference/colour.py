@@ -61,7 +61,7 @@ def matrix(numbers: Sequence[float]) -> Matrix:
     """
     if len(numbers) != 9:
         raise ValueError(f"a camera matrix has nine numbers, got {len(numbers)}")
-    a, b, c, d, e, f, g, h, i = (float(number) for number in numbers)
+    a, b, c, d, e, f, g, h, i = map(float, numbers)
     return a, b, c, d, e, f, g, h, i
 
 
@@ -78,12 +78,10 @@ def multiply(left: Matrix, right: Matrix) -> Matrix:
     Matrix
         The product.
     """
+    a, b, c, d, e, f, g, h, i = right
+    rows = (left[0:3], left[3:6], left[6:9])
     return matrix(
-        [
-            left[3 * i] * right[j] + left[3 * i + 1] * right[3 + j] + left[3 * i + 2] * right[6 + j]
-            for i in range(3)
-            for j in range(3)
-        ]
+        [sum_ for x, y, z in rows for sum_ in (x * a + y * d + z * g, x * b + y * e + z * h, x * c + y * f + z * i)]
     )
 
 
@@ -147,26 +145,28 @@ def normalise_rows(entries: Matrix) -> Matrix:
     ValueError
         As `rgb2cam`.
     """
-    if not all(math.isfinite(entry) for entry in entries):
+    if not all(map(math.isfinite, entries)):
         raise ValueError("a camera matrix has finite entries")
     if not _is_well_conditioned(entries) and not condition(entries) <= MAX_CONDITION:
         raise ValueError(f"the camera matrix is not invertible (condition number above {MAX_CONDITION:g})")
     return matrix([entry for row in (entries[0:3], entries[3:6], entries[6:9]) for entry in _unit_row(row)])
 
 
-def _unit_row(row: Sequence[float]) -> list[float]:
+def _unit_row(row: tuple[float, float, float]) -> list[float]:
     """Return one row divided by its sum, on the grid of `normalise_rows`."""
-    total = row[0] + row[1] + row[2]
-    if abs(total) <= 1e-9 * max(abs(entry) for entry in row):
+    a, b, c = row
+    total = a + b + c
+    if abs(total) <= 1e-9 * max(abs(a), abs(b), abs(c)):
         raise ValueError("a row of the camera matrix sums to zero, so white cannot be kept")
-    unit = [entry / total for entry in row]
-    largest = max(range(3), key=lambda i: abs(unit[i]))
+    a, b, c = a / total, b / total, c / total
+    sizes = [abs(a), abs(b), abs(c)]
     # The sum of two entries is 1 minus the third entry; the grid must represent these sums, too.
-    reach = max(max(abs(entry), abs(1 - entry)) for entry in unit)
+    reach = max(*sizes, abs(1 - a), abs(1 - b), abs(1 - c))
     grid = math.ldexp(1.0, max(math.frexp(reach)[1], 1) - 53)
-    unit = [math.floor(entry / grid + 0.5) * grid for entry in unit]
-    others = sum(unit[i] for i in range(3) if i != largest)
-    unit[largest] = 1.0 - others
+    unit = [math.floor(entry / grid + 0.5) * grid for entry in (a, b, c)]
+    largest = sizes.index(max(sizes))
+    unit[largest] = 0.0
+    unit[largest] = 1.0 - (unit[0] + unit[1] + unit[2])
     return unit
 
 
