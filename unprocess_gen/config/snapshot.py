@@ -15,6 +15,7 @@ CLASSES = list(GROUPS.values())
 TOP_LEVEL = tuple(name for name in Config.__dataclass_fields__ if name not in (*GROUPS, "seed"))
 _groups_of, _others_of = attrgetter(*GROUPS), attrgetter(*TOP_LEVEL)
 
+NOISE = list(GROUPS).index("noise")
 PARTS = {"branches": BranchConfig, "provenance": ProvenanceConfig}
 """Lists of the noise profile, and the class of their items. Their fields alone are pickled in half the time."""
 
@@ -36,14 +37,14 @@ def snapshot(config: Config) -> bytes | None:
     groups = _groups_of(config)
     if [*map(type, groups)] != CLASSES:
         return None
-    values = {name: dict(vars(group)) for name, group in zip(GROUPS, groups, strict=True)}
-    noise = values["noise"]
+    values = [*map(vars, groups), _others_of(config)]
     try:
+        noise = values[NOISE] = {**vars(config.noise)}
         for name, kind in PARTS.items():
             if {*map(type, noise[name])} - {kind}:
                 return None
             noise[name] = [*map(vars, noise[name])]
-        return pickle.dumps((values, _others_of(config)), pickle.HIGHEST_PROTOCOL)
+        return pickle.dumps(values, pickle.HIGHEST_PROTOCOL)
     except (pickle.PicklingError, AttributeError, TypeError):
         return None
 
@@ -61,8 +62,8 @@ def restored(content: bytes) -> Config:
     Config
         A new config.
     """
-    values, others = pickle.loads(content)
+    *values, others = pickle.loads(content)
     for name, kind in PARTS.items():
-        values["noise"][name] = [kind(**fields) for fields in values["noise"][name]]
-    groups = {name: kind(**values[name]) for name, kind in GROUPS.items()}
+        values[NOISE][name] = [kind(**fields) for fields in values[NOISE][name]]
+    groups = {name: kind(**fields) for (name, kind), fields in zip(GROUPS.items(), values, strict=True)}
     return Config(**groups, **dict(zip(TOP_LEVEL, others, strict=True)))

@@ -13,6 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from fractions import Fraction
+from itertools import repeat
+from operator import add, mul
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """Nine entries, row by row."""
@@ -78,10 +80,12 @@ def multiply(left: Matrix, right: Matrix) -> Matrix:
     Matrix
         The product.
     """
-    a, b, c, d, e, f, g, h, i = right
-    rows = (left[0:3], left[3:6], left[6:9])
     return matrix(
-        [sum_ for x, y, z in rows for sum_ in (x * a + y * d + z * g, x * b + y * e + z * h, x * c + y * f + z * i)]
+        [
+            left[3 * i] * right[j] + left[3 * i + 1] * right[3 + j] + left[3 * i + 2] * right[6 + j]
+            for i in range(3)
+            for j in range(3)
+        ]
     )
 
 
@@ -102,7 +106,7 @@ def mix(matrices: Sequence[Matrix], weights: Sequence[float]) -> Matrix:
     """
     mixed = [0.0] * 9
     for weight, entries in zip(weights, matrices, strict=True):
-        mixed = [sum_ + weight * entry for sum_, entry in zip(mixed, entries, strict=True)]
+        mixed = [*map(add, mixed, map(mul, repeat(weight), entries))]
     return matrix(mixed)
 
 
