@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import os
@@ -84,13 +85,19 @@ QUICK_LAWS = (
 """Laws of the quick tests; the others are slow."""
 
 
+@functools.lru_cache(maxsize=64)
+def decoded(path: Path) -> NDArray[np.uint8]:
+    """Return a photograph at half its size."""
+    image = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_2)
+    assert image is not None
+    return image[..., ::-1]  # type: ignore[return-value]
+
+
 def photograph(number: int, side: int) -> NDArray[np.uint8]:
     """Return a square of a photograph in the folder PHOTOS, or of a built-in scene; less if it is smaller."""
     paths = sorted(Path(os.environ["PHOTOS"]).glob("*.jpg")) if "PHOTOS" in os.environ else []
     if paths:
-        image = cv2.imread(str(paths[number % len(paths)]), cv2.IMREAD_REDUCED_COLOR_2)
-        assert image is not None
-        image = image[..., ::-1]
+        image = decoded(paths[number % len(paths)])
     else:
         image = synthetic.scene(synthetic.NAMES[number % len(synthetic.NAMES)])
     draws = np.random.default_rng(number)
@@ -111,7 +118,8 @@ def checked_with_faults(
     settings: Settings, overrides: Sequence[str], number: int, side: int, faults: Iterable[str]
 ) -> list[Checked]:
     """Return the plan and the scores of a pair for each fault; an empty name leaves the pair untouched."""
-    config = settings(*overrides, f"seed={number}")
+    config = settings(*overrides)
+    config.seed = number  # an override would compose the config of each pair anew
     validate_config(config)
     srgb = photograph(number, side)
     pair = make_pair(srgb, config)
