@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float
-from unprocess_gen.reports.noise_check.law import NoiseLaw
+from unprocess_gen.reports.noise_check.law import Factors, NoiseLaw
 
 Mask = NDArray[np.bool_]
 
@@ -136,7 +136,8 @@ def expectations(law: NoiseLaw, clean_dn: Float, site: tuple[int, int]) -> Expec
     low, high = np.full(signal.shape, -half), np.full(signal.shape, half)
     if not plan.averaged:  # the clean frame has no values below black
         low[clean_dn == plan.black_level_dn] = 0.0
-    one, two, three = (law.characteristic(signal, k / std).real for k in (1, 2, 3))
+    at = {k: law.factors(signal, k / std) for k in (1, 2, 3, 4)}
+    one, two, three = (at[k].value.real for k in (1, 2, 3))
     hot_z = law.hot.value_dn / std
     hot_mean = hot_z * -np.expm1(-LARGEST_Z / np.maximum(hot_z, 1e-3))
     dead_mean = np.clip((law.dead.value_dn - clean_dn) / std, -LARGEST_Z, LARGEST_Z)
@@ -149,34 +150,40 @@ def expectations(law: NoiseLaw, clean_dn: Float, site: tuple[int, int]) -> Expec
         outlier_mean=law.hot.share * hot_mean + law.dead.share * dead_mean,
         variance=1 + outliers,
         fixed_variance=law.fixed_variance(signal) / std**2 + outliers,
-        cosine=_cosine(law, signal, std, low, high, 1),
-        double=_cosine(law, signal, std, low, high, 2),
+        cosine=_cosine(law, at[1], at[2], low, high),
+        double=_cosine(law, at[2], at[4], low, high),
         covariance=(three + one) / 2 - one * two,
     )
 
 
-def _cosine(law: NoiseLaw, signal: Float, std: Float, low: Float, high: Float, k: int) -> Cosine:
-    """Return the expectations of cos kz if x is between ``signal + low`` and ``signal + high``."""
-    tau, middle, width = k / std, (low + high) / 2, high - low
+def _cosine(law: NoiseLaw, at: Factors, at_double: Factors, low: Float, high: Float) -> Cosine:
+    """Return the expectations of cos kz if x is between ``signal + low`` and ``signal + high``.
+
+    ``at`` and ``at_double`` are the factors of the characteristic function at k / std and at 2k / std.
+    """
+    tau, middle, width = at.tau, (low + high) / 2, high - low
 
     def expected(error: Float) -> Float:
-        values = law.characteristic(np.maximum(signal + error, 0.0), tau) * np.exp(1j * tau * error)
-        return np.asarray(values.real)
+        values, moved = at.value.real.copy(), error != 0
+        if moved.any():
+            tau, error = at.tau[moved], error[moved]
+            signal = np.maximum(at.signal[moved] + error, 0.0)
+            values[moved] = (law.factors(signal, tau).value * np.exp(1j * tau * error)).real
+        return values
 
     at_low, at_middle, at_high = expected(low), expected(middle), expected(high)
     slope = np.divide(at_high - at_low, width, out=np.zeros_like(width), where=width > 0)
     bend = at_high + at_low - 2 * at_middle  # the parabola through the three has the coefficient 2 bend / width²
-    one, two = law.characteristic(signal, tau).real, law.characteristic(signal, 2 * tau).real
-    temporal, fixed = law.temporal_characteristic(signal, tau), law.fixed_characteristic(signal, tau)
+    one, two = at.value.real, at_double.value.real
     # variance, over fixed patterns, of the mean over frames: E[Re(φ exp(iτF))²] - Re(E[φ exp(iτF)])²
-    square = ((temporal**2 * law.fixed_characteristic(signal, 2 * tau)).real + np.abs(temporal) ** 2) / 2
+    square = ((at.temporal**2 * at_double.fixed).real + np.abs(at.temporal) ** 2) / 2
     return Cosine(
         mean=at_middle + bend / 6 - slope * middle,
         slope=slope,
         unknown=2 * np.abs(bend) * ROUNDING_SQUARE,
         by_variance=-0.5 * tau * tau * one,
         variance=(1 + two) / 2 - one * one,
-        fixed_variance=np.maximum(square - (temporal * fixed).real ** 2, 0.0) + 4 * law.dead.share,
+        fixed_variance=np.maximum(square - (at.temporal * at.fixed).real ** 2, 0.0) + 4 * law.dead.share,
     )
 
 

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,8 @@ from unprocess_gen.core.types import Float, Patch, Physics, Plan
 from unprocess_gen.simulation.reference import noise as reference
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
-Complex = NDArray[np.complexfloating[Any, Any]]
+Complex = NDArray[np.inexact[Any]]
+"""Values of a characteristic function; float64 if it is real."""
 
 RARE = 1e-5
 """Probability of a read-noise value beyond the distance that sites keep from the limits of the sensor."""
@@ -58,6 +60,26 @@ class Term(NamedTuple):
     is_fixed: bool = False
 
 
+class Factors(NamedTuple):
+    """Characteristic function E[exp(iτ·noise)] at some signals and frequencies.
+
+    Attributes
+    ----------
+    signal, tau : ndarray of float64
+        Signals in DN above black, and frequencies in radians per DN.
+    temporal, fixed : ndarray of complex128 or float64
+        Factor of the noise that is new in every frame, and of the patterns that frames of one body share.
+    value : ndarray of complex128 or float64
+        Characteristic function of all noise, with outliers.
+    """
+
+    signal: Float
+    tau: Float
+    temporal: Complex
+    fixed: Complex
+    value: Complex
+
+
 class Outliers(NamedTuple):
     """Rare sites with another value: their fraction, and the mean excess in DN (hot) or their value (dead)."""
 
@@ -66,7 +88,13 @@ class Outliers(NamedTuple):
 
 
 def _gaussian(variance: Callable[[Float], Float], is_fixed: bool = False) -> Term:
-    return Term(variance, lambda u, tau: np.exp(-0.5 * tau * tau * variance(u)) + 0j, is_fixed)
+    return Term(variance, lambda u, tau: np.exp(-0.5 * tau * tau * variance(u)), is_fixed)
+
+
+def _product(terms: Sequence[Term], signal: Float, tau: Float) -> Complex:
+    """Return the product of the factors of some terms."""
+    factors = (term.factor(signal, tau) for term in terms)
+    return functools.reduce(operator.mul, factors, np.ones(signal.shape))
 
 
 def _constant(variance_dn2: float) -> Callable[[Float], Float]:
@@ -78,9 +106,12 @@ def _counts(gain_dn: float, rate_e: Callable[[Float], Float], normal: tuple[floa
 
     def factor(u: Float, tau: Float) -> Complex:
         rate, phase = rate_e(u), gain_dn * tau
-        counted = np.exp(rate * (np.expm1(1j * phase) - 1j * phase))
+        half_sine = np.sin(0.5 * phase)  # cos - 1 loses digits of small phases
+        counted: Complex = np.exp(rate * (-2 * half_sine * half_sine + 1j * (np.sin(phase) - phase)))
+        if normal == (0.0, math.inf):
+            return counted
         is_normal = (rate <= normal[0]) | (rate >= normal[1])
-        return np.where(is_normal, np.exp(-0.5 * rate * phase * phase), counted)
+        return np.asarray(np.where(is_normal, np.exp(-0.5 * rate * phase * phase), counted))
 
     return Term(lambda u: gain_dn * gain_dn * rate_e(u), factor)
 
@@ -128,7 +159,7 @@ def _read(plan: Plan) -> list[Term]:
     if physics.read_law == "gaussian":
         return [_gaussian(_constant(std * std))]
     law = physics.read_law
-    return [Term(_constant(std * std), lambda u, tau: tukey_factor(std * tau, law, shape) + 0j)]
+    return [Term(_constant(std * std), lambda u, tau: tukey_factor(std * tau, law, shape))]
 
 
 def _row(plan: Plan) -> list[Term]:
@@ -136,7 +167,7 @@ def _row(plan: Plan) -> list[Term]:
 
 
 def _quantise(plan: Plan) -> list[Term]:
-    return [] if plan.normalised else [Term(_constant(1 / 12), lambda u, tau: np.sinc(tau / (2 * np.pi)) + 0j)]
+    return [] if plan.normalised else [Term(_constant(1 / 12), lambda u, tau: np.sinc(tau / (2 * np.pi)))]
 
 
 def _none(plan: Plan) -> list[Term]:
@@ -273,30 +304,18 @@ class NoiseLaw:
         """Return the part of the variance that frames of one body share, DN²."""
         return sum((term.variance(signal) for term in self._fixed), np.zeros_like(signal))
 
-    def characteristic(self, signal: Float, tau: Float) -> Complex:
-        """Return E[exp(iτ·noise)] for each signal and frequency, with outliers."""
-        value: Complex = self.temporal_characteristic(signal, tau) * self.fixed_characteristic(signal, tau)
-        if self.dead.share:
-            dead_dn = self.dead.value_dn - signal - self.plan.black_level_dn
-            value = (1 - self.dead.share) * value + self.dead.share * np.exp(1j * tau * dead_dn)
-        return value
-
-    def temporal_characteristic(self, signal: Float, tau: Float) -> Complex:
-        """Return the factor of the noise that is new in every frame."""
-        return functools.reduce(
-            lambda value, term: value * term.factor(signal, tau), self._temporal, np.ones(signal.shape, complex)
-        )
-
-    def fixed_characteristic(self, signal: Float, tau: Float) -> Complex:
-        """Return the factor of the patterns that frames of one body share."""
-        value = functools.reduce(
-            lambda value, term: value * term.factor(signal, tau), self._fixed, np.ones(signal.shape, complex)
-        )
+    def factors(self, signal: Float, tau: Float) -> Factors:
+        """Return the factors of the characteristic function for each signal and frequency (radians per DN)."""
+        temporal, fixed = (_product(terms, signal, tau) for terms in (self._temporal, self._fixed))
         if self.hot.share and self.hot.value_dn:
             gain = _physics(self.plan).dn_per_e
             mean_e = self.hot.value_dn / gain
-            value = value * (1 - self.hot.share + self.hot.share / (1 - mean_e * np.expm1(1j * gain * tau)))
-        return value
+            fixed = fixed * (1 - self.hot.share + self.hot.share / (1 - mean_e * np.expm1(1j * gain * tau)))
+        value = temporal * fixed
+        if self.dead.share:
+            dead_dn = self.dead.value_dn - signal - self.plan.black_level_dn
+            value = (1 - self.dead.share) * value + self.dead.share * np.exp(1j * tau * dead_dn)
+        return Factors(signal, tau, temporal, fixed, value)
 
     def is_far_from_limits(self, clean_dn: Float, site: tuple[int, int]) -> NDArray[np.bool_]:
         """Return for which clean DN noise reaches no limit of the sensor, except in about `RARE` of the sites."""
@@ -330,8 +349,11 @@ class NoiseLaw:
 LEAST_TAIL = 2.0**-33
 """Least tail probability of a random word."""
 
-_FREQUENCIES = np.linspace(0.0, 12.0, 1201)
-"""Frequencies, in radians per standard deviation, at which the characteristic function of read noise is tabulated."""
+_FREQUENCIES = np.linspace(0.0, 4.5, 451)
+"""Frequencies, in radians per standard deviation, at which the characteristic function of read noise is tabulated.
+
+Those of cos 4z, the highest that is computed, are at most 4, because read noise is a part of all noise.
+"""
 
 
 def tukey_factor(frequency: Float, law: str, shape: float) -> Float:
@@ -350,21 +372,33 @@ def tukey_factor(frequency: Float, law: str, shape: float) -> Float:
     Returns
     -------
     ndarray of float64
-        E[cos(frequency · n)]; absolute error below 3e-4 for shapes from -0.4.
+        E[cos(frequency · n)]; absolute error below 3e-4 for shapes from -0.4. Frequencies above 4.5 count as 4.5.
     """
     return np.asarray(np.interp(np.abs(frequency), _FREQUENCIES, _tukey_table(law, shape)))
 
 
 @functools.lru_cache(maxsize=256)
 def _tukey_table(law: str, shape: float) -> Float:
-    """Return ∫cos(ω·Q(p))dp at `_FREQUENCIES` by the trapezoidal rule in the logit of p, which converges quickly."""
-    logit = np.linspace(-40.0, 0.0, 1601)
+    """Return ∫cos(ω·Q(p))dp at `_FREQUENCIES`.
+
+    The trapezoidal rule in the logit of p converges quickly: 501 nodes have an error below 3e-6 for shapes from -0.4.
+    """
+    values, weights = _quantiles(shape, -25.0, 501)
+    if law == "tukey":
+        std = float(tukey_std(shape))
+    else:  # the square of the quantile function needs nodes farther out
+        some, of_some = _quantiles(shape, -40.0, 1601)
+        std = math.sqrt(float((some * some) @ of_some))
+    return np.asarray(np.cos(np.outer(_FREQUENCIES, values / std)) @ weights)
+
+
+def _quantiles(shape: float, lowest: float, count: int) -> tuple[Float, Float]:
+    """Return the quantiles of Tukey's lambda distribution at logits from ``lowest`` to 0, and the nodes' weights."""
+    logit = np.linspace(lowest, 0.0, count)
     p = 1 / (1 + np.exp(-logit))
     weights = 2 * (logit[1] - logit[0]) * p * (1 - p)  # both halves: the distribution is symmetric
     weights[-1] /= 2
-    values = tukey_quantile(np.maximum(p, LEAST_TAIL), shape)
-    std = float(tukey_std(shape)) if law == "tukey" else math.sqrt(float((values * values) @ weights))
-    return np.asarray(np.cos(np.outer(_FREQUENCIES, values / std)) @ weights)
+    return tukey_quantile(np.maximum(p, LEAST_TAIL), shape), weights
 
 
 def tukey_quantile(p: Any, shape: float) -> Any:

@@ -95,13 +95,14 @@ def scores_of(sums: Sums) -> Scores:
         Scores of all checks for which the pair has sites.
     """
     planes = planes_of(sums)
+    spread = _spread_of(sums, planes)
     scores: Scores = {("mean", plane.name): plane.location(np.ones_like(plane.count)) for plane in planes}
-    scores["mean", ""] = _added(plane.location(np.ones_like(plane.count)) for plane in planes)
+    scores["mean", ""] = _added(scores.values())
     scores["mean against signal", ""] = _added(plane.location(plane.expected.signal) for plane in planes)
     scores["variance", ""] = _added(plane.scale(np.ones_like(plane.count)) for plane in planes)
     scores["variance against signal", ""] = _added(plane.scale(plane.expected.signal) for plane in planes)
     scores["kurtosis", ""] = _added(plane.shape() for plane in planes)
-    scores |= _line_scores(sums, planes) | _neighbour_scores(sums, planes) | _partner_scores(sums, planes)
+    scores |= _line_scores(sums, spread) | _neighbour_scores(sums, planes, spread) | _partner_scores(sums, spread)
     return scores
 
 
@@ -267,13 +268,13 @@ def _spread_of(sums: Sums, planes: Sequence[Plane]) -> _Spread:
     )
 
 
-def _line_scores(sums: Sums, planes: Sequence[Plane]) -> Scores:
+def _line_scores(sums: Sums, spread: _Spread) -> Scores:
     """Return the scores of the variances of row and column offsets.
 
     The rounding of a smooth clean frame can move complete lines by up to half a DN. Differences of lines n and n + 2,
     and products of distant parts of a line, are almost free of it, with a third of the information.
     """
-    spread, scores = _spread_of(sums, planes), Scores()
+    scores = Scores()
     for name, (score, information), variance in (
         ("row", sums.rows, sums.law.row_std_dn**2),
         ("column", sums.columns, 0.0),
@@ -346,9 +347,9 @@ def _quadratic_score(a: Float, j: Float, mask: Float, variance: float, spread: _
 # ---------------------------------------------------------------------------------------------- neighbours and sites
 
 
-def _neighbour_scores(sums: Sums, planes: Sequence[Plane]) -> Scores:
+def _neighbour_scores(sums: Sums, planes: Sequence[Plane], spread: _Spread) -> Scores:
     """Return the scores of the correlation of horizontal and vertical neighbours of one plane."""
-    spread, scores = _spread_of(sums, planes), Scores()
+    scores = Scores()
     squares = np.concatenate([plane.count / plane.expected.std**2 for plane in planes])
     row_dn2 = sums.law.row_std_dn**2
     for name, (product, pairs, inverse), offset_dn2 in (
@@ -370,9 +371,9 @@ def _neighbour_scores(sums: Sums, planes: Sequence[Plane]) -> Scores:
     return scores
 
 
-def _partner_scores(sums: Sums, planes: Sequence[Plane]) -> Scores:
+def _partner_scores(sums: Sums, spread: _Spread) -> Scores:
     """Return the scores of the agreement of noisy sites with the clean values of other sites of their tile."""
-    spread, scores = _spread_of(sums, planes), Scores()
+    scores = Scores()
     names = "diagonal sites", "horizontal sites", "vertical sites"
     for name, (total, squares, rounding, information, scaled) in zip(names, sums.partners, strict=True):
         if information:

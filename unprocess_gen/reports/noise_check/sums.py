@@ -1,4 +1,4 @@
-"""Sum the statistics of a pair over its sites, block by block.
+"""Sum the statistics of a pair over its sites.
 
 ``z`` is noisy minus expected DN over the expected standard deviation, and bounded (`expectation.LARGEST_Z`). Sites that
 cannot be checked have weight 0.
@@ -6,13 +6,11 @@ cannot be checked have weight 0.
 
 from __future__ import annotations
 
-import bisect
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import (
     LARGEST_Z,
     Expectation,
@@ -22,6 +20,9 @@ from unprocess_gen.reports.noise_check.expectation import (
     usable_values,
 )
 from unprocess_gen.reports.noise_check.law import NoiseLaw
+
+if TYPE_CHECKING:
+    from unprocess_gen.reports.noise_check.site_sums import PlaneTables
 
 TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Sites of the tile of the CFA; a plane is the set of all sites at one of these places."""
@@ -38,7 +39,7 @@ LARGEST_DIFFERENCE = 3.0
 """Bound of the difference in standard deviations of the noise."""
 
 BLOCK_SITES = 2**18
-"""Sites of a block of rows: 20 MB of scratch memory."""
+"""Sites whose variance is computed at once in frames without rounding: 10 MB of scratch memory."""
 
 
 class Sums:
@@ -75,26 +76,19 @@ class Sums:
     """
 
     def __init__(self, law: NoiseLaw, clean: Any, noisy: Any) -> None:
+        from unprocess_gen.reports.noise_check.site_sums import count_sites  # imports Numba
+
         self.law = law
         self.height, self.width = int(clean.shape[0]) // 2 * 2, int(clean.shape[1]) // 2 * 2
         self._clean, self._noisy = clean[: self.height, : self.width], noisy[: self.height, : self.width]
+        self._offsets = law.offset_dn[:, : self.width].astype(np.float32)
         self._size = int(self._clean.max(initial=0)) + 2
-        self.counts = np.stack([self._histogram(site) for site in TILE])
+        self.counts = np.zeros((4, self._size))
+        count_sites(self._clean, self._offsets, self.counts)
         # without fixed patterns in the clean frame, the expectations are equal in all planes
         tables = [self._table(site) for site in (TILE if law.plan.averaged else TILE[:1])]
         self.usable, self.tables = ([*some] * (4 // len(tables)) for some in zip(*tables, strict=True))
         self.sites = int(sum(count[usable].sum() for count, usable in zip(self.counts, self.usable, strict=True)))
-
-    def _histogram(self, site: tuple[int, int]) -> Float:
-        counts = np.zeros(self._size)
-        for top in range(0, self.height, self._block_rows):
-            block = self._clean[top : top + self._block_rows]
-            counts += np.bincount(_nearest(block[site[0] :: 2, site[1] :: 2]).ravel(), minlength=self._size)
-        return counts
-
-    @property
-    def _block_rows(self) -> int:
-        return max(2, BLOCK_SITES // max(self.width, 1) // 2 * 2)
 
     def _table(self, site: tuple[int, int]) -> tuple[Mask, Expectation]:
         at = np.flatnonzero(self.counts.any(axis=0))
@@ -105,98 +99,51 @@ class Sums:
 
     def fill(self) -> None:
         """Compute all sums."""
-        self.z, self.cosine, self.double = (np.zeros((4, self._size)) for _ in range(3))
-        self._row_parts, self._column_parts = _segment_starts(self.width), _segment_starts(self.height)
-        self.rows = np.zeros((2, self.height, len(self._row_parts)))
-        self.columns = np.zeros((2, self.width, len(self._column_parts)))
-        self.neighbours, self.partners = np.zeros((2, 3)), np.zeros((3, 5))
-        for top in range(0, self.height, self._block_rows):
-            self._add_block(top, min(top + self._block_rows, self.height))
+        from unprocess_gen.reports.noise_check.site_sums import SiteSums, add_sites  # imports Numba
 
-    def _add_block(self, top: int, bottom: int) -> None:
-        z, weight = (np.empty((bottom - top, self.width), np.float32) for _ in range(2))
-        clean, noisy = self._clean[top:bottom], self._noisy[top:bottom]
-        for plane, (y, x) in enumerate(TILE):
-            at = slice(y, None, 2), slice(x, None, 2)
-            z[at], weight[at] = self._add_plane(plane, clean[at], noisy[at])
-        self._add_lines(top, bottom, z, weight)
-        self._add_neighbours(z, weight)
-        for kind, planes in enumerate(PARTNERS):
-            for first, second in planes:
-                self._add_partners(kind, clean, z, weight, TILE[first], TILE[second])
-
-    def _add_plane(self, plane: int, clean: Any, noisy: Any) -> tuple[Any, Any]:
-        """Add the sites of a plane to the sums by clean DN; return z without its mean, and 1 / std."""
-        table, usable, (y, x) = self.tables[plane], self.usable[plane], TILE[plane]
-        inverse = np.divide(1.0, table.std, out=np.zeros(self._size), where=usable).astype(np.float32)
-        dn = _nearest(clean)
-        weight = inverse[dn]
-        if self.law.plan.clean_normalised:
-            variance = self.law.variance(self.law.signal(clean, (y, x)))
-            weight = np.divide(1.0, np.sqrt(variance), out=np.zeros(clean.shape), where=weight > 0).astype(np.float32)
-        offset = self.law.offset_dn[y, x : self.width : 2].astype(np.float32)
-        z = np.clip((np.subtract(noisy, clean, dtype=np.float32) - offset) * weight, -LARGEST_Z, LARGEST_Z)
-        cosine = np.cos(z)
-        double = 2 * cosine * cosine - 1
-        if self.law.plan.clean_normalised and usable.any():
-            known = np.flatnonzero(usable)
-            for values, of in ((cosine, table.cosine), (double, table.double)):
-                values -= np.interp(clean, known, of.mean[known]) - of.mean[dn]
-        flat = dn.ravel()
-        for sums, values in ((self.z, z), (self.cosine, cosine), (self.double, double)):
-            sums[plane] += np.bincount(flat, weights=values.ravel(), minlength=self._size)
-        mean = (table.rounding_mean * inverse + table.outlier_mean).astype(np.float32)
-        return z - mean[dn], weight
-
-    def _add_lines(self, top: int, bottom: int, z: Any, weight: Any) -> None:
-        first = bisect.bisect_right(self._column_parts, top) - 1
-        last = bisect.bisect_left(self._column_parts, bottom)
-        starts = [max(start - top, 0) for start in self._column_parts[first:last]]
-        for number, values in enumerate((z * weight, weight * weight)):
-            self.rows[number, top:bottom] = np.add.reduceat(values, self._row_parts, axis=1, dtype=np.float64)
-            self.columns[number, :, first:last] += np.add.reduceat(values, starts, axis=0, dtype=np.float64).T
-
-    def _add_neighbours(self, z: Any, weight: Any) -> None:
-        used = (weight > 0).astype(np.float32)
-        everything = slice(None)
-        for direction, (before, after) in enumerate(
-            (((everything, slice(None, -2)), (everything, slice(2, None))), ((slice(None, -2),), (slice(2, None),)))
-        ):
-            self.neighbours[direction] += [_dot(values[before], values[after]) for values in (z, used, weight)]
-
-    def _add_partners(
-        self, kind: int, clean: Any, z: Any, weight: Any, first: tuple[int, int], second: tuple[int, int]
-    ) -> None:
-        y, x = ([slice(place[axis], None, 2) for place in (first, second)] for axis in (0, 1))
-        w, v = (weight[y[place], x[place]] for place in (0, 1))
-        difference = np.subtract(clean[y[1], x[1]], clean[y[0], x[0]], dtype=np.float32)
-        is_rounded = not self.law.plan.clean_normalised
-        chosen = (np.abs(difference) >= (LEAST_DIFFERENCE_DN if is_rounded else 0.0)) & (w > 0) & (v > 0)
-        at = np.flatnonzero(chosen.ravel())
-        first_std, second_std = 1 / w.ravel()[at], 1 / v.ravel()[at]
-        scale = 1 / np.sqrt(first_std * first_std + second_std * second_std)
-        # a common offset of both sites cancels
-        noise = z[y[0], x[0]].ravel()[at] * first_std - z[y[1], x[1]].ravel()[at] * second_std
-        step = difference.ravel()[at] * scale
-        limited = np.clip(step, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
-        scaled = limited * scale
-        self.partners[kind] += (
-            _dot(scaled, noise),
-            _dot(limited, limited),
-            float(np.abs(scaled).sum(dtype=np.float64)) if is_rounded else 0.0,
-            2 * _dot(limited, step),
-            _dot(scaled, scaled),
+        row_starts, column_starts = (np.array(_segment_starts(length)) for length in (self.width, self.height))
+        sums = SiteSums(
+            z=np.zeros((4, self._size)),
+            cosine=np.zeros((4, self._size)),
+            double=np.zeros((4, self._size)),
+            rows=np.zeros((2, self.height, len(row_starts))),
+            columns=np.zeros((2, len(column_starts), self.width)),
+            neighbours=np.zeros((2, 3)),
+            partners=np.zeros((3, 5)),
         )
+        is_rounded = not self.law.plan.clean_normalised
+        weights = np.zeros((0, 0), np.float32) if is_rounded else self._weights()
+        frames = self._clean, self._noisy, self._offsets
+        add_sites(*frames, weights, row_starts, column_starts, self._plane_tables(is_rounded), sums)
+        self.z, self.cosine, self.double = sums.z, sums.cosine, sums.double
+        self.rows, self.columns = sums.rows, sums.columns.transpose(0, 2, 1)
+        self.neighbours, self.partners = sums.neighbours, sums.partners
 
+    def _plane_tables(self, is_rounded: bool) -> PlaneTables:
+        from unprocess_gen.reports.noise_check.site_sums import PlaneTables
 
-def _nearest(clean: Any) -> NDArray[np.intp]:
-    if clean.dtype == np.uint16:
-        return np.asarray(clean, dtype=np.intp)
-    return np.asarray(np.rint(np.maximum(clean, 0.0)), dtype=np.intp)
+        inverse, mean, cosine, double = (np.zeros((4, self._size)) for _ in range(4))
+        for plane, (usable, of) in enumerate(zip(self.usable, self.tables, strict=True)):
+            known = np.flatnonzero(usable)
+            inverse[plane, known] = 1 / of.std[known]
+            mean[plane] = of.rounding_mean * inverse[plane] + of.outlier_mean
+            if not is_rounded and len(known):
+                for values, expected in ((cosine, of.cosine), (double, of.double)):
+                    values[plane] = np.interp(np.arange(self._size), known, expected.mean[known])
+        least = LEAST_DIFFERENCE_DN if is_rounded else 0.0
+        return PlaneTables(inverse, mean, cosine, double, LARGEST_Z, least, LARGEST_DIFFERENCE)
 
-
-def _dot(a: Any, b: Any) -> float:
-    return float(np.einsum("i,i->" if a.ndim == 1 else "ij,ij->", a, b, dtype=np.float64))
+    def _weights(self) -> NDArray[np.float32]:
+        """Return 1 / std of each site of a clean frame that is not rounded, [H, W]."""
+        weights = np.empty((self.height, self.width), np.float32)
+        rows = max(1, BLOCK_SITES // max(self.width, 1))
+        for site in TILE:
+            of_site = np.s_[site[0] :: 2, site[1] :: 2]
+            for top in range(0, self.height // 2, rows):
+                clean = self._clean[of_site][top : top + rows]
+                std = np.sqrt(self.law.variance(self.law.signal(clean, site)))
+                weights[of_site][top : top + rows] = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
+        return weights
 
 
 def _segment_starts(length: int) -> list[int]:

@@ -1,0 +1,275 @@
+"""Sum the statistics of a pair over its sites, in one pass over its rows (Numba).
+
+NumPy needs thirty passes over blocks of the frames for the same sums, and four times the time: 0.3 s instead of 0.08 s
+for a pair of 6 megapixels.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from unprocess_gen.core.jit import inner, kernel
+from unprocess_gen.core.types import Float
+
+_COSINE = tuple((-1) ** n / math.factorial(2 * n) for n in range(10))
+_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = _COSINE
+
+
+_PARTNERS = (
+    *((0, 0, 0, 1, 1), (0, 0, 1, 1, 0)),
+    *((1, 0, 0, 0, 1), (1, 1, 0, 1, 1)),
+    *((2, 0, 0, 1, 0), (2, 0, 1, 1, 1)),
+)
+"""Kind, row and column of one site and of the other, for each pair of `sums.PARTNERS`."""
+
+
+class PlaneTables(NamedTuple):
+    """Hold what the law predicts for each plane and clean DN, and the limits of the statistics.
+
+    Attributes
+    ----------
+    inverse : ndarray of float64, [4, N]
+        1 / std; 0 for DN that are not checked.
+    mean : ndarray of float64, [4, N]
+        Mean of z.
+    cosine, double : ndarray of float64, [4, N]
+        Expectations of cos z and cos 2z, from which those between two DN are interpolated.
+    largest_z : float
+        Bound of z.
+    least_difference : float
+        Least difference of the clean values of two sites that are compared, DN.
+    largest_difference : float
+        Bound of this difference in standard deviations.
+    """
+
+    inverse: Float
+    mean: Float
+    cosine: Float
+    double: Float
+    largest_z: float
+    least_difference: float
+    largest_difference: float
+
+
+class SiteSums(NamedTuple):
+    """Hold the sums; attributes of the same names are described in `sums.Sums`.
+
+    Attributes
+    ----------
+    z, cosine, double : ndarray of float64, [4, N]
+        Sums by plane and clean DN.
+    rows : ndarray of float64, [2, H, segments]
+        Sums of the parts of rows.
+    columns : ndarray of float64, [2, segments, W]
+        Sums of the parts of columns.
+    neighbours, partners : ndarray of float64, [2, 3] and [3, 5]
+        Sums of products.
+    """
+
+    z: Float
+    cosine: Float
+    double: Float
+    rows: Float
+    columns: Float
+    neighbours: Float
+    partners: Float
+
+
+class _Line(NamedTuple):
+    """Hold the sites of one row, [W]: z, 1 / std, std, cos z and cos 2z; weights are 0 where sites are not used."""
+
+    z: Any
+    weight: Any
+    std: Any
+    cosine: Any
+    double: Any
+
+
+@kernel
+def count_sites(clean: Any, offsets: Any, counts: Any) -> None:
+    """Count the sites by plane and clean DN.
+
+    Parameters
+    ----------
+    clean : ndarray of uint16 or float64, [H, W]
+        Clean frame in DN.
+    offsets : ndarray of float32, [2, W] or [H, W]
+        As in `add_sites`; sites with NaN are not counted.
+    counts : ndarray of float64, [4, N]
+        Where the numbers are added.
+    """
+    height, width = clean.shape
+    for y in range(height):
+        offset_row = y if len(offsets) == height else y & 1
+        for x in range(width):
+            if not math.isnan(offsets[offset_row, x]):
+                counts[2 * (y & 1) + (x & 1), _nearest(clean[y, x])] += 1
+
+
+@kernel
+def add_sites(
+    clean: Any, noisy: Any, offsets: Any, weights: Any, row_starts: Any, column_starts: Any, tables: Any, sums: Any
+) -> None:
+    """Add all sites of a pair to its sums.
+
+    Parameters
+    ----------
+    clean, noisy : ndarray of uint16 or float64, [H, W]
+        Frames in DN; H and W are even.
+    offsets : ndarray of float32, [2, W] or [H, W]
+        What is known to be added to the noisy frame, DN; NaN for sites that are not used.
+    weights : ndarray of float32, [H, W] or [0, 0]
+        1 / std of each site if ``clean`` is not rounded.
+    row_starts, column_starts : ndarray of int64
+        First column of each part of the rows, first row of each part of the columns.
+    tables : PlaneTables
+        What the law predicts.
+    sums : SiteSums
+        Where the sums are added.
+    """
+    height, width = clean.shape
+    memory, part, is_rounded = np.zeros((4, 5, width)), 0, len(weights) == 0
+    for y in range(height):
+        line = _line(memory[y & 3])  # `memory` has the last four rows
+        offset = offsets[y if len(offsets) == height else y & 1]
+        of_row = weights[0:0].ravel() if is_rounded else weights[y]
+        _standardise(line, clean[y], noisy[y], offset, of_row, tables.inverse[2 * (y & 1) :], tables.largest_z)
+        _fill_cosines(line)
+        _add_values(line, clean[y], y & 1, is_rounded, tables, sums)
+        if part + 1 < len(column_starts) and y >= column_starts[part + 1]:
+            part += 1
+        _add_lines(line, row_starts, sums.rows[:, y], sums.columns[:, part])
+        _add_products(line, 2, line, sums.neighbours[0])
+        if y >= 2:
+            _add_products(_line(memory[(y - 2) & 3]), 0, line, sums.neighbours[1])
+        if y & 1:
+            for kind, upper, x, lower, other_x in _PARTNERS:
+                first, second = y - 1 + upper, y - 1 + lower
+                sites = _line(memory[first & 3]), x, clean[second], _line(memory[second & 3]), other_x
+                _add_partners(clean[first], *sites, tables, sums.partners[kind])
+
+
+@inner
+def _line(memory: Any) -> _Line:
+    return _Line(memory[0], memory[1], memory[2], memory[3], memory[4])
+
+
+@inner
+def _nearest(clean_dn: Any) -> int:
+    return int(np.rint(max(float(clean_dn), 0.0)))
+
+
+@inner
+def _standardise(line: Any, clean: Any, noisy: Any, offset: Any, weights: Any, inverse: Any, largest: float) -> None:
+    """Fill ``line`` with z and the scale of each site; ``inverse`` [2, N] has the planes of this row."""
+    for x in range(len(clean)):
+        weight = inverse[x & 1, _nearest(clean[x])]
+        if len(weights) and weight > 0:
+            weight = float(weights[x])
+        difference = float(noisy[x]) - float(clean[x]) - float(offset[x])
+        if math.isnan(difference):
+            difference = weight = 0.0
+        line.z[x] = min(max(difference * weight, -largest), largest)
+        line.weight[x] = weight
+        line.std[x] = 1 / weight if weight > 0 else 0.0
+
+
+@inner
+def _fill_cosines(line: Any) -> None:
+    """Compute cos z with an error below 1e-9: the series of cos(z/4), whose angle is doubled twice; then cos 2z."""
+    for n in range(len(line.z)):
+        x = line.z[n] * line.z[n] / 16
+        tail = _C5 + x * (_C6 + x * (_C7 + x * (_C8 + x * _C9)))
+        quarter = _C0 + x * (_C1 + x * (_C2 + x * (_C3 + x * (_C4 + x * tail))))
+        half = 2 * quarter * quarter - 1
+        cosine = 2 * half * half - 1
+        line.cosine[n] = cosine
+        line.double[n] = 2 * cosine * cosine - 1
+
+
+@inner
+def _add_values(line: Any, clean: Any, odd: int, is_rounded: bool, tables: Any, sums: Any) -> None:
+    """Add a line to the sums by plane and clean DN, and subtract the expected mean from its z."""
+    for x in range(len(clean)):
+        if line.weight[x] == 0:
+            continue
+        plane, dn = 2 * odd + (x & 1), _nearest(clean[x])
+        cosine, double = line.cosine[x], line.double[x]
+        if not is_rounded:
+            cosine -= _between(tables.cosine[plane], dn, float(clean[x]))
+            double -= _between(tables.double[plane], dn, float(clean[x]))
+        sums.z[plane, dn] += line.z[x]
+        sums.cosine[plane, dn] += cosine
+        sums.double[plane, dn] += double
+        line.z[x] -= tables.mean[plane, dn]
+
+
+@inner
+def _between(values: Any, dn: int, clean_dn: float) -> Any:
+    """Return by how much an expectation at a value between two DN differs from that at the nearest DN."""
+    lower = int(max(clean_dn, 0.0))
+    share = max(clean_dn, 0.0) - lower
+    return values[lower] + share * (values[lower + 1] - values[lower]) - values[dn]
+
+
+@inner
+def _add_lines(line: Any, starts: Any, row: Any, column: Any) -> None:
+    width = len(line.z)
+    for part in range(len(starts)):
+        end = starts[part + 1] if part + 1 < len(starts) else width
+        score, information = 0.0, 0.0
+        for x in range(starts[part], end):
+            scaled, square = line.z[x] * line.weight[x], line.weight[x] * line.weight[x]
+            score += scaled
+            information += square
+            column[0, x] += scaled
+            column[1, x] += square
+        row[0, part] += score
+        row[1, part] += information
+
+
+@inner
+def _add_products(first: Any, distance: int, second: Any, sums: Any) -> None:
+    """Add the products of the sites of one row and those of another, or those ``distance`` to the right."""
+    product, pairs, inverse = 0.0, 0.0, 0.0
+    for x in range(len(first.z) - distance):
+        scale = first.weight[x] * second.weight[x + distance]
+        product += first.z[x] * second.z[x + distance]
+        pairs += 1.0 if scale > 0 else 0.0
+        inverse += scale
+    sums[0] += product
+    sums[1] += pairs
+    sums[2] += inverse
+
+
+@inner
+def _add_partners(
+    clean: Any, first: Any, x: int, other_clean: Any, second: Any, other_x: int, tables: Any, sums: Any
+) -> None:
+    """Add the comparisons of the sites of two planes, which begin at ``x`` and ``other_x``."""
+    agreement, squares, distance, products, scaled_squares = 0.0, 0.0, 0.0, 0.0, 0.0
+    least, largest = tables.least_difference, tables.largest_difference
+    for n in range(len(clean) // 2):
+        a, b = x + 2 * n, other_x + 2 * n
+        difference = float(other_clean[b]) - float(clean[a])
+        if abs(difference) < least or first.weight[a] == 0 or second.weight[b] == 0:
+            continue
+        scale = 1 / math.sqrt(first.std[a] * first.std[a] + second.std[b] * second.std[b])
+        # a common offset of both sites cancels
+        noise = first.z[a] * first.std[a] - second.z[b] * second.std[b]
+        step = difference * scale
+        limited = min(max(step, -largest), largest)
+        scaled = limited * scale
+        agreement += scaled * noise
+        squares += limited * limited
+        distance += abs(scaled)
+        products += limited * step
+        scaled_squares += scaled * scaled
+    sums[0] += agreement
+    sums[1] += squares
+    sums[2] += distance if least > 0 else 0.0
+    sums[3] += 2 * products
+    sums[4] += scaled_squares
