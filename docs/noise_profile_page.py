@@ -29,16 +29,19 @@ ISOS_OF = {"imx385": (1600, 3200, 6400, 12800, 25600)}
 INTRODUCTION = """\
 # Noise profiles and their sources
 
-For each physical noise profile: its numbers and those of every published calibration of the camera, with source and
-uncertainty of each number (`noise.provenance`). Numbers are in DN of the calibration, without scatter.
+This page compares each physical noise profile with every published calibration of its camera, and lists the source and
+the uncertainty of each number (`noise.provenance`). Numbers are in DN of the calibration, without scatter.
+[Abbreviations of sources](#sources), such as ELD and PMN, are explained at the end.
 
-- Read noise is a standard deviation, in parentheses in electrons. "Tukey" is the standard deviation of a Tukey-lambda
-  distribution with the published scale and shape.
-- Shapes and black errors of ELD are the mean of the two values at a full stop; the profile has the first.
+- Read noise is a standard deviation, in DN and, in parentheses, in electrons. "Tukey" is the standard deviation of a
+  Tukey-lambda distribution with the published scale and shape.
+- ELD gives two shapes and two sets of black errors for each full stop. The rows of ELD have their means, and the
+  profile has the first.
 - An asterisk marks an ISO outside the range of the calibration. The last column is the profile divided by the source,
   over the ISOs inside that range.
+- An assumed number (`noise.assumed`) is typical or inferred; no source gives it directly for this camera.
 
-[Numbers of noise profiles](../design/noise_profiles.md) explains why these numbers were chosen."""
+[Numbers of noise profiles](../design/noise_profiles.md) explains the choice of the numbers."""
 
 
 @cache
@@ -228,7 +231,7 @@ def provenance_rows(noise: NoiseConfig) -> list[list[str]]:
     """Return a row for each statement about the numbers of a profile: numbers, ISO, source, uncertainty."""
     return [
         [
-            ", ".join(f"`{number}`" for number in one.numbers),
+            ", ".join(f"`{number}`{' (assumed)' * (number in noise.assumed)}" for number in one.numbers),
             f"{one.iso[0]:g} to {one.iso[1]:g}" if one.iso else "all",
             _words(one.source),
             _words(one.uncertainty),

@@ -28,26 +28,33 @@ SCENES = ("daylight", "indoor", "low_light", "night", "long_exposure", "video_ni
 INTRODUCTION = """\
 # Effects by scene
 
-Which effects `effects.all=auto` simulates, for each scene and physical noise profile. The photograph has 24 megapixels
-and codes from 0 to 255. The sensor has the bits of the profile. Light is divided by the mean of the scene's range.
+This page lists the effects that `effects.all=auto` simulates, for each scene and physical noise profile. The
+predictions are for a photograph of 24 megapixels with codes from 0 to 255. The sensor has the bits of the profile.
+Light is divided by the mean of the scene's range. [Physical scenes](../guides/physical_scenes.md#what-you-get) explains
+each effect.
 
-The number behind an effect is its ratio to the noise that hides it; of the full well, an upper limit. Hot and dead
-pixels have the number of pixels above the noise instead. All effects that are left out, together, stay below a tenth
-of the noise. Effects with an asterisk use an [assumed number](noise_profiles.md).
+The number after an effect is its ratio to the noise that hides it; for the full well it is an upper limit. For hot and
+dead pixels it is the number of pixels above the noise. All omitted effects together stay below a tenth of the noise. An
+effect with an asterisk uses an assumed number: a typical value, because [no source](noise_profiles.md) gives one for
+this camera.
 
 ![each effect by itself, amplified](effects.png)
 
-Each picture has one effect of `noise=nikon_d850`, amplified (`python docs/draw_effects.py`). Hot and dead pixels are
-more frequent there than in the profile, and the full well is smaller."""
+Each picture shows one effect of `noise=nikon_d850`, amplified (`python docs/draw_effects.py`). In the pictures, hot and
+dead pixels are more frequent than in the profile, and the full well is smaller."""
 
 REASONS = {
-    "daylight": "Light is plentiful: PRNU, which grows faster than shot noise, shows, and so do offsets that are the "
-    "same in a row, a column or a plane. A millisecond leaves no time for heat.",
-    "indoor": "Less light at a higher gain. The exposure is still too short for most of the heat.",
-    "low_light": "Heat begins to show where the read noise is small.",
-    "night": "Few electrons: PRNU is too small to see. A tenth of a second of heat shows next to so little light.",
-    "long_exposure": "Half a minute at 35 °C: dark current adds electrons everywhere, and more pixels are hot.",
-    "video_night": "A warm sensor: heat shows, although the exposure is short. PRNU is too small to see.",
+    "daylight": "There is much light. PRNU grows faster with the signal than shot noise does, so it is visible. "
+    "Offsets that are the same in a row, a column or a plane are visible too. In a millisecond, dark current is "
+    "negligible.",
+    "indoor": "There is less light, at a higher gain. For most profiles, the exposure is still too short for dark "
+    "current.",
+    "low_light": "Dark current becomes visible if the read noise is small.",
+    "night": "There are few electrons, so PRNU is too small to see. Compared with so little light, the dark current "
+    "of a tenth of a second is visible.",
+    "long_exposure": "In half a minute at 35 °C, dark current adds electrons everywhere, and more pixels are hot.",
+    "video_night": "The sensor is warm, so dark current is visible although the exposure is short. PRNU is too small "
+    "to see.",
 }
 """Why the effects of each scene are simulated."""
 
@@ -113,5 +120,5 @@ def scenes_page(table: Callable[[Iterable[str], Iterable[Iterable[str]]], str], 
             rows.append(
                 [f"`{profile}`", ", ".join(_entry(profile, one) for one in known if one.simulated), ", ".join(left_out)]
             )
-        blocks.append(table(["profile", "simulated", "left out"], rows))
+        blocks.append(table(["profile", "simulated", "omitted"], rows))
     return page(*blocks)

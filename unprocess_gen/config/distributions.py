@@ -262,7 +262,18 @@ def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
 
 
 def lowest(distribution: Distribution) -> float:
-    """Return a lower limit of all draws from a distribution."""
+    """Return a lower limit of all draws from a distribution.
+
+    Parameters
+    ----------
+    distribution : Distribution
+        Validated distribution.
+
+    Returns
+    -------
+    float
+        In the unit of the parameter; -inf if there is no limit.
+    """
     if distribution.kind in ("constant", "choice"):
         return min(distribution.numbers)
     if distribution.kind == "truncated_normal":
@@ -273,7 +284,18 @@ def lowest(distribution: Distribution) -> float:
 
 
 def highest(distribution: Distribution) -> float:
-    """Return an upper limit of all draws from a distribution."""
+    """Return an upper limit of all draws from a distribution.
+
+    Parameters
+    ----------
+    distribution : Distribution
+        Validated distribution.
+
+    Returns
+    -------
+    float
+        In the unit of the parameter; inf if there is no limit.
+    """
     if distribution.kind == "choice":
         return max(distribution.numbers)
     if distribution.kind == "inverse_truncated_normal":
