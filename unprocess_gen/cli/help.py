@@ -22,7 +22,7 @@ INTRODUCTION = """\
 gen-dataset: pairs of clean and noisy raw images from ordinary photographs
 
   gen-dataset camera=convex noise=imx385_iso3200 source.root=photos out=ds     one dataset
-  gen-dataset                          the same from the built-in scenes, into ds
+  gen-dataset                          a dataset of the built-in scenes, in ds
   gen-dataset -m camera=sony_a7r,nexus_6p noise=imx385_iso1600,imx385_iso3200 out=sweep
                                        a sweep: one dataset folder each, and sweep/sweep.csv
   gen-dataset VERB --help              the arguments of a verb
@@ -31,8 +31,9 @@ Verbs:
 """
 
 SETTINGS = """
-Settings are key=value, in any order. group=option chooses an option, group.key=value changes one
-value. gen-dataset --help GROUP explains the options and keys of a group. Groups, options and keys:
+Settings are key=value, in any order. group=option selects an option, group.key=value changes one
+value. gen-dataset --help GROUP explains the options and keys of a group. Each group is listed with
+its options and, in parentheses, its keys:
 """
 
 SHOWN_HYDRA_FLAGS = (("-m", "--multirun"), ("-c", "--cfg"), ("-cd", "--config-dir"), ("--hydra-help",))

@@ -110,7 +110,7 @@ PART_VARIABLES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDE
 
 
 def run_prepare(call: Call) -> int:
-    """Freeze a run in parts."""
+    """List the sources of a run and split it into parts."""
     from unprocess_gen.cli.hydra_app import compose
 
     if "parts" not in call.values:
@@ -133,7 +133,7 @@ def _prepare(config: Config, label: str = "", *, parts: int) -> tuple[int, None,
 
 
 def run_part(call: Call) -> int:
-    """Make one part of a prepared run."""
+    """Generate one part of a prepared run."""
     from unprocess_gen.pipeline.parts import make_part
 
     out, part = str(call.path), call.values.get("part", _part_of_environment())
@@ -629,7 +629,7 @@ DARK_FRAMES = Argument(
 )
 DATASET = Place("DIR", "the folder of a dataset")
 KEYS = Argument(
-    ("--keys",), "rows: source indices and ranges, full keys, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
+    ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
 )
 
 
@@ -669,7 +669,7 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "prepare",
-            "freeze a run in parts, which separate jobs make",
+            "list the sources of a run and split it into parts, for separate jobs",
             run_prepare,
             (
                 Argument(("parts",), "number of parts", "N", _positive, "an integer of 1 or more", required=True),
@@ -679,10 +679,10 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "part",
-            "make part K of a prepared run; K from 0, or the number of the array job",
+            "generate part K (from 0) of a prepared run; default: that of the array job",
             run_part,
             (
-                _whole_number(("n_jobs",), "worker processes; -1: all cores; by default as prepared"),
+                _whole_number(("n_jobs",), "number of worker processes; -1: all cores; default: as prepared"),
                 Argument(
                     ("--source", "source.root"), "folder of the photographs on this host", "ROOT", completes="folders"
                 ),
@@ -700,7 +700,7 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "merge",
-            "write manifest and dataset.json once all parts are made",
+            "write manifest.csv and dataset.json when all parts are finished",
             run_merge,
             place=PREPARED,
         ),
@@ -713,14 +713,14 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "accuracy",
-            "measure error and time of each tier; write a report to out (accuracy)",
+            "measure error and time of each tier; report in out (default: accuracy)",
             run_accuracy,
             (SETTINGS_SOURCE,),
             composes=True,
         ),
         Verb(
             "figures",
-            "draw the article's figures for the first photograph, in out (figures)",
+            "draw the article's figures for the first photograph in out (default: figures)",
             run_figures,
             (SETTINGS_SOURCE,),
             composes=True,
@@ -793,7 +793,7 @@ VERBS: dict[str, Verb] = {
                 SOURCE,
                 DARK_FRAMES,
                 Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True),
-                _whole_number(("n_jobs",), "worker processes; -1: all cores"),
+                _whole_number(("n_jobs",), "number of worker processes; -1: all cores"),
                 Argument(("executor",), "what runs the workers: local or dask", "NAME"),
                 Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
                 _whole_number(("source.max_failed",), "largest number of failed sources with exit code 0"),

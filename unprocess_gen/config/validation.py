@@ -270,7 +270,7 @@ def _check_dark_frames(config: Config) -> None:
             )
     if config.clean.includes_fixed_pattern:
         raise ConfigError(
-            "clean.includes_fixed_pattern=true: the fixed pattern of dark frames is not known apart from their noise; "
+            "clean.includes_fixed_pattern=true: dark frames do not separate the fixed pattern from the noise; "
             "expected false; noise.dark_shading=remove subtracts their mean"
         )
     for effect in REPLACED:

@@ -465,7 +465,7 @@ def _trimmed_variance(counts: Counts, steps: int) -> float:
 def _variance_around_mean(folder: DarkFolder, frames: Sequence[DarkFrame]) -> float:
     """Return the variance of the differences from the mean of all frames, DN²."""
     if len(frames) < 2:
-        raise ConfigError("noise.dark_shading=remove: one dark frame has no mean apart from itself; expected several")
+        raise ConfigError("noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several")
     mean = folder.mean(folder.sha256)
     counts = np.zeros(2 * FARTHEST_STEPS + 1, dtype=np.int64)
     for frame in frames:
