@@ -713,14 +713,14 @@ VERBS: dict[str, Verb] = {
         ),
         Verb(
             "accuracy",
-            "measure error and time of each tier; report in out (default: accuracy)",
+            "measure error and time of each tier; write a report; default out: accuracy",
             run_accuracy,
             (SETTINGS_SOURCE,),
             composes=True,
         ),
         Verb(
             "figures",
-            "draw the article's figures for the first photograph in out (default: figures)",
+            "draw the article's figures for the first photograph; default out: figures",
             run_figures,
             (SETTINGS_SOURCE,),
             composes=True,
