@@ -48,8 +48,9 @@ SETTINGS_INTRODUCTION = """\
 # Settings
 
 Settings are `key=value` arguments of `gen-dataset`, in any order. `group=option` selects an option, a file of `conf/`.
-`group.key=value` changes one value; `-m` with commas sweeps over values. `gen-dataset --cfg job` prints all settings of
-a run, and `gen-dataset --help GROUP` the options and keys of a group."""
+`group.key=value` changes one value. With `-m`, values separated by commas are swept. `gen-dataset --cfg job` prints all
+settings of a run, and `gen-dataset --help GROUP` the options and keys of a group.
+[Compose settings](../guides/configuration.md) has examples."""
 
 DISTRIBUTIONS_INTRODUCTION = """\
 ## Distributions
@@ -71,8 +72,8 @@ A number of a branch is constant, or one of these forms:"""
 BRANCH_INTRODUCTION = """\
 ### Keys of a branch
 
-Each item of `noise.branches` holds the numbers of a physical profile for one range of ISO. Two ranges may share an end.
-An ISO that no branch contains is refused."""
+Each item of `noise.branches` contains the numbers of a physical profile for one range of ISO. Two ranges may share an
+end; the first branch is used there. An ISO outside of all branches is refused."""
 
 EFFECTS_INTRODUCTION = """\
 ### Numbers that an effect needs
@@ -174,11 +175,11 @@ COLUMNS_INTRODUCTION = """\
 # Manifest columns
 
 `manifest.csv` has one row for each pair, and one for each source that failed. The columns are in this order; later
-versions append columns. `KEY.json` in the shards holds the same values, typed, without `detail`, `source_noise_dn` and
-empty values of columns that were added after version 0.1.
+versions append columns. `KEY.json` in the shards contains the same values, typed, without `detail`, `source_noise_dn`
+and empty values of columns that were added after version 0.1.
 
-An empty cell means that the value does not exist. Numbers are written so that they read back exactly. The columns of
-physical profiles, marked with an asterisk, are 0 or `none` in rows of other profiles."""
+An empty cell means that there is no value. Numbers are written so that they read back exactly. Columns with an asterisk
+belong to physical profiles; in rows of other profiles they are 0 or `none`."""
 
 REASONS_INTRODUCTION = """\
 ## Reasons for failures
@@ -218,9 +219,9 @@ COMMAND_LINE_INTRODUCTION = """\
     gen-dataset [key=value ...] [flags]    generate a dataset; the same command resumes it
     gen-dataset VERB ...                   one of the verbs below
 
-The first word is a verb if it consists of small letters only. [Settings](settings.md) and flags may be mixed in any
-order. `gen-dataset VERB --help` prints the arguments of a verb, `gen-dataset --help GROUP` the options and keys of a
-group of settings. An argument that names an existing folder is a folder, whatever characters its name contains.
+The first word is a verb if it consists of lower-case letters only. [Settings](settings.md) and flags may be mixed in
+any order. `gen-dataset VERB --help` prints the arguments of a verb, and `gen-dataset --help GROUP` the options and keys
+of a group of settings. An argument that names an existing folder is a folder, whatever characters its name contains.
 Everything after `--` is a file or folder, even with a leading hyphen."""
 
 HYDRA_INTRODUCTION = """\
@@ -237,6 +238,7 @@ def command_line_page() -> str:
     for verb in VERBS.values():
         blocks += [f"## {verb.name}", f"    {synopsis(verb)}", _summary(verb)]
         arguments = [[code(verb.place.metavar), verb.place.expected]] if verb.place else []
+        arguments += [[code(verb.extra.metavar), verb.extra.help]] if verb.extra else []
         arguments += [_argument(argument) for argument in verb.arguments]
         if arguments:
             blocks.append(table(["argument", "meaning"], arguments))
@@ -247,7 +249,7 @@ def command_line_page() -> str:
     blocks += ["## Flags of every verb", table(["flag", "meaning"], flags)]
     blocks += [HYDRA_INTRODUCTION, table(["flag", "meaning"], hydra)]
     blocks += ["## Exit codes", table(["code", "meaning"], codes)]
-    blocks.append("The exit code of a sweep, and of `verify` for a sweep, is that of its worst part.")
+    blocks.append("The exit code of a sweep, and of `verify` for a sweep, is that of its worst job.")
     return page(*blocks)
 
 

@@ -56,7 +56,7 @@ EXIT_CODES = (
     ExitCode(
         (MachineError.exit_code,),
         "system error (disk full, source changed)",
-        "A system error, such as a full disk, or a source that was changed or deleted.",
+        "A system error, such as a full disk; a source that was changed or deleted; or `merge`, if parts are left.",
     ),
     ExitCode((LockedError.exit_code,), "output locked by another run", "Another run is writing to the same `out`."),
     ExitCode(
@@ -66,4 +66,4 @@ EXIT_CODES = (
     ),
     ExitCode((BROKEN_PIPE,), "reader of stdout ended", "The program that reads stdout ended, as `head` does."),
 )
-"""All exit codes. The exit code of a sweep, and of ``verify`` for a sweep, is that of its worst part."""
+"""All exit codes. The exit code of a sweep, and of ``verify`` for a sweep, is that of its worst job."""

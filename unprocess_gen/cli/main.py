@@ -1,4 +1,4 @@
-"""The entry point of ``gen-dataset``: dispatch to a verb; turn errors and signals into exit codes.
+"""Run ``gen-dataset``: call the function of a verb, and turn errors and signals into exit codes.
 
 ``--help`` and ``--version`` are answered before anything slow is imported.
 

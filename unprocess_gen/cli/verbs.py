@@ -1,4 +1,4 @@
-"""The verbs of ``gen-dataset``: one function each, and `VERBS`, which describes them.
+"""Define the verbs of ``gen-dataset``: one function each, and `VERBS`, which describes them.
 
 A function takes the parsed command line and returns the exit code. It imports what it needs, because importing the
 kernels or Hydra takes longer than ``--help`` may take.

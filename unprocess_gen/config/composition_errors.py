@@ -67,7 +67,7 @@ def several_values(override: str, advice: str = "") -> str:
     Returns
     -------
     str
-        One sentence; for a key that is no group of options it says how a list is written.
+        One sentence; for a key that is no group of options it explains how to write a list.
     """
     key, _, values = override.partition("=")
     as_list = "" if group_options(key.lstrip("+")) else f"; for a list, write {key}=[{values}]"

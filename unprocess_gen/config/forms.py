@@ -50,7 +50,7 @@ ISO_FORMS: Mapping[str, Form] = {
     "line": Form(
         ("slope", "intercept", "scatter"),
         "the standard deviation σ with ln σ = slope · ln K + intercept + scatter · n, where K is `dn_per_e` and n a "
-        "standard normal deviate, drawn as `noise.scatter` says",
+        "standard normal deviate, drawn according to `noise.scatter`",
     ),
     "scale_line": Form(
         ("slope", "intercept", "scatter"),
@@ -73,8 +73,8 @@ ISO_FORMS: Mapping[str, Form] = {
     ),
     "by_colour": Form(
         ("R", "G1", "B", "G2"),
-        "black-level errors of the red, the green of the red rows, the blue, and the green of the blue rows, whatever "
-        "the CFA pattern; before `by_stop` or `by_log_iso`, the fours of the table are in this order",
+        "black-level errors of the red, the green of the red rows, the blue, and the green of the blue rows, for any "
+        "CFA pattern; before `by_stop` or `by_log_iso`, each row of four numbers has this order",
     ),
 }
 """Functions of ISO that the number of a branch can be; `planning.noise_profile` evaluates them."""

@@ -1,4 +1,4 @@
-"""Typed dataclasses of the configuration: one for each folder of ``conf/``, and `Config` for all of them.
+"""Define the configuration as typed dataclasses: one for each folder of ``conf/``, and `Config` for all of them.
 
 Each key is declared once, with its meaning, unit and allowed values (`settings.key`). OmegaConf checks keys and types
 against these dataclasses; `validation` checks values by the same declarations. The dataclasses are not frozen, because
@@ -62,7 +62,7 @@ class SourceConfig:
     )
     icc: str = key(
         "ignore",
-        "colour profiles of photographs: ignore treats pixels as sRGB, refuse fails images with another profile "
+        "colour profiles of photographs: ignore reads pixels as sRGB; with refuse, images with another profile fail "
         "(extra icc)",
         Choice(("ignore", "refuse")),
     )
@@ -160,9 +160,9 @@ class SensorConfig:
     )
     saturated: str = key(
         "noisy",
-        "noisy value where the clean frame is saturated: noisy adds noise to the clipped value, as in the article, "
-        "pinned is the white level; auto is pinned for physical profiles that reach a full well or the end of the "
-        "converter, otherwise noisy",
+        "noisy value at sites where the clean frame is saturated: noisy is the clipped value plus noise, as in the "
+        "article; pinned is the white level; auto is pinned for physical profiles that reach a full well or the end of "
+        "the converter, otherwise noisy",
         Choice(("noisy", "pinned", "auto")),
     )
     dark_offset: str = key(
@@ -172,8 +172,8 @@ class SensorConfig:
     )
     units: Any = key(
         "image",
-        "camera bodies, which have their own fixed patterns: image is a new body for each image, a number is how many "
-        "to draw from",
+        "camera bodies, each with its own fixed patterns: image is a new body for each image; with a number, each "
+        "image has one of that many bodies",
         NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"),
     )
 
@@ -331,9 +331,9 @@ class NoiseConfig:
     )
     scatter: str = key(
         "image",
-        "scatter of a physical profile's lines and choice of its read_shape: body draws them once for each camera body "
-        "and ISO, image for each image, off takes the lines without scatter and the median shape; with "
-        "sensor.units=image, body draws them once for all images of an ISO",
+        "how the scatter of a physical profile's lines and its read_shape are drawn: body once for each camera body "
+        "and ISO (with sensor.units=image, once for each ISO), image for each image; off is no scatter and the median "
+        "shape",
         limits.SCATTER,
         section=CHOSEN,
         since="0.2",
@@ -453,7 +453,7 @@ class NoiseConfig:
     )
     assumed: list[str] = key(
         [],
-        "keys whose numbers no source gives for this camera; effects.assumed decides about their effects",
+        "keys whose numbers no source gives for this camera; effects.assumed controls their effects",
         Described("a list of keys of this section or of a branch"),
         section=PHYSICAL,
     )
@@ -489,7 +489,7 @@ class SceneConfig:
     temperature_c: Any = key(25, "temperature of the sensor", limits.TEMPERATURE_C, unit="degrees Celsius")
     exposure_ratio: Any = key(
         1,
-        "divisor of the light in the photograph, so that 100 leaves a hundredth; nothing multiplies the frames by it "
+        "number by which the light of the photograph is divided: 100 leaves a hundredth; the frames are not brightened "
         "afterwards",
         limits.EXPOSURE_RATIO,
     )
@@ -516,8 +516,8 @@ class EffectsConfig:
     )
     assumed: str = key(
         "off",
-        "effects with an assumed number of a physical profile (noise.assumed): use decides about them like about other "
-        "effects, off simulates them only if they are switched on by name",
+        "effects with an assumed number of a physical profile (noise.assumed): use treats them like other effects, off "
+        "simulates them only if they are switched on by name",
         Choice(("use", "off")),
         since="0.2",
     )
@@ -609,7 +609,8 @@ class OutputConfig:
     )
     clean_dtype: Optional[str] = key(
         None,
-        "type of clean frames: float32, 0 at black and 1 at white, holds the unrounded mean of noisy frames in uint16",
+        "type of clean frames: float32 stores the unrounded mean, 0 at black and 1 at white, next to noisy frames in "
+        "uint16",
         Choice(("uint16", "float32")),
         null="the type of dtype",
         since="0.2",
@@ -660,7 +661,7 @@ class ExecutorConfig:
     )
     chunk_s: float = key(
         30.0,
-        "work that a Dask task holds; the first tasks hold less, because the time of a shard is measured",
+        "work in one Dask task; the first tasks contain less, because the time of a shard must be measured first",
         Numbers(0, 86400, open_low=True),
         unit="seconds",
         decides_data=False,

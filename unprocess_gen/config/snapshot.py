@@ -1,7 +1,7 @@
-"""Identify configs by their content, so that what follows from a config is computed once, not for every image.
+"""Identify configs by their content, so that values derived from a config are computed once, not for every image.
 
 The dataclasses of a config are not frozen: Hydra sets their fields, and so may any program. A cache therefore uses the
-content as its key, which is immutable. Taking it costs 10 µs; checking and interpreting a config cost 0.3 to 0.6 ms.
+content as its key, which is immutable. A snapshot takes 10 µs; checking and interpreting a config take 0.3 to 0.6 ms.
 """
 
 from __future__ import annotations

@@ -429,10 +429,10 @@ COLUMNS = (
     ),
     *(
         Column(
-            f"gain_{colour}", float, f"system gain of {colour}, relative to dn_per_e", Range(0.1, 10), Physics,
+            f"gain_{colour[0]}", float, f"system gain of {colour}, relative to dn_per_e", Range(0.1, 10), Physics,
             "gain_by_colour", since="0.2", empty_if="all are 1",
         )
-        for colour in ("r", "g", "b")
+        for colour in ("red", "green", "blue")
     ),
     *(
         Column(

@@ -1,8 +1,8 @@
-"""Count the workers that died at a shard, where no coordinator sees them: by files below ``.work/deaths``.
+"""Count the workers that died at a shard by files below ``.work/deaths``, for runs without a coordinator.
 
-A worker creates a file before it makes a shard and removes it afterwards. Files that remain are deaths, whatever ended
-the process: a signal, the system out of memory, the end of a batch job. From the second attempt on, the file contains
-the index of the source in progress.
+A worker creates a file before it generates a shard and removes it afterwards. A file that remains is a death, whatever
+ended the process: a signal, a lack of memory, the end of a batch job. From the second attempt on, the file contains the
+index of the source in progress.
 """
 
 from __future__ import annotations

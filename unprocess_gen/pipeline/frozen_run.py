@@ -1,10 +1,10 @@
-"""Freeze a run below ``.work``, so that processes that share only ``out`` can make its shards.
+"""Record a run below ``.work``, so that processes that share only ``out`` can generate its shards.
 
     .work/plan.json     version, digests of settings and listing, settings that decide no data, and the canary
 
-The settings themselves are ``config.yaml``, the sources `listing_record`. The canary is one image of the run: the
-process that freezes the run records the digest of its rows, which contain the digests of its frames. Every other
-process makes it too before its first shard, so that a host with other results makes none.
+The settings themselves are in ``config.yaml``, and the sources in the files of `listing_record`. The canary is one
+image of the run. The process that prepares the run records the digest of its rows, which contain the digests of its
+frames. Every other process regenerates the canary before its first shard, and generates no shard if the digest differs.
 """
 
 from __future__ import annotations

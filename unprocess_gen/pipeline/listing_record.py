@@ -1,10 +1,10 @@
-"""Record the sources of a run below ``.work``, in files that hold a range of them each.
+"""Record the sources of a run below ``.work``, in files of up to 4096 sources.
 
     .work/sources/00000.json    sources 0 to 4095, one list of values for each
-    .work/listing.json          their number, and the digest of each of those files; written last
+    .work/listing.json          number of sources, and digests of these files; written last
 
-A process that makes some shards reads only the files of their sources. A resumed run compares its own listing with the
-record. Version 0.1 recorded name, size and digest of all sources in ``.work/sources.json``.
+A process that generates some of the shards reads only the files of their sources. A resumed run compares its own
+listing with the record. Version 0.1 recorded name, size and digest of all sources in ``.work/sources.json``.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Make a dataset in parts that share only the output folder: prepare, make a part, show what is left, merge.
+"""Generate a dataset in parts that share only the output folder: prepare, part, status and merge.
 
-    prepare    freezes settings, listing, canary (`frozen_run`) and the number of parts; takes the lock
-    part       makes and commits the shards of one part; takes no lock, so any number of parts run at once
-    status     lists the parts that are not done
-    merge      writes manifest and dataset.json once all parts are done; takes the lock
+    prepare    records settings, listing, canary (`frozen_run`) and the number of parts; takes the lock
+    part       generates and commits the shards of one part; takes no lock, so parts can run at the same time
+    status     lists the parts that are left
+    merge      writes manifest and dataset.json when all parts are done; takes the lock
 
-Part K of N holds the shards from K·S // N to before (K + 1)·S // N, of S in all.
+Of S shards, part K of N contains those from K·S // N up to, but not including, (K + 1)·S // N.
 """
 
 from __future__ import annotations

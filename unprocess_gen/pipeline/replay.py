@@ -1,7 +1,7 @@
 """Regenerate pairs from manifest rows and compare them with the digests in the rows.
 
 A replay needs the row and the source; no config file and no other row. A source that was changed or deleted is not
-damage of the dataset: it is reported apart, with exit code 5 instead of 4.
+damage of the dataset: it is reported separately, with exit code 5 instead of 4.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Records that travel between a coordinator and its workers: a run's context, a shard's task, result and report."""
+"""Define what a coordinator and its workers exchange: the context of a run, and task, result and report of a shard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The output folder of a run: checks, lock, start and end of a dataset.
+"""Check and lock the output folder of a run, and write the files that begin and finish a dataset.
 
     out/config.yaml              the resolved config, written first
     out/.work/lock               the process that coordinates a run (`core.locks`)

@@ -1,4 +1,4 @@
-"""Warn about dark scenes whose noise profile cannot follow them."""
+"""Warn about dark scenes with a two-parameter noise profile, which ignores their ISO."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
 def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Sequence[int] = ()) -> str:
-    """Return a warning if a dark scene meets a profile with two numbers, which ignores its ISO; else an empty text.
+    """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text.
 
     Parameters
     ----------

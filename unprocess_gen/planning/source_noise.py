@@ -1,4 +1,4 @@
-"""Estimate the noise that a source brings along, which a pair has in both frames.
+"""Estimate the noise of a source itself, which both frames of a pair contain.
 
 Photographs contain sensor noise, and JPEG adds residue. Both pass through the inverse pipeline into the clean frame, so
 a network learns to keep them. The estimate is made in the raw domain, from a fixed sample of tiles. It decides nothing:
