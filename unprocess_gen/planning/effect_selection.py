@@ -257,7 +257,7 @@ class Selection:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Return the simulated effects, in the order in which light meets them."""
+        """Return the simulated effects, in the order of image formation."""
         on = (effect for effect in EFFECTS if effect in self.on)
         return tuple("dark_frame" if self.rules.dark_frames and effect == "read" else effect for effect in on)
 
@@ -287,7 +287,7 @@ class Selection:
         return replace(found, effect="dark_frame") if self.rules.dark_frames and effect == "read" else found
 
     def predictions(self) -> tuple[Prediction, ...]:
-        """Return the prediction of each of `noise.EFFECTS`, in the order in which light meets them."""
+        """Return the prediction of each of `noise.EFFECTS`, in the order of image formation."""
         return tuple(self.prediction(effect) for effect in EFFECTS)
 
 

@@ -86,7 +86,7 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
 
 
 def source_noise_dn(srgb: Srgb, plan: Plan) -> float | None:
-    """Estimate the standard deviation of the noise that a source brings into the clean frame.
+    """Estimate the standard deviation of the noise of a source in the clean frame.
 
     Parameters
     ----------
