@@ -22,7 +22,8 @@ def numpy_sums(sums: Sums, clean: Any, noisy: Any) -> dict[str, Float]:
         dn = np.rint(np.maximum(x, 0)).astype(int)
         of_site = 1 / np.maximum(table.std[dn], 1e-300)
         if sums.law.plan.clean_normalised:
-            of_site = 1 / np.sqrt(sums.law.variance(sums.law.signal(x, site)))
+            law = sums.law.of_site(plane)
+            of_site = 1 / np.sqrt(law.variance(law.signal(x, site)))
         scale = np.where(sums.usable[plane][dn], of_site, 0)
         offset = sums.law.offset_dn[site[0], site[1] :: 2]
         of_plane = np.clip((noisy[at] - x - offset) * scale, -LARGEST_Z, LARGEST_Z)
@@ -36,27 +37,45 @@ def numpy_sums(sums: Sums, clean: Any, noisy: Any) -> dict[str, Float]:
         mean = table.rounding_mean[dn] * np.where(scale > 0, 1 / np.maximum(table.std[dn], 1e-300), 0)
         z[at] = np.where(scale > 0, of_plane - mean - table.outlier_mean[dn], 0)
         weight[at] = scale
-    return (
-        found
-        | _lines(z, weight)
-        | {"neighbours": _neighbours(z, weight), "partners": _partners(sums, clean_dn, z, weight)}
-    )
+    found["neighbours"], found["partners"] = _neighbours(z, weight), _partners(sums, clean_dn, z, weight)
+    return found | _lines(z, weight, sums.law.rows.variance)
 
 
-def _lines(z: Float, weight: Float) -> dict[str, Float]:
-    values = np.stack([z * weight, weight * weight])
+def _residuals(z: Float, weight: Float) -> Float:
+    """Return z without the weighted mean of each row."""
+    information = np.maximum((weight * weight).sum(axis=1, keepdims=True), 1e-300)
+    return z - weight * (z * weight).sum(axis=1, keepdims=True) / information
+
+
+def _residual_variances(variance: Float, weight: Float) -> Float:
+    """Return the variances of `_residuals` for independent z: the diagonal of P diag(variance) Pᵀ."""
+    found = np.zeros_like(weight)
+    for y, of_row in enumerate(weight):
+        if of_row.any():
+            projection = np.eye(len(of_row)) - np.outer(of_row, of_row) / (of_row @ of_row)
+            found[y] = (projection**2) @ variance[y]
+    return found
+
+
+def _lines(z: Float, weight: Float, row_dn2: float) -> dict[str, Float]:
     rows, columns = ([n * length // 8 // 2 * 2 for n in range(8)] for length in reversed(z.shape))
+    square, own = weight**2, 1 - row_dn2 * weight**2
+    of_rows = np.stack([z * weight, square, own * square])
+    of_columns = np.stack([_residuals(z, weight) * weight, square, _residual_variances(own, weight) * square])
     return {
-        "rows": np.add.reduceat(values, rows, axis=2),
-        "columns": np.add.reduceat(values, columns, axis=1).transpose(0, 2, 1),
+        "rows": np.add.reduceat(of_rows, rows, axis=2),
+        "columns": np.add.reduceat(of_columns, columns, axis=1).transpose(0, 2, 1),
     }
 
 
 def _neighbours(z: Float, weight: Float) -> Float:
     found = []
-    for before, after in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
-        found.append([(some[before] * some[after]).sum() for some in (z, weight > 0, weight)])
-    return np.array(found, dtype=np.float64)
+    horizontal, vertical = (np.s_[:, :-2], np.s_[:, 2:], z), (np.s_[:-2], np.s_[2:], _residuals(z, weight))
+    for before, after, of in (horizontal, vertical):
+        inverse = weight[before] * weight[after]
+        sums = (of[before] * of[after]).sum(), (inverse > 0).sum(), inverse.sum()
+        found.append([*sums, (inverse.sum(axis=1) ** 2).sum()])
+    return np.array(found)
 
 
 def _partners(sums: Sums, clean: Float, z: Float, weight: Float) -> Float:

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Facts, Patch, Plan
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.manifest import plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.noise_check import law as laws
@@ -58,6 +59,7 @@ EVERY_EFFECT = (
     *("noise=nikon_d850", "scene=low_light", "effects.all=on", "scene.exposure_s=2", "noise.hot_pixel_share=0.002"),
     *("noise.dead_pixel_share=0.001", "noise.prnu_std=0.01", "noise.full_well_e=9000", "noise.dark_e_per_s=20"),
 )
+GAINS = ("noise.gain_by_colour=[0.8,1.0,1.3]", "effects.gain_by_colour=on")
 LAWS = {
     "default": (),
     "Poisson": ("noise.law=poisson",),
@@ -77,12 +79,18 @@ LAWS = {
     "fast": ("accuracy=fast", "noise=sony_a7s2", "scene=video_night"),
     "10 bits": ("noise=oppo_reno10x", "noise.iso=1600", "sensor=generic_10bit"),
     "linear codes": ("isp=linear", "camera=identity", "gains=unity", "scene.exposure_ratio=15"),
+    "correlated rows": (*NIGHT_D850, "sensor=generic_14bit", "noise.row_correlation=0.7"),
+    "gains by colour": (*NIGHT_D850, "sensor=generic_14bit", *GAINS),
+    "every effect, gains by colour, in float32": (*EVERY_EFFECT, *GAINS, "output.dtype=float32", "sensor.clip=none"),
+    "every effect, gains by colour, patterns in the clean frame": (
+        *(*EVERY_EFFECT, *GAINS, "clean.includes_fixed_pattern=true", "sensor.dark_offset=kept"),
+    ),
     "pinned": ("noise=canon_700d", "scene=daylight", "sensor.saturated=pinned"),
 }
 
 QUICK_LAWS = (
     *("default", "random levels", "night, 14 bits", "float32 clean", "clipped at black, packed", "fast"),
-    "every effect, dark offset kept",
+    *("every effect, dark offset kept", "correlated rows", "gains by colour"),
 )
 """Laws of the quick tests; the others are slow."""
 
@@ -258,6 +266,56 @@ def test_planted_faults_are_found_in_95_percent_of_runs(name: str, settings: Set
     assert fewest >= 0.95 * runs
 
 
+def with_numbers(
+    settings: Settings, overrides: Sequence[str], number: int, recorded: dict[str, Any], simulated: dict[str, Any]
+) -> Checked:
+    """Return the plan and the scores of a pair whose row records some numbers, and whose noise has others."""
+    config = settings(*overrides)
+    config.seed = number
+    validate_config(config)
+    srgb = photograph(number, 256)
+    plan = plan_from_row(make_pair(srgb, config).row)
+    assert plan.physics is not None
+    plan = replace(plan, physics=replace(plan.physics, **recorded))
+    assert plan.physics is not None
+    pair = make_pair(srgb, plan)
+    noisy = make_pair(srgb, replace(plan, physics=replace(plan.physics, **simulated))).noisy
+    sums = pair_sums(pair.clean, noisy, pair.row)
+    assert sums is not None
+    return plan, pair_scores(sums)
+
+
+NIGHT_ROWS = (*NIGHT_D850, "sensor=generic_14bit")
+ROWS_DN = 15.0
+"""Standard deviation of row offsets that are as strong as the read noise of `NIGHT_ROWS`."""
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9, -0.5])
+def test_strong_row_noise_raises_no_alarm(correlation: float, settings: Settings) -> None:
+    """Row offsets as large as all other noise move the means of columns and correlate vertical neighbours."""
+    numbers = {"row_std_dn": ROWS_DN, "row_correlation": correlation}
+    pairs = [with_numbers(settings, NIGHT_ROWS, number, numbers, {}) for number in range(4)]
+    assert [str(alarm) for alarm in alarms(pairs, len(pairs))] == []
+    assert max(abs(score.errors) for _, scores in pairs for score in scores.values()) < 6
+
+
+@pytest.mark.parametrize(("recorded", "simulated"), [(0.9, 0.0), (0.0, 0.9)])
+def test_wrong_correlation_of_rows_is_found(recorded: float, simulated: float, settings: Settings) -> None:
+    numbers = {"row_std_dn": ROWS_DN / 2, "row_correlation": recorded}
+    other = {"row_correlation": simulated}
+    pairs = [with_numbers(settings, NIGHT_ROWS, number, numbers, other) for number in range(6)]
+    assert "row differences" in {alarm.check for alarm in alarms(pairs, len(pairs))}
+
+
+@pytest.mark.parametrize("simulated", [(1.0, 1.0, 1.0), (1.3, 1.0, 0.8)])
+def test_wrong_gains_by_colour_are_found(simulated: tuple[float, float, float], settings: Settings) -> None:
+    overrides = ("noise=nikon_d850", "scene=low_light", "sensor=generic_14bit", *GAINS)
+    pairs = [with_numbers(settings, overrides, number, {}, {"gain_by_colour": simulated}) for number in range(2)]
+    found = {(alarm.check, alarm.plane) for alarm in alarms(pairs, len(pairs))}
+    assert {("variance against signal", "R"), ("variance against signal", "B")} <= found
+    assert not {plane for _, plane in found} & {"Gr", "Gb"}
+
+
 def test_replaced_noise_of_intact_shards_ends_verify_with_4(make: Make, run_main: RunMain, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=3", *NIGHT_A7S2)
     assert (run_main("verify", "ds", "--noise").code, run_main("verify", "ds").code) == (0, 0)
@@ -290,7 +348,7 @@ def test_many_wrong_pairs_are_counted(make: Make, run_main: RunMain, tmp_path: P
 
 
 def test_every_effect_has_an_entry() -> None:
-    assert laws.EFFECTS.keys() == {"heteroscedastic", *reference.EFFECTS} - {"gain_by_colour"}
+    assert laws.EFFECTS.keys() == {"heteroscedastic", *reference.EFFECTS}
 
 
 def test_pair_with_an_unknown_effect_is_not_checked(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -331,7 +389,7 @@ def test_characteristic_function_agrees_with_drawn_noise(name: str, settings: Se
             cosine = np.cos(k * noise / std)
             rounding = np.sinc(k / std / (2 * np.pi)) if "quantise" in plan.effects else 1.0  # not rounded here
             expected = law.factors(signal, k / std).value.real / rounding
-            lines = 1 + (law.row_std_dn**2 / std**2) ** 2 * 512
+            lines = 1 + (law.rows.variance / std**2) ** 2 * 512
             error = cosine.std() / 512 * math.sqrt(float(lines[0]))
             assert abs(cosine.mean() - expected[0]) < 5 * error + 2e-4
 
@@ -379,7 +437,25 @@ def test_rounding_errors_of_one_curve_add_linearly(settings: Settings) -> None:
 
 def test_threshold_keeps_the_probability_of_a_false_alarm() -> None:
     assert 2 * TESTS * 101 * math.exp(-threshold(100)) == pytest.approx(FALSE_ALARM)
-    assert len(CHECKS) + len(plane_names("RGGB")) == TESTS
+    assert len(CHECKS) + 2 * len(plane_names("RGGB")) == TESTS
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9, -0.6])
+def test_sums_of_correlations_of_rows_are_those_of_the_matrix(correlation: float) -> None:
+    count = 2400
+    powers = np.zeros(count)
+    powers[:200] = np.float_power(correlation, np.arange(200))  # the squares of smaller ones would underflow
+    covariance = 3.0 * powers[np.abs(np.subtract.outer(np.arange(count), np.arange(count)))]
+    first = np.array([4 * group + row for group in range(count // 4) for row in (0, 1)])
+    rows, others = covariance[first] - covariance[first + 2], (first, first + 2)
+    for of, matrix in (
+        (laws.row_offsets(3.0, correlation), covariance),
+        (laws.row_differences(3.0, correlation), rows[:, others[0]] - rows[:, others[1]]),
+    ):
+        middle = matrix[len(matrix) // 2] / of.variance
+        assert matrix[0, 0] == pytest.approx(of.variance)
+        assert np.abs(middle).sum() == pytest.approx(of.magnitudes)
+        assert (middle**2).sum() == pytest.approx(of.squares)
 
 
 @pytest.mark.parametrize(
@@ -396,6 +472,14 @@ def test_overlapping_patches_count_common_noise(make: Make, tmp_path: Path) -> N
     assert (min(found), max(found)) == (4, 9)  # 3 x 3 patches overlap, 2 x 2 in the corners; draws do not
     make(None, tmp_path / "rows", "source.limit=1", "source.patch=128", *NIGHT_A7S2)
     assert set(overlaps(tmp_path / "rows")) == {6}  # six patches share rows of 768 sites
+
+
+def test_patches_share_correlated_rows_beyond_their_own(make: Make, tmp_path: Path) -> None:
+    overrides = *LAWS["correlated rows"], "source.limit=1", "source.patch=[grid,64,64]"
+    make(None, tmp_path / "ds", *overrides)
+    in_row = len({row["patch_x"] for row in read_rows(tmp_path / "ds" / "manifest.csv")})
+    # offsets have a correlation of 1 % at a distance of 13 rows, and so reach into the patches above and below
+    assert set(overlaps(tmp_path / "ds")) == {2 * in_row, 3 * in_row}
 
 
 def test_clips_and_levels_are_checked(make: Make, tmp_path: Path) -> None:

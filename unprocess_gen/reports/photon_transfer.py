@@ -185,10 +185,11 @@ def fit_sums(key: str, sums: Sums) -> NoiseFit | None:
     inverse = np.linalg.inv(normal)
     slope, intercept = inverse @ ((columns / error) @ difference)
     expected = law.line
-    shared = law.row_std_dn**2 * math.sqrt(2 / sums.height)
+    shared = law.rows.variance * math.sqrt(2 * law.rows.squares / sums.height)
     count = np.concatenate([plane.count for plane in planes])
     drawn = count >= LEAST_SITES_OF_POINT
-    variance = difference + law.variance(signal) + (0.0 if law.plan.clean_normalised else 1 / 12)
+    predicted = np.concatenate([law.of_site(plane.number).variance(plane.expected.signal) for plane in planes])
+    variance = difference + predicted + (0.0 if law.plan.clean_normalised else 1 / 12)
     return NoiseFit(
         key=key,
         slope=expected[0] + float(slope),

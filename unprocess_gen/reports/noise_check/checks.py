@@ -85,8 +85,8 @@ CHECKS = {
 }  # fmt: skip
 """Checks by name."""
 
-TESTS = len(CHECKS) + 4
-"""Scores of one pair: the check of the mean has one for each of the four planes too."""
+TESTS = len(CHECKS) + 8
+"""Scores of one pair: those of the mean and of the variance against the signal have one for each plane too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,5 +313,13 @@ def _overlaps_of(rows: Sequence[Row]) -> Iterator[int]:
         same = (level == level[n]) & (draw == draw[n])
         in_rows = (y < y[n] + height[n]) & (y[n] < y + height)
         in_columns = (x < x[n] + width[n]) & (x[n] < x + width)
-        has_rows = "row" in str(row["effects"]).split(";")
-        yield int((same & in_rows & (in_columns | has_rows)).sum())
+        shared = in_rows & in_columns
+        if "row" in str(row["effects"]).split(";"):
+            reach = _row_reach(float(row.get("row_correlation") or 0.0))
+            shared = (y < y[n] + height[n] + reach) & (y[n] < y + height + reach)
+        yield int((same & shared).sum())
+
+
+def _row_reach(correlation: float) -> int:
+    """Return the distance of rows whose offsets have a correlation below 1 %."""
+    return 0 if correlation == 0 else math.ceil(math.log(0.01) / math.log(abs(correlation)))

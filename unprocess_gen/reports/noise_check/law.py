@@ -16,9 +16,11 @@ random here, and marked as fixed: frames of one body share it, so it does not av
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import operator
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -183,8 +185,9 @@ EFFECTS: dict[str, Callable[[Plan], list[Term]]] = {
     "dark_current": _dark_current,
     "hot_pixels": _none,  # `NoiseLaw.hot`
     "full_well": _none,  # `NoiseLaw.is_far_from_limits`
+    "gain_by_colour": _none,  # `NoiseLaw.of_site`
     "read": _read,
-    "row": _row,  # also `NoiseLaw.row_std_dn`
+    "row": _row,  # also `NoiseLaw.rows`
     "column": _none,  # `NoiseLaw.offset_dn`
     "column_temporal": _none,  # `NoiseLaw.offset_dn`, because the row determines it
     "black_error": _none,  # `NoiseLaw.offset_dn`
@@ -205,10 +208,27 @@ def is_supported(plan: Plan) -> bool:
     Returns
     -------
     bool
-        False for gains by colour and for correlated rows: signal and rows are taken to be alike and independent.
+        False if an effect has no entry in `EFFECTS`.
     """
-    correlated = "row" in plan.effects and _physics(plan).row_correlation != 0
-    return EFFECTS.keys() >= set(plan.effects) and not correlated
+    return EFFECTS.keys() >= set(plan.effects)
+
+
+def _plans_by_site(plan: Plan) -> list[Plan]:
+    """Return plans with the gain of each site of the tile in place of gains by colour; empty without them."""
+    if "gain_by_colour" not in plan.effects:
+        return []
+    physics = _physics(plan)
+    gains = [physics.gain_by_colour["RGB".index(colour)] for colour in plan.pattern]
+    return [
+        replace(
+            plan,
+            a_dn=plan.a_dn * gain,
+            physics=replace(physics, dn_per_e=physics.dn_per_e * gain, full_well_e=physics.full_well_e / gain),
+            effects=tuple(effect for effect in plan.effects if effect != "gain_by_colour"),
+            methods=tuple(method for method in plan.methods if method != APPROXIMATE_SHOT),  # as kernels do
+        )
+        for gain in gains
+    ]
 
 
 def _physics(plan: Plan) -> Physics:
@@ -219,8 +239,46 @@ def _physics(plan: Plan) -> Physics:
 # ----------------------------------------------------------------------------------------------------------------- law
 
 
+class LineOffsets(NamedTuple):
+    """Offsets of rows or columns, or their differences, with their correlations.
+
+    Attributes
+    ----------
+    variance : float
+        Variance of an offset, DN².
+    magnitudes, squares : float
+        Sums over all lines of the magnitudes and of the squares of their correlations with one line. The former bounds
+        the eigenvalues of the correlation matrix.
+    """
+
+    variance: float
+    magnitudes: float = 1.0
+    squares: float = 1.0
+
+
+def row_offsets(variance: float, correlation: float) -> LineOffsets:
+    """Return the offsets of rows, an autoregressive process of order 1."""
+    size, square = abs(correlation), correlation * correlation
+    return LineOffsets(variance, (1 + size) / (1 - size), (1 + square) / (1 - square))
+
+
+def row_differences(variance: float, correlation: float) -> LineOffsets:
+    """Return the differences of rows n and n + 2 of such a process, for the first two rows of groups of four.
+
+    At a distance of k rows, the covariance is variance · (2 rᵏ - rᵏ⁺² - r^|k-2|); the sums are geometric series.
+    """
+    size, square = abs(correlation), correlation * correlation
+    return LineOffsets(
+        2 * variance * (1 - square),
+        1 + size / 2 + size * (1 + size) ** 2 / (2 * (1 + square)),
+        1 + square / (2 * (1 + square * square)),
+    )
+
+
 class NoiseLaw:
     """The noise that a plan predicts for each site of a pair.
+
+    With gains by colour, it is that of a site with the gain 1, and `of_site` returns that of the others.
 
     Parameters
     ----------
@@ -241,9 +299,22 @@ class NoiseLaw:
         self._temporal = [term for term in terms if not term.is_fixed]
         self._fixed = [term for term in terms if term.is_fixed]
         self.limits = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
-        self.row_std_dn = self._number("row", "row_std_dn")
+        rows = self._number("row", "row_std_dn") ** 2, self._number("row", "row_correlation")
+        self.rows, self.row_differences = row_offsets(*rows), row_differences(*rows)
         self.hot, self.dead = self._hot(), self._dead()
         self.offset_dn, self._clean_offset_dn = self._offsets(patch)
+        self._by_site = [NoiseLaw(one, patch) for one in _plans_by_site(plan)]
+        for (y, x), law in zip(itertools.product((0, 1), repeat=2), self._by_site, strict=False):
+            self.offset_dn[y, x::2] = law.offset_dn[y, x::2]
+
+    @property
+    def differs_by_site(self) -> bool:
+        """Whether the expectations for a clean DN differ between the sites of the tile."""
+        return self.plan.averaged or bool(self._by_site)
+
+    def of_site(self, number: int) -> NoiseLaw:
+        """Return the law of a site of the 2x2 tile, counted row by row."""
+        return self._by_site[number] if self._by_site else self
 
     @property
     def line(self) -> tuple[float, float]:

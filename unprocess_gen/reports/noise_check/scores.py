@@ -13,6 +13,7 @@ import numpy as np
 
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, Cosine, chosen
+from unprocess_gen.reports.noise_check.law import LineOffsets
 from unprocess_gen.reports.noise_check.sums import LARGEST_DIFFERENCE, Sums
 
 LEAST_SITES = 64
@@ -96,11 +97,13 @@ def scores_of(sums: Sums) -> Scores:
     """
     planes = planes_of(sums)
     spread = _spread_of(sums, planes)
-    scores: Scores = {("mean", plane.name): plane.location(np.ones_like(plane.count)) for plane in planes}
-    scores["mean", ""] = _added(scores.values())
+    scores: Scores = {("mean", plane.name): plane.location(np.ones_like(plane.count), 1) for plane in planes}
+    scores["mean", ""] = _added(plane.location(np.ones_like(plane.count)) for plane in planes)
     scores["mean against signal", ""] = _added(plane.location(plane.expected.signal) for plane in planes)
     scores["variance", ""] = _added(plane.scale(np.ones_like(plane.count)) for plane in planes)
-    scores["variance against signal", ""] = _added(plane.scale(plane.expected.signal) for plane in planes)
+    gains = {plane.name: plane.scale(plane.expected.signal) for plane in planes}
+    scores |= {("variance against signal", name): score for name, score in gains.items()}
+    scores["variance against signal", ""] = _added(gains.values())
     scores["kurtosis", ""] = _added(plane.shape() for plane in planes)
     scores |= _line_scores(sums, spread) | _neighbour_scores(sums, planes, spread) | _partner_scores(sums, spread)
     return scores
@@ -123,6 +126,8 @@ class Plane:
 
     Attributes
     ----------
+    number, name : int, str
+        Number of the plane in the tile, and its name.
     dn, count : ndarray, [N]
         Clean DN that are used, and their numbers of sites.
     expected : Expectation
@@ -132,7 +137,7 @@ class Plane:
     """
 
     def __init__(self, sums: Sums, number: int, name: str) -> None:
-        self.name = name
+        self.number, self.name = number, name
         self.dn = np.flatnonzero(sums.usable[number] & (sums.counts[number] > 0))
         self.count = sums.counts[number][self.dn]
         self.expected = chosen(sums.tables[number], self.dn)
@@ -140,7 +145,7 @@ class Plane:
         self.shift = self.expected.std * (z - self.expected.outlier_mean)
         self._cosine, self._double = cosine, double
         self._rounding_mean = self._mean_of_rounding(sums.counts[number])
-        self._row_dn2, self._sites_of_row = sums.law.row_std_dn**2, sums.width / 2
+        self._rows, self._sites_of_row = sums.law.rows, sums.width / 2
         self._is_linear = sums.law.plan.tone == "none" and sums.law.plan.gamma == 1
 
     def _mean_of_rounding(self, counts: Float) -> Float:
@@ -151,13 +156,15 @@ class Plane:
         applies = (of.rounding_mean == 0) & (of.rounding_std > 0)
         return of.rounding_mean + np.where(applies, np.clip(slope, -1 / 12, 1 / 12), 0.0)
 
-    def location(self, direction: Float) -> Score:
+    def location(self, direction: Float, planes_in_row: int = 2) -> Score:
         """Return the score of a shift of the mean.
 
         Parameters
         ----------
         direction : ndarray of float64, [N]
             Shift for each clean DN, in units of the estimated quantity.
+        planes_in_row : int
+            Planes with common rows whose scores are added: 2 for the sum of all planes.
 
         Returns
         -------
@@ -168,9 +175,11 @@ class Plane:
         noise = of.std**2 * of.variance / self.count
         weight = direction / (noise + of.rounding_std**2)
         rounding = np.abs(weight) * of.rounding_std
+        # by Cauchy's inequality: the sites of a row have a common offset, whatever their clean DN
+        row = self._rows.variance * self._rows.magnitudes * planes_in_row * self._sites_of_row
         return Score(
             total=float((weight * (self.shift - self._rounding_mean)).sum()),
-            variance=float((weight**2 * (noise + self._row_dn2 * self._sites_of_row / self.count)).sum()),
+            variance=float((weight**2 * (noise + row / self.count)).sum()),
             # codes of a linear curve are equidistant, so rounding errors of different values can be equal
             rounding=math.sqrt(3) * float(rounding.sum()) if self._is_linear else _root(rounding),
             fixed=_root(weight * of.std * np.sqrt(of.fixed_variance / self.count)),
@@ -208,7 +217,7 @@ class Plane:
     def _cosine_score(self, residual: Float, noise: Float, unknown: Float, fixed: Float, gain: Float) -> Score:
         weight = gain / (noise + unknown**2)
         # the cosines of two sites of one row have a covariance of at most 4 (τ² · variance of row noise)²
-        row = 4 * self._sites_of_row * (self._row_dn2 / self.expected.std**2) ** 2
+        row = 8 * self._sites_of_row * self._rows.squares * (self._rows.variance / self.expected.std**2) ** 2
         return Score(
             total=float((weight * residual).sum()),
             variance=float((weight**2 * (noise + row / self.count)).sum()),
@@ -274,28 +283,28 @@ def _line_scores(sums: Sums, spread: _Spread) -> Scores:
     The rounding of a smooth clean frame can move complete lines by up to half a DN. Differences of lines n and n + 2,
     and products of distant parts of a line, are almost free of it, with a third of the information.
     """
-    scores = Scores()
-    for name, (score, information), variance in (
-        ("row", sums.rows, sums.law.row_std_dn**2),
-        ("column", sums.columns, 0.0),
+    scores, law = Scores(), sums.law
+    of_rows, of_columns = (law.rows, law.row_differences), (LineOffsets(0.0), LineOffsets(0.0))
+    for name, lines, (offsets, differences) in (
+        ("row", sums.rows, of_rows),
+        ("column", sums.columns, of_columns),
     ):
-        parts = score.shape[1]
-        everything = np.ones((parts, parts))
-        scores[f"{name} means", ""] = _quadratic_score(score, information, everything, variance, spread)
-        if parts >= 3 and len(score) >= 4:
-            scores[f"{name} differences", ""] = _difference_score(score, information, variance, spread)
+        count, parts = lines.shape[1:]
+        scores[f"{name} means", ""] = _quadratic_score(lines, np.ones((parts, parts)), offsets, spread)
+        if parts >= 3 and count >= 4:
+            scores[f"{name} differences", ""] = _difference_score(lines, differences, spread)
     return scores
 
 
-def _difference_score(score: Float, information: Float, variance: float, spread: _Spread) -> Score:
+def _difference_score(lines: Float, differences: LineOffsets, spread: _Spread) -> Score:
     """Return the score of the variance of line offsets, from differences of lines.
 
     Parameters
     ----------
-    score, information : ndarray of float64, [lines, parts]
-        Sums of z / std, and of 1 / std².
-    variance : float
-        Expected variance of a line's offset, DN².
+    lines : ndarray of float64, [3, lines, parts]
+        `Sums.rows` or `Sums.columns`.
+    differences : LineOffsets
+        Differences of the offsets of lines n and n + 2.
     spread : _Spread
         Variances of z and of the rounding errors.
 
@@ -304,31 +313,45 @@ def _difference_score(score: Float, information: Float, variance: float, spread:
     Score
         Sum over products of parts that are not adjacent.
     """
-    lines, parts = len(score) // 4 * 4, score.shape[1]
-    (a, c), (b, d) = (
-        values[:lines].reshape(-1, 2, 2, parts).transpose(1, 0, 2, 3).reshape(2, -1, parts)
-        for values in (score, information)
-    )
+    parts = lines.shape[2]
+    groups = lines[:, : lines.shape[1] // 4 * 4].reshape(3, -1, 2, 2, parts)
+    (a, b, u), (c, d, v) = (groups[:, :, number].reshape(3, -1, parts) for number in (0, 1))
     total = np.where(b + d > 0, b + d, 1.0)
     place = np.arange(parts)
     distant = (np.abs(place[:, None] - place) >= 2).astype(np.float64)
-    rounded = spread._replace(rounding_dn2=0.0)
-    found = _quadratic_score((a * d - c * b) / total, b * d / total, distant, 2 * variance, rounded)
+    differing = np.stack([(a * d - c * b) / total, b * d / total, (u * d * d + v * b * b) / (total * total)])
+    found = _quadratic_score(differing, distant, differences, spread._replace(rounding_dn2=0.0))
     return found._replace(information=2 * found.information)
 
 
-def _quadratic_score(a: Float, j: Float, mask: Float, variance: float, spread: _Spread) -> Score:
+def _quadratic_score(lines: Float, mask: Float, offsets: LineOffsets, spread: _Spread) -> Score:
     """Return the score of sums of products of the parts of lines.
 
-    ``a`` [lines, parts] has the covariance ``spread.variance · diag(j) + variance · j jᵀ`` in each line; ``mask``
-    selects the products.
+    Parameters
+    ----------
+    lines : ndarray of float64, [3, lines, parts]
+        Sums ``a`` of the parts, their information ``j``, and variances ``u``. In each line, ``a`` has the covariance
+        ``spread.variance · diag(u) + offsets.variance · j jᵀ``.
+    mask : ndarray of float64, [parts, parts]
+        1 for the products that are added.
+    offsets : LineOffsets
+        Offsets of the lines.
+    spread : _Spread
+        Variances of z and of the rounding errors.
+
+    Returns
+    -------
+    Score
+        Sum over all lines.
     """
+    (a, j, u), variance = lines, offsets.variance
     products = ((a @ mask) * a).sum(axis=1)
     masked = j @ mask
     pairs = (masked * j).sum(axis=1)
-    excess = products - variance * pairs - spread.variance * (j @ np.diag(mask))
-    own, cross = spread.variance**2 * pairs, 2 * variance * spread.variance * (masked**2 * j).sum(axis=1)
-    predicted = 2 * float((own + cross + (variance * pairs) ** 2).sum())
+    excess = products - variance * pairs - spread.variance * (u @ np.diag(mask))
+    own = spread.variance**2 * ((u @ mask) * u).sum(axis=1)
+    cross = 2 * variance * spread.variance * (masked**2 * u).sum(axis=1)
+    predicted = 2 * float((own + cross + offsets.squares * (variance * pairs) ** 2).sum())
     # rounding errors of neighbouring sites can be equal in a smooth frame, which increases the variance
     total_variance = max(predicted, float((excess**2).sum()))
     norm = float(mask.sum(axis=1).max())  # at least the largest eigenvalue
@@ -338,7 +361,7 @@ def _quadratic_score(a: Float, j: Float, mask: Float, variance: float, spread: _
         rounding=spread.rounding_dn2 * _root(pairs),
         fixed=spread.fixed * math.sqrt(total_variance),
         # a quadratic form of normal values exceeds √(2·variance·x) + 2·norm·x with probability exp(-x)
-        step=6 * float((variance * pairs + norm * spread.variance * j.max(axis=1)).max()),
+        step=6 * float((offsets.magnitudes * variance * pairs + norm * spread.variance * u.max(axis=1)).max()),
         above=spread.rounding_dn2 * float(pairs.sum()),
         information=float(pairs.sum()),
     )
@@ -349,18 +372,18 @@ def _quadratic_score(a: Float, j: Float, mask: Float, variance: float, spread: _
 
 def _neighbour_scores(sums: Sums, planes: Sequence[Plane], spread: _Spread) -> Scores:
     """Return the scores of the correlation of horizontal and vertical neighbours of one plane."""
-    scores = Scores()
+    scores, rows = Scores(), sums.law.rows
     squares = np.concatenate([plane.count / plane.expected.std**2 for plane in planes])
-    row_dn2 = sums.law.row_std_dn**2
-    for name, (product, pairs, inverse), offset_dn2 in (
-        ("horizontal neighbours", sums.neighbours[0], row_dn2),
-        ("vertical neighbours", sums.neighbours[1], 0.0),
+    for name, (product, pairs, inverse, inverse_squares), offset_dn2 in (
+        ("horizontal neighbours", sums.neighbours[0], rows.variance),
+        ("vertical neighbours", sums.neighbours[1], 0.0),  # the mean of each row is removed
     ):
         if pairs:
-            of_row = offset_dn2 * inverse / sums.height
             scores[name, ""] = Score(
                 total=product - offset_dn2 * inverse,
-                variance=pairs * spread.variance**2 + 4 * row_dn2 * inverse + 2 * sums.height * of_row**2,
+                variance=pairs * spread.variance**2
+                + 4 * offset_dn2 * inverse
+                + 2 * rows.squares * offset_dn2**2 * inverse_squares,
                 rounding=spread.rounding_dn2 * _root(squares),
                 fixed=spread.fixed * math.sqrt(pairs),
                 step=LARGEST_Z**2,
@@ -375,11 +398,12 @@ def _partner_scores(sums: Sums, spread: _Spread) -> Scores:
     """Return the scores of the agreement of noisy sites with the clean values of other sites of their tile."""
     scores = Scores()
     names = "diagonal sites", "horizontal sites", "vertical sites"
+    row_dn2 = sums.law.rows.variance * sums.law.rows.magnitudes
     for name, (total, squares, rounding, information, scaled) in zip(names, sums.partners, strict=True):
         if information:
             scores[name, ""] = Score(
                 total=total,
-                variance=squares * spread.variance + sums.law.row_std_dn**2 * scaled * sums.width,
+                variance=squares * spread.variance + row_dn2 * scaled * sums.width,
                 fixed=math.sqrt(spread.fixed * squares),
                 step=LARGEST_DIFFERENCE * LARGEST_Z,
                 above=rounding,

@@ -37,6 +37,8 @@ class PlaneTables(NamedTuple):
         Mean of z.
     cosine, double : ndarray of float64, [4, N]
         Expectations of cos z and cos 2z, from which those between two DN are interpolated.
+    row_dn2 : float
+        Variance of the offsets of rows, DN²; a part of the variance of z.
     largest_z : float
         Bound of z.
     least_difference : float
@@ -49,6 +51,7 @@ class PlaneTables(NamedTuple):
     mean: Float
     cosine: Float
     double: Float
+    row_dn2: float
     largest_z: float
     least_difference: float
     largest_difference: float
@@ -61,11 +64,11 @@ class SiteSums(NamedTuple):
     ----------
     z, cosine, double : ndarray of float64, [4, N]
         Sums by plane and clean DN.
-    rows : ndarray of float64, [2, H, segments]
+    rows : ndarray of float64, [3, H, segments]
         Sums of the parts of rows.
-    columns : ndarray of float64, [2, segments, W]
+    columns : ndarray of float64, [3, segments, W]
         Sums of the parts of columns.
-    neighbours, partners : ndarray of float64, [2, 3] and [3, 5]
+    neighbours, partners : ndarray of float64, [2, 4] and [3, 5]
         Sums of products.
     """
 
@@ -79,9 +82,20 @@ class SiteSums(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """Hold the sites of one row, [W]: z, 1 / std, std, cos z and cos 2z; weights are 0 where sites are not used."""
+    """Hold the sites of one row, [W]; weights are 0 where sites are not used.
+
+    Attributes
+    ----------
+    z, residual : ndarray of float64
+        z, without its mean after `_add_values`, and without the weighted mean of the row.
+    weight, std : ndarray of float64
+        1 / std and std.
+    cosine, double : ndarray of float64
+        cos z and cos 2z.
+    """
 
     z: Any
+    residual: Any
     weight: Any
     std: Any
     cosine: Any
@@ -131,7 +145,7 @@ def add_sites(
         Where the sums are added.
     """
     height, width = clean.shape
-    memory, part, is_rounded = np.zeros((4, 5, width)), 0, len(weights) == 0
+    memory, part, is_rounded = np.zeros((4, 6, width)), 0, len(weights) == 0
     for y in range(height):
         line = _line(memory[y & 3])  # `memory` has the last four rows
         offset = offsets[y if len(offsets) == height else y & 1]
@@ -141,10 +155,13 @@ def add_sites(
         _add_values(line, clean[y], y & 1, is_rounded, tables, sums)
         if part + 1 < len(column_starts) and y >= column_starts[part + 1]:
             part += 1
-        _add_lines(line, row_starts, sums.rows[:, y], sums.columns[:, part])
-        _add_products(line, 2, line, sums.neighbours[0])
+        _add_row(line, row_starts, tables.row_dn2, sums.rows[:, y])
+        _add_products(line.z, line.weight, line.z[2:], line.weight[2:], sums.neighbours[0])
+        _remove_row_offset(line, sums.rows[:, y])
+        _add_columns(line, sums.rows[:, y], tables.row_dn2, sums.columns[:, part])
         if y >= 2:
-            _add_products(_line(memory[(y - 2) & 3]), 0, line, sums.neighbours[1])
+            before = _line(memory[(y - 2) & 3])
+            _add_products(before.residual, before.weight, line.residual, line.weight, sums.neighbours[1])
         if y & 1:
             for kind, upper, x, lower, other_x in _PARTNERS:
                 first, second = y - 1 + upper, y - 1 + lower
@@ -154,7 +171,7 @@ def add_sites(
 
 @inner
 def _line(memory: Any) -> _Line:
-    return _Line(memory[0], memory[1], memory[2], memory[3], memory[4])
+    return _Line(memory[0], memory[1], memory[2], memory[3], memory[4], memory[5])
 
 
 @inner
@@ -216,33 +233,58 @@ def _between(values: Any, dn: int, clean_dn: float) -> Any:
 
 
 @inner
-def _add_lines(line: Any, starts: Any, row: Any, column: Any) -> None:
-    width = len(line.z)
+def _add_row(line: Any, starts: Any, row_dn2: float, row: Any) -> None:
     for part in range(len(starts)):
-        end = starts[part + 1] if part + 1 < len(starts) else width
-        score, information = 0.0, 0.0
+        end = starts[part + 1] if part + 1 < len(starts) else len(line.z)
+        score, information, variance = 0.0, 0.0, 0.0
         for x in range(starts[part], end):
-            scaled, square = line.z[x] * line.weight[x], line.weight[x] * line.weight[x]
-            score += scaled
+            square = line.weight[x] * line.weight[x]
+            score += line.z[x] * line.weight[x]
             information += square
-            column[0, x] += scaled
-            column[1, x] += square
-        row[0, part] += score
-        row[1, part] += information
+            variance += square - row_dn2 * square * square
+        row[0, part], row[1, part], row[2, part] = score, information, variance
 
 
 @inner
-def _add_products(first: Any, distance: int, second: Any, sums: Any) -> None:
-    """Add the products of the sites of one row and those of another, or those ``distance`` to the right."""
+def _remove_row_offset(line: Any, row: Any) -> None:
+    """Fill ``residual``: the noise without its weighted mean, and so without the offset of the row."""
+    information = row[1].sum()
+    offset_dn = row[0].sum() / information if information > 0 else 0.0
+    for x in range(len(line.z)):
+        line.residual[x] = line.z[x] - offset_dn * line.weight[x]
+
+
+@inner
+def _add_columns(line: Any, row: Any, row_dn2: float, column: Any) -> None:
+    """Add the residuals of a row to the sums of columns.
+
+    Without the offset of the row, z has the variance v = 1 - row_dn2 · weight². That of the residual is
+    v - weight² / Σweight² · (2v - mean of v), because it is z minus its projection on the weights.
+    """
+    information = row[1].sum()
+    share = 1 / information if information > 0 else 0.0
+    mean = row[2].sum() * share
+    for x in range(len(line.z)):
+        square = line.weight[x] * line.weight[x]
+        own = 1 - row_dn2 * square
+        column[0, x] += line.residual[x] * line.weight[x]
+        column[1, x] += square
+        column[2, x] += square * (own - square * share * (2 * own - mean))
+
+
+@inner
+def _add_products(z: Any, weight: Any, other_z: Any, other_weight: Any, sums: Any) -> None:
+    """Add the products of sites with others, which may be fewer."""
     product, pairs, inverse = 0.0, 0.0, 0.0
-    for x in range(len(first.z) - distance):
-        scale = first.weight[x] * second.weight[x + distance]
-        product += first.z[x] * second.z[x + distance]
+    for x in range(len(other_z)):
+        scale = weight[x] * other_weight[x]
+        product += z[x] * other_z[x]
         pairs += 1.0 if scale > 0 else 0.0
         inverse += scale
     sums[0] += product
     sums[1] += pairs
     sums[2] += inverse
+    sums[3] += inverse * inverse
 
 
 @inner

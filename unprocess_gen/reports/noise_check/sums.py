@@ -62,13 +62,14 @@ class Sums:
         Expectations for every clean DN, by plane.
     z, cosine, double : ndarray of float64, [4, N]
         Sums of z, cos z and cos 2z by plane and clean DN.
-    rows : ndarray of float64, [2, H, segments]
-        Sums of z / std and of 1 / std² in each part of each row.
-    columns : ndarray of float64, [2, W, segments]
-        The same for columns.
-    neighbours : ndarray of float64, [2, 3]
-        For horizontal and vertical neighbours of one plane: sum of products of z, number of pairs, and sum of the
-        products of 1 / std.
+    rows : ndarray of float64, [3, H, segments]
+        Sums of z / std and of 1 / std² in each part of each row, and the variance of the former without the offset of
+        the row.
+    columns : ndarray of float64, [3, W, segments]
+        The same for columns, from z without the mean of each row.
+    neighbours : ndarray of float64, [2, 4]
+        For horizontal and vertical neighbours of one plane: sum of products of z, number of pairs, sum of the products
+        of 1 / std, and sum over rows of the square of the latter. The vertical ones are without the mean of each row.
     partners : ndarray of float64, [3, 5]
         For each kind of `PARTNERS`, with n the difference of the noise of both sites, s its standard deviation, and d
         the difference of their clean values over s, limited: sums of d·n/s, d², |d|/s, 2d times the difference over s
@@ -85,17 +86,17 @@ class Sums:
         self._size = int(self._clean.max(initial=0)) + 2
         self.counts = np.zeros((4, self._size))
         count_sites(self._clean, self._offsets, self.counts)
-        # without fixed patterns in the clean frame, the expectations are equal in all planes
-        tables = [self._table(site) for site in (TILE if law.plan.averaged else TILE[:1])]
+        tables = [self._table(number) for number in range(4 if law.differs_by_site else 1)]
         self.usable, self.tables = ([*some] * (4 // len(tables)) for some in zip(*tables, strict=True))
         self.sites = int(sum(count[usable].sum() for count, usable in zip(self.counts, self.usable, strict=True)))
 
-    def _table(self, site: tuple[int, int]) -> tuple[Mask, Expectation]:
+    def _table(self, plane: int) -> tuple[Mask, Expectation]:
+        law, site = self.law.of_site(plane), TILE[plane]
         at = np.flatnonzero(self.counts.any(axis=0))
-        at = at[usable_values(self.law, at.astype(np.float64), site)]
+        at = at[usable_values(law, at.astype(np.float64), site)]
         usable = np.zeros(self._size, dtype=np.bool_)
         usable[at] = True
-        return usable, spread(expectations(self.law, at.astype(np.float64), site), at, self._size)
+        return usable, spread(expectations(law, at.astype(np.float64), site), at, self._size)
 
     def fill(self) -> None:
         """Compute all sums."""
@@ -106,9 +107,9 @@ class Sums:
             z=np.zeros((4, self._size)),
             cosine=np.zeros((4, self._size)),
             double=np.zeros((4, self._size)),
-            rows=np.zeros((2, self.height, len(row_starts))),
-            columns=np.zeros((2, len(column_starts), self.width)),
-            neighbours=np.zeros((2, 3)),
+            rows=np.zeros((3, self.height, len(row_starts))),
+            columns=np.zeros((3, len(column_starts), self.width)),
+            neighbours=np.zeros((2, 4)),
             partners=np.zeros((3, 5)),
         )
         is_rounded = not self.law.plan.clean_normalised
@@ -131,17 +132,18 @@ class Sums:
                 for values, expected in ((cosine, of.cosine), (double, of.double)):
                     values[plane] = np.interp(np.arange(self._size), known, expected.mean[known])
         least = LEAST_DIFFERENCE_DN if is_rounded else 0.0
-        return PlaneTables(inverse, mean, cosine, double, LARGEST_Z, least, LARGEST_DIFFERENCE)
+        row_dn2 = self.law.rows.variance
+        return PlaneTables(inverse, mean, cosine, double, row_dn2, LARGEST_Z, least, LARGEST_DIFFERENCE)
 
     def _weights(self) -> NDArray[np.float32]:
         """Return 1 / std of each site of a clean frame that is not rounded, [H, W]."""
         weights = np.empty((self.height, self.width), np.float32)
         rows = max(1, BLOCK_SITES // max(self.width, 1))
-        for site in TILE:
-            of_site = np.s_[site[0] :: 2, site[1] :: 2]
+        for number, site in enumerate(TILE):
+            law, of_site = self.law.of_site(number), np.s_[site[0] :: 2, site[1] :: 2]
             for top in range(0, self.height // 2, rows):
                 clean = self._clean[of_site][top : top + rows]
-                std = np.sqrt(self.law.variance(self.law.signal(clean, site)))
+                std = np.sqrt(law.variance(law.signal(clean, site)))
                 weights[of_site][top : top + rows] = np.divide(1.0, std, out=np.zeros_like(std), where=std > 0)
         return weights
 
