@@ -309,7 +309,7 @@ class NoiseLaw:
 
     @property
     def differs_by_site(self) -> bool:
-        """Whether the expectations for a clean DN differ between the sites of the tile."""
+        """Return whether the expectations for a clean DN differ between the sites of the tile."""
         return self.plan.averaged or bool(self._by_site)
 
     def of_site(self, number: int) -> NoiseLaw:
