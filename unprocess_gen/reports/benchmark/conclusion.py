@@ -28,8 +28,8 @@ RECOMMENDATIONS = (
     Recommendation(
         "training data",
         EXACT,
-        "fast can shorten only the simulation, so its errors pay only if the simulation is most of a run "
-        "(noise.levels, noise.draws, pairs made from arrays) and the table of runs shows that fast saves time",
+        "fast shortens only the simulation; use it if the simulation takes most of the time (noise.levels, "
+        "noise.draws, pairs made from arrays) and the table of runs shows that fast saves time",
     ),
     Recommendation(
         "benchmark whose files are published",
