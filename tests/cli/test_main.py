@@ -86,7 +86,7 @@ REFUSED = [
     (["plan", "seed=-1"], r"seed=-1: expected 0 to "),
     (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
     (["--config-name", "other"], r".*'other'"),
-    (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs nine numbers"),
+    (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs a matrix; expected nine numbers"),
     (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a distribution"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
     (["gains.red=0"], r"gains.red=0: expected a gain above 0"),

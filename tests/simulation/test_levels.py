@@ -166,7 +166,10 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
         (("noise.levels=0",), r"noise.levels=0: expected how many, 1 to 100"),
         (("noise.levels=101",), r"noise.levels=101: expected how many"),
         (("noise.levels=[]",), r"noise.levels=\[\]: expected how many"),
-        (("noise.levels=[800]",), r"noise.levels=\[800\]: 800 is not {a: …, b: …}; expected a list of them for "),
+        (
+            ("noise.levels=[800]",),
+            r"noise.levels=\[800\]: 800 is not {a: …, b: …}; expected a list of them for .*; for ISOs, choose a physical",
+        ),
         (
             ("noise.levels=[{a:1}]",),
             r"noise.levels=\[{'a': 1}\]: {'a': 1} is not {a: …, b: …}; expected a list of them",

@@ -126,9 +126,10 @@ def _level(noise: NoiseConfig, level: Any) -> NoiseConfig:
     if not is_physical(noise) and isinstance(level, dict) and level.keys() == {"a", "b"}:
         return dataclasses.replace(noise, a=level["a"], b=level["b"])
     wanted = "an ISO" if is_physical(noise) else "{a: …, b: …}"
+    advice = "; for ISOs, choose a physical profile" if is_number(level) else ""
     raise ConfigError(
         f"noise.levels={value_text(noise.levels)}: {value_text(level)} is not {wanted}; expected a list of them for "
-        f"noise={noise.name}, or how many levels"
+        f"noise={noise.name}, or how many levels{advice}"
     )
 
 

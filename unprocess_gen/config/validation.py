@@ -208,10 +208,15 @@ def _check_camera(camera: CameraConfig) -> None:
         one_of("camera.name", camera.name, (camera.law,))
     if camera.law != "custom":
         if camera.xyz2cam is not None:
-            raise ConfigError(f"camera.xyz2cam={camera.xyz2cam}: a matrix needs camera.law=custom, not {camera.law}")
+            raise ConfigError(
+                f"camera.xyz2cam={camera.xyz2cam}: a matrix needs camera.law=custom, not {camera.law}; "
+                "set camera=custom"
+            )
         return
     if camera.xyz2cam is None:
-        raise ConfigError("camera.xyz2cam=null: camera=custom needs nine numbers, XYZ to camera, row by row")
+        raise ConfigError(
+            "camera.xyz2cam=null: camera=custom needs a matrix; expected nine numbers, XYZ to camera, row by row"
+        )
     try:
         colour.rgb2cam(colour.matrix(camera.xyz2cam))
     except ValueError as error:

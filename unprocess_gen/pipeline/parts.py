@@ -159,8 +159,8 @@ def prepare(config: Config, parts: int) -> Prepared:
     tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
     if parts > len(tasks):
         raise ConfigError(
-            f"parts={parts}: this dataset has {len(tasks)} shards; expected 1 to {len(tasks)}; lower parts or "
-            "output.pairs_per_shard"
+            f"parts={parts}: this dataset has {len(tasks)} shard{'s' * (len(tasks) != 1)}; expected 1 to {len(tasks)}; "
+            "lower parts or output.pairs_per_shard"
         )
     with Workspace(config.out, dataset_yaml(config)) as workspace:
         workspace.open()
