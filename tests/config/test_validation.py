@@ -270,7 +270,10 @@ REFUSED = [
     ("source.icc=convert", r"source.icc=convert: expected one of ignore, refuse"),
     ("camera.law=mean", r"camera.law=mean: expected one of fixed, convex, choice, identity, custom"),
     ("camera.law=fixed", r"camera.name=convex: expected one of nexus_6p, sony_a7r, olympus_em10, sony_rx100"),
-    (f"camera.xyz2cam={MATRIX}", r"camera.xyz2cam=\[0.7, .*\]: a matrix needs camera.law=custom, not convex; set camera=custom"),
+    (
+        f"camera.xyz2cam={MATRIX}",
+        r"camera.xyz2cam=\[0.7, .*\]: a matrix needs camera.law=custom, not convex; set camera=custom",
+    ),
     ("camera.law=custom", r"camera.xyz2cam=null: camera=custom needs a matrix; expected nine numbers"),
     ("camera.law=custom;camera.xyz2cam=[1,2,3]", r"camera.xyz2cam=\[1.0, 2.0, 3.0\]: .*nine"),
     ("camera.law=custom;camera.xyz2cam=[1,2,3,2,4,6,1,1,1]", r"camera.xyz2cam=\[1.0, 2.0, .*\]: .*invert"),

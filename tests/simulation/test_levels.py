@@ -168,7 +168,7 @@ def test_levels_can_be_pairs_of_numbers(photographs: Path, make: Make, tmp_path:
         (("noise.levels=[]",), r"noise.levels=\[\]: expected how many"),
         (
             ("noise.levels=[800]",),
-            r"noise.levels=\[800\]: 800 is not {a: …, b: …}; expected a list of them for .*; for ISOs, choose a physical",
+            r"noise.levels=\[800\]: 800 is not {a: …, b: …}; expected a list of them .*; for ISOs, choose a physical",
         ),
         (
             ("noise.levels=[{a:1}]",),
