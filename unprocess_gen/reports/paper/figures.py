@@ -5,7 +5,7 @@ from the article's text. Raw frames are grey, from the lowest DN (black) to the 
 article's photographs are not published, so its claims are checked on other photographs: those of Figure 6 on up to
 `PHOTOGRAPHS_COUNTED`.
 
-Figure 6 of the article has two interpretations (`paper_sources.INTERPRETATIONS`). The formula divides by g_rgb, so the
+Figure 6 of the article has two interpretations (`paper.sources.INTERPRETATIONS`). The formula divides by g_rgb, so the
 largest g_rgb gives the darkest raw frame. The caption describes the most saturation for the largest g_rgb, which
 multiplication by g_rgb gives.
 """

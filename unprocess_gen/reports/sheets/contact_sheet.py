@@ -103,7 +103,7 @@ def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | N
         Folder of the dataset.
     keys : sequence of str
         Keys of pairs, or of images and patches, which select all of their pairs. By default,
-        `sheet_pairs.PAIRS_SHOWN` evenly spaced pairs.
+        `pairs.PAIRS_SHOWN` evenly spaced pairs.
     source : Path or ObjectPath, optional
         Folder of the photographs; by default the one recorded in ``dataset.json``.
 

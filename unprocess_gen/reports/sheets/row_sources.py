@@ -1,6 +1,6 @@
 """Load the source pixels that a manifest row was made from.
 
-`sheet_pairs` imports this module when it needs a source, because the decoders of `sources` import Numba.
+`pairs` imports this module when it needs a source, because the decoders of `sources` import Numba.
 """
 
 from __future__ import annotations
