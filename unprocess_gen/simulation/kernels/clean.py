@@ -41,7 +41,7 @@ from unprocess_gen.simulation.kernels.simd import (
     to_float64,
     to_uint32,
 )
-from unprocess_gen.simulation.kernels.strips import ONES, Float32, Strip, Workspace
+from unprocess_gen.simulation.kernels.strips import ONES, Float32, Strip, Workspace, count_outside
 from unprocess_gen.simulation.reference.cfa import tile
 
 _0, _1, _2, _3, _4, _8 = (np.uint64(number) for number in (0, 1, 2, 3, 4, 8))
@@ -217,22 +217,15 @@ def _load_sites(values: Pointer, strip: Strip) -> Vector:
 
 
 @inner
-def _row_products(products: Pointer, code_count: int, site_channels: Pointer, y: int) -> tuple[Pointer, Pointer]:
-    """Return pointers to the products of the even and of the odd columns of row ``y``."""
-    even, odd = site_channels[_ROW_SITES * (y & 1)], site_channels[_ROW_SITES * (y & 1) + 1]
-    return pointer_to(products, 3 * code_count * even), pointer_to(products, 3 * code_count * odd)
-
-
-@inner
-def _sum_products(
-    codes: Pointer, even: Pointer, odd: Pointer, code_count: int, length: int, is_uint8: bool, signal: Pointer
-) -> None:
-    """Sum the three products of each pixel of a row: ``even`` for even columns, ``odd`` for odd ones."""
-    done = 0
+def _fill_signal(codes: Pointer, is_uint8: bool, strip: Strip, scene: Any, signal: Pointer) -> None:
+    """Linearise codes and apply the matrix, for the channel of each site: sum three products."""
+    channels, code_count, done = pointer_to(scene.site_channels, _ROW_SITES * (strip.y & 1)), scene.code_count, 0
+    even = pointer_to(scene.products, 3 * code_count * channels[0])
+    odd = pointer_to(scene.products, 3 * code_count * channels[1])
     if is_uint8:
-        done = length // 4 * 4
+        done = strip.length // 4 * 4
         _sum_products_uint8(codes, even, odd, done // 4, signal)
-    for x in range(done, length):
+    for x in range(done, strip.length):
         of_site = odd if x & 1 else even
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
         signal[x] = (of_site[r] + of_site[code_count + g]) + of_site[2 * code_count + b]
@@ -289,13 +282,6 @@ def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Any, out: Pointe
         out[x] = i * max(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
 
 
-@inner
-def _fill_codes(codes: Pointer, is_uint8: bool, strip: Strip, scene: Any, out: Pointer) -> None:
-    """Linearise codes and apply the matrix, for the channel of each site, in either precision."""
-    even, odd = _row_products(scene.products, scene.code_count, scene.site_channels, strip.y)
-    _sum_products(codes, even, odd, scene.code_count, strip.length, is_uint8, out)
-
-
 # ------------------------------------------------------------------------------------------------- float64 and float32
 
 
@@ -333,7 +319,7 @@ def _bright_light32(scene: Scene32, signal: Vector, x: np.uint64, strip: Strip) 
 
 
 @inner
-def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: Workspace, clean: Pointer) -> None:
+def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
     dn = above_black + scene.black_dn
     rounded = (dn + ROUND) - ROUND
@@ -341,14 +327,14 @@ def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: W
     store(workspace.unrounded_dn, x, dn)
     store(workspace.rounded_dn, x, rounded_dn)
     store(workspace.residual_dn, x, to_float32(dn - rounded))
-    store(clean, x, to_uint32(rounded_dn))
+    store(workspace.clean, x, to_uint32(rounded_dn))
 
 
 @inner
-def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace, clean: Pointer) -> None:
+def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
     """Store eight clean values: DN above black, and as uint16."""
     store(workspace.unrounded_dn, x, above_black)
-    store(clean, x, to_bits(above_black + ROUND32) + scene.black_dn)
+    store(workspace.clean, x, to_bits(above_black + ROUND32) + scene.black_dn)
 
 
 _linear_dn = by_class({Scene: _linear_dn64, Scene32: _linear_dn32})
@@ -363,29 +349,28 @@ _store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
 
 
 @inner
-def fill_clean(
-    scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, clean: Pointer, counts: Pointer
-) -> bool:
+def fill_clean(scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer) -> bool:
     """Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
 
-    ``clean`` (uint16) receives the rounded values. Return whether any site can be saturated.
+    Return whether any site can be saturated.
     """
     signal = pointer_to(workspace.signal, strip.first)
     if scene.gray_mean:
         _fill_gray_mean_signal(codes, strip, scene, signal)
     else:
-        _fill_codes(codes, is_uint8, strip, scene, signal)
-    has_negative, has_bright = _fill_linear(scene, strip, workspace, clean)
+        _fill_signal(codes, is_uint8, strip, scene, signal)
+    has_negative, has_bright = _fill_linear(scene, strip, workspace)
     if has_bright:
-        _recompute_bright(scene, strip, workspace, clean)
-        counts[1] += _count_above(strip, workspace.bright_light, scene.clipped)
+        _recompute_bright(scene, strip, workspace)
+        counts[1] += count_outside(strip, workspace.bright_light, 0.0, scene.clipped)[1]
     if has_negative:
-        counts[0] += _count_negative(strip, workspace.bright_light if scene.response_steps[1] else workspace.signal)
+        light = workspace.bright_light if scene.response_steps[1] else workspace.signal
+        counts[0] += count_outside(strip, light, 0.0, np.inf)[0]
     return bool(has_bright)
 
 
 @inner
-def _fill_linear(scene: Any, strip: Strip, workspace: Workspace, clean: Pointer) -> tuple[bool, bool]:
+def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, bool]:
     """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
     gains, limits = _load_sites(scene.gains, strip), _load_sites(scene.limits, strip)
     lowest = highest = load(workspace.signal, _0)
@@ -393,12 +378,12 @@ def _fill_linear(scene: Any, strip: Strip, workspace: Workspace, clean: Pointer)
         x = np.uint64(n) * _8
         signal = load(workspace.signal, x)
         lowest, highest = minimum(lowest, signal), maximum(highest, signal)
-        _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace, clean)
+        _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace)
     return has_any_bit(less_than(lowest, _ZERO32)), has_any_bit(less_than(limits, highest))
 
 
 @inner
-def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace, clean: Pointer) -> None:
+def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
     """Recompute vectors that contain a bright signal: highlights per channel, exposure, fixed pattern, clipping.
 
     ``bright_light`` receives their light, and 0 elsewhere.
@@ -413,20 +398,4 @@ def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace, clean: Poi
         light = _bright_light(scene, signal, x, strip)
         store(workspace.bright_light, x, light)
         above_black = minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn
-        _store_clean(scene, above_black, x, workspace, clean)
-
-
-@inner
-def _count_negative(strip: Strip, values: Pointer) -> int:
-    count = 0
-    for x in range(strip.first, strip.after):
-        count += values[x] < 0.0
-    return count
-
-
-@inner
-def _count_above(strip: Strip, values: Pointer, limit: float) -> int:
-    count = 0
-    for x in range(strip.first, strip.after):
-        count += values[x] > limit
-    return count
+        _store_clean(scene, above_black, x, workspace)

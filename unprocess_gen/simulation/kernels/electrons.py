@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
 from unprocess_gen.core.lookup_tables import quantile_table
-from unprocess_gen.core.random_streams import BLOCK, LANES, ROUNDS, purpose, words
+from unprocess_gen.core.random_streams import BLOCK, purpose, words
 from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.kernels.body import HOT, WITHOUT_PATTERNS, Body
 from unprocess_gen.simulation.kernels.gaussian import HETEROSCEDASTIC
@@ -33,15 +33,7 @@ from unprocess_gen.simulation.kernels.normal import (
     normal_quantiles,
     value_by_line,
 )
-from unprocess_gen.simulation.kernels.philox import (
-    KEY_STEP0,
-    KEY_STEP1,
-    LOW32,
-    PhiloxKey,
-    fill_word_blocks,
-    first_word,
-    philox_round,
-)
+from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, first_word
 from unprocess_gen.simulation.kernels.poisson import (
     FLOAT32_RATE,
     LOW_RATE,
@@ -95,7 +87,6 @@ _0, _8, _16, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint64(16), np.ui
 _ZERO32, _INFINITY32, _FLOAT32_ERROR32 = np.float32(0), np.float32(np.inf), np.float32(FLOAT32_ERROR_DN)
 _LOW_RATE32, _EVERY_LANE = np.float32(LOW_RATE), np.uint32(2**VECTOR_WIDTH - 1)
 _RATE_ERROR32, _NORMAL_ERROR32 = np.float32(FLOAT32_RATE), np.float32(2.0**-19)
-_LANES = np.uint64(LANES)
 
 
 class Electrons(NamedTuple):
@@ -472,7 +463,8 @@ def _dark_frame_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
 def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
     """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, and all words."""
     of, tables = _load_numbers(noise, n), noise.tables
-    _fill_words(key, noise.read_purposes[n] | key[2], strip, workspace.words, workspace.read_words)
+    fill_word_blocks(key, strip, SHOT, workspace.words)
+    fill_word_blocks(key, strip, noise.read_purposes[n], workspace.read_words)
     row_dn = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
     workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
     if of.dark_e > 0.0:
@@ -512,27 +504,6 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, work
     first, after = _defects_of(noise.body, strip)
     if first < after:
         _draw_defects(noise, key, first, after, strip, workspace)
-
-
-@inner
-def _fill_words(key: PhiloxKey, read_purpose: np.uint64, strip: Strip, shot: Pointer, read: Pointer) -> None:
-    """Fill the words of shot and read noise; written out for the words of a counter as `philox.fill_word_blocks`."""
-    for block in range(strip.blocks):
-        counter = (strip.block + np.uint64(block)) * _LANES
-        for lane in range(LANES):
-            x0 = block * BLOCK - strip.lead + lane
-            x1, x2, x3 = x0 + LANES, x0 + 2 * LANES, x0 + 3 * LANES
-            c0, c1, c2, c3 = counter + np.uint64(lane), strip.row, SHOT | key[2], key[3]
-            d0, d1, d2, d3 = counter + np.uint64(lane), strip.row, read_purpose, key[3]
-            k0, k1 = key[0], key[1]
-            for _ in range(ROUNDS):
-                c0, c1, c2, c3 = philox_round(c0, c1, c2, c3, k0, k1)
-                d0, d1, d2, d3 = philox_round(d0, d1, d2, d3, k0, k1)
-                k0, k1 = (k0 + KEY_STEP0) & LOW32, (k1 + KEY_STEP1) & LOW32
-            shot[x0], shot[x1] = np.uint32(c0 & LOW32), np.uint32(c1 & LOW32)
-            shot[x2], shot[x3] = np.uint32(c2 & LOW32), np.uint32(c3 & LOW32)
-            read[x0], read[x1] = np.uint32(d0 & LOW32), np.uint32(d1 & LOW32)
-            read[x2], read[x3] = np.uint32(d2 & LOW32), np.uint32(d3 & LOW32)
 
 
 @inner

@@ -57,7 +57,7 @@ from unprocess_gen.simulation.kernels.simd import (
     to_uint64,
     uint32_zeros,
 )
-from unprocess_gen.simulation.kernels.strips import Strip, Workspace, copy_values, list_lanes
+from unprocess_gen.simulation.kernels.strips import Strip, Workspace, count_outside, list_lanes
 from unprocess_gen.simulation.reference.cfa import plane_sites
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
@@ -65,8 +65,8 @@ _8, _HALF32 = np.uint64(8), np.float32(0.5)
 _DECREASED, _INCREASED = 1.0 - 2.0**-50, 1.0 + 2.0**-50
 
 
-class Integers(NamedTuple):
-    """Hold what the read-out of N frames of uint16 needs."""
+class ReadOut(NamedTuple):
+    """Hold what the read-out of N frames needs; a subclass selects the compiled code."""
 
     limits_dn: Float  # [N, 4]: lowest and highest DN, pinned level, and clean value from which sites are pinned
     averaged: bool  # whether the clean frame contains the fixed patterns
@@ -77,28 +77,16 @@ class Integers(NamedTuple):
     planes: NDArray[np.int64]  # [4]: first element of the plane of each site of the tile
 
 
-class Normalised(NamedTuple):
-    """Hold what the read-out of N frames of float32 needs; members as in `Integers`."""
-
-    limits_dn: Float
-    averaged: bool
-    black_dn: float
-    span_dn: float
-    white: float
-    packed: bool
-    planes: NDArray[np.int64]
+class Integers(ReadOut):
+    """Read out frames of uint16."""
 
 
-class FloatClean(NamedTuple):
-    """Hold what N noisy frames of uint16 and a clean frame of float32 need; members as in `Integers`."""
+class Normalised(ReadOut):
+    """Read out frames of float32."""
 
-    limits_dn: Float
-    averaged: bool
-    black_dn: float
-    span_dn: float
-    white: float
-    packed: bool
-    planes: NDArray[np.int64]
+
+class FloatClean(ReadOut):
+    """Read out noisy frames of uint16 and a clean frame of float32."""
 
 
 class Output(NamedTuple):
@@ -112,7 +100,7 @@ class Output(NamedTuple):
 
 def readout_of(
     plans: Sequence[Plan], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
-) -> Integers | Normalised | FloatClean:
+) -> ReadOut:
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
     black_dn = float(first.black_level_dn)
@@ -122,8 +110,8 @@ def readout_of(
     ]
     packed = first.layout == PACKED
     planes = _planes(first.pattern, origin[0] % 2, origin[1] % 2)
-    kind: Any = Normalised if first.normalised else FloatClean if first.clean_normalised else Integers
-    readout: Integers | Normalised | FloatClean = kind(
+    kind = Normalised if first.normalised else FloatClean if first.clean_normalised else Integers
+    return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
         averaged=first.averaged,
         black_dn=black_dn,
@@ -132,7 +120,6 @@ def readout_of(
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
-    return readout
 
 
 @functools.lru_cache(maxsize=16)
@@ -212,31 +199,32 @@ average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Ele
 
 @inner
 def _read_integers(readout: Any, noise: Any, base: Pointer, output: Output, strip: Strip, workspace: Workspace) -> None:
-    n, noisy = output.n, _destination(readout, strip, workspace.noisy, output.sites)
-    limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * n))
+    n, limits_dn = output.n, pointer_to(readout.limits_dn, np.uint64(4 * output.n))
     low, high = np.float32(limits_dn[0]), np.float32(limits_dn[1])
-    found, has_clipped = _round_and_list(noise, base, low, high, strip, workspace, noisy)
+    found, has_clipped = _round_and_list(noise, base, low, high, strip, workspace)
     found = _list_defects(noise, strip, found, workspace)
     for m in range(found):
         x = workspace.uncertain[m]
         dn = np.float32((_exact_dn(noise, n, x, strip, workspace) + ROUND) - ROUND)
-        has_clipped = _replace(x, dn, low, high, workspace, noisy) or has_clipped
+        has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
     clear_defects_of(noise, strip, workspace)
     if output.may_saturate and limits_dn[3] < np.inf:
         dn = np.float32((limits_dn[2] + ROUND) - ROUND)
         for x in range(strip.first, strip.after):
             if workspace.unrounded_dn[x] >= limits_dn[3]:
-                has_clipped = _replace(x, dn, low, high, workspace, noisy) or has_clipped
+                has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
     if has_clipped:
-        _count_clipped(strip, workspace.noisy_dn, low, high, output.counts)
-    _write(readout, strip, noisy, output.sites)
+        below, above = count_outside(strip, workspace.noisy_dn, low, high)
+        output.counts[2] += below
+        output.counts[3] += above
+    _write(readout, strip, workspace.noisy, output.sites)
 
 
 @inner
 def _round_and_list(
-    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace, noisy: Pointer
+    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
 ) -> tuple[int, bool]:
-    """Round half to even, clip and cast to ``noisy``; list sites whose error bound reaches a rounding boundary.
+    """Round half to even, clip and cast to uint16; list sites whose error bound reaches a rounding boundary.
 
     Return how many sites are uncertain, and whether any was clipped.
     """
@@ -249,7 +237,7 @@ def _round_and_list(
         dn = load(base, x) + rounded
         clipped = minimum(maximum(dn, low), high)
         store(workspace.noisy_dn, x, dn)
-        store(noisy, x, to_uint32(clipped))
+        store(workspace.noisy, x, to_uint32(clipped))
         clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
         if _needs_exact_sites(noise):
             to_boundary = _HALF32 - absolute(noise_dn - rounded)
@@ -258,27 +246,16 @@ def _round_and_list(
 
 
 @inner
-def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace, noisy: Pointer) -> bool:
+def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace) -> bool:
     """Replace a noisy value with a rounded DN; return whether it is clipped."""
     workspace.noisy_dn[x] = dn
-    noisy[x] = np.uint16(np.int64(min(max(dn, low), high)))
+    workspace.noisy[x] = np.uint16(np.int64(min(max(dn, low), high)))
     return bool(dn < low or dn > high)
 
 
 @inner
-def _count_clipped(strip: Strip, values: Pointer, low: float, high: float, counts: Pointer) -> None:
-    """Count values below and above the limits."""
-    below = above = 0
-    for x in range(strip.first, strip.after):
-        below += values[x] < low
-        above += values[x] > high
-    counts[2] += below
-    counts[3] += above
-
-
-@inner
 def _write_integers(readout: Integers, output: Output, strip: Strip, workspace: Workspace) -> None:
-    clean = _destination(readout, strip, workspace.clean, output.sites)
+    clean = workspace.clean
     if readout.averaged:
         low, high = readout.limits_dn[0], readout.limits_dn[1]
         for x in range(strip.total):
@@ -306,13 +283,14 @@ def _read_normalised(
 ) -> None:
     clear_defects_of(noise, strip, workspace)
     limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * output.n))
-    noisy = _destination(readout, strip, workspace.normalised, output.sites)
     if output.may_saturate and limits_dn[3] < np.inf:
         for x in range(strip.total):
             noisy_dn[x] = limits_dn[2] if workspace.unrounded_dn[x] >= limits_dn[3] else noisy_dn[x]
-    if _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, noisy):
-        _count_clipped(strip, noisy_dn, limits_dn[0], limits_dn[1], output.counts)
-    _write(readout, strip, noisy, output.sites)
+    if _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, workspace.normalised):
+        below, above = count_outside(strip, noisy_dn, limits_dn[0], limits_dn[1])
+        output.counts[2] += below
+        output.counts[3] += above
+    _write(readout, strip, workspace.normalised, output.sites)
 
 
 @inner
@@ -342,7 +320,7 @@ def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip:
 
 @inner
 def _write_normalised(readout: Any, output: Output, strip: Strip, workspace: Workspace) -> None:
-    clean = _destination(readout, strip, workspace.normalised, output.sites)
+    clean = workspace.normalised
     low, high = readout.black_dn, readout.black_dn + readout.span_dn
     if readout.averaged:
         low, high = readout.limits_dn[0], readout.limits_dn[1]
@@ -356,35 +334,11 @@ def _write_normalised(readout: Any, output: Output, strip: Strip, workspace: Wor
 
 
 @inner
-def _is_direct(readout: Any, strip: Strip) -> bool:
-    """Return whether a strip is written to its frame at once: complete vectors of a mosaic."""
-    return bool(strip.total == strip.length and not readout.packed)
-
-
-@inner
-def _destination(readout: Any, strip: Strip, buffer: Pointer, sites: Pointer) -> Pointer:
-    """Return where a strip is written: the frame, or the buffer from which `_write` copies it."""
-    return sites if _is_direct(readout, strip) else buffer
-
-
-@inner
-def _clean_buffer(readout: Normalised | FloatClean, strip: Strip, workspace: Workspace, sites: Pointer) -> Pointer:
-    return workspace.clean
-
-
-@inner
-def _clean_destination(readout: Integers, strip: Strip, workspace: Workspace, sites: Pointer) -> Pointer:
-    destination: Pointer = _destination(readout, strip, workspace.clean, sites)
-    return destination
-
-
-@inner
 def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
     """Write a strip to a frame: in place in a mosaic, or to the planes of its sites."""
-    if _is_direct(readout, strip):
-        return
     if not readout.packed:
-        copy_values(strip.length, pointer_to(values, strip.first), out)
+        for x in range(strip.length):
+            out[x] = values[strip.first + x]
         return
     for site in range(2):
         target = pointer_to(out, readout.planes[2 * (strip.y & 1) + site])
@@ -410,5 +364,3 @@ Arguments: read-out, noise, what `sample_noise` returned, output, strip, workspa
 """
 write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
 """Read out the clean frame of a strip; arguments: read-out, output, strip, workspace."""
-clean_destination = by_class({Integers: _clean_destination, Normalised: _clean_buffer, FloatClean: _clean_buffer})
-"""Return where a strip of the clean frame is rounded to; arguments: read-out, strip, workspace, place in the frame."""

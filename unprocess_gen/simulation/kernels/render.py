@@ -24,12 +24,9 @@ from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
-    FloatClean,
-    Integers,
-    Normalised,
     Output,
+    ReadOut,
     average_patterns,
-    clean_destination,
     clear_defects_of,
     count_zero_variance,
     draw_noise,
@@ -108,7 +105,7 @@ def _fill_frames(
 
 def _records(
     plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, origin: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, Integers | Normalised | FloatClean]:
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, ReadOut]:
     """Return the scene, the noise and the read-out, whose classes select the compiled code."""
     first = plans[0]
     scene, noise, readout = _records_of_plans(
@@ -128,7 +125,7 @@ def _records(
 @functools.lru_cache(maxsize=4)
 def _records_of_plans(
     plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, corner: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | None, Integers | Normalised | FloatClean]:
+) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | None, ReadOut]:
     """Return what all patches of an image share; the noise is None if it is counted in electrons."""
     if uses_scene32(plans[0]):
         return scene32_of(plans[0], codes, corner), gaussian_noise32(plans), readout_of(plans, shape, corner, True)
@@ -174,8 +171,7 @@ def _render(
             strip = locate(origin, y, x, min(STRIP, width - x))
             at = (y // 2) * (width // 2) + x // 2 if readout.packed else y * width + x
             source, target = pointer_to(codes, 3 * (y * width + x)), pointer_to(clean_sites, at)
-            rounded = clean_destination(frames, strip, buffers, target)
-            may_saturate = fill_clean(light, source, is_uint8, strip, buffers, rounded, all_counts)
+            may_saturate = fill_clean(light, source, is_uint8, strip, buffers, all_counts)
             for n in range(noisy.shape[0]):
                 draw_noise(sampler, n, load_key(key_words, n), strip, buffers)
                 values, of_frame = sample_noise(frames, sampler, n, strip, buffers), pointer_to(all_counts, 6 * n)

@@ -209,7 +209,10 @@ def list_lanes(lanes: Vector, x: np.uint64, found: int, workspace: Workspace) ->
 
 
 @inner
-def copy_values(length: int, source: Pointer, target: Pointer) -> None:
-    """Copy ``length`` values."""
-    for x in range(length):
-        target[x] = source[x]
+def count_outside(strip: Strip, values: Pointer, low: float, high: float) -> tuple[int, int]:
+    """Return the numbers of values of a strip below and above the limits."""
+    below = above = 0
+    for x in range(strip.first, strip.after):
+        below += values[x] < low
+        above += values[x] > high
+    return below, above
