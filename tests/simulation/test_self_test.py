@@ -156,9 +156,9 @@ def test_a_wrong_philox_constant_is_detected(monkeypatch: pytest.MonkeyPatch) ->
 KERNEL_MODULES = (philox, strips, clean, normal, readout, gaussian, render)
 
 KERNELS = {
-    "_sum_products": "", "_fill_gray_mean_signal": "", "_fill_linear": "", "_recompute_bright": "",
-    "fill_word_blocks": "", "fill_depths": "", "add_gaussian": "noise_dn", "_round_and_list": "",
-    "exact_gaussian_dn": "", "_replace": "",
+    "_fill_signal": "", "_fill_gray_mean_signal": "", "_fill_linear": "clean", "_recompute_bright": "clean",
+    "fill_word_blocks": "", "fill_depths": "", "add_gaussian": "noise_dn", "_round_and_list": "noisy",
+    "exact_gaussian_dn": "", "_replace": "noisy",
 }  # fmt: skip
 """Kernels of the set ``gaussian``, and the member of the workspace that each fills; "" for its last argument or its
 return value."""

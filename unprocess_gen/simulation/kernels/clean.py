@@ -31,7 +31,6 @@ from unprocess_gen.simulation.kernels.simd import (
     has_any_bit,
     less_than,
     load,
-    load_four_bytes,
     maximum,
     minimum,
     pointer_to,
@@ -44,9 +43,7 @@ from unprocess_gen.simulation.kernels.simd import (
 from unprocess_gen.simulation.kernels.strips import ONES, Float32, Strip, Workspace, count_outside
 from unprocess_gen.simulation.reference.cfa import tile
 
-_0, _1, _2, _3, _4, _8 = (np.uint64(number) for number in (0, 1, 2, 3, 4, 8))
-_BYTE, _S8, _S16, _S24 = (np.uint32(number) for number in (0xFF, 8, 16, 24))
-_G, _B = np.uint32(256), np.uint32(512)
+_0, _8 = np.uint64(0), np.uint64(8)
 _ZERO32, _ONE32 = np.float32(0), np.float32(1)
 _ROW_SITES = VECTOR_WIDTH + 2
 
@@ -65,106 +62,68 @@ class Scene(NamedTuple):
     inverse_gains: Float  # [3]
     gray_mean: bool
     highlight_threshold: float
+    steepness: float  # of the highlight term: 1 / (1 - threshold); used in float32 only
     exposure: float
     brightest: float
     clipped: float  # light above it counts as clipped
-    black_dn: float
+    black_dn: Any  # float, or uint32 in Scene32
     span_dn: float
     dn_per_signal: float  # scale of the signal with gray_mean
     limits: Float  # [2, VECTOR_WIDTH + 2]: signals up to it are neither highlights nor clipped nor saturated
+    signal_per_dn: Float  # [2, VECTOR_WIDTH + 2]; used in float32 only
     gains: Float  # [2, VECTOR_WIDTH + 2]: of the sites of even and of odd rows; 1 with gray_mean
     headroom: Float  # [2, VECTOR_WIDTH + 2]: factor of the per-channel highlight term, or 0
     response: Float32  # [H * P], relative gain of each pixel; ones if the clean frame has no fixed pattern
     response_steps: tuple[int, int]  # of a row and of a column; 0 if it has no fixed pattern
 
 
-class Scene32(NamedTuple):
-    """Hold the parameters of a clean frame in float32; DN count from the black level."""
+class Scene32(Scene):
+    """Hold the parameters of a clean frame in float32; DN count from the black level, and ``clipped`` has a margin.
 
-    products: Float32  # [3, 3, codes], scaled to DN; not scaled with gray_mean, which compares channels
-    code_count: int
-    site_channels: NDArray[np.int64]
-    inverse_gains: Float32
-    gray_mean: bool
-    highlight_threshold: np.float32
-    steepness: np.float32  # of the highlight term: 1 / (1 - threshold)
-    exposure: np.float32
-    brightest: np.float32
-    clipped: np.float32  # includes FLOAT32_MARGIN
-    black_dn: np.uint32
-    span_dn: np.float32
-    dn_per_signal: np.float32  # without gains
-    limits: Float32
-    signal_per_dn: Float32  # [2, VECTOR_WIDTH + 2]
-    gains: Float32
-    headroom: Float32
-    response_steps: tuple[int, int]
+    ``products`` are scaled to DN, except with gray_mean, which compares channels.
+    """
 
 
-def scene_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene:
-    """Return the parameters of a plan for sources of ``codes`` codes."""
-    channels = _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
-    gray_mean = plan.highlight == "gray_mean"
-    of_channels = (_linear_limit(plan),) * 3, _site_gains(plan), _headroom(plan)
-    limits, gains, headroom = np.array(of_channels).take(channels, axis=1)
-    return Scene(
-        products=_products(plan.rgb2cam, plan.tone, plan.gamma, codes),
+def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] = Scene) -> Scene:
+    """Return the parameters of a plan for sources of ``codes`` codes; ``kind`` is `Scene` or `Scene32`."""
+    in_float32, channels = kind is Scene32, _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
+    f: Any = np.float32 if in_float32 else np.float64
+    gray_mean, gains, limit = plan.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
+    exposure, brightest, span_dn = plan.exposure, plan.brightest, float(plan.white_level_dn - plan.black_level_dn)
+    scale = tuple(gain * exposure * span_dn if in_float32 else 1.0 for gain in gains)
+    numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
+    limits, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
+    products: Any = _products(plan.rgb2cam, plan.tone, plan.gamma, codes)
+    if in_float32:
+        products = _products32(plan.rgb2cam, plan.tone, plan.gamma, codes, (1.0,) * 3 if gray_mean else scale)
+    return kind(
+        products=products,
         code_count=codes,
         site_channels=channels,
-        inverse_gains=np.array(plan.inverse_gains),
+        inverse_gains=np.array(plan.inverse_gains, dtype=f),
         gray_mean=gray_mean,
-        highlight_threshold=plan.highlight_threshold,
-        exposure=plan.exposure,
-        brightest=plan.brightest,
-        clipped=plan.brightest,
-        black_dn=float(plan.black_level_dn),
-        span_dn=float(plan.white_level_dn - plan.black_level_dn),
-        dn_per_signal=1.0,
+        highlight_threshold=f(plan.highlight_threshold),
+        steepness=f(1 / (1 - plan.highlight_threshold)),
+        exposure=f(exposure),
+        brightest=f(brightest),
+        clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
+        black_dn=np.uint32(plan.black_level_dn) if in_float32 else float(plan.black_level_dn),
+        span_dn=f(span_dn),
+        dn_per_signal=f(exposure * span_dn if in_float32 else 1.0),
         limits=limits,
-        gains=gains,
+        signal_per_dn=signal_per_dn,
+        gains=site_gains,
         headroom=headroom,
         response=ONES,
         response_steps=(0, 0),
     )
 
 
-def with_response(scene: Any, response: Response) -> Scene:
+def with_response(scene: Scene, response: Response) -> Scene:
     """Return the scene of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
     limits = np.full_like(scene.limits, -np.inf)
-    changed: Scene = scene._replace(response=response.factors, response_steps=response.steps, limits=limits)
-    return changed
-
-
-def scene32_of(plan: Plan, codes: int, origin: tuple[int, int]) -> Scene32:
-    """Return the parameters of a plan in float32, for sources of ``codes`` codes."""
-    f, channels = np.float32, _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
-    gray_mean, gains, limit = plan.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
-    exposure, brightest, threshold = plan.exposure, plan.brightest, plan.highlight_threshold
-    span_dn = float(plan.white_level_dn - plan.black_level_dn)
-    scale = [gain * exposure * span_dn for gain in gains]
-    numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
-    limits, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
-    return Scene32(
-        products=_products32(plan.rgb2cam, plan.tone, plan.gamma, codes, (1.0,) * 3 if gray_mean else tuple(scale)),
-        code_count=codes,
-        site_channels=channels,
-        inverse_gains=np.array(plan.inverse_gains, dtype=f),
-        gray_mean=gray_mean,
-        highlight_threshold=f(threshold),
-        steepness=f(1 / (1 - threshold)),
-        exposure=f(exposure),
-        brightest=f(brightest),
-        clipped=f(brightest * (1 + FLOAT32_MARGIN)),
-        black_dn=np.uint32(plan.black_level_dn),
-        span_dn=f(span_dn),
-        dn_per_signal=f(exposure * span_dn),
-        limits=limits,
-        signal_per_dn=signal_per_dn,
-        gains=site_gains,
-        headroom=headroom,
-        response_steps=(0, 0),
-    )
+    return scene._replace(response=response.factors, response_steps=response.steps, limits=limits)
 
 
 @functools.lru_cache(maxsize=4)
@@ -217,36 +176,15 @@ def _load_sites(values: Pointer, strip: Strip) -> Vector:
 
 
 @inner
-def _fill_signal(codes: Pointer, is_uint8: bool, strip: Strip, scene: Any, signal: Pointer) -> None:
+def _fill_signal(codes: Pointer, strip: Strip, scene: Any, signal: Pointer) -> None:
     """Linearise codes and apply the matrix, for the channel of each site: sum three products."""
-    channels, code_count, done = pointer_to(scene.site_channels, _ROW_SITES * (strip.y & 1)), scene.code_count, 0
+    channels, code_count = pointer_to(scene.site_channels, _ROW_SITES * (strip.y & 1)), scene.code_count
     even = pointer_to(scene.products, 3 * code_count * channels[0])
     odd = pointer_to(scene.products, 3 * code_count * channels[1])
-    if is_uint8:
-        done = strip.length // 4 * 4
-        _sum_products_uint8(codes, even, odd, done // 4, signal)
-    for x in range(done, strip.length):
+    for x in range(strip.length):
         of_site = odd if x & 1 else even
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
         signal[x] = (of_site[r] + of_site[code_count + g]) + of_site[2 * code_count + b]
-
-
-@inner
-def _sum_products_uint8(codes: Pointer, even: Pointer, odd: Pointer, fours: int, signal: Pointer) -> None:
-    """Sum the products of four pixels at a time: three loads give their codes, and loads limit the speed."""
-    for four in range(fours):
-        x = np.uint64(four) * _4
-        at = _3 * x
-        first, second = load_four_bytes(codes, at), load_four_bytes(codes, at + _4)
-        third = load_four_bytes(codes, at + _8)
-        r, g, b = first & _BYTE, (first >> _S8) & _BYTE, (first >> _S16) & _BYTE
-        signal[x] = (even[r] + even[_G + g]) + even[_B + b]
-        r, g, b = first >> _S24, second & _BYTE, (second >> _S8) & _BYTE
-        signal[x + _1] = (odd[r] + odd[_G + g]) + odd[_B + b]
-        r, g, b = (second >> _S16) & _BYTE, second >> _S24, third & _BYTE
-        signal[x + _2] = (even[r] + even[_G + g]) + even[_B + b]
-        r, g, b = (third >> _S8) & _BYTE, (third >> _S16) & _BYTE, third >> _S24
-        signal[x + _3] = (odd[r] + odd[_G + g]) + odd[_B + b]
 
 
 @inner
@@ -349,7 +287,7 @@ _store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
 
 
 @inner
-def fill_clean(scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspace: Workspace, counts: Pointer) -> bool:
+def fill_clean(scene: Any, codes: Pointer, strip: Strip, workspace: Workspace, counts: Pointer) -> bool:
     """Fill one strip of the clean frame, before and after rounding, and update the counts of clipped sites.
 
     Return whether any site can be saturated.
@@ -358,7 +296,7 @@ def fill_clean(scene: Any, codes: Pointer, is_uint8: bool, strip: Strip, workspa
     if scene.gray_mean:
         _fill_gray_mean_signal(codes, strip, scene, signal)
     else:
-        _fill_signal(codes, is_uint8, strip, scene, signal)
+        _fill_signal(codes, strip, scene, signal)
     has_negative, has_bright = _fill_linear(scene, strip, workspace)
     if has_bright:
         _recompute_bright(scene, strip, workspace)

@@ -336,14 +336,15 @@ def _write_normalised(readout: Any, output: Output, strip: Strip, workspace: Wor
 @inner
 def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
     """Write a strip to a frame: in place in a mosaic, or to the planes of its sites."""
+    source = pointer_to(values, strip.first)
     if not readout.packed:
         for x in range(strip.length):
-            out[x] = values[strip.first + x]
+            out[x] = source[x]
         return
     for site in range(2):
         target = pointer_to(out, readout.planes[2 * (strip.y & 1) + site])
         for x in range(strip.length // 2):
-            target[x] = values[strip.first + 2 * x + site]
+            target[x] = source[2 * x + site]
 
 
 @inner

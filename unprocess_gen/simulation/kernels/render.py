@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.types import PACKED, Counts, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import body_of, clean_response, fixed_patterns
-from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene32_of, scene_of, with_response
+from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene_of, with_response
 from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise, with_dark_frames
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
@@ -105,7 +105,7 @@ def _fill_frames(
 
 def _records(
     plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, origin: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | Electrons, ReadOut]:
+) -> tuple[Scene, Gaussian | Gaussian32 | Electrons, ReadOut]:
     """Return the scene, the noise and the read-out, whose classes select the compiled code."""
     first = plans[0]
     scene, noise, readout = _records_of_plans(
@@ -125,10 +125,11 @@ def _records(
 @functools.lru_cache(maxsize=4)
 def _records_of_plans(
     plans: tuple[Plan, ...], shape: tuple[int, int], codes: int, corner: tuple[int, int]
-) -> tuple[Scene | Scene32, Gaussian | Gaussian32 | None, ReadOut]:
+) -> tuple[Scene, Gaussian | Gaussian32 | None, ReadOut]:
     """Return what all patches of an image share; the noise is None if it is counted in electrons."""
     if uses_scene32(plans[0]):
-        return scene32_of(plans[0], codes, corner), gaussian_noise32(plans), readout_of(plans, shape, corner, True)
+        scene = scene_of(plans[0], codes, corner, Scene32)
+        return scene, gaussian_noise32(plans), readout_of(plans, shape, corner, True)
     noise = None if plans[0].counts_electrons else gaussian_noise(plans)
     return scene_of(plans[0], codes, corner), noise, readout_of(plans, shape, corner, False)
 
@@ -165,13 +166,13 @@ def _render(
         workspace_in(scratch),
     )
     codes, clean_sites, noisy_sites = pointer_to(srgb, 0), pointer_to(clean, 0), pointer_to(noisy, 0)
-    is_uint8, key_words, all_counts, sites = srgb.itemsize == 1, pointer_to(keys, 0), pointer_to(counts, 0), clean.size
+    key_words, all_counts, sites = pointer_to(keys, 0), pointer_to(counts, 0), clean.size
     for y in range(height):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
             at = (y // 2) * (width // 2) + x // 2 if readout.packed else y * width + x
             source, target = pointer_to(codes, 3 * (y * width + x)), pointer_to(clean_sites, at)
-            may_saturate = fill_clean(light, source, is_uint8, strip, buffers, all_counts)
+            may_saturate = fill_clean(light, source, strip, buffers, all_counts)
             for n in range(noisy.shape[0]):
                 draw_noise(sampler, n, load_key(key_words, n), strip, buffers)
                 values, of_frame = sample_noise(frames, sampler, n, strip, buffers), pointer_to(all_counts, 6 * n)

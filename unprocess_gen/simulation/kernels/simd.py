@@ -286,15 +286,6 @@ def store(pointer: Pointer, at: Index, lanes: Vector) -> None:
     pointer[at : at + VECTOR_WIDTH] = lanes.astype(pointer.dtype)
 
 
-@_compiled(
-    lambda pointer, at: types.uint32,
-    lambda context, builder, call, arguments: builder.load(_address(builder, ir.IntType(32), *arguments), align=1),
-)
-def load_four_bytes(pointer: Pointer, at: Index) -> np.uint32:
-    """Load bytes ``at`` to ``at + 3`` as one little-endian number, in a single instruction."""
-    return np.uint32(int.from_bytes(pointer[at : at + 4].tobytes(), "little"))
-
-
 def _build_columns(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
     """Load each row at once and transpose, because single loads would take three times as long."""
     table, starts, at = arguments
