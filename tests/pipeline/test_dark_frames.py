@@ -12,6 +12,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.dark_frames import banded, save_frames
 from helpers.datasets import Make, Settings, TreeHash
+from helpers.noise_faults import replace_noisy_frames
 from helpers.photographs import pixels
 from PIL import Image
 
@@ -23,6 +24,7 @@ from unprocess_gen.dataset.shards import json_inside
 from unprocess_gen.pipeline.replay import PairRegenerator
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
+from unprocess_gen.reports.noise_check.checks import failed_checks, pair_scores, pair_sums, threshold
 from unprocess_gen.sources.dark_frames import open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "camera=identity", "gains=unity")
@@ -287,10 +289,45 @@ def test_report_describes_the_frames(made: Path, run_main: RunMain, tmp_path: Pa
     assert "dark_frame" in page
 
 
-def test_noise_of_dark_frames_is_not_checked(made: Path, run_main: RunMain) -> None:
-    done = run_main("verify", made, "--noise")
-    assert done.code == 0, done.err
-    assert "no number of the row describes, such as that of dark frames" in done.out
+def test_noise_of_dark_frames_is_checked_with_their_folder(make: Make, run_main: RunMain, tmp_path: Path) -> None:
+    save_frames(tmp_path / "darks", 3)
+    overrides = *NOISE, f"noise.dark_frames={tmp_path / 'darks'}", "source.limit=2", "source.patch=[grid, 256]"
+    make(None, tmp_path / "ds", *overrides, "scene.exposure_ratio=50")
+    count = len(rows(tmp_path / "ds"))
+    done = run_main("verify", "ds", "--noise")
+    assert (done.code, done.err) == (0, "")
+    assert f"noise of {count} pairs checked, 0 wrong\n" in done.out
+    (tmp_path / "darks").rename(tmp_path / "moved")
+    done = run_main("verify", "ds", "--noise")
+    assert (done.code, done.err) == (0, "")
+    assert "dark frames that are not available; noise.dark_frames=FOLDER names their folder" in done.out
+    done = run_main("verify", "ds", "--noise", f"noise.dark_frames={tmp_path / 'moved'}")
+    assert f"noise of {count} pairs checked, 0 wrong\n" in done.out
+    assert run_main("verify", "ds", "--noise", f"noise.dark_frames={tmp_path / 'none'}").code == 2
+    draws = np.random.default_rng(0)
+    replace_noisy_frames(
+        tmp_path / "ds",
+        lambda clean, noisy, row: np.rint(noisy + draws.normal(0, 4, noisy.shape)).astype(np.uint16),
+    )
+    done = run_main("verify", "ds", "--noise", f"noise.dark_frames={tmp_path / 'moved'}")
+    assert done.code == 4
+    assert "noise of all pairs together: variance" in done.err
+
+
+@pytest.mark.parametrize("shading", ["keep", "remove"])
+@pytest.mark.parametrize("overrides", [(), ("output.dtype=float32", "sensor.clip=none"), ("accuracy=fast",)])
+def test_sums_of_dark_frames_raise_no_alarm(overrides: tuple[str, ...], shading: str, darks: Path) -> None:
+    config, _, access = open_dark_frames(
+        ug.load_config([*NOISE, f"noise.dark_frames={darks}", f"noise.dark_shading={shading}", *overrides])
+    )
+    for number in range(2):
+        config.seed = number
+        pair = ug.make_pair(pixels(number, 200, 300), config)
+        sums = pair_sums(pair.clean, pair.noisy, pair.row, access)
+        assert sums is not None
+        assert sums.sites > 0.5 * pair.clean.size
+        assert failed_checks("", pair_scores(sums), threshold(1)) == []
+        assert pair_sums(pair.clean, pair.noisy, pair.row) is None
 
 
 # Dark shading ---------------------------------------------------------------------------------------------------------

@@ -423,7 +423,7 @@ def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -
         regenerated, codes = len(replayed), [result.exit_code for result in replayed]
         damages += _reported(folder, (_complaint(result) for result in replayed if result.complaint))
     if "noise" in call.values and not damages:
-        damages += _check_noise(folder, call.values.get("to"))
+        damages += _check_noise(folder, dark_frames, call)
     if damages:
         return worst(codes) or DamageError.exit_code
     print_result(
@@ -436,16 +436,24 @@ def _complaint(result: ReplayResult) -> str:
     return f"{result.key} ({result.source}): {result.complaint}"
 
 
-def _check_noise(folder: AnyPath, to: str | None) -> list[str]:
+def _check_noise(folder: AnyPath, dark_frames: str | None, call: Call) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen.reports import photon_transfer
+    from unprocess_gen.sources.dark_frames import dark_folder
 
-    found = photon_transfer.examine_dataset(folder)
+    to, access = call.values.get("to"), None
+    if dark_frames is not None:
+        try:
+            access = dark_folder(dark_frames)
+        except ConfigError:  # without the recorded folder, the pairs are counted as not checked
+            if "dark_frames" in call.values:
+                raise
+    found = photon_transfer.examine_dataset(folder, access)
     checks = found.checks
     if not checks.count:
         print_result(
-            f"{folder}: no pair can be checked: too few usable sites, or noise that no number of the row describes, "
-            "such as that of dark frames"
+            f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
+            "noise.dark_frames=FOLDER names their folder"
         )
         return []
     if found.worst is not None:
@@ -453,7 +461,7 @@ def _check_noise(folder: AnyPath, to: str | None) -> list[str]:
             f"noise of {counted(found.count, 'pair')} fitted (a, b with 95 % intervals); "
             f"the farthest from its row: {found.worst}"
         )
-    unchecked = f"; {checks.unchecked} not checked: too few usable sites, or an effect that cannot be checked"
+    unchecked = f"; {checks.unchecked} not checked: too few usable sites, or a dark frame that is not available"
     print_result(
         f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"
         + (unchecked if checks.unchecked else "")

@@ -18,7 +18,7 @@ import numpy as np
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.core.types import Float, Frame, Row
+from unprocess_gen.core.types import DarkPixels, Float, Frame, Row
 from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.reports.noise_check.checks import Checker, NoiseChecks, pair_sums
 from unprocess_gen.reports.noise_check.scores import planes_of
@@ -99,13 +99,15 @@ class NoiseSummary:
     checks: NoiseChecks
 
 
-def examine_dataset(folder: AnyPath) -> NoiseSummary:
+def examine_dataset(folder: AnyPath, dark_pixels: DarkPixels | None = None) -> NoiseSummary:
     """Fit and check the noise of every pair of a dataset, one pair at a time.
 
     Parameters
     ----------
     folder : Path or ObjectPath
         Folder of the dataset.
+    dark_pixels : DarkPixels or None
+        Access to its dark frames; without it, pairs with dark frames are not checked.
 
     Returns
     -------
@@ -116,12 +118,14 @@ def examine_dataset(folder: AnyPath) -> NoiseSummary:
     ------
     DamageError
         If the dataset is damaged.
+    SourceChangedError
+        If a dark frame is missing or has changed.
     """
     count, worst = 0, None
     first: list[NoiseFit] = []
     checker = Checker(folder)
     for clean, noisy, row in RawPairs(folder):
-        sums = pair_sums(clean, noisy, row)
+        sums = pair_sums(clean, noisy, row, dark_pixels)
         checker.add(row, sums)
         fit = None if sums is None else fit_sums(str(row["key"]), sums)
         if fit is None:

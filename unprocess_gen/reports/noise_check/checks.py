@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unprocess_gen.core.object_store import AnyPath
-from unprocess_gen.core.types import Frame, Plan, Row
+from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
 from unprocess_gen.reports.noise_check.law import NoiseLaw, is_supported
@@ -144,7 +144,7 @@ class NoiseChecks:
     wrong_pairs: int = 0
 
 
-def pair_sums(clean: Frame, noisy: Frame, row: Row) -> Sums | None:
+def pair_sums(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> Sums | None:
     """Sum the statistics of a pair.
 
     Parameters
@@ -153,6 +153,8 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row) -> Sums | None:
         Frames in the dtype and layout of the dataset.
     row : Row
         Manifest row of the pair.
+    dark_pixels : DarkPixels or None
+        Access to the dark frames of the dataset, which pairs with dark frames need.
 
     Returns
     -------
@@ -163,12 +165,15 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row) -> Sums | None:
     ------
     DamageError
         If the row is not a plan.
+    SourceChangedError
+        If its dark frame is missing or has changed.
     """
     plan = plan_from_row(row)
-    if not is_supported(plan):
+    if not is_supported(plan, dark_pixels):
         return None
     with np.errstate(under="ignore"):
-        sums = Sums(NoiseLaw(plan, patch_from_row(row)), mosaic_dn(clean, row), mosaic_dn(noisy, row))
+        law = NoiseLaw(plan, patch_from_row(row), dark_pixels)
+        sums = Sums(law, mosaic_dn(clean, row), mosaic_dn(noisy, row))
         if sums.sites < LEAST_SITES:
             return None
         sums.fill()

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.exact_distributions import LOGISTIC, tukey_std
-from unprocess_gen.core.types import Float, Patch, Physics, Plan
+from unprocess_gen.core.types import DarkPixels, Float, Patch, Physics, Plan
 from unprocess_gen.simulation.reference import noise as reference
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
@@ -164,6 +164,12 @@ def _read(plan: Plan) -> list[Term]:
     return [Term(_constant(std * std), lambda u, tau: tukey_factor(std * tau, law, shape))]
 
 
+def _dark_frame(plan: Plan) -> list[Term]:
+    """Dither of a dark frame; its pixels are an offset that `NoiseLaw.offsets` returns."""
+    width_dn = plan.dark_scale
+    return [Term(_constant(width_dn * width_dn / 12), lambda u, tau: np.sinc(width_dn * tau / (2 * np.pi)))]
+
+
 def _row(plan: Plan) -> list[Term]:
     return [_gaussian(_constant(_physics(plan).row_std_dn ** 2))]
 
@@ -187,6 +193,7 @@ EFFECTS: dict[str, Callable[[Plan], list[Term]]] = {
     "full_well": _none,  # `NoiseLaw.is_far_from_limits`
     "gain_by_colour": _none,  # `NoiseLaw.of_site`
     "read": _read,
+    "dark_frame": _dark_frame,
     "row": _row,  # also `NoiseLaw.rows`
     "column": _none,  # `NoiseLaw.offset_dn`
     "column_temporal": _none,  # `NoiseLaw.offset_dn`, because the row determines it
@@ -197,20 +204,22 @@ EFFECTS: dict[str, Callable[[Plan], list[Term]]] = {
 """What each effect adds to the noise of a site. A new effect enters the checks here."""
 
 
-def is_supported(plan: Plan) -> bool:
+def is_supported(plan: Plan, dark_pixels: DarkPixels | None) -> bool:
     """Return whether the noise of a plan can be checked.
 
     Parameters
     ----------
     plan : Plan
         Plan of a pair.
+    dark_pixels : DarkPixels or None
+        Access to the dark frames of the dataset.
 
     Returns
     -------
     bool
-        False if an effect has no entry in `EFFECTS`.
+        False if an effect has no entry in `EFFECTS`, and for plans with a dark frame without access to it.
     """
-    return EFFECTS.keys() >= set(plan.effects)
+    return EFFECTS.keys() >= set(plan.effects) and not (plan.dark_frame and dark_pixels is None)
 
 
 def _plans_by_site(plan: Plan) -> list[Plan]:
@@ -286,6 +295,8 @@ class NoiseLaw:
         Plan of the pair, from its manifest row.
     patch : Patch
         Part of the full frame that the pair shows.
+    dark_pixels : DarkPixels or None
+        Access to the dark frame of the plan, if it has one.
 
     Raises
     ------
@@ -293,8 +304,9 @@ class NoiseLaw:
         If an effect of the plan has no entry in `EFFECTS`.
     """
 
-    def __init__(self, plan: Plan, patch: Patch) -> None:
+    def __init__(self, plan: Plan, patch: Patch, dark_pixels: DarkPixels | None = None) -> None:
         self.plan = plan
+        self._patch, self._dark_pixels = patch, dark_pixels
         terms = [term for effect in plan.effects for term in EFFECTS[effect](plan)]
         self._temporal = [term for term in terms if not term.is_fixed]
         self._fixed = [term for term in terms if term.is_fixed]
@@ -363,6 +375,33 @@ class NoiseLaw:
         errors = reference.black_error(physics, (2, 2), patch.origin) if "black_error" in plan.effects else 0.0
         return np.zeros((2, patch.width)) + temporal, np.zeros((2, 2)) + errors + dark
 
+    @property
+    def farthest_dark_dn(self) -> float:
+        """Largest value of a dark frame at sites that are checked, DN above its black level; hot pixels have more."""
+        return NORMAL_DISTANCE * math.sqrt(max(self.plan.b_dn2, 0.0)) if self.plan.dark_frame else 0.0
+
+    def offsets(self, height: int, width: int) -> NDArray[np.float32]:
+        """Return what is known to be added to the noisy frame, DN.
+
+        Parameters
+        ----------
+        height, width : int
+            Size of the part of the patch that is checked, from its first site.
+
+        Returns
+        -------
+        ndarray of float32, [2, W], or [H, W] with a dark frame
+            NaN for sites that are not checked.
+        """
+        offsets = self.offset_dn[:, :width].astype(np.float32)
+        if not self.plan.dark_frame:
+            return offsets
+        dark = reference.dark_frame_offsets(self.plan, self._dark_pixels, (height, width), self._patch.origin)
+        dark[np.abs(dark) > self.farthest_dark_dn] = np.nan
+        dark[0::2] += offsets[0]
+        dark[1::2] += offsets[1]
+        return dark
+
     def signal(self, clean_dn: Float, site: tuple[int, int]) -> Float:
         """Return the signal above black that causes shot noise, for DN of the clean frame at a site of the tile."""
         return np.asarray(np.maximum(clean_dn - self.plan.black_level_dn - self._clean_offset_dn[site], 0.0))
@@ -394,7 +433,8 @@ class NoiseLaw:
         u = self.signal(clean_dn, site)
         read_dn, read_distance = self._read_distance()
         other = np.sqrt(np.maximum(self.variance(u) - read_dn * read_dn, 0.0))
-        distance = NORMAL_DISTANCE * other + read_distance * read_dn + np.abs(self.offset_dn).max(initial=0.0)
+        offset_dn = np.abs(self.offset_dn).max(initial=0.0) + self.farthest_dark_dn
+        distance = NORMAL_DISTANCE * other + read_distance * read_dn + offset_dn
         low, high = self.limits
         far = (clean_dn - distance > low) & (clean_dn + distance < high) & (clean_dn < plan.brightest_dn - 0.5)
         if plan.averaged:

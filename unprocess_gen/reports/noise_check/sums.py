@@ -82,7 +82,7 @@ class Sums:
         self.law = law
         self.height, self.width = int(clean.shape[0]) // 2 * 2, int(clean.shape[1]) // 2 * 2
         self._clean, self._noisy = clean[: self.height, : self.width], noisy[: self.height, : self.width]
-        self._offsets = law.offset_dn[:, : self.width].astype(np.float32)
+        self._offsets = law.offsets(self.height, self.width)
         self._size = int(self._clean.max(initial=0)) + 2
         self.counts = np.zeros((4, self._size))
         count_sites(self._clean, self._offsets, self.counts)
