@@ -229,10 +229,11 @@ commit, made = worker.commit_shard, []
 
 
 def commits(storage, shard):
-    commit(storage, shard)
+    report = commit(storage, shard)
     made.append(shard)
     if len(made) == 18:
         os.kill(os.getpid(), signal.SIGKILL)
+    return report
 
 
 worker.commit_shard = commits

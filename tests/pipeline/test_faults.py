@@ -50,6 +50,7 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.tasks import ShardReport
 
 COUNT = 24
 
@@ -75,11 +76,12 @@ def after_commits(number: int, action: Callable[[], Any], monkeypatch: pytest.Mo
     """Call ``action`` once a run of this process has committed ``number`` shards."""
     commit, done = worker.commit_shard, []
 
-    def commits(storage: Storage, made: Any) -> None:
-        commit(storage, made)
+    def commits(storage: Storage, made: Any) -> ShardReport:
+        report = commit(storage, made)
         done.append(made.shard)
         if len(done) == number:
             action()
+        return report
 
     monkeypatch.setattr(worker, "commit_shard", commits)
 
@@ -421,7 +423,7 @@ def intact(out: Path) -> bool:
         recorded = out / ".work/rows" / f"{int(shard.stem[6:]):05d}.json"
         if not recorded.exists():
             continue
-        record = json.loads(recorded.read_text())["entry"]
+        record = json.loads(recorded.read_text().partition("\n")[0])["entry"]
         content = shard.read_bytes()
         if (len(content), hashlib.sha256(content).hexdigest()) != (record["bytes"], record["sha256"]):
             return False

@@ -395,6 +395,24 @@ def test_committed_shard_with_unreadable_rows_is_regenerated(begun: Path, make: 
     assert_complete(begun / "ds")
 
 
+def test_committed_shard_with_truncated_rows_is_regenerated(
+    begun: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
+) -> None:
+    record = begun / "ds/.work/rows/00000.json"
+    record.write_bytes(record.read_bytes()[:-1])
+    make(begun / "p", begun / "ds", TWO)
+    make(begun / "p", tmp_path / "other", TWO)
+    assert tree_hash(begun / "ds") == tree_hash(tmp_path / "other")
+
+
+def test_records_of_many_shards_are_deleted(begun: Path, make: Make) -> None:
+    """More files than one thread deletes at a time."""
+    for number in range(100, 300):
+        (begun / f"ds/.work/rows/{number:05d}.json").write_text("{}")
+    make(begun / "p", begun / "ds", TWO)
+    assert_complete(begun / "ds")
+
+
 def test_work_folder_left_by_a_kill_is_deleted(finished: Path, make: Make) -> None:
     (finished / "ds/.work/rows").mkdir(parents=True)
     make(finished / "p", finished / "ds", TWO)

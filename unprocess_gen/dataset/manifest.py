@@ -367,9 +367,12 @@ def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = NAMES
     names : sequence of str
         Header. `read_header` returns the one of an older manifest, whose bytes are thereby restored.
     """
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows([_cell(row[name]) for name in names] for row in rows)
+    csv.writer(stream, lineterminator="\n").writerow(names)
+    _write_lines(stream, rows, names)
+
+
+def _write_lines(stream: TextIO, rows: Iterable[Row], names: Sequence[str]) -> None:
+    csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in names] for row in rows)
 
 
 def rows_text(rows: Iterable[Row]) -> str:
@@ -386,7 +389,7 @@ def rows_text(rows: Iterable[Row]) -> str:
         One line for each row.
     """
     stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows([_cell(row[name]) for name in NAMES] for row in rows)
+    _write_lines(stream, rows, NAMES)
     return stream.getvalue()
 
 
@@ -401,20 +404,20 @@ def header_text() -> str:
     return ",".join(NAMES) + "\n"
 
 
-def current_text(text: str, columns: int) -> str:
-    """Return lines of `rows_text` with an empty cell for each column that was added later.
+def current_lines(lines: bytes, columns: int) -> bytes:
+    """Return lines of a manifest with an empty cell for each column that was added later.
 
     Parameters
     ----------
-    text : str
-        Lines that any version wrote.
+    lines : bytes
+        Lines of `rows_text` that any version wrote, in UTF-8.
     columns : int
         Number of columns of that version.
 
     Returns
     -------
-    str
-        The text itself if this version has no other columns.
+    bytes
+        The lines themselves if this version has no other columns.
 
     Raises
     ------
@@ -422,13 +425,13 @@ def current_text(text: str, columns: int) -> str:
         If no version has as many columns.
     """
     if columns == len(NAMES):
-        return text
+        return lines
     if columns not in map(len, HEADERS):
         raise ValueError(f"rows of {columns} columns; expected those of a known version")
     stream = io.StringIO()
-    rows = csv.reader(io.StringIO(text, newline=""))
+    rows = csv.reader(io.StringIO(lines.decode(), newline=""))
     csv.writer(stream, lineterminator="\n").writerows([*row, *[""] * (len(NAMES) - columns)] for row in rows)
-    return stream.getvalue()
+    return stream.getvalue().encode()
 
 
 def _cell(value: Value) -> str:

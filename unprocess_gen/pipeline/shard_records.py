@@ -2,6 +2,8 @@
 
 A worker puts a shard in place first and its record second, so the record is the commit: a shard with a record is
 complete. Any number of writers may commit the same shard, because all of them make the same bytes.
+
+A record is a line of JSON, then the shard's lines of the manifest. The end of a run only joins these lines.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.dataset.columns import NAMES
-from unprocess_gen.dataset.manifest import current_text, row_of_values, rows_text
+from unprocess_gen.dataset.manifest import current_lines, row_of_values, rows_text
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tally import Tally
@@ -25,22 +27,21 @@ ROWS = ".work/rows"
 """Folder of the records below ``out``."""
 
 
-def commit_shard(storage: Storage, result: ShardResult) -> None:
-    """Put a finished shard in place, then its record; raise OSError if the storage fails.
-
-    The record holds the lines of the manifest, so that the end of a run only joins them.
-    """
+def commit_shard(storage: Storage, result: ShardResult) -> ShardReport:
+    """Put a finished shard in place, then its record, and describe it; raise OSError if the storage fails."""
     if result.path is not None:
         storage.commit(Path(result.path), f"shards/{shard_name(result.shard)}")
     report = result.report()
-    record = {
+    csv = rows_text(result.rows)
+    facts = {
         "entry": result.entry(),
         "report": [report.images, report.failed, report.rows, report.frame_sizes],
         "tally": Tally.of(result.rows).facts(),
         "columns": len(NAMES),
-        "csv": rows_text(result.rows),
+        "csv_bytes": len(csv.encode()),
     }
-    storage.write(record_name(result.shard), json.dumps(record, separators=(",", ":")))
+    storage.write(record_name(result.shard), json.dumps(facts, separators=(",", ":")) + "\n" + csv)
+    return report
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,19 +56,23 @@ class ShardRecord:
         Without times.
     tally : Tally
         Counts of the rows.
-    csv : str
+    csv : bytes
         Lines of the manifest.
     """
 
     entry: dict[str, Any]
     report: ShardReport
     tally: Tally
-    csv: str
+    csv: bytes
 
 
 def record_name(shard: int) -> str:
     """Return the name of a shard's record below ``out``."""
-    return f"{ROWS}/{shard:05d}.json"
+    return f"{ROWS}/{_file_name(shard)}"
+
+
+def _file_name(shard: int) -> str:
+    return f"{shard:05d}.json"
 
 
 class ShardRecords:
@@ -96,7 +101,7 @@ class ShardRecords:
     def recorded(self, shards: Iterable[int]) -> set[int]:
         """Return which of some shards have a record, provisional ones included."""
         names = self._storage.names(ROWS)
-        return {shard for shard in shards if Path(record_name(shard)).name in names}
+        return {shard for shard in shards if _file_name(shard) in names}
 
     def is_committed(self, shard: int) -> bool:
         """Return whether one shard is committed."""
@@ -104,7 +109,7 @@ class ShardRecords:
 
     def _is_committed(self, shard: int, size: int | None) -> bool:
         try:
-            entry = self._read(shard)["entry"]
+            entry = self._read(shard)[0]["entry"]
             return not entry.get("provisional") and (entry["file"] is None or entry["bytes"] == size)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return False
@@ -112,26 +117,31 @@ class ShardRecords:
     def record(self, shard: int) -> ShardRecord:
         """Return the record of a shard; raise DamageError if it cannot be read."""
         try:
-            found = self._read(shard)
-            if "rows" in found:
-                return _old_record(shard, found)
-            images, failed, rows, sizes = found["report"]
+            facts, csv = self._read(shard)
+            if "rows" in facts:
+                return _old_record(shard, facts)
+            images, failed, rows, sizes = facts["report"]
             report = ShardReport(shard, images, failed, rows, tuple((clip, int(w), int(h)) for clip, w, h in sizes))
-            text = current_text(found["csv"], found["columns"])
-            return ShardRecord(dict(found["entry"]), report, Tally(**found["tally"]), text)
+            return ShardRecord(
+                dict(facts["entry"]), report, Tally(**facts["tally"]), current_lines(csv, facts["columns"])
+            )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DamageError(
                 f"{self._place}/{record_name(shard)}: cannot be read ({error_in_one_line(error)}); delete the file and "
                 "rerun to make its shard"
             ) from error
 
-    def _read(self, shard: int) -> dict[str, Any]:
-        record: dict[str, Any] = json.loads(self._storage.read(record_name(shard)))
-        return record
+    def _read(self, shard: int) -> tuple[dict[str, Any], bytes]:
+        """Return the first line of a record, and its lines of the manifest."""
+        line, _, csv = self._storage.read_bytes(record_name(shard)).partition(b"\n")
+        facts: dict[str, Any] = json.loads(line)
+        if len(csv) != facts.get("csv_bytes", 0):
+            raise ValueError(f"{len(csv)} bytes of rows; expected {facts.get('csv_bytes', 0)}")
+        return facts, csv
 
 
-def _old_record(shard: int, found: dict[str, Any]) -> ShardRecord:
+def _old_record(shard: int, facts: dict[str, Any]) -> ShardRecord:
     """Return the record of a shard that version 0.1 committed, with values of rows instead of lines."""
-    rows = tuple(row_of_values(values) for values in found["rows"])
+    rows = tuple(row_of_values(values) for values in facts["rows"])
     report = ShardResult(shard, None, 0, None, rows).report()
-    return ShardRecord(dict(found["entry"]), report, Tally.of(rows), rows_text(rows))
+    return ShardRecord(dict(facts["entry"]), report, Tally.of(rows), rows_text(rows).encode())

@@ -57,23 +57,18 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
     storage = open_storage(context.config.out)
     try:
         if not context.counts_deaths:
-            return _make_and_commit(context, task)
+            return commit_shard(storage, make_shard(context, task))
         deaths = Deaths(storage, task.shard)
         if deaths.count >= LIMIT:
             report = commit_provisional(context, task, deaths.source(task.sources), LIMIT)
         else:
             with deaths.marked() as marker:
-                report = _make_and_commit(replace(context, marker=marker if deaths.count else ""), task)
+                with_marker = replace(context, marker=marker if deaths.count else "")
+                report = commit_shard(storage, make_shard(with_marker, task))
         deaths.forget()
     except OSError as error:
         raise machine_error(error, any_path(context.config.out), RESUME) from error
     return report
-
-
-def _make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
-    result = make_shard(context, task)
-    commit_shard(open_storage(context.config.out), result)
-    return result.report()
 
 
 DEATHS = {2: ("two workers died", "its worker died twice"), 4: ("four workers died", "its worker died four times")}
@@ -104,10 +99,9 @@ def commit_provisional(context: RunContext, task: ShardTask, source: Source, dea
     rows = [failed_row(one, None, task.shard, context.config.seed, "worker_died", detail) for one in task.sources]
     result = ShardResult(task.shard, None, 0, None, tuple(rows), killer=f"{source.name}: {in_progress}")
     try:
-        commit_shard(open_storage(context.config.out), result)
+        return commit_shard(open_storage(context.config.out), result)
     except OSError as error:
         raise machine_error(error, any_path(context.config.out), RESUME) from error
-    return result.report()
 
 
 def make_shard(context: RunContext, task: ShardTask) -> ShardResult:

@@ -41,8 +41,7 @@ from unprocess_gen.dataset.dataset_json import MAX_BYTES, PARQUET_SHA256, check_
 from unprocess_gen.dataset.manifest import header_text, read_rows
 from unprocess_gen.pipeline.listing_record import RecordedFile, read_record, recorded_files, write_listing
 from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.storage import WORK, open_storage
-from unprocess_gen.pipeline.storage.local import cannot_write
+from unprocess_gen.pipeline.storage import WORK, cannot_write, open_storage
 from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.sources.listing import content_sha256
 
@@ -273,7 +272,7 @@ class Workspace:
         try:
             manifest = self.storage.scratch / "manifest.csv"
             digest = hashlib.sha256()
-            with manifest.open("wb") as stream:
+            with manifest.open("wb", buffering=2**20) as stream:
                 for text in self._manifest(shards, entries, tally):
                     digest.update(text)
                     stream.write(text)
@@ -301,7 +300,7 @@ class Workspace:
         for record in self.storage.each(self.records.record, range(shards)):
             entries.append(record.entry)
             tally.add(record.tally)
-            yield record.csv.encode()
+            yield record.csv
 
 
 def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) -> str | None:

@@ -5,10 +5,13 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
 
+from unprocess_gen.core.errors import ConfigError, UnprocessGenError
+from unprocess_gen.core.files import RESUME, machine_error
 from unprocess_gen.core.object_store import Item, ObjectPath, Result, any_path
 
 WORK = ".work"
@@ -44,6 +47,9 @@ class Storage(Protocol):
     def read(self, name: str) -> str:
         """Return the text of a file; raise FileNotFoundError if there is none."""
 
+    def read_bytes(self, name: str) -> bytes:
+        """Return the content of a file; raise FileNotFoundError if there is none."""
+
     def fetch(self, name: str) -> Path:
         """Return a local file with the content of a file, valid until `close`."""
 
@@ -77,6 +83,13 @@ class Storage(Protocol):
     @property
     def scratch(self) -> Path:
         """Local folder for unfinished files of this process and its workers; created when it is first used."""
+
+
+def cannot_write(error: OSError, out: str) -> UnprocessGenError:
+    """Return the error of a place that cannot be begun: MachineError for a full disk, else ConfigError."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return machine_error(error, any_path(out), RESUME)
+    return ConfigError(f"out={out}: cannot be written ({error.strerror})")
 
 
 def open_storage(out: str) -> Storage:

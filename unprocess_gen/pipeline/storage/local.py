@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import errno
+import io
 import os
 import platform
 import re
@@ -11,14 +11,21 @@ import shutil
 import sys
 import uuid
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from unprocess_gen.core.errors import ConfigError, LockedError, UnprocessGenError
-from unprocess_gen.core.files import RESUME, commit_file, machine_error, sync
+from unprocess_gen.core.errors import ConfigError, LockedError
+from unprocess_gen.core.files import commit_file, sync
 from unprocess_gen.core.locks import LockFile, has_ended, is_held
-from unprocess_gen.core.object_store import Item, Result, any_path
+from unprocess_gen.core.object_store import Item, Result
 from unprocess_gen.core.output_paths import enclosing_dataset
-from unprocess_gen.pipeline.storage import OWNER, TMP, WORK
+from unprocess_gen.pipeline.storage import OWNER, TMP, WORK, cannot_write
+
+DELETERS = 16
+"""Threads that delete files."""
+
+DELETED_AT_ONCE = 64
+"""Files that a thread deletes before it takes others."""
 
 
 class LocalStorage:
@@ -89,7 +96,12 @@ class LocalStorage:
 
     def read(self, name: str) -> str:
         """Return the text of a file."""
-        return (self._out / name).read_text(encoding="utf-8")
+        return self.read_bytes(name).decode()
+
+    def read_bytes(self, name: str) -> bytes:
+        """Return the content of a file."""
+        with io.FileIO(f"{self._out}/{name}") as stream:  # a merge reads many small files: half the time of pathlib
+            return stream.read()
 
     def fetch(self, name: str) -> Path:
         """Return the file itself."""
@@ -174,11 +186,25 @@ class LocalStorage:
         for name, size in self.names(WORK).items() if not keep_records else ():
             path = self._out / WORK / name
             if name not in kept:
-                shutil.rmtree(path) if size < 0 else path.unlink(missing_ok=True)
+                _delete_folder(path) if size < 0 else path.unlink(missing_ok=True)
 
 
-def cannot_write(error: OSError, out: str) -> UnprocessGenError:
-    """Return the error of a place that cannot be begun: MachineError for a full disk, else ConfigError."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return machine_error(error, any_path(out), RESUME)
-    return ConfigError(f"out={out}: cannot be written ({error.strerror})")
+def _delete_folder(folder: Path) -> None:
+    """Delete a folder and what it contains, its files in threads.
+
+    On a disk that is mounted with ``discard``, a file that was synced takes 0.3 to 2 ms to delete. Threads wait for
+    several at a time: 16 of them delete 12,500 files in 0.7 s, one in 3 to 25 s.
+    """
+    with os.scandir(folder) as entries:
+        files = [Path(entry.path) for entry in entries if entry.is_file(follow_symlinks=False)]
+    batches = [files[first : first + DELETED_AT_ONCE] for first in range(0, len(files), DELETED_AT_ONCE)]
+    if len(batches) > 1:
+        with ThreadPoolExecutor(DELETERS) as pool:
+            for _ in pool.map(_delete_files, batches):
+                pass
+    shutil.rmtree(folder)
+
+
+def _delete_files(files: Iterable[Path]) -> None:
+    for file in files:
+        file.unlink(missing_ok=True)

@@ -79,7 +79,11 @@ class RemoteStorage:
 
     def read(self, name: str) -> str:
         """Return the text of an object."""
-        return (self._out / name).read_text()
+        return self.read_bytes(name).decode()
+
+    def read_bytes(self, name: str) -> bytes:
+        """Return the content of an object."""
+        return (self._out / name).read_bytes()
 
     def fetch(self, name: str) -> Path:
         """Return a copy of an object in `scratch`."""
