@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import builtins
+import json
 import os
 import pickle
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from types import ModuleType
@@ -149,10 +151,69 @@ def test_missing_bucket_is_named_in_one_line(s3: str) -> None:
     missing = ObjectPath("s3://no-such-bucket/photos")
     for action in (lambda: list(missing.objects()), lambda: missing.write_bytes(b"1"), missing.exists):
         with pytest.raises(
-            StoreAccessError, match=r"^s3://no-such-bucket/photos: access was refused \(.*Bucket"
+            StoreAccessError,
+            match=r"^s3://no-such-bucket/photos: the bucket no-such-bucket does not exist \(404 .*Bucket",
         ) as error:
             action()
         assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "is_missing"), [("NoSuchBucket", True), ("ContainerNotFound", True), ("NoSuchKey", False)]
+)
+def test_missing_bucket_is_not_a_missing_object(code: str, is_missing: bool) -> None:
+    """The codes of S3 and Google, and of Azure; a missing object has another one."""
+    text = f"status code: 404 Not Found: <Error><Code>{code}</Code><Message>none</Message></Error>"
+    with pytest.raises((StoreAccessError, FileNotFoundError)) as error, object_store._request(ObjectPath("s3://a/b")):
+        raise FileNotFoundError(text)
+    assert isinstance(error.value, StoreAccessError) == is_missing
+
+
+def use_google(endpoint: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    account = {"gcs_base_url": endpoint, "disable_oauth": True}
+    account |= dict.fromkeys(("client_email", "private_key", "private_key_id"), "")
+    (folder / "account.json").write_text(json.dumps(account))
+    monkeypatch.setenv("GOOGLE_SERVICE_ACCOUNT", str(folder / "account.json"))
+
+
+def use_azure(endpoint: str, _: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "lab")
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_KEY", base64.b64encode(bytes(32)).decode())
+    monkeypatch.setenv("AZURE_STORAGE_ENDPOINT", endpoint)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "use", "create_only"),
+    [
+        ("gs", use_google, ("x-goog-if-generation-match", "0")),
+        ("az", use_azure, ("if-none-match", "*")),
+    ],
+)
+def test_google_and_azure_get_the_conditions_of_requests(
+    scheme: str,
+    use: Callable[[str, Path, pytest.MonkeyPatch], None],
+    create_only: tuple[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The variables are those of the guide; servers of these stores are simulated by one that accepts everything."""
+    object_store._store.cache_clear()
+    with servers.one_object_server(CONTENT) as (endpoint, requests):
+        use(endpoint, tmp_path, monkeypatch)
+        path = ObjectPath(f"{scheme}://bucket/a/b c.jpg")
+        assert path.read_bytes('"listed"') == CONTENT
+        assert path.create(b"1")
+        path.write_bytes(b"2")
+    object_store._store.cache_clear()
+    assert [(request.method, request.path) for request in requests] == [
+        ("GET", "/bucket/a/b c.jpg"),
+        ("PUT", "/bucket/a/b c.jpg"),
+        ("PUT", "/bucket/a/b c.jpg"),
+    ]
+    read, create, overwrite = (request.headers for request in requests)
+    assert (read["if-match"], read["range"]) == ('"listed"', f"bytes=0-{MAX_PIECE - 1}")
+    assert create_only in create.items()
+    assert create_only not in overwrite.items()
 
 
 def test_refused_credentials_are_named_in_one_line(slow_proxy: Proxy, bucket: ObjectPath) -> None:

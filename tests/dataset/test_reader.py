@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.datasets import Make
 from helpers.photographs import fill
 
 import unprocess_gen
@@ -21,6 +22,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.types import Source
+from unprocess_gen.dataset import reader
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
@@ -145,6 +147,16 @@ def test_no_file_stays_open(dataset: Path) -> None:
 
 def digests(dataset: Path) -> list[Any]:
     return [row["noisy_xxh3"] for row in read_rows(dataset / "manifest.csv")]
+
+
+def test_places_of_members_are_bounded(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six shards of two images with three members each; the places of one and a half shards may be kept."""
+    make(fill(tmp_path / "p", 12), tmp_path / "ds", "output.pairs_per_shard=2")
+    monkeypatch.setattr(reader, "MAX_MEMBERS", 9)
+    pairs = RawPairs(tmp_path / "ds")
+    for number in (0, 1, 11, 2, 0, 11):
+        assert pairs[number].row["key"] == f"{number:08d}"
+        assert sum(map(len, pairs._datasets[0]._indexes.values())) <= 9
 
 
 def digest(pairs: RawPairs, number: int) -> str:

@@ -111,7 +111,7 @@ def test_verbs_read_datasets_of_a_url(
         (("verify", "{}/none"), 4, "verify: {}/none: no such folder"),
         (("verify", "{}", "--repair"), 0, ""),
         (("report", "{}"), 2, "report: {} is in an object store; expected a local file; give --to FILE"),
-        (("replay", "s3://no-such-bucket/ds"), 5, "s3://no-such-bucket/ds: access was refused"),
+        (("replay", "s3://no-such-bucket/ds"), 5, "s3://no-such-bucket/ds: the bucket no-such-bucket does not exist"),
     ],
     ids=["missing", "repair of an intact dataset", "report without file", "bucket"],
 )

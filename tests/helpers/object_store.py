@@ -26,6 +26,8 @@ START_S = 60
 
 VARIABLES = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_REGION": "us-east-1"}
 
+INJECTED = b"<Error><Code>Injected</Code><Message>by the test</Message></Error>"
+
 Answer = Callable[[str, str], int]
 """Return the status to answer a request (method, path) with instead of the server, or 0 to pass it on."""
 
@@ -135,13 +137,11 @@ def proxy(target: str) -> Iterator[Proxy]:
                 state.most_at_once = max(state.most_at_once, state._active)
             try:
                 time.sleep(state.delay_s)
-                if status:
-                    self.reply(status, [], b"<Error><Code>Injected</Code><Message>by the test</Message></Error>")
-                else:
-                    self.reply(*self.passed_on(content))
+                reply = (status, [], INJECTED) if status else self.passed_on(content)
             finally:
-                with state._lock:
+                with state._lock:  # before the reply, after which the client can send its next request
                     state._active -= 1
+            self.reply(*reply)
 
         def passed_on(self, content: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
             server = http.client.HTTPConnection(urllib.parse.urlsplit(state.target).netloc)
@@ -181,6 +181,53 @@ def proxy(target: str) -> Iterator[Proxy]:
     thread.start()
     try:
         yield state
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@dataclass(frozen=True)
+class Request:
+    """Hold a request that a server got; names of headers are in lower case."""
+
+    method: str
+    path: str
+    headers: dict[str, str]
+
+
+@contextmanager
+def one_object_server(content: bytes) -> Iterator[tuple[str, list[Request]]]:
+    """Start a server that answers every request as if for one object; yield its endpoint and the requests so far."""
+    requests: list[Request] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def answer(self) -> None:
+            self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            headers = {name.lower(): value for name, value in self.headers.items()}
+            requests.append(Request(self.command, urllib.parse.unquote(self.path), headers))
+            body = content if self.command == "GET" else b""
+            self.send_response_only({"GET": 206, "PUT": 201}[self.command])
+            for name, value in {
+                "Content-Length": str(len(body)),
+                "Content-Range": f"bytes 0-{len(content) - 1}/{len(content)}",
+                "ETag": '"listed"',
+                "Last-Modified": "Mon, 23 Nov 2026 00:00:00 GMT",
+            }.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(body)
+
+        do_GET = do_PUT = answer  # noqa: N815
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}", requests
     finally:
         server.shutdown()
         server.server_close()

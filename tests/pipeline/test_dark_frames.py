@@ -468,6 +468,12 @@ def test_other_keys_need_dark_frames(run_main: RunMain) -> None:
     assert (done.code, "there are no dark frames; give noise.dark_frames=FOLDER" in done.err) == (2, True)
 
 
+def test_dark_frames_in_an_object_store_are_refused(run_main: RunMain) -> None:
+    done = run_main(*NOISE, "noise.dark_frames=s3://bucket/darks", "source.limit=1")
+    sentence = "noise.dark_frames=s3://bucket/darks: dark frames are read from a local folder only; copy them to one"
+    assert (done.code, sentence in done.err, done.err.count("\n")) == (2, True, 1)
+
+
 def test_missing_folder_is_refused(run_main: RunMain, tmp_path: Path) -> None:
     done = run_main(*NOISE, f"noise.dark_frames={tmp_path}/none", "source.limit=1")
     assert (done.code, "no such folder" in done.err) == (2, True)

@@ -28,6 +28,7 @@ from helpers.promise_report import Figure
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
+from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.pipeline.verify import verify
 
 pytest.importorskip("distributed")
@@ -85,6 +86,21 @@ def committed(out: Path) -> dict[str, tuple[int, int]]:
         for path in (out / "shards").glob("*.tar")
         if (out / ".work/rows" / f"{path.stem.removeprefix('shard-')}.json").exists()
     }
+
+
+UNCOMPILED = """
+import multiprocessing
+from unprocess_gen.simulation import self_test
+
+self_test.are_compiled = lambda kernels: multiprocessing.parent_process() is None
+"""
+
+
+def test_workers_report_compiling(photographs: Path, cli: Cli, tmp_path: Path) -> None:
+    """The workers of a cluster on other hosts compile; here only they seem to lack compiled kernels."""
+    env = imported_first(tmp_path, UNCOMPILED)
+    done = cli(ROOT, ONE, "out=ds", "n_jobs=2", "executor=dask", **env)
+    assert (done.returncode, done.stderr.count(f"0/12 images, {COMPILING}")) == (0, 1), done.stderr
 
 
 # Same bytes -----------------------------------------------------------------------------------------------------------

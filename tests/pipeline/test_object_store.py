@@ -325,7 +325,7 @@ def test_finished_dataset_with_a_missing_shard_is_damage(twelve: Path, bucket: O
     [
         (
             ("out=s3://no-such-bucket/ds",),
-            "out=s3://no-such-bucket/ds: access was refused (404 Not Found, NoSuchBucket",
+            "out=s3://no-such-bucket/ds: the bucket no-such-bucket does not exist (404 Not Found, NoSuchBucket",
         ),
         (("out={}/ds/inner",), "out={}/ds/inner: is inside the dataset {}/ds"),
         (("out={}/foreign",), "out={}/foreign: contains notes.txt, but no config.yaml"),

@@ -25,7 +25,9 @@ from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import deaths, parts
 from unprocess_gen.pipeline.listing_record import PER_FILE
 from unprocess_gen.pipeline.parts import left_text, shards_of_part
+from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.simulation import self_test
 
 COUNT = 12
 ONE = "output.pairs_per_shard=1"
@@ -64,6 +66,16 @@ def edit_json(path: Path, **values: Any) -> None:
 
 def replace_text(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
+
+
+def test_prepare_and_part_report_compiling(
+    photographs: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both compile before the first image, where a user would wait for up to a minute."""
+    monkeypatch.setattr(self_test, "are_compiled", lambda kernels: False)
+    for arguments in (("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds"), ("part", "ds", 0)):
+        done = run_main(*arguments)
+        assert (done.code, COMPILING in done.err) == (0, True), done.err
 
 
 # Same bytes -----------------------------------------------------------------------------------------------------------

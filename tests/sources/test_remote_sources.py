@@ -137,7 +137,10 @@ def test_path_of_an_edited_row_cannot_leave_the_prefix(remote: ObjectPath) -> No
 @pytest.mark.parametrize(
     ("root", "text"),
     [
-        ("s3://no-such-bucket/photos", r"source\.root=s3://no-such-bucket/photos: access was refused .*NoSuchBucket"),
+        (
+            "s3://no-such-bucket/photos",
+            r"source\.root=s3://no-such-bucket/photos: the bucket no-such-bucket does not exist .*NoSuchBucket",
+        ),
         ("{}/none", r"source\.root={}/none: no such folder or file; expected photographs"),
         ("{}/sub/notes", r"source\.root={}/sub/notes: no such folder or file"),
         ("s3://", r"s3://: not the URL of an object store"),

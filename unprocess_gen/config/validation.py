@@ -43,7 +43,7 @@ from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.config.values import one_of, value_text
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.object_store import StoreAccessError, any_path
+from unprocess_gen.core.object_store import StoreAccessError, any_path, is_url
 from unprocess_gen.core.types import UINT16
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.noise import REPLACED
@@ -289,6 +289,10 @@ def _check_dark_folder(noise: NoiseConfig) -> None:
     """Raise ConfigError if the dark frames of a recorded config are not given, or the folder does not exist."""
     if noise.dark_frames is None and noise.dark_frames_sha256 is not None:
         raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
+    if is_url(noise.dark_frames):
+        raise ConfigError(
+            f"noise.dark_frames={noise.dark_frames}: dark frames are read from a local folder only; copy them to one"
+        )
     if noise.dark_frames is not None and not Path(noise.dark_frames).is_dir():
         raise ConfigError(f"noise.dark_frames={noise.dark_frames}: no such folder; expected a folder of dark frames")
 

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 SCHEMES = {"s3": "AWS_ACCESS_KEY_ID", "gs": "GOOGLE_SERVICE_ACCOUNT", "az": "AZURE_STORAGE_ACCOUNT_NAME"}
 """Schemes of URLs, and the environment variable that a user most likely has to set for each."""
 
+MISSING_BUCKET = ("NoSuchBucket", "ContainerNotFound")
+"""Codes by which S3 and Google, and Azure, report that a bucket does not exist."""
+
 REQUEST_TIMEOUT_S = 60
 """Longest time for one request; no request carries more than `MAX_PIECE` bytes."""
 
@@ -507,7 +510,7 @@ class _RangeReader(io.RawIOBase):
             sequential = self._position == end and end > 0
             self._piece_size = min(2 * self._piece_size, MAX_PIECE) if sequential else self._first_piece
             size = max(self._piece_size, min(wanted, MAX_PIECE))
-            self._piece, self._start = memoryview(self._fetch(self._position, size)), self._position
+            self._piece, self._start = self._fetch(self._position, size), self._position
         return self._piece[self._position - self._start :]
 
     def _known_size(self) -> int:
@@ -515,16 +518,16 @@ class _RangeReader(io.RawIOBase):
             self._size = self._path.stat().st_size
         return self._size
 
-    def _fetch(self, start: int, size: int) -> bytes:
+    def _fetch(self, start: int, size: int) -> memoryview:
         if 0 <= self._size <= start:
-            return b""
+            return memoryview(b"")
         options = {"range": (start, start + size), **({"if_match": self._etag} if self._etag else {})}
         try:
             with _request(self._path) as (obstore, store):
                 found = obstore.get(store, self._path.key, options=options)
-                content = bytes(found.bytes())
+                content = memoryview(found.bytes())
         except _EndOfObjectError:
-            return b""
+            return memoryview(b"")
         self._size, self._etag = found.meta["size"], self._etag or found.meta["e_tag"]
         return content
 
@@ -573,8 +576,8 @@ def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
         yield obstore, _store(path.scheme, path.bucket)
     except FileNotFoundError as error:
         reason = _reason(error)
-        if "NoSuchBucket" in reason:
-            raise _no_access(path, reason) from None
+        if _is_missing_bucket(reason):
+            raise _no_bucket(path, reason) from None
         raise FileNotFoundError(2, "no such object", str(path)) from None
     except exceptions.AlreadyExistsError:
         raise FileExistsError(17, "the object exists", str(path)) from None
@@ -586,15 +589,27 @@ def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
         reason = _reason(error)
         if reason.startswith("416"):
             raise _EndOfObjectError from None
-        if "NoSuchBucket" in reason or reason.startswith(("401", "403")):  # the latter from a service of credentials
+        if _is_missing_bucket(reason):
+            raise _no_bucket(path, reason) from None
+        if reason.startswith(("401", "403")):  # from a service of credentials
             raise _no_access(path, reason) from None
         raise MachineError(f"{path}: the object store failed ({reason}); rerun when it answers") from None
 
 
 def _no_access(path: ObjectPath, reason: str) -> StoreAccessError:
     return StoreAccessError(
-        f"{path}: access was refused ({reason}); expected an existing bucket, and credentials in the environment, "
-        f"such as {SCHEMES[path.scheme]}"
+        f"{path}: access was refused ({reason}); expected credentials in the environment, such as "
+        f"{SCHEMES[path.scheme]}"
+    )
+
+
+def _is_missing_bucket(reason: str) -> bool:
+    return any(code in reason for code in MISSING_BUCKET)
+
+
+def _no_bucket(path: ObjectPath, reason: str) -> StoreAccessError:
+    return StoreAccessError(
+        f"{path}: the bucket {path.bucket} does not exist ({reason}); create it, or correct its name"
     )
 
 

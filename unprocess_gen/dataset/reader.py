@@ -29,6 +29,9 @@ from unprocess_gen.dataset.shards import (
 from unprocess_gen.simulation.reference.cfa import unpack
 from unprocess_gen.simulation.reference.sensor import in_dn
 
+MAX_MEMBERS = 2**20
+"""Members of a dataset whose places in shards are kept, 0.2 kB each."""
+
 SWEEP_TABLE = "sweep.csv"
 FINISHED = ("0", "3")
 """Exit codes of jobs that left a dataset: complete, and complete with failed sources."""
@@ -179,6 +182,7 @@ class _Dataset:
         self._manifest = path / "manifest.csv"
         self._columns: tuple[str, ...] = ()
         self._indexes: dict[int, dict[str, Member]] = {}
+        self._members = 0
 
     def offsets(self) -> NDArray[np.int64]:
         """Return the offsets of the rows of all pairs."""
@@ -199,12 +203,22 @@ class _Dataset:
 
     def _array(self, shard: int, name: str, form: ArrayFormat) -> Frame:
         path = self.path / "shards" / shard_name(shard)
-        if shard not in self._indexes:
-            self._indexes[shard] = read_index(path)
-        member = self._indexes[shard].get(name)
+        member = self._index(shard, path).get(name)
         if member is None:
             raise DamageError(f"{path}: member {name} is missing")
         return map_array(path, member, form)
+
+    def _index(self, shard: int, path: AnyPath) -> dict[str, Member]:
+        """Return the members of a shard; those of shards that were read before are kept, up to `MAX_MEMBERS`."""
+        index = self._indexes.get(shard)
+        if index is None:
+            index = read_index(path)
+            self._members += len(index)
+            if self._members > MAX_MEMBERS:
+                self._indexes.clear()  # in one step, because other threads may read
+                self._members = len(index)
+            self._indexes[shard] = index
+        return index
 
 
 def _dataset_folders(path: AnyPath) -> list[AnyPath]:

@@ -15,7 +15,7 @@ import json
 import os
 import platform
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -39,6 +39,9 @@ from unprocess_gen.sources.listing import Listing, absolute_root
 
 PACKAGE = "unprocess_gen"
 PLAN = f"{WORK}/plan.json"
+
+OnCompiling = Callable[[], object]
+"""Function that is called before kernels are compiled, so that a user knows why nothing else happens."""
 
 TRIED = 64
 """Sources of which the smallest usable one becomes the canary; without one, only the self-test compares hosts."""
@@ -116,7 +119,9 @@ class FrozenPlan:
         return hashlib.sha256(self.text.encode()).hexdigest()
 
 
-def freeze(workspace: Workspace, config: Config, listing: Listing) -> FrozenPlan:
+def freeze(
+    workspace: Workspace, config: Config, listing: Listing, on_compiling: OnCompiling | None = None
+) -> FrozenPlan:
     """Record the plan of a run that `Workspace.begin` has begun, or return the plan that is recorded.
 
     Parameters
@@ -127,6 +132,8 @@ def freeze(workspace: Workspace, config: Config, listing: Listing) -> FrozenPlan
         Its validated config.
     listing : Listing
         Its sources, with which ``workspace`` began.
+    on_compiling : callable, optional
+        Called before kernels are compiled.
 
     Returns
     -------
@@ -144,20 +151,21 @@ def freeze(workspace: Workspace, config: Config, listing: Listing) -> FrozenPlan
     """
     known = _read_plan(workspace.storage, workspace.out)
     if known is None:
-        known = _new_plan(workspace, config, listing)
-        if not workspace.storage.create(PLAN, known.text):
-            known = _read_plan(workspace.storage, workspace.out) or known
+        known = _new_plan(workspace, config, listing, on_compiling)
+        if workspace.storage.create(PLAN, known.text):
+            return known
+        known = _read_plan(workspace.storage, workspace.out) or known
     check_version(known, workspace.out)
-    check_canary(known, config, listing.sources)
+    check_canary(known, config, listing.sources, on_compiling)
     return known
 
 
-def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenPlan:
+def _new_plan(workspace: Workspace, config: Config, listing: Listing, on_compiling: OnCompiling | None) -> FrozenPlan:
     record = read_record(workspace.storage, workspace.out)
     if record is None:  # version 0.1 began the dataset
         record = write_listing(workspace.storage, workspace.out, listing.sources)
     smallest_first = sorted(listing.sources[:TRIED], key=lambda source: source.size_bytes or 0)
-    canary = next(_canaries(config, smallest_first), (None, ""))
+    canary = next(_canaries(config, smallest_first, on_compiling), (None, ""))
     return FrozenPlan(
         version=version(PACKAGE),
         config_sha256=hashlib.sha256(workspace.config_yaml.encode()).hexdigest(),
@@ -176,10 +184,10 @@ def _new_plan(workspace: Workspace, config: Config, listing: Listing) -> FrozenP
     )
 
 
-def _canaries(config: Config, sources: Sequence[Source]) -> Iterator[tuple[int, str]]:
+def _canaries(config: Config, sources: Sequence[Source], on_compiling: OnCompiling | None) -> Iterator[tuple[int, str]]:
     """Yield the index of each usable source, and the digest of its rows."""
     storage = open_storage(config.out)
-    context = RunContext(config, str(storage.scratch), os.getpid())
+    context = RunContext(config, str(storage.scratch), os.getpid(), on_compiling=on_compiling)
     path = storage.scratch / "canary.tar"
     try:
         for source in sources:
@@ -246,7 +254,9 @@ def check_version(plan: FrozenPlan, out: str) -> None:
         )
 
 
-def check_canary(plan: FrozenPlan, config: Config, sources: Sequence[Source]) -> None:
+def check_canary(
+    plan: FrozenPlan, config: Config, sources: Sequence[Source], on_compiling: OnCompiling | None = None
+) -> None:
     """Make the canary of a plan once per process, and compare it.
 
     Parameters
@@ -257,6 +267,8 @@ def check_canary(plan: FrozenPlan, config: Config, sources: Sequence[Source]) ->
         Its config.
     sources : sequence of Source
         Sources that include the canary.
+    on_compiling : callable, optional
+        Called before kernels are compiled.
 
     Raises
     ------
@@ -268,7 +280,7 @@ def check_canary(plan: FrozenPlan, config: Config, sources: Sequence[Source]) ->
     if plan.canary_source is None:
         return
     canary = [source for source in sources if source.index == plan.canary_source]
-    found = next(_canaries(config, canary), (None, ""))
+    found = next(_canaries(config, canary, on_compiling), (None, ""))
     if found != (plan.canary_source, plan.canary_sha256):
         raise CanaryError(
             f"{platform.node()} makes other bytes from source {canary[0].name} than the host that began the run; "
@@ -299,6 +311,7 @@ class FrozenRun:
         self.config = self._config(root)
         self._listing = RecordedListing(self.storage, out, self.plan.record)
         self._making = threading.Lock()
+        self._is_checked = False
 
     def _config(self, root: str | None) -> Config:
         plan = self.plan
@@ -312,11 +325,12 @@ class FrozenRun:
         config.source.max_failed, config.n_jobs, config.self_test = plan.max_failed, plan.n_jobs, plan.self_test
         return config
 
-    def check_host(self) -> None:
-        """Run the self-test and make the canary; raise as `check_canary`."""
+    def check_host(self, on_compiling: OnCompiling | None = None) -> None:
+        """Run the self-test and make the canary, unless it was done before; arguments and errors of `check_canary`."""
         index = self.plan.canary_source
-        if index is not None:
-            check_canary(self.plan, self.config, self._listing.sources(index, index + 1))
+        if index is not None and not self._is_checked:
+            check_canary(self.plan, self.config, self._listing.sources(index, index + 1), on_compiling)
+        self._is_checked = True
 
     def tasks(self, shards: Iterable[int]) -> Iterator[ShardTask]:
         """Yield the tasks of shards in ascending order; only the listing files of their sources are read."""
@@ -355,7 +369,7 @@ class FrozenRun:
             yield report
 
 
-def open_run(out: str, plan_sha256: str, root: str | None = None) -> FrozenRun:
+def open_run(out: str, plan_sha256: str, root: str | None = None, on_compiling: OnCompiling | None = None) -> FrozenRun:
     """Return a frozen run for this process, after the self-test and the canary.
 
     Parameters
@@ -366,6 +380,8 @@ def open_run(out: str, plan_sha256: str, root: str | None = None) -> FrozenRun:
         Digest of the plan (`FrozenPlan.sha256`), so that a later run in the same folder is another one.
     root : str, optional
         Place of the sources, if they were moved since the run was frozen.
+    on_compiling : callable, optional
+        Called before kernels are compiled.
 
     Returns
     -------
@@ -380,7 +396,9 @@ def open_run(out: str, plan_sha256: str, root: str | None = None) -> FrozenRun:
         As `check_canary`.
     """
     with _OPENING:
-        return _open_run(out, plan_sha256, root)
+        run = _open_run(out, plan_sha256, root)
+        run.check_host(on_compiling)
+        return run
 
 
 _OPENING = threading.Lock()
@@ -391,5 +409,4 @@ def _open_run(out: str, plan_sha256: str, root: str | None) -> FrozenRun:
     run = FrozenRun(out, root)
     if run.plan.sha256 != plan_sha256:
         raise ConfigError(f"out={out}: its plan is not that of this run; prepare another out")
-    run.check_host()
     return run

@@ -211,7 +211,7 @@ def execute_locally(work: Assignment, progress: Progress) -> tuple[int, StageTim
     """Make shards in worker processes of this machine; return number of rows, times and number of workers."""
     n_jobs = effective_jobs(work.context.config.n_jobs, len(work.tasks))
     context = replace(work.context, core_to_spare=n_jobs < own_cores())
-    progress.report_compiling(context.compiling_path)
+    progress.watch_compiling(context.compiling_path)
     return *follow(run_tasks(context, work.tasks, n_jobs), progress), n_jobs
 
 
@@ -223,10 +223,10 @@ def execute_on_dask(work: Assignment, progress: Progress) -> tuple[int, StageTim
     out, root = absolute_root(config.out), absolute_root(config.source.root)
     assert out is not None
     with connected(config.executor, effective_jobs(config.n_jobs, len(work.tasks)), workspace.storage) as client:
-        plan = freeze(workspace, config, work.listing)
+        plan = freeze(workspace, config, work.listing, progress.report_compiling)
         request = ChunkRequest(out, root, plan.sha256)
         shards = [task.shard for task in work.tasks]
-        run = DaskRun(client, config.executor, request, workspace.records, shards)
+        run = DaskRun(client, config.executor, request, workspace.records, shards, progress.report_compiling)
         return *follow(run.reports(), progress), run.workers.most
 
 

@@ -15,6 +15,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
@@ -32,7 +33,7 @@ from unprocess_gen.pipeline.generate import (
     summary_of,
     warnings_before,
 )
-from unprocess_gen.pipeline.progress import Progress
+from unprocess_gen.pipeline.progress import COMPILING, LOGGER, Progress
 from unprocess_gen.pipeline.shard_records import ShardRecords
 from unprocess_gen.pipeline.sizes import check_free_space, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
@@ -177,7 +178,7 @@ def prepare(config: Config, parts: int) -> Prepared:
         if config.check_disk:
             check_free_space(config, [task for task in tasks if task.shard not in done], any_path(config.out))
         workspace.begin(listing.sources, len(tasks))
-        freeze(workspace, config, listing)
+        freeze(workspace, config, listing, partial(LOGGER.info, COMPILING))
         workspace.storage.create(PARTS, json.dumps({"parts": parts}) + "\n")
     return Prepared(parts, len(tasks), len(listing.sources), warnings=warnings_before(config, listing))
 
@@ -219,14 +220,14 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
         raise ConfigError(f"part {part}: {out} has {parts} parts; expected 0 to {parts - 1}")
     wanted = shards_of_part(part, parts, run.plan.shards)
     try:
-        run.check_host()
         done = run.records.committed(wanted)
         todo = list(run.tasks(shard for shard in wanted if shard not in done))
         jobs = effective_jobs(run.plan.n_jobs if n_jobs is None else n_jobs, len(todo))
         scratch, spare = str(run.storage.scratch), jobs < own_cores()
         context = RunContext(run.config, scratch, os.getpid(), core_to_spare=spare, counts_deaths=True)
         with Progress(sum(len(task.sources) for task in todo), 0, f"part {part} of {parts}") as progress:
-            progress.report_compiling(context.compiling_path)
+            run.check_host(progress.report_compiling)
+            progress.watch_compiling(context.compiling_path)
             rows, _ = follow(run_tasks(context, todo, jobs), progress)
     except OSError as error:
         raise machine_error(error, any_path(out), RESUME) from error

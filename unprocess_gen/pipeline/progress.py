@@ -20,6 +20,7 @@ from tqdm import tqdm
 LOGGER = logging.getLogger("unprocess_gen")
 LINE_S = 5.0
 """Seconds between progress lines if stderr is not a terminal."""
+COMPILING = "compiling kernels, once per machine and version"
 COMPILING_POLL_S = 0.1
 COLUMNS = 80
 """Width of the bar on a terminal that reports none."""
@@ -85,7 +86,13 @@ class Progress:
         LOGGER.warning("%s%s", self._prefix, message)
         self._bar.refresh()
 
-    def report_compiling(self, marker: Path) -> None:
+    def report_compiling(self) -> None:
+        """Report that kernels are being compiled, which takes seconds in which no item is finished."""
+        self._bar.set_postfix_str(COMPILING)
+        if self._lines:
+            LOGGER.info("%s%d/%d %ss, %s", self._prefix, self._done, self._total, self._unit, COMPILING)
+
+    def watch_compiling(self, marker: Path) -> None:
         """Report that kernels are being compiled as soon as the file ``marker`` exists.
 
         Only workers know whether the kernels they need are compiled, so they report it by creating the file.
@@ -96,12 +103,7 @@ class Progress:
         while not marker.exists():
             if self._over.wait(COMPILING_POLL_S):
                 return
-        self._bar.set_postfix_str("compiling kernels, once per machine and version")
-        if self._lines:
-            LOGGER.info(
-                "%s%d/%d %ss, compiling kernels, once per machine and version",
-                *(self._prefix, self._done, self._total, self._unit),
-            )
+        self.report_compiling()
 
 
 class _Unfailing:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,6 +84,8 @@ class RunContext:
         Whether the deaths of workers at a shard are counted below ``out`` (`deaths`), because nothing else sees them.
     marker : str
         Name below ``out`` of the file that contains the index of the source in progress; empty without one.
+    on_compiling : callable or None
+        Called before kernels are compiled; None for contexts that travel to workers, which write `compiling_path`.
     dark_frames, dark_folder : DarkFrames, DarkFolder, or None
         The dark frames of the config, and access to their pixels; None if it uses none, or a worker is to read them.
     """
@@ -94,6 +96,7 @@ class RunContext:
     core_to_spare: bool = False
     counts_deaths: bool = False
     marker: str = ""
+    on_compiling: Callable[[], object] | None = None
     dark_frames: DarkFrames | None = None
     dark_folder: DarkFolder | None = None
 
@@ -102,6 +105,12 @@ class RunContext:
         if self.dark_folder is None:
             return open_dark_frames(self.config)[1:]
         return self.dark_frames, self.dark_folder
+
+    def report_compiling(self) -> None:
+        """Report that this process is about to compile kernels."""
+        self.compiling_path.touch()
+        if self.on_compiling is not None:
+            self.on_compiling()
 
     @property
     def compiling_path(self) -> Path:

@@ -226,7 +226,7 @@ def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:
     failures: list[str] = []
     for kernels in dict.fromkeys(map(self_test.kernels, plans)):
         if not self_test.are_compiled(kernels):
-            context.compiling_path.touch()
+            context.report_compiling()
         if context.config.self_test == "stop":
             self_test.check(kernels, ", or set self_test=go_on")
         failures += self_test.failures(kernels)

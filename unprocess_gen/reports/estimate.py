@@ -33,6 +33,7 @@ from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import DarkFrames, Frame, Plan, Source
 from unprocess_gen.dataset.shards import shard_bytes
+from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.pipeline.sizes import shards_warning, source_bytes, with_pairs_per_shard
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.planning.dark_scene import dark_scene_warning
@@ -347,7 +348,7 @@ def _compile_kernels(config: Config, tiers: Iterable[AccuracyConfig]) -> float:
     needed = {self_test.kernels(plan) for some in (plans, *of_tiers) for plan in some}
     compiled = all(self_test.are_compiled(kernels) for kernels in needed)
     if not compiled:
-        LOGGER.info("compiling kernels, once per machine and version")
+        LOGGER.info(COMPILING)
     started = time.perf_counter()
     for _ in make_pairs(srgb, plans):
         pass
