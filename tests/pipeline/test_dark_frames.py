@@ -304,6 +304,8 @@ def test_noise_of_dark_frames_is_checked_with_their_folder(make: Make, run_main:
     done = run_main("verify", "ds", "--noise", f"noise.dark_frames={tmp_path / 'moved'}")
     assert f"noise of {count} pairs checked, 0 wrong\n" in done.out
     assert run_main("verify", "ds", "--noise", f"noise.dark_frames={tmp_path / 'none'}").code == 2
+    save_frames(tmp_path / "others", 1, std=5.0)
+    assert run_main("verify", "ds", "--noise", f"noise.dark_frames={tmp_path / 'others'}").code == 5
     draws = np.random.default_rng(0)
     replace_noisy_frames(
         tmp_path / "ds",

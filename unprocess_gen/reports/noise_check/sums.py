@@ -81,7 +81,8 @@ class Sums:
 
         self.law = law
         self.height, self.width = int(clean.shape[0]) // 2 * 2, int(clean.shape[1]) // 2 * 2
-        self._clean, self._noisy = clean[: self.height, : self.width], noisy[: self.height, : self.width]
+        # kernels are compiled for contiguous arrays
+        self._clean, self._noisy = (np.ascontiguousarray(one[: self.height, : self.width]) for one in (clean, noisy))
         self._offsets = law.offsets(self.height, self.width)
         self._size = int(self._clean.max(initial=0)) + 2
         self.counts = np.zeros((4, self._size))
