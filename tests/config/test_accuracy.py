@@ -29,7 +29,7 @@ from unprocess_gen.core.exact_distributions import tukey_std
 from unprocess_gen.core.types import Facts, Plan
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.kernels.electrons import count_roots
+from unprocess_gen.simulation.kernels.electron_records import count_roots
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.poisson import core_share, gaussian_distance, gaussian_from
 from unprocess_gen.sources.scenes import synthetic

@@ -136,7 +136,7 @@ def _shot(plan: Plan) -> list[Term]:
 def _shot_of(plan: Plan, gain_dn: float, read_std_dn: float) -> Term:
     normal = (0.0, math.inf)
     if APPROXIMATE_SHOT in plan.methods:
-        from unprocess_gen.simulation.kernels.electrons import count_roots  # imports Numba
+        from unprocess_gen.simulation.kernels.electron_records import count_roots  # imports Numba
 
         lowest, highest = count_roots(plan, read_std_dn / gain_dn, plan.normalised)
         normal = lowest * lowest, highest * highest

@@ -20,7 +20,8 @@ from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.types import PACKED, Counts, DarkPixels, Frame, Pair, Plan, Srgb
 from unprocess_gen.simulation.kernels.body import body_of, clean_response, fixed_patterns
 from unprocess_gen.simulation.kernels.clean import Scene, Scene32, fill_clean, scene_of, with_response
-from unprocess_gen.simulation.kernels.electrons import Electrons, electron_noise, with_dark_frames
+from unprocess_gen.simulation.kernels.electron_records import electron_noise, with_dark_frames
+from unprocess_gen.simulation.kernels.electrons import Electrons
 from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32, gaussian_noise, gaussian_noise32
 from unprocess_gen.simulation.kernels.philox import load_key, philox_keys
 from unprocess_gen.simulation.kernels.readout import (
