@@ -31,7 +31,7 @@ from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.pipeline.verify import verify
 
-pytest.importorskip("distributed")
+Client = pytest.importorskip("distributed").Client
 
 COUNT = 12
 ONE = "output.pairs_per_shard=1"
@@ -382,20 +382,64 @@ frozen_run.check_canary = failing
 """
 
 
+UNTESTED = """
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.simulation import self_test
+
+
+def failing(*arguments):
+    raise MachineError("makes other bytes: the self-test failed")
+
+
+self_test.check = failing
+"""
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("code", [UNFIT, UNTESTED], ids=["canary", "self-test"])
 def test_worker_with_other_results_is_retired(
-    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+    code: str, photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
     with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
-        unfit = cluster.add_worker(**imported_first(tmp_path, UNFIT))
+        unfit = cluster.add_worker(**imported_first(tmp_path, code))
         done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
         assert (done.code, len(messages(done.err))) == (5, 1)
         assert "Dask worker tcp://" in done.err
         assert "makes other bytes" in done.err
         assert unfit.wait(20) is not None
         cluster.add_worker()
-        cluster.add_worker(**imported_first(tmp_path / "cluster", UNFIT))
+        cluster.add_worker(**imported_first(tmp_path / "cluster", code))
         assert run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides).code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
+FAILING = """
+from unprocess_gen.core.errors import MachineError
+from unprocess_gen.pipeline import worker
+
+
+def failing(context, task):
+    raise MachineError("the object store failed (503)")
+
+
+worker.make_shard = failing
+"""
+
+
+@pytest.mark.slow
+def test_system_error_of_one_worker_is_retried_on_another(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
+        cluster.add_worker(**imported_first(tmp_path, FAILING))
+        done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+        assert (done.code, len(messages(done.err))) == (5, 1)
+        assert "the object store failed (503)" in done.err
+        cluster.add_worker(**imported_first(tmp_path / "cluster", slow_shards(0.5)))
+        with Client(cluster.address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)
+        assert (done.code, messages(done.err)) == (0, [])
     assert tree_hash(tmp_path / "ds") == undisturbed
 
 

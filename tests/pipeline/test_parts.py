@@ -170,6 +170,23 @@ def test_killed_part_loses_at_most_one_shard(
     assert tree_hash(tmp_path / "ds") == undisturbed
 
 
+@pytest.mark.linux_only("ends a process by a signal")
+def test_part_ended_at_its_walltime_counts_no_death(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    """Batch systems send SIGTERM at the end of the walltime."""
+    assert run_main("prepare", "parts=1", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    rows = tmp_path / "ds/.work/rows"
+    with running("part", "ds", "0", cwd=tmp_path, **imported_first(tmp_path, SLOW_SHARDS)) as process:
+        wait_for(lambda: rows.exists() and len(list(rows.iterdir())) >= 2)
+        process.terminate()
+        assert process.wait(20) == 143
+    assert list((tmp_path / "ds" / deaths.FOLDER).iterdir()) == []
+    assert run_main("part", "ds", 0, "-q").code == 0
+    assert run_main("merge", "ds").code == 0
+    assert tree_hash(tmp_path / "ds") == undisturbed
+
+
 @pytest.mark.slow
 @pytest.mark.linux_only("kills processes by a signal")
 def test_parts_killed_at_random_moments_end_with_the_same_bytes(

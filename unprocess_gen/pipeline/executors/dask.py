@@ -94,7 +94,10 @@ FAILURES = 20
 """Tasks that may fail one after the other without a finished shard before the run ends."""
 
 TRIES = 3
-"""Workers that try a task which ends with a system error, such as a store that does not answer."""
+"""Workers that may report a system error, such as a store that does not answer, without a finished shard meanwhile."""
+
+AVOID_S = 60.0
+"""Time in which a worker that reported a system error gets no tasks if there are others."""
 
 QUIET = {
     "distributed.admin.tick.interval": "60 s",
@@ -259,12 +262,15 @@ class Workers:
         Time without a sign of life after which a worker is lost.
     retired : set of str
         Addresses of workers that make other bytes.
+    failing : dict of str to float
+        Workers that reported a system error, and the time until which others are preferred.
     most : int
         Largest number of workers at a time.
     """
 
     lost_worker_s: float
     retired: set[str] = field(default_factory=set)
+    failing: dict[str, float] = field(default_factory=dict)
     most: int = 0
     _signs: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -280,13 +286,18 @@ class Workers:
         """Return the workers that respond and are not retired."""
         return {address for address, (_, at) in self._signs.items() if now_s - at < self.lost_worker_s} - self.retired
 
+    def preferred(self, now_s: float) -> set[str]:
+        """Return the workers that should get tasks: those that respond, without failing ones if there are others."""
+        live = self.live(now_s)
+        return {address for address in live if self.failing.get(address, now_s) <= now_s} or live
+
     def lost(self, now_s: float) -> set[str]:
         """Return the workers that the scheduler knows and that do not respond."""
         return {address for address, (_, at) in self._signs.items() if now_s - at >= self.lost_worker_s}
 
     def avoided(self, now_s: float) -> bool:
         """Return whether the scheduler knows workers that should get no tasks."""
-        return len(self.live(now_s)) < len(self._signs)
+        return len(self.preferred(now_s)) < len(self._signs)
 
 
 class DaskRun:
@@ -326,7 +337,8 @@ class DaskRun:
         self._chunks = ChunkQueue(shards, executor.chunk_s)
         self._running: dict[Key, tuple[Future[ChunkResult], Chunk]] = {}
         self._events: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
-        self._failures, self._tries = 0, 0
+        self._failures = 0
+        self._reported_by: list[str] = []
         self._unfit: UnprocessGenError | None = None
         self._over = threading.Event()
         self._report_compiling: OnCompiling | None = on_compiling
@@ -399,12 +411,12 @@ class DaskRun:
 
     def _submit(self) -> None:
         """Submit chunks until each worker has `window` of them."""
-        live = self.workers.live(time.monotonic())
-        while live and len(self._running) < self._executor.window * len(live):
-            chunk = self._chunks.take(len(live), time.monotonic())
+        workers = self.workers.preferred(time.monotonic())
+        while workers and len(self._running) < self._executor.window * len(workers):
+            chunk = self._chunks.take(len(workers), time.monotonic())
             if chunk is None:
                 return
-            self._start(chunk, sorted(live) if self.workers.avoided(time.monotonic()) else None)
+            self._start(chunk, sorted(workers) if self.workers.avoided(time.monotonic()) else None)
 
     def _start(self, chunk: Chunk, workers: list[str] | None) -> None:
         """Submit one chunk, preferably to some workers."""
@@ -443,7 +455,8 @@ class DaskRun:
         now = time.monotonic()
         for report in reports:
             if self._chunks.finish(report.shard, now):
-                self._failures = self._tries = 0
+                self._failures = 0
+                self._reported_by.clear()
                 yield report
 
     def _on_done(self, event: tuple[Key, Any]) -> Iterator[ShardReport]:
@@ -467,14 +480,17 @@ class DaskRun:
         """Give shards of lost workers to others, and shards of slow workers to idle ones."""
         now = self._answered_s = time.monotonic()
         self.workers.update(poll, now)
-        live = self.workers.live(now)
         for address in self.workers.lost(now):
             for key in poll.keys.get(address, ()):
                 if key in self._running:
                     future, chunk = self._running.pop(key)
                     future.release()
                     self._chunks.end(chunk)
-        idle = [address for address in sorted(live) if not poll.keys.get(address) and not self._chunks.waits]
+        idle = [
+            address
+            for address in sorted(self.workers.preferred(now))
+            if not poll.keys.get(address) and not self._chunks.waits
+        ]
         running = [chunk for _, chunk in self._running.values()]
         for address, chunk in zip(idle, self._chunks.share(running, len(idle), now), strict=False):
             self._start(chunk, [address])
@@ -521,8 +537,13 @@ class DaskRun:
             self._unfit = error
             self._retire(result.worker)
             return
-        self._tries += 1
-        if self._tries >= TRIES or not isinstance(error, MachineError) or isinstance(error, SourceChangedError):
+        if not isinstance(error, MachineError) or isinstance(error, SourceChangedError):
+            raise error
+        now = time.monotonic()
+        self.workers.failing[result.worker] = now + AVOID_S
+        self._reported_by.append(result.worker)
+        workers = set(self._reported_by)
+        if len(workers) >= TRIES or (len(self._reported_by) >= TRIES and not self.workers.live(now) - workers):
             raise error
 
     def _retire(self, address: str) -> None:
