@@ -413,6 +413,18 @@ def test_worker_with_other_results_is_retired(
     assert tree_hash(tmp_path / "ds") == undisturbed
 
 
+def test_failing_workers_get_no_tasks_while_there_are_others() -> None:
+    from unprocess_gen.pipeline.executors.dask import Poll, Workers
+
+    workers = Workers(lost_worker_s=100)
+    workers.update(Poll({"a": 1.0, "b": 1.0}, {}), now_s=0)
+    workers.failing["a"] = 60
+    assert (workers.preferred(59), workers.avoided(59)) == ({"b"}, True)
+    assert (workers.preferred(60), workers.avoided(60)) == ({"a", "b"}, False)
+    workers.failing["b"] = 60
+    assert workers.preferred(59) == {"a", "b"}
+
+
 FAILING = """
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline import worker
