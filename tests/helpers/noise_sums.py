@@ -18,7 +18,7 @@ def numpy_sums(sums: Sums, clean: Any, noisy: Any) -> dict[str, Float]:
     found = {name: np.zeros_like(sums.z) for name in ("z", "cosine", "double")}
     for plane, site in enumerate(TILE):
         at = np.s_[site[0] :: 2, site[1] :: 2]
-        x, table, used = clean_dn[at], sums.tables[plane], np.flatnonzero(sums.usable[plane])
+        x, table = clean_dn[at], sums.tables[plane]
         dn = np.rint(np.maximum(x, 0)).astype(int)
         of_site = 1 / np.maximum(table.std[dn], 1e-300)
         if sums.law.plan.clean_normalised:
@@ -30,8 +30,8 @@ def numpy_sums(sums: Sums, clean: Any, noisy: Any) -> dict[str, Float]:
         values = {"z": of_plane, "cosine": np.cos(of_plane), "double": np.cos(2 * of_plane)}
         if sums.law.plan.clean_normalised:
             for name in ("cosine", "double"):
-                mean = getattr(table, name).mean
-                values[name] = values[name] - np.interp(x, used, mean[used]) + mean[dn]
+                of, distance = getattr(table, name), x - dn
+                values[name] = values[name] - distance * of.by_clean[dn] - distance**2 * of.by_square[dn]
         for name, some in values.items():
             np.add.at(found[name][plane], dn[scale > 0], some[scale > 0])
         mean = table.rounding_mean[dn] * np.where(scale > 0, 1 / np.maximum(table.std[dn], 1e-300), 0)

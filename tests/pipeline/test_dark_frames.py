@@ -317,17 +317,23 @@ def test_noise_of_dark_frames_is_checked_with_their_folder(make: Make, run_main:
 
 
 @pytest.mark.parametrize("shading", ["keep", "remove"])
-@pytest.mark.parametrize("overrides", [(), ("output.dtype=float32", "sensor.clip=none"), ("accuracy=fast",)])
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        *(NOISE, (*NOISE, "accuracy=fast"), (*NOISE, "effects.all=on")),
+        ("noise=canon_5d4", "scene=night", "output.dtype=float32", "sensor.clip=none"),
+    ],
+)
 def test_sums_of_dark_frames_raise_no_alarm(overrides: tuple[str, ...], shading: str, darks: Path) -> None:
     config, _, access = open_dark_frames(
-        ug.load_config([*NOISE, f"noise.dark_frames={darks}", f"noise.dark_shading={shading}", *overrides])
+        ug.load_config([*overrides, f"noise.dark_frames={darks}", f"noise.dark_shading={shading}"])
     )
     for number in range(2):
         config.seed = number
         pair = ug.make_pair(pixels(number, 200, 300), config)
         sums = pair_sums(pair.clean, pair.noisy, pair.row, access)
         assert sums is not None
-        assert sums.sites > 0.5 * pair.clean.size
+        assert sums.sites > 0.3 * pair.clean.size
         assert failed_checks("", pair_scores(sums), threshold(1)) == []
         assert pair_sums(pair.clean, pair.noisy, pair.row) is None
 

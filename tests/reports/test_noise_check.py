@@ -275,13 +275,18 @@ def test_planted_faults_are_found_in_95_percent_of_runs(name: str, settings: Set
 
 
 def with_numbers(
-    settings: Settings, overrides: Sequence[str], number: int, recorded: dict[str, Any], simulated: dict[str, Any]
+    settings: Settings,
+    overrides: Sequence[str],
+    number: int,
+    recorded: dict[str, Any],
+    simulated: dict[str, Any],
+    side: int = 256,
 ) -> Checked:
     """Return the plan and the scores of a pair whose row records some numbers, and whose noise has others."""
     config = settings(*overrides)
     config.seed = number
     validate_config(config)
-    srgb = photograph(number, 256)
+    srgb = photograph(number, side)
     plan = plan_from_row(make_pair(srgb, config).row)
     assert plan.physics is not None
     plan = replace(plan, physics=replace(plan.physics, **recorded))
@@ -416,7 +421,29 @@ def test_expectations_without_rounding_know_x_exactly(settings: Settings) -> Non
     plan = plan_image(settings("output.dtype=float32"), "0" * 64)
     law = laws.NoiseLaw(plan, Patch(0, 0, 0, 2, 2))
     of = expectations(law, np.array([300.0, 1000.0]), (0, 0))
-    assert not of.rounding_std.any() and not of.cosine.unknown.any() and not of.cosine.slope.any()
+    assert not of.rounding_std.any() and not of.cosine.slope.any() and of.cosine.unknown.max() < 1e-12
+
+
+def test_expectations_between_two_dn_are_within_their_error(settings: Settings) -> None:
+    config = settings("noise=canon_5d4", "scene=night", "output.dtype=float32", "sensor.clip=none")
+    plan = plan_image(config, "0" * 64, facts=FACTS)
+    assert plan.physics is not None
+    law = laws.NoiseLaw(replace(plan, physics=replace(plan.physics, read_std_dn=0.3)), Patch(0, 0, 0, 2, 2))
+    signal = np.arange(1.0, 40.0)
+    of = expectations(law, signal + plan.black_level_dn, (0, 0))
+    for k, cosine in ((1, of.cosine), (2, of.double)):
+        for distance in np.linspace(-0.5, 0.5, 21):
+            std = np.sqrt(law.variance(signal + distance))
+            exact = law.factors(signal + distance, k / std).value.real
+            error = np.abs(cosine.mean + distance * cosine.by_clean + distance**2 * cosine.by_square - exact)
+            assert (error <= 1.2 * cosine.unknown + 1e-5).all()
+        assert cosine.unknown[5:].max() < 1e-3
+
+
+def test_few_electrons_raise_no_alarm_in_float32(settings: Settings) -> None:
+    overrides = ("noise=canon_5d4", "scene=night", "output.dtype=float32", "sensor.clip=none")
+    pair = with_numbers(settings, overrides, 5, {"read_std_dn": 0.3}, {}, side=512)
+    assert alarms([pair], 1) == []
 
 
 # Scores ---------------------------------------------------------------------------------------------------------------

@@ -44,7 +44,10 @@ class Cosine:
     mean, slope : ndarray of float64, [N]
         Expectation of ``cos kz - slope · (noisy - c)``, and the derivative of the expectation of cos kz by x (per DN).
     unknown : ndarray of float64, [N]
-        Standard deviation of that expectation due to the rounding of x.
+        Standard deviation of that expectation due to the rounding of x; without rounding, error of ``by_square``.
+    by_clean, by_square : ndarray of float64, [N]
+        For frames without rounding: coefficients of the difference d of x from the nearest DN, and of d², by which the
+        expectation at x differs. 0 for rounded frames.
     by_variance : ndarray of float64, [N]
         Derivative by the variance of the noise (per DN²).
     variance, fixed_variance : ndarray of float64, [N]
@@ -54,6 +57,8 @@ class Cosine:
     mean: Float
     slope: Float
     unknown: Float
+    by_clean: Float
+    by_square: Float
     by_variance: Float
     variance: Float
     fixed_variance: Float
@@ -161,7 +166,21 @@ def _cosine(law: NoiseLaw, at: Factors, at_double: Factors, low: Float, high: Fl
 
     ``at`` and ``at_double`` are the factors of the characteristic function at k / std and at 2k / std.
     """
-    tau, middle, width = at.tau, (low + high) / 2, high - low
+    known = _unrounded(law, at) if law.plan.clean_normalised else _rounded(law, at, low, high)
+    one, two = at.value.real, at_double.value.real
+    # variance, over fixed patterns, of the mean over frames: E[Re(φ exp(iτF))²] - Re(E[φ exp(iτF)])²
+    square = ((at.temporal**2 * at_double.fixed).real + np.abs(at.temporal) ** 2) / 2
+    return Cosine(
+        *known,
+        by_variance=-0.5 * at.tau * at.tau * one,
+        variance=(1 + two) / 2 - one * one,
+        fixed_variance=np.maximum(square - (at.temporal * at.fixed).real ** 2, 0.0) + 4 * law.dead.share,
+    )
+
+
+def _rounded(law: NoiseLaw, at: Factors, low: Float, high: Float) -> tuple[Float, Float, Float, Float, Float]:
+    """Return the attributes of `Cosine` that depend on x, for rounded frames."""
+    middle, width = (low + high) / 2, high - low
 
     def expected(error: Float) -> Float:
         values, moved = at.value.real.copy(), error != 0
@@ -174,17 +193,27 @@ def _cosine(law: NoiseLaw, at: Factors, at_double: Factors, low: Float, high: Fl
     at_low, at_middle, at_high = expected(low), expected(middle), expected(high)
     slope = np.divide(at_high - at_low, width, out=np.zeros_like(width), where=width > 0)
     bend = at_high + at_low - 2 * at_middle  # the parabola through the three has the coefficient 2 bend / width²
-    one, two = at.value.real, at_double.value.real
-    # variance, over fixed patterns, of the mean over frames: E[Re(φ exp(iτF))²] - Re(E[φ exp(iτF)])²
-    square = ((at.temporal**2 * at_double.fixed).real + np.abs(at.temporal) ** 2) / 2
-    return Cosine(
-        mean=at_middle + bend / 6 - slope * middle,
-        slope=slope,
-        unknown=2 * np.abs(bend) * ROUNDING_SQUARE,
-        by_variance=-0.5 * tau * tau * one,
-        variance=(1 + two) / 2 - one * one,
-        fixed_variance=np.maximum(square - (at.temporal * at.fixed).real ** 2, 0.0) + 4 * law.dead.share,
-    )
+    nothing = np.zeros_like(slope)
+    return at_middle + bend / 6 - slope * middle, slope, 2 * np.abs(bend) * ROUNDING_SQUARE, nothing, nothing
+
+
+def _unrounded(law: NoiseLaw, at: Factors) -> tuple[Float, Float, Float, Float, Float]:
+    """Return the attributes of `Cosine` that depend on x, for frames without rounding.
+
+    The expectation between two DN is the parabola through those half a DN below, at and above the nearest one. Its
+    error is computed a quarter of a DN from it.
+    """
+    k = at.tau * np.sqrt(law.variance(at.signal))
+
+    def expected(distance: float) -> Float:
+        signal = np.maximum(at.signal + distance, 0.0)
+        std = np.maximum(np.sqrt(law.variance(signal)), 1e-3 * k / at.tau)
+        return np.asarray(law.factors(signal, k / std).value.real)
+
+    middle, low, high = at.value.real, expected(-0.5), expected(0.5)
+    slope, square = high - low, 2 * (high + low - 2 * middle)
+    error = [np.abs(expected(d) - middle - d * slope - d * d * square) for d in (-0.25, 0.25)]
+    return middle, np.zeros_like(slope), np.maximum(*error), slope, square
 
 
 def spread(values: Expectation, at: NDArray[np.intp], size: int) -> Expectation:

@@ -35,8 +35,8 @@ class PlaneTables(NamedTuple):
         1 / std; 0 for DN that are not checked.
     mean : ndarray of float64, [4, N]
         Mean of z.
-    cosine, double : ndarray of float64, [4, N]
-        Expectations of cos z and cos 2z, from which those between two DN are interpolated.
+    cosine, double : ndarray of float64, [4, N, 2]
+        Coefficients of d and d², by which the expectations of cos z and cos 2z differ d DN from the nearest DN.
     row_dn2 : float
         Variance of the offsets of rows, DN²; a part of the variance of z.
     largest_z : float
@@ -216,8 +216,8 @@ def _add_values(line: Any, clean: Any, odd: int, is_rounded: bool, tables: Any, 
         plane, dn = 2 * odd + (x & 1), _nearest(clean[x])
         cosine, double = line.cosine[x], line.double[x]
         if not is_rounded:
-            cosine -= _between(tables.cosine[plane], dn, float(clean[x]))
-            double -= _between(tables.double[plane], dn, float(clean[x]))
+            cosine -= _difference(tables.cosine[plane, dn], float(clean[x]) - dn)
+            double -= _difference(tables.double[plane, dn], float(clean[x]) - dn)
         sums.z[plane, dn] += line.z[x]
         sums.cosine[plane, dn] += cosine
         sums.double[plane, dn] += double
@@ -225,11 +225,8 @@ def _add_values(line: Any, clean: Any, odd: int, is_rounded: bool, tables: Any, 
 
 
 @inner
-def _between(values: Any, dn: int, clean_dn: float) -> Any:
-    """Return by how much an expectation at a value between two DN differs from that at the nearest DN."""
-    lower = int(max(clean_dn, 0.0))
-    share = max(clean_dn, 0.0) - lower
-    return values[lower] + share * (values[lower + 1] - values[lower]) - values[dn]
+def _difference(coefficients: Any, distance_dn: float) -> Any:
+    return distance_dn * (coefficients[0] + distance_dn * coefficients[1])
 
 
 @inner

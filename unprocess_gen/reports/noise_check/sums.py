@@ -124,14 +124,13 @@ class Sums:
     def _plane_tables(self, is_rounded: bool) -> PlaneTables:
         from unprocess_gen.reports.noise_check.site_sums import PlaneTables
 
-        inverse, mean, cosine, double = (np.zeros((4, self._size)) for _ in range(4))
+        inverse, mean = (np.zeros((4, self._size)) for _ in range(2))
+        cosine, double = (np.zeros((4, self._size, 2)) for _ in range(2))
         for plane, (usable, of) in enumerate(zip(self.usable, self.tables, strict=True)):
-            known = np.flatnonzero(usable)
-            inverse[plane, known] = 1 / of.std[known]
+            inverse[plane, usable] = 1 / of.std[usable]
             mean[plane] = of.rounding_mean * inverse[plane] + of.outlier_mean
-            if not is_rounded and len(known):
-                for values, expected in ((cosine, of.cosine), (double, of.double)):
-                    values[plane] = np.interp(np.arange(self._size), known, expected.mean[known])
+            for values, expected in ((cosine, of.cosine), (double, of.double)):
+                values[plane, :, 0], values[plane, :, 1] = expected.by_clean, expected.by_square
         least = LEAST_DIFFERENCE_DN if is_rounded else 0.0
         row_dn2 = self.law.rows.variance
         return PlaneTables(inverse, mean, cosine, double, row_dn2, LARGEST_Z, least, LARGEST_DIFFERENCE)
