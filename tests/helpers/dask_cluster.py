@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from helpers.commands import environment
-from helpers.processes import session, wait_for
+from helpers.processes import ended_with_tests, kill_session, session, wait_for
 
 
 @dataclass
@@ -23,6 +21,7 @@ class DaskCluster:
     folder: Path
     scheduler: subprocess.Popen[bytes]
     env: dict[str, str]
+    stack: ExitStack
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     @property
@@ -36,7 +35,7 @@ class DaskCluster:
     def add_worker(self, *arguments: str, **env: str) -> subprocess.Popen[bytes]:
         """Start a nanny with one worker of one thread."""
         options = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.folder))
-        worker = _start(self.folder, self.env | env, "worker", self.address, *options, *arguments)
+        worker = _start(self.stack, self.folder, self.env | env, "worker", self.address, *options, *arguments)
         self.workers.append(worker)
         return worker
 
@@ -48,25 +47,18 @@ class DaskCluster:
         """Return the processes that make shards."""
         return [pid for pid in self.processes() if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
-    def kill_all(self) -> None:
-        for process in [*self.workers, self.scheduler]:
-            for pid in session(process.pid):
-                with_signal(pid, signal.SIGKILL)
-            process.wait()
 
-
-def with_signal(pid: int, number: int) -> None:
-    """Send a signal to a process that may have ended."""
-    with suppress(ProcessLookupError):
-        os.kill(pid, number)
-
-
-def _start(folder: Path, env: dict[str, str], *arguments: str) -> subprocess.Popen[bytes]:
+def _start(stack: ExitStack, folder: Path, env: dict[str, str], *arguments: str) -> subprocess.Popen[bytes]:
+    """Start a process in a new session, all of which is killed when the stack closes."""
     with (folder / f"{arguments[0]}.log").open("ab") as log:
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]],
             cwd=folder, env=environment(**env), stdout=log, stderr=log, start_new_session=True,
         )  # fmt: skip
+    stack.callback(process.wait)
+    stack.callback(kill_session, process.pid)
+    stack.enter_context(ended_with_tests(process))
+    return process
 
 
 @contextmanager
@@ -76,11 +68,10 @@ def dask_cluster(folder: Path, workers: int = 2, env: dict[str, str] | None = No
     file = folder / "scheduler.json"
     file.unlink(missing_ok=True)
     options: Sequence[str] = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
-    cluster = DaskCluster(folder, _start(folder, env or {}, "scheduler", *options), env or {})
-    try:
+    with ExitStack() as stack:
+        scheduler = _start(stack, folder, env or {}, "scheduler", *options)
+        cluster = DaskCluster(folder, scheduler, env or {}, stack)
         wait_for(lambda: file.exists() and file.read_text().strip().endswith("}"), 60)
         for _ in range(workers):
             cluster.add_worker()
         yield cluster
-    finally:
-        cluster.kill_all()

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.processes import ended_with_tests, free_port
 from unprocess_gen.core import object_store
 from unprocess_gen.core.object_store import ObjectPath
 
@@ -32,20 +33,17 @@ Answer = Callable[[str, str], int]
 """Return the status to answer a request (method, path) with instead of the server, or 0 to pass it on."""
 
 
-def free_port() -> int:
-    """Return a TCP port that no process listens on."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
-
-
 @contextmanager
 def moto_server(log: Path) -> Iterator[str]:
     """Start an S3 server; yield its endpoint."""
     port = free_port()
     endpoint = f"http://127.0.0.1:{port}"
     command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-    with log.open("w") as stream, subprocess.Popen(command, stdout=stream, stderr=stream) as process:
+    with (
+        log.open("w") as stream,
+        subprocess.Popen(command, stdout=stream, stderr=stream, start_new_session=True) as process,
+        ended_with_tests(process),
+    ):
         try:
             _wait_for(process, port)
             yield endpoint

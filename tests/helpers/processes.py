@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,40 @@ os.fsync = slow
 """
 """Module for `imported_first`: a shard takes 0.04 s or more to commit, so that a run does not end before its kill."""
 
+POISON = """
+import hashlib, os, pathlib, signal
+
+killer, sha256 = pathlib.Path(os.environ["KILLER"]), hashlib.sha256
+
+
+def deadly(data=b"", **options):
+    if isinstance(data, bytes) and killer.exists() and data == killer.read_bytes():
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sha256(data, **options)
+
+
+hashlib.sha256 = deadly
+"""
+"""Module for `imported_first`: hashing the photograph that KILLER names kills the process."""
+
+
+def slow_shards(seconds: float) -> str:
+    """Return a module for `imported_first`: a shard takes ``seconds`` longer."""
+    return f"""
+import time
+from unprocess_gen.pipeline import worker
+
+make_shard = worker.make_shard
+
+
+def slow(context, task):
+    time.sleep({seconds})
+    return make_shard(context, task)
+
+
+worker.make_shard = slow
+"""
+
 
 def imported_first(folder: Path, code: str) -> dict[str, str]:
     """Return an environment in which every Python process runs ``code`` first, from a new folder in ``folder``."""
@@ -45,6 +80,17 @@ def imported_first(folder: Path, code: str) -> dict[str, str]:
 
 
 @contextmanager
+def ended_with_tests(process: subprocess.Popen[Any]) -> Iterator[None]:
+    """Kill the group that ``process`` leads if the tests are killed: a shell sees the end of its input."""
+    command = ["sh", "-c", f"read line || kill -s KILL -- -{process.pid} 2>/dev/null"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True) as guard:
+        try:
+            yield
+        finally:
+            guard.communicate("\n")
+
+
+@contextmanager
 def running(*arguments: object, cwd: Path, **env: str) -> Iterator[subprocess.Popen[str]]:
     """Start ``gen-dataset`` in a new session; processes of it that are left afterwards are killed."""
     process = subprocess.Popen(
@@ -52,11 +98,23 @@ def running(*arguments: object, cwd: Path, **env: str) -> Iterator[subprocess.Po
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     try:
-        yield process
+        with ended_with_tests(process):
+            yield process
     finally:
-        for pid in session(process.pid):
-            os.kill(pid, signal.SIGKILL)
+        kill_session(process.pid)
         process.communicate()
+
+
+def with_signal(pid: int, number: int) -> None:
+    """Send a signal to a process that may have ended."""
+    with suppress(ProcessLookupError):
+        os.kill(pid, number)
+
+
+def kill_session(leader: int) -> None:
+    """Kill the processes of a session that are alive."""
+    for pid in session(leader):
+        with_signal(pid, signal.SIGKILL)
 
 
 def session(leader: int) -> list[int]:
@@ -98,6 +156,13 @@ def processes_per_core() -> float:
 
 def committed(out: Path) -> int:
     return len(list((out / "shards").glob("*.tar")))
+
+
+def free_port() -> int:
+    """Return a TCP port that no process listens on."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
 
 
 def kill_group(process: subprocess.Popen[str]) -> None:

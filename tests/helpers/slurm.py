@@ -9,15 +9,14 @@ from __future__ import annotations
 import os
 import platform
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from helpers.processes import wait_for
+from helpers.processes import ended_with_tests, free_port, wait_for
 
 CONFIG = """
 ClusterName=test
@@ -110,24 +109,15 @@ def running_slurm(folder: Path, binaries: dict[str, Path]) -> Iterator[Slurm]:
         [binaries["slurmctld"], "-D", "-c"],
         [binaries["slurmd"], "-D", "-d", binaries["slurmstepd"]],
     ]
-    daemons = []
-    try:
+    with ExitStack() as stack:
         for command in commands:
-            log = (folder / f"{Path(command[0]).name}.out").open("w")
-            daemons.append(subprocess.Popen([*map(str, command)], env=env, stdout=log, stderr=log))
-            log.close()
+            with (folder / f"{Path(command[0]).name}.out").open("w") as log:
+                arguments = [*map(str, command)]
+                daemon = subprocess.Popen(arguments, env=env, stdout=log, stderr=log, start_new_session=True)
+            stack.callback(daemon.wait)
+            stack.callback(daemon.terminate)
+            stack.enter_context(ended_with_tests(daemon))
             time.sleep(2)
         slurm = Slurm(binaries, env)
         wait_for(lambda: "idle" in slurm("sinfo", "--noheader"), seconds=60)
         yield slurm
-    finally:
-        for daemon in reversed(daemons):
-            daemon.terminate()
-            daemon.wait()
-
-
-def free_port() -> int:
-    """Return a port that no process listens to."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])

@@ -19,10 +19,21 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import Cli, RunMain, messages
-from helpers.dask_cluster import DaskCluster, dask_cluster, with_signal
+from helpers.dask_cluster import DaskCluster, dask_cluster
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
-from helpers.processes import assert_complete, imported_first, processes_per_core, running, session, wait_for
+from helpers.processes import (
+    ONE,
+    POISON,
+    assert_complete,
+    imported_first,
+    processes_per_core,
+    running,
+    session,
+    slow_shards,
+    wait_for,
+    with_signal,
+)
 from helpers.promise_report import Figure
 
 from unprocess_gen.core.object_store import ObjectPath
@@ -34,29 +45,8 @@ from unprocess_gen.pipeline.verify import verify
 Client = pytest.importorskip("distributed").Client
 
 COUNT = 12
-ONE = "output.pairs_per_shard=1"
 ROOT = "source.root=p"
 SMALL = "executor.chunk_s=1"
-
-SLOW_SHARDS = """
-import time
-from unprocess_gen.pipeline import worker
-
-make_shard = worker.make_shard
-
-
-def slow(context, task):
-    time.sleep(SECONDS)
-    return make_shard(context, task)
-
-
-worker.make_shard = slow
-"""
-"""Module for `imported_first`: a shard takes SECONDS longer."""
-
-
-def slow_shards(seconds: float) -> str:
-    return SLOW_SHARDS.replace("SECONDS", str(seconds))
 
 
 @pytest.fixture(scope="module")
@@ -211,23 +201,6 @@ def test_scheduler_without_workers_ends_the_run(photographs: Path, run_main: Run
 
 
 # Faults ---------------------------------------------------------------------------------------------------------------
-
-
-POISON = """
-import hashlib, os, pathlib, signal
-
-killer, sha256 = pathlib.Path(os.environ["KILLER"]), hashlib.sha256
-
-
-def deadly(data=b"", **options):
-    if isinstance(data, bytes) and killer.exists() and data == killer.read_bytes():
-        os.kill(os.getpid(), signal.SIGKILL)
-    return sha256(data, **options)
-
-
-hashlib.sha256 = deadly
-"""
-"""Module for `imported_first`: hashing one photograph kills its process."""
 
 
 @pytest.mark.slow

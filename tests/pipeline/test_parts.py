@@ -15,12 +15,13 @@ from typing import Any
 
 import pytest
 from helpers.commands import COMMAND, Cli, RunMain, environment, messages
-from helpers.datasets import Make, TreeHash
+from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill, pixels
-from helpers.processes import imported_first, running, wait_for
+from helpers.processes import ONE, POISON, imported_first, running, slow_shards, wait_for
 from helpers.promise_report import Figure
 from PIL import Image
 
+from unprocess_gen.config.validation import validate_config
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import deaths, parts
 from unprocess_gen.pipeline.listing_record import PER_FILE
@@ -30,7 +31,6 @@ from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation import self_test
 
 COUNT = 12
-ONE = "output.pairs_per_shard=1"
 ROOT = "source.root=p"
 
 
@@ -42,18 +42,49 @@ def undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest.TempPa
     return tree_hash(folder / "ds")
 
 
+@pytest.fixture(scope="module")
+def prepared(settings: Settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Prepare a dataset ds of twelve photographs p in six parts, and return the folder of both."""
+    folder = tmp_path_factory.mktemp("prepared")
+    config = settings(ONE, "n_jobs=1")
+    config.source.root, config.out = str(fill(folder / "p", COUNT)), str(folder / "ds")
+    validate_config(config)
+    parts.prepare(config, 6)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(prepared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make all parts of a copy of the prepared dataset, and return it."""
+    ds = shutil.copytree(prepared / "ds", tmp_path_factory.mktemp("made") / "ds")
+    for part in range(6):
+        parts.make_part(str(ds), part)
+    return ds
+
+
 @pytest.fixture
-def photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def photographs(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    return fill(tmp_path / "p", COUNT)
+    return shutil.copytree(prepared / "p", tmp_path / "p")
+
+
+def copied(dataset: Path, photographs: Path) -> Path:
+    """Copy a dataset to the folder of its photographs."""
+    ds = shutil.copytree(dataset, photographs.with_name("ds"))
+    edit_json(ds / ".work/plan.json", root=str(photographs))
+    return ds
 
 
 @pytest.fixture
-def ds(photographs: Path, run_main: RunMain, tmp_path: Path) -> Path:
-    """Prepare a dataset in six parts."""
-    done = run_main("prepare", "parts=6", ROOT, ONE, "n_jobs=1", "out=ds")
-    assert done.code == 0, done.err
-    return tmp_path / "ds"
+def ds(prepared: Path, photographs: Path) -> Path:
+    """Return a dataset that is prepared in six parts."""
+    return copied(prepared / "ds", photographs)
+
+
+@pytest.fixture
+def ds_made(made: Path, photographs: Path) -> Path:
+    """Return a dataset that is prepared in six parts, all of which are made."""
+    return copied(made, photographs)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -125,31 +156,14 @@ def test_run_begun_one_way_is_finished_the_other(
     assert tree_hash(tmp_path / "ds") == undisturbed
 
 
-def test_two_writers_of_one_part_make_the_same_bytes(ds: Path, run_main: RunMain, undisturbed: str,
-                                                     tree_hash: TreeHash) -> None:  # fmt: skip
-    for part in (0, 3):
-        with running("part", "ds", part, cwd=ds.parent) as one, running("part", "ds", part, cwd=ds.parent) as other:
-            assert (one.wait(120), other.wait(120)) == (0, 0)
-    for part in (1, 2, 4, 5):
-        run_main("part", "ds", part, "-q")
+def test_two_writers_of_one_part_make_the_same_bytes(
+    photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    assert run_main("prepare", "parts=1", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
+    with running("part", "ds", 0, cwd=tmp_path) as one, running("part", "ds", 0, cwd=tmp_path) as other:
+        assert (one.wait(120), other.wait(120)) == (0, 0)
     assert run_main("merge", "ds").code == 0
-    assert tree_hash(ds) == undisturbed
-
-
-SLOW_SHARDS = """
-import time
-from unprocess_gen.pipeline import worker
-
-make_shard = worker.make_shard
-
-
-def slowly(*given):
-    time.sleep(0.3)
-    return make_shard(*given)
-
-
-worker.make_shard = slowly
-"""
+    assert tree_hash(tmp_path / "ds") == undisturbed
 
 
 @pytest.mark.linux_only("kills a process by a signal")
@@ -158,7 +172,7 @@ def test_killed_part_loses_at_most_one_shard(
 ) -> None:
     assert run_main("prepare", "parts=1", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
     rows = tmp_path / "ds/.work/rows"
-    with running("part", "ds", "0", cwd=tmp_path, **imported_first(tmp_path, SLOW_SHARDS)) as process:
+    with running("part", "ds", "0", cwd=tmp_path, **imported_first(tmp_path, slow_shards(0.3))) as process:
         wait_for(lambda: rows.exists() and len(list(rows.iterdir())) >= 3)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
@@ -193,7 +207,7 @@ def test_parts_killed_at_random_moments_end_with_the_same_bytes(
     ds: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, figure: Figure, tmp_path: Path
 ) -> None:
     moment, kills = random.Random(5), 0
-    env = imported_first(tmp_path, SLOW_SHARDS)
+    env = imported_first(tmp_path, slow_shards(0.3))
     while kills < 20:
         left = left_text(parts.parts_status("ds").left)
         part = moment.choice(left.replace("-", ",").split(",")) if left else "0"
@@ -208,12 +222,10 @@ def test_parts_killed_at_random_moments_end_with_the_same_bytes(
     figure("parts", f"same bytes after {kills} kills of parts")
 
 
-def test_report_names_the_parts_of_a_dataset(ds: Path, run_main: RunMain) -> None:
-    for part in range(6):
-        run_main("part", "ds", part, "-q")
+def test_report_names_the_parts_of_a_dataset(ds_made: Path, run_main: RunMain) -> None:
     run_main("merge", "ds")
     assert run_main("report", "ds").code == 0
-    assert "merged from 6 parts" in (ds / "report.html").read_text()
+    assert "merged from 6 parts" in (ds_made / "report.html").read_text()
 
 
 # What is left ---------------------------------------------------------------------------------------------------------
@@ -325,11 +337,10 @@ CHANGES: list[tuple[str, Callable[[Path], Any], str]] = [
 @pytest.mark.parametrize(("what", "change", "message"), CHANGES, ids=[what for what, _, _ in CHANGES])
 @pytest.mark.parametrize("verb", ["part", "merge"])
 def test_other_version_settings_or_listing_is_refused_with_2(
-    verb: str, what: str, change: Callable[[Path], Any], message: str, ds: Path, run_main: RunMain
-) -> None:
-    if verb == "merge":
-        for part in range(6):
-            run_main("part", "ds", part, "-q")
+    verb: str, what: str, change: Callable[[Path], Any], message: str, prepared: Path, made: Path, photographs: Path,
+    run_main: RunMain,
+) -> None:  # fmt: skip
+    ds = copied(prepared / "ds" if verb == "part" else made, photographs)
     change(ds)
     before = files(ds)
     done = run_main(*(("part", "ds", "0") if verb == "part" else ("merge", "ds")))
@@ -389,22 +400,6 @@ def test_full_disk_ends_a_part_with_5_and_keeps_its_shards(
 
 # Deaths ---------------------------------------------------------------------------------------------------------------
 
-POISON = """
-import hashlib, os, pathlib, signal
-
-killer, sha256 = pathlib.Path(os.environ["KILLER"]), hashlib.sha256
-
-
-def deadly(data=b"", **options):
-    if isinstance(data, bytes) and killer.exists() and data == killer.read_bytes():
-        os.kill(os.getpid(), signal.SIGKILL)
-    return sha256(data, **options)
-
-
-hashlib.sha256 = deadly
-"""
-"""Module for `imported_first`: hashing one photograph kills its process."""
-
 
 @pytest.mark.linux_only("kills a process by a signal")
 def test_photograph_that_kills_its_part_gets_provisional_rows(
@@ -436,7 +431,7 @@ def test_two_coordinators_without_a_lock_make_one_dataset(
     photographs: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
     unlocked = "from unprocess_gen.core import locks\nlocks.LockFile.acquire = lambda self, wait: None\n"
-    env = imported_first(tmp_path, unlocked + SLOW_SHARDS)
+    env = imported_first(tmp_path, unlocked + slow_shards(0.3))
     arguments = (ROOT, ONE, "n_jobs=1", "out=ds")
     with running(*arguments, cwd=tmp_path, **env) as one, running(*arguments, cwd=tmp_path, **env) as other:
         results = [(process.wait(180), process.stderr.read() if process.stderr else "") for process in (one, other)]

@@ -21,6 +21,7 @@ import pytest
 from helpers.commands import COMMAND, RunMain, environment
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
+from helpers.processes import ONE
 
 from unprocess_gen.cli.messages import logging_to
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
@@ -35,8 +36,6 @@ from unprocess_gen.pipeline.repair import repair
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import have_same_rows, verify, verify_sweep
 from unprocess_gen.pipeline.workspace import Workspace, dataset_facts, dataset_text, read_dataset
-
-ONE = "output.pairs_per_shard=1"
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import fill
+from helpers.processes import ONE
 
 from unprocess_gen import load_config
 from unprocess_gen.core.errors import MachineError
@@ -18,8 +19,6 @@ from unprocess_gen.pipeline import sizes
 from unprocess_gen.pipeline.generate import shard_tasks
 from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.sources.loader import list_photographs
-
-ONE = "output.pairs_per_shard=1"
 
 
 def estimate(settings: Settings, root: Path | None, *overrides: str) -> sizes.SizeEstimate:

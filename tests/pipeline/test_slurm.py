@@ -11,7 +11,7 @@ import pytest
 from helpers.commands import COMMAND, RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
-from helpers.processes import imported_first, wait_for
+from helpers.processes import ONE, imported_first, slow_shards, wait_for
 from helpers.promise_report import Figure
 from helpers.slurm import Slurm, find_binaries, running_slurm
 
@@ -25,24 +25,21 @@ pytestmark = [
 ]
 
 COUNT = 16
-ONE = "output.pairs_per_shard=1"
 
-SLOW_SHARDS = """
-import os, time
+NOTED_SHARDS = f"""
+{slow_shards(0.5)}
+import os
 from pathlib import Path
-from unprocess_gen.pipeline import worker
-
-make_shard = worker.make_shard
 
 
-def slowly(context, task):
+def noted(context, task):
     Path("pids", os.environ.get("SLURM_ARRAY_TASK_ID", "")).write_text(str(os.getpid()))
-    time.sleep(0.5)
-    return make_shard(context, task)
+    return slow(context, task)
 
 
-worker.make_shard = slowly
+worker.make_shard = noted
 """
+"""Module for `imported_first`: a shard takes half a second longer, and its process is noted in ``pids``."""
 
 
 @pytest.fixture
@@ -60,7 +57,7 @@ def test_array_with_killed_and_requeued_parts_ends_with_the_same_bytes(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pids").mkdir()
     assert run_main("prepare", "parts=4", "source.root=p", ONE, "n_jobs=1", "out=ds").code == 0
-    env = imported_first(tmp_path, SLOW_SHARDS)
+    env = imported_first(tmp_path, NOTED_SHARDS)
     part, merge = tmp_path / "part.sh", tmp_path / "merge.sh"
     part.write_text(f"#!/bin/bash\nexport PYTHONPATH={env['PYTHONPATH']}\nexec {COMMAND} part ds\n")
     merge.write_text(f"#!/bin/bash\n{COMMAND} merge ds\necho exit $?\n")
