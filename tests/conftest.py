@@ -13,7 +13,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -27,15 +26,16 @@ from helpers.configs import composed
 from helpers.datasets import MadeHash, Make, Settings, TreeHash
 from helpers.photographs import pixels
 from helpers.processes import WAIT_S
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 from PIL import Image
 
 from unprocess_gen.cli import main as entry_point
+from unprocess_gen.config import composition
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.pipeline import generate as runner
-from unprocess_gen.sources import loader
 from unprocess_gen.sources.scenes import synthetic
 
 _BUCKETS = itertools.count()
@@ -58,6 +58,11 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_I
     signal.signal(signal.SIGHUP, lambda number, frame: None)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run benchmarks last: they use all kernels, which two processes would compile at the same time."""
+    items.sort(key=lambda item: "benchmarks" in item.path.parts)
+
+
 def pytest_collection_finish() -> None:
     """Exclude modules and collected tests from garbage collection, which takes a tenth of the time of compositions."""
     gc.freeze()
@@ -76,14 +81,13 @@ def _no_sync() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _scenes_drawn_once() -> Iterator[None]:
-    """Let the loader draw each built-in scene once: a scene takes up to 0.5 s, and half of the datasets use one.
+    """Draw each built-in scene once in this process: a scene takes up to 0.5 s, and half of the datasets use one.
 
-    Tests of the scenes call `synthetic.scene` itself.
+    Tests of the scenes import the function itself, before this fixture replaces it.
     """
     drawn = functools.cache(synthetic.scene)
-    module = SimpleNamespace(**vars(synthetic) | {"scene": lambda name: drawn(name).copy()})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loader, "synthetic", module)
+        patch.setattr(synthetic, "scene", lambda name: drawn(name).copy())
         yield
 
 
@@ -107,6 +111,32 @@ def _options_parsed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OmegaConf, "load", staticmethod(loaded))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _composed_once() -> Iterator[None]:
+    """Let Hydra compose equal overrides of the package's options once: a composition takes 0.1 s, a third are equal.
+
+    Compositions with other folders of options, and those that fail, are done each time.
+    """
+    compose = hydra.compose
+    kept: dict[tuple[str, ...], bytes] = {}
+
+    def composed_once(name: str, overrides: list[str], **options: bool) -> Any:
+        folders = [one.path for one in GlobalHydra.instance().config_loader().get_search_path().get_path()]
+        added = any("searchpath" in one for one in overrides)
+        if added or composition._own_folder or str(conf_dir()) not in folders or not options:
+            return compose(name, overrides, **options)
+        key = (name, *folders, *overrides)
+        if key not in kept:
+            kept[key] = pickle.dumps(compose(name, overrides, return_hydra_config=True))
+        node = pickle.loads(kept[key])
+        node.hydra.runtime.cwd = str(Path.cwd())
+        return node
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hydra, "compose", composed_once)
         yield
 
 

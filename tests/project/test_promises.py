@@ -19,7 +19,8 @@ def test_files_of_every_promise_exist() -> None:
 
 
 def test_every_promise_has_a_test_that_reports_a_figure() -> None:
-    assert [promise.id for promise in PROMISES if not reporting_files()[promise.id] & set(promise.files)] == []
+    reporting = reporting_files()
+    assert [promise.id for promise in PROMISES if not reporting[promise.id] & set(promise.files)] == []
 
 
 def test_every_reported_promise_exists() -> None:
