@@ -28,7 +28,6 @@ from types import ModuleType
 
 import cv2
 import numpy as np
-from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from helpers import algorithm1
@@ -204,6 +203,8 @@ def sample_pmn(light: np.ndarray, plan: Plan) -> np.ndarray:
     Its ``data_process/process.py`` draws the read noise with scipy, models rounding as uniform noise, adds a bias per
     colour plane, clips, and returns float32.
     """
+    from scipy import stats  # takes a second, in every process that collects the tests
+
     physics = plan.physics
     assert physics is not None
     span_dn = plan.white_level_dn - plan.black_level_dn
@@ -222,6 +223,8 @@ def sample_pmn(light: np.ndarray, plan: Plan) -> np.ndarray:
 @functools.cache
 def tukey_std(shape: float) -> float:
     """Return the standard deviation of Tukey's lambda distribution at scale 1."""
+    from scipy import stats
+
     return float(stats.tukeylambda.std(shape))
 
 

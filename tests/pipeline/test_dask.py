@@ -15,6 +15,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,7 @@ from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.pipeline.verify import verify
 
-Client = pytest.importorskip("distributed").Client
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra dask")
 
 COUNT = 12
 ROOT = "source.root=p"
@@ -415,6 +416,8 @@ worker.make_shard = failing
 def test_system_error_of_one_worker_is_retried_on_another(
     photographs: Path, run_main: RunMain, undisturbed: str, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
+    from distributed import Client  # takes a second, in every process that collects the tests
+
     with dask_cluster(tmp_path / "cluster", workers=0) as cluster:
         cluster.add_worker(**imported_first(tmp_path, FAILING))
         done = run_main(ROOT, ONE, SMALL, "out=ds", *cluster.overrides)

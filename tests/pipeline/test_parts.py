@@ -191,7 +191,7 @@ def test_part_ended_at_its_walltime_counts_no_death(
     """Batch systems send SIGTERM at the end of the walltime."""
     assert run_main("prepare", "parts=1", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
     rows = tmp_path / "ds/.work/rows"
-    with running("part", "ds", "0", cwd=tmp_path, **imported_first(tmp_path, SLOW_SHARDS)) as process:
+    with running("part", "ds", "0", cwd=tmp_path, **imported_first(tmp_path, slow_shards(0.3))) as process:
         wait_for(lambda: rows.exists() and len(list(rows.iterdir())) >= 2)
         process.terminate()
         assert process.wait(20) == 143

@@ -73,7 +73,9 @@ def profiles() -> BenchmarkProfiles:
 
 @pytest.fixture(scope="session")
 def found(settings: Settings, profiles: BenchmarkProfiles) -> BenchmarkReport:
-    return measure.measure_accuracy(settings("scene=low_light", "source.downscale=2"), profiles, LITTLE, "gen-dataset accuracy")
+    return measure.measure_accuracy(
+        settings("scene=low_light", "source.downscale=2"), profiles, LITTLE, "gen-dataset accuracy"
+    )
 
 
 def rows_of(found: BenchmarkReport, *stages: str) -> dict[str, Measurement]:
