@@ -459,7 +459,8 @@ def test_the_noise_of_the_arrays_fits_the_rows(overrides: tuple[str, ...], make:
     assert len(found) == 1
     assert found[0].deviation < 5
     clean, noisy, row = RawPairs(tmp_path / "ds")[0]
-    lying = transfer.fit_pair(clean, noisy, row | {"a_dn": row["a_dn"] * 1.1})
+    gain = "dn_per_e" if row["dn_per_e"] else "a_dn"  # the law of a physical profile follows from dn_per_e
+    lying = transfer.fit_pair(clean, noisy, row | {gain: row[gain] * 1.1})
     assert lying is not None
     assert lying.deviation > 6
 
