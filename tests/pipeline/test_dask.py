@@ -534,3 +534,25 @@ def kill_one(kind: str, cluster: DaskCluster, process: subprocess.Popen[str], dr
     else:
         with_signal(draw.choice([worker.pid for worker in cluster.workers if worker.poll() is None]), signal.SIGKILL)
         cluster.add_worker()
+
+
+def test_own_workers_keep_freed_memory_in_threads(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import dask
+
+    from unprocess_gen.config.schema import ExecutorConfig
+    from unprocess_gen.core.errors import MachineError
+    from unprocess_gen.pipeline.executors import dask as executor
+    from unprocess_gen.pipeline.storage import open_storage
+
+    variables: dict[str, object] = {}
+
+    def refuse(**_: object) -> None:
+        variables.update(dask.config.get("distributed.nanny.pre-spawn-environ"))
+        raise OSError
+
+    monkeypatch.setattr(executor, "LocalCluster", refuse)
+    settings = ExecutorConfig(kind="dask")
+    with pytest.raises(MachineError), executor._local_cluster(settings, 1, open_storage(str(tmp_path / "ds"))):
+        pass
+    assert variables["MALLOC_ARENA_MAX"] == 1
+    assert variables["OMP_NUM_THREADS"] == 1  # the others remain
