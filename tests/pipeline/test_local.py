@@ -1,0 +1,33 @@
+"""Local workers run in a pool of joblib, whose own warnings about its processes do not concern users."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import joblib
+import pytest
+
+from unprocess_gen.pipeline.executors import local
+
+LOKY = "joblib.externals.loky.process_executor"
+
+
+@pytest.mark.parametrize(
+    "message", ["A worker stopped while some jobs were given to the executor.", "3 tasks which were still running"]
+)
+def test_warnings_of_the_pool_are_hidden(message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Pool:
+        def __init__(self, **_: object) -> None:
+            pass
+
+        def __call__(self, calls: Any) -> Iterator[object]:
+            warnings.warn_explicit(message, UserWarning, "process_executor.py", 1, module=LOKY)
+            yield "report"
+
+    monkeypatch.setattr(joblib, "Parallel", Pool)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        context: Any = None
+        assert [*local._run_pool(context, [], 2)] == ["report"]
