@@ -34,7 +34,29 @@ def slow(handle):
 
 os.fsync = slow
 """
-"""Module for `imported_first`: a shard takes 0.04 s or more to commit, so that a run does not end before its kill."""
+"""Module for `imported_first`: a shard takes 0.04 s or more to commit."""
+
+
+def unfinished(out: Path, shards: int) -> str:
+    """Return `SLOW_DISK` for a run to ``out`` that does not end before it is killed, however late that is.
+
+    Once ``shards`` are committed, each process waits at its next write until its parent has ended.
+    """
+    return f"""{SLOW_DISK}
+import pathlib
+
+folder, parent = pathlib.Path({str(out / "shards")!r}), os.getppid()
+
+
+def waits(handle):
+    while len(list(folder.glob("*.tar"))) >= {shards} and os.getppid() == parent:
+        time.sleep(0.01)
+    slow(handle)
+
+
+os.fsync = waits
+"""
+
 
 POISON = """
 import hashlib, os, pathlib, signal

@@ -39,6 +39,7 @@ from helpers.processes import (
     processes_per_core,
     running,
     session,
+    unfinished,
     wait_for,
     workers,
 )
@@ -189,7 +190,8 @@ def test_orphaned_workers_do_not_disturb_the_next_run(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Workers are stopped (SIGSTOP) amid a shard, outlive their coordinator, and continue in the next run."""
-    out, env = tmp_path / "ds", imported_first(tmp_path, SLOW_DISK)
+    out = tmp_path / "ds"
+    env = imported_first(tmp_path, unfinished(out, COUNT - 4))
     with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path, **env) as process:
         wait_for(lambda: committed(out) >= 2)
         orphans = workers(process.pid)

@@ -23,7 +23,6 @@ from helpers.datasets import MadeHash, Make, TreeHash
 from helpers.photographs import fill, pixels
 from helpers.processes import (
     ONE,
-    SLOW_DISK,
     WAIT_S,
     Killed,
     assert_complete,
@@ -33,6 +32,7 @@ from helpers.processes import (
     processes_per_core,
     running,
     session,
+    unfinished,
     wait_for,
     workers,
 )
@@ -76,7 +76,8 @@ def test_run_killed_repeatedly_ends_as_if_undisturbed(
 ) -> None:
     """Each kill comes a few random milliseconds after a number of shards that grows from kill to kill."""
     moment = random.Random(385)
-    out, env = tmp_path / "ds", imported_first(tmp_path, SLOW_DISK)
+    out = tmp_path / "ds"
+    env = imported_first(tmp_path, unfinished(out, 36))
     for kill in range(kills):
         with running(f"source.root={forty}", ONE, f"n_jobs={1 + (kill % 3 == 0)}", cwd=tmp_path, **env) as process:
             wait_for(lambda at=3 * kill: (out.exists() and committed(out) >= at) or process.poll() is not None)
@@ -525,7 +526,10 @@ def stopped(request: pytest.FixtureRequest, forty: Path, tmp_path_factory: pytes
     folder = tmp_path_factory.mktemp("stopped")
     arguments, env = LONG, {}
     if sources == "photographs":
-        arguments, env = (f"source.root={forty}", ONE, "n_jobs=2"), imported_first(folder, SLOW_DISK)
+        arguments, env = (
+            (f"source.root={forty}", ONE, "n_jobs=2"),
+            imported_first(folder, unfinished(folder / "ds", 36)),
+        )
     with running(*arguments, cwd=folder, **env) as process:
         wait_for(lambda: committed(folder / "ds") or process.poll() is not None)
         assert workers(process.pid), process.communicate()

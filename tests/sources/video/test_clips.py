@@ -10,7 +10,7 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings, TreeHash
 from helpers.photographs import pixels
-from helpers.processes import SLOW_DISK, committed, imported_first, kill_group, running, wait_for
+from helpers.processes import committed, imported_first, kill_group, running, unfinished, wait_for
 from helpers.videos import (
     encode,
     film,
@@ -118,7 +118,8 @@ def key(row: dict[str, str]) -> tuple[str, ...]:
 def test_killed_run_of_videos_resumes_to_the_same_bytes(
     n_jobs: int, films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
 ) -> None:
-    out, env = tmp_path / "ds", imported_first(tmp_path, SLOW_DISK)
+    out = tmp_path / "ds"
+    env = imported_first(tmp_path, unfinished(out, 2))
     with running(*CLIPS, f"source.root={films}", f"out={out}", f"n_jobs={n_jobs}", cwd=tmp_path, **env) as run:
         wait_for(lambda: committed(out) or run.poll() is not None)
         kill_group(run)
