@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from unprocess_gen.core.errors import ConfigError
@@ -87,3 +88,22 @@ def error_in_one_line(error: BaseException) -> str:
         The message, or the name of the exception's class if the message is empty.
     """
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def value_range(values: Sequence[float], digits: int = 6) -> str:
+    """Return the smallest and largest of some numbers as text.
+
+    Parameters
+    ----------
+    values : sequence of float
+        At least one number.
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+        Both numbers, or the number itself if they are equal.
+    """
+    low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
+    return low if low == high else f"{low} to {high}"

@@ -9,6 +9,7 @@ from unprocess_gen.config.interpretation import is_physical
 from unprocess_gen.config.limits import EXPOSURE_RATIO, ISO
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.values import value_range
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
@@ -36,18 +37,14 @@ def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Seq
         ratios = lowest(drawn), highest(drawn)
     if max(ratios) <= 1:
         return ""
+    ratios = [float(f"{ratio:.3g}") for ratio in ratios]
     iso = parse_drawn("scene.iso", config.scene.iso, ISO)
-    left = f", which leaves {_span(levels)} distinct DN in a clean frame" if levels else ""
+    left = f", which leaves {value_range(levels)} distinct DN in a clean frame" if levels else ""
     return (
-        f"scene={config.scene.name}: light is divided by {_span(ratios)}{left}, but noise={config.noise.name} "
-        f"ignores ISO {_span((lowest(iso), highest(iso)))}; physical profiles follow the scene: "
+        f"scene={config.scene.name}: light is divided by {value_range(ratios)}{left}, but noise={config.noise.name} "
+        f"ignores ISO {value_range((lowest(iso), highest(iso)))}; physical profiles follow the scene: "
         f"{', '.join(physical_profiles())}"
     )
-
-
-def _span(values: Sequence[float]) -> str:
-    low, high = (f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in (min(values), max(values)))
-    return low if low == high else f"{low} to {high}"
 
 
 def physical_profiles() -> list[str]:

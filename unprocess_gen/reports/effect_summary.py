@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 from unprocess_gen.config.interpretation import HEAT, assumed_numbers, missing_number, uses_dark_frames
 from unprocess_gen.config.schema import Config, NoiseConfig
+from unprocess_gen.config.values import value_range
 from unprocess_gen.core.types import DarkFrames, Plan
 from unprocess_gen.planning.effect_contributions import OUTLIERS
 from unprocess_gen.planning.effect_selection import COST_NS, MIN_OUTLIERS, Prediction
-from unprocess_gen.reports.formatting import counted, short_number, value_range
+from unprocess_gen.reports.formatting import counted, short_number
 from unprocess_gen.simulation.reference.noise import REPLACED
 
 Predictions = Sequence[Sequence[Prediction]]

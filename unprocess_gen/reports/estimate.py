@@ -27,6 +27,7 @@ from unprocess_gen.config.interpretation import (
     without_dark_frames,
 )
 from unprocess_gen.config.schema import AccuracyConfig, Config
+from unprocess_gen.config.values import value_range
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.files import array_xxh3, free_bytes
 from unprocess_gen.core.object_store import is_url
@@ -51,7 +52,7 @@ from unprocess_gen.reports.effect_summary import (
 )
 from unprocess_gen.reports.empty_bands import NONE as NO_BANDS
 from unprocess_gen.reports.empty_bands import EmptyBands, empty_bands, highlight_sentence
-from unprocess_gen.reports.formatting import byte_size, counted, value_range
+from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pairs
 from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 NOT_MEASURED = "–"
 
 
@@ -15,12 +13,6 @@ def short_number(value: float | None, digits: int = 2) -> str:
 def percentage(fraction: float | None, digits: int = 2) -> str:
     """Return a fraction as a percentage; a dash for None."""
     return NOT_MEASURED if fraction is None else f"{short_number(fraction * 100, digits)} %"
-
-
-def value_range(values: Sequence[float], digits: int = 6) -> str:
-    """Return the smallest and largest of some numbers, or the number itself if they are equal."""
-    low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
-    return low if low == high else f"{low} to {high}"
 
 
 def byte_size(count: int) -> str:
