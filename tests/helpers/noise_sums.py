@@ -8,7 +8,8 @@ import numpy as np
 
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z
-from unprocess_gen.reports.noise_check.sums import LARGEST_DIFFERENCE, LEAST_DIFFERENCE_DN, PARTNERS, TILE, Sums
+from unprocess_gen.reports.noise_check.site_sums import PARTNERS
+from unprocess_gen.reports.noise_check.sums import LARGEST_DIFFERENCE, LEAST_DIFFERENCE_DN, TILE, Sums
 
 
 def numpy_sums(sums: Sums, clean: Any, noisy: Any) -> dict[str, Float]:

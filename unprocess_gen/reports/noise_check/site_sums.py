@@ -18,12 +18,13 @@ _COSINE = tuple((-1) ** n / math.factorial(2 * n) for n in range(10))
 _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9 = _COSINE
 
 
-_PARTNERS = (
-    *((0, 0, 0, 1, 1), (0, 0, 1, 1, 0)),
-    *((1, 0, 0, 0, 1), (1, 1, 0, 1, 1)),
-    *((2, 0, 0, 1, 0), (2, 0, 1, 1, 1)),
+PARTNERS = (((0, 3), (1, 2)), ((0, 1), (2, 3)), ((0, 2), (1, 3)))
+"""Planes whose sites are compared: diagonal, horizontal and vertical partners."""
+
+_PARTNERS = tuple(
+    (kind, *divmod(one, 2), *divmod(other, 2)) for kind, planes in enumerate(PARTNERS) for one, other in planes
 )
-"""Kind, row and column of one site and of the other, for each pair of `sums.PARTNERS`."""
+"""Kind, row and column of one site and of the other."""
 
 
 class PlaneTables(NamedTuple):

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Sites of the tile of the CFA; a plane is the set of all sites at one of these places."""
 
-PARTNERS = (((0, 3), (1, 2)), ((0, 1), (2, 3)), ((0, 2), (1, 3)))
-"""Planes whose sites are compared: diagonal, horizontal and vertical partners."""
-
 SEGMENTS = 8
 """Parts into which lines are divided."""
 
@@ -71,9 +68,9 @@ class Sums:
         For horizontal and vertical neighbours of one plane: sum of products of z, number of pairs, sum of the products
         of 1 / std, and sum over rows of the square of the latter. The vertical ones are without the mean of each row.
     partners : ndarray of float64, [3, 5]
-        For each kind of `PARTNERS`, with n the difference of the noise of both sites, s its standard deviation, and d
-        the difference of their clean values over s, limited: sums of d·n/s, d², |d|/s, 2d times the difference over s
-        without limit, and (d/s)².
+        For each kind of `site_sums.PARTNERS`, with n the difference of the noise of both sites, s its standard
+        deviation, and d the difference of their clean values over s, limited: sums of d·n/s, d², |d|/s, 2d times the
+        difference over s without limit, and (d/s)².
     """
 
     def __init__(self, law: NoiseLaw, clean: Any, noisy: Any) -> None:
