@@ -9,9 +9,11 @@ Names are imported on first access. ``RawPairs`` needs only NumPy and xxhash.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # as `typing` has it, whose import takes most of the time until the command handles Ctrl-C
 if TYPE_CHECKING:
+    from typing import Any
+
     from unprocess_gen.api import RawPair, develop, generate, make_pair, plan_image, replay, verify
     from unprocess_gen.config.composition import load_config
     from unprocess_gen.config.schema import Config

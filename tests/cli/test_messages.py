@@ -254,7 +254,39 @@ def test_signal_during_a_run_gives_one_line(number: signal.Signals, tmp_path: Pa
     process.send_signal(number)
     _, err = process.communicate(timeout=WAIT_S)
     assert process.returncode == 128 + number
-    assert messages(err) == [f"gen-dataset: {ENDS[number]}; finished shards are kept; rerun to resume"]
+    assert messages(err) == [
+        f"gen-dataset: {ENDS[number]}; finished shards are kept; run the same command again to resume"
+    ]
+
+
+INTERRUPTING = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+from unprocess_gen.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(
+    "module", ["unprocess_gen.cli", "unprocess_gen.cli.main", "argparse", "unprocess_gen.cli.verbs"]
+)
+def test_interrupted_import_gives_one_line(module: str) -> None:
+    command = [sys.executable, "-c", INTERRUPTING, module]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "gen-dataset: interrupted\n")
+
+
+def test_ignored_interrupt_stays_ignored_during_imports() -> None:
+    command = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", sys.executable, "-c", INTERRUPTING, "argparse"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert done.returncode == 2
+    assert messages(done.stderr)[0].startswith("gen-dataset: argparse: no such verb; expected ")
 
 
 @pytest.mark.slow  # `test_signals_end_composing_within_two_seconds` sends them at one moment of the composition

@@ -31,7 +31,7 @@ from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.types import Plan
 from unprocess_gen.dataset import dng
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.manifest import plan_from_row, without_empty
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation.reference.colour import CAMERAS
 from unprocess_gen.simulation.reference.isp import apply_gains
@@ -393,12 +393,21 @@ def test_file_identifies_its_frame(ds: Path) -> None:
 @pytest.mark.parametrize("number", range(3))
 def test_file_contains_the_row(number: int, name: str, ds: Path) -> None:
     row = pair(ds, number)[2]
-    assert xmp_of(tags_of(row, name)) == (name, row)
+    frame, stored = xmp_of(tags_of(row, name))
+    assert (frame, stored) == (name, without_empty(row))
+    assert plan_from_row(stored) == plan_from_row(row)
+
+
+def test_file_lacks_later_columns_that_are_empty(ds: Path) -> None:
+    row = pair(ds)[2]
+    assert "detail" in row
+    assert not {"detail", "clean_dtype", "dark_frame"} & xmp_of(tags_of(row))[1].keys()
+    assert xmp_of(tags_of(row | {"clean_dtype": "float32"}))[1]["clean_dtype"] == "float32"
 
 
 def test_xml_characters_in_a_name_are_escaped(ds: Path) -> None:
     row = pair(ds)[2] | {"source": "a&b<c>\"'é]]>.png"}
-    assert xmp_of(tags_of(row))[1] == row
+    assert xmp_of(tags_of(row))[1] == without_empty(row)
 
 
 def exiftool(*arguments: object) -> str:

@@ -217,7 +217,7 @@ def test_photograph_that_kills_its_workers_gets_provisional_rows(
         seconds = time.monotonic() - started
         assert done.code == 3, done.err
         warnings = messages(done.err)
-        assert warnings == ["gen-dataset: 004.png: its worker died four times; rerun to retry it"]
+        assert warnings == ["gen-dataset: 004.png: its worker died four times; run the same command again to retry it"]
         reasons = [(row["source"], row["reason"]) for row in read_rows(tmp_path / "ds/manifest.csv") if row["reason"]]
         assert reasons == [("004.png", "worker_died")]
         assert seconds < 60
@@ -270,7 +270,7 @@ def test_dead_scheduler_ends_the_run_with_one_line(
             lines = messages(process.stderr.read())
         assert lines == [
             f"gen-dataset: executor.address={cluster.address}: the Dask scheduler ended or cannot be reached; "
-            "finished shards are kept; rerun to resume"
+            "finished shards are kept; run the same command again to resume"
         ]
     assert run_main(ROOT, ONE, "n_jobs=1", "out=ds").code == 0
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -292,7 +292,7 @@ def test_stopped_scheduler_ends_the_run(photographs: Path, tmp_path: Path) -> No
             lines = messages(process.stderr.read())
     assert lines == [
         f"gen-dataset: executor.address={cluster.address}: the Dask scheduler has not answered for 5 s; "
-        "finished shards are kept; rerun to resume"
+        "finished shards are kept; run the same command again to resume"
     ]
     assert seconds < 15
 
@@ -334,7 +334,10 @@ def test_interrupt_ends_the_run_in_a_second(
         seconds = time.monotonic() - started
         assert process.stderr is not None
         lines = messages(process.stderr.read())
-        assert (code, lines) == (130, ["gen-dataset: interrupted; finished shards are kept; rerun to resume"])
+        assert (code, lines) == (
+            130,
+            ["gen-dataset: interrupted; finished shards are kept; run the same command again to resume"],
+        )
         wait_for(lambda: not session(process.pid), 10)
     assert seconds < 2.5
     done = cli(ROOT, ONE, SMALL, "out=ds", *executor)

@@ -710,7 +710,7 @@ def test_signal_in_a_library_callback_ends_the_run(sent: signal.Signals, tmp_pat
     command = [sys.executable, "-c", IN_A_CALLBACK, str(int(sent))]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, restore_signals=True)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (128 + sent, "", 1)
-    assert "finished shards are kept; rerun to resume" in done.stderr
+    assert "finished shards are kept; run the same command again to resume" in done.stderr
 
 
 @pytest.mark.parametrize("number", [3, pytest.param(40, marks=pytest.mark.slow)])

@@ -247,8 +247,8 @@ def test_merge_names_the_parts_left_and_writes_nothing(ds: Path, run_main: RunMa
     done = run_main("merge", "ds")
     assert (done.code, done.out) == (5, "")
     assert messages(done.err) == [
-        "gen-dataset: merge: ds: parts left: 0,3-4 (of 6), 6 of 12 shards; make them with gen-dataset part; nothing "
-        "was written"
+        "gen-dataset: merge: ds: parts left: 0,3-4 (of 6), 6 of 12 shards; run gen-dataset part ds K for each, "
+        "then merge again; nothing was written"
     ]
     assert files(ds) == before
     assert run_main("status", "ds", "--left").out == "0,3-4\n"
@@ -421,7 +421,10 @@ def test_photograph_that_kills_its_part_gets_provisional_rows(
     assert codes == [-signal.SIGKILL] * deaths.LIMIT
     done = cli("part", "ds", 0, **env)
     assert done.returncode == 0, done.stderr
-    assert "gen-dataset: part 0 of 2: 004.png: its worker died four times; rerun to retry it" in messages(done.stderr)
+    assert (
+        "gen-dataset: part 0 of 2: 004.png: its worker died four times; run the same command again to retry it"
+        in messages(done.stderr)
+    )
     assert run_main("part", "ds", 1, "-q").code == 0
     merged = run_main("merge", "ds")
     assert merged.code == 3

@@ -24,8 +24,8 @@ from helpers.photographs import fill
 from helpers.processes import ONE
 
 from unprocess_gen.cli.messages import logging_to
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
-from unprocess_gen.core.files import RESUME, machine_error
+from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
+from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.limits import LEAST_ADDRESS_SPACE
 from unprocess_gen.dataset.columns import HEADERS
 from unprocess_gen.dataset.manifest import read_rows, write_rows
@@ -106,7 +106,7 @@ def test_file_error_reports_its_true_reason(number: int, exists: bool, wanted: s
 def test_file_error_reports_free_space_on_a_full_disk(tmp_path: Path) -> None:
     text = str(machine_error(OSError(errno.ENOSPC, "No space left on device"), tmp_path / "a/b", RESUME))
     assert text.startswith(f"{tmp_path}/a/b: No space left on device (")
-    assert text.endswith(" bytes free); finished shards are kept; rerun to resume")
+    assert text.endswith(" bytes free); finished shards are kept; run the same command again to resume")
 
 
 def test_unreadable_shard_is_a_system_error(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -623,7 +623,10 @@ def test_source_that_kills_two_workers_is_retried_by_reruns(
 ) -> None:
     done = run_with_deaths(cli, tmp_path, deaths=2)
     lines = [line for line in done.stderr.splitlines() if "images/s" not in line]
-    assert (done.returncode, lines) == (3, ["gen-dataset: 009.png: its worker died twice; rerun to retry it"])
+    assert (done.returncode, lines) == (
+        3,
+        ["gen-dataset: 009.png: its worker died twice; run the same command again to retry it"],
+    )
     rows = list(read_rows(tmp_path / "ds/manifest.csv"))
     assert [row["reason"] for row in rows] == [""] * 8 + ["worker_died"] * 4
     entries = read_dataset(tmp_path / "ds/dataset.json")["shards"]

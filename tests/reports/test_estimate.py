@@ -115,6 +115,11 @@ def test_sentences_name_what_is_simulated_and_left_out(settings: Settings, tmp_p
     )
 
 
+def test_missing_number_is_named_once(settings: Settings, tmp_path: Path) -> None:
+    text = estimate_text(settings, tmp_path, "noise=sony_a7s2")
+    assert "lens_shading, gain_by_colour, column_temporal (column_temporal_std_dn)." in text
+
+
 def test_sentences_say_none_if_nothing_visible_is_left_out(settings: Settings, tmp_path: Path) -> None:
     text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=long_exposure")
     assert "Left out though it would show: none." in text

@@ -19,6 +19,7 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.dataset.manifest import plan_from_row
 from unprocess_gen.reports.sheets import contact_sheet, panels, stages_sheet
@@ -308,10 +309,11 @@ def test_packed_planes_are_shown_as_a_mosaic(gray_world: Path, make: Make, tmp_p
     for layout in ("mosaic", "packed"):
         make(gray_world, tmp_path / layout, "source.include=[large.png]", f"output.layout={layout}")
         [drawn] = contact_sheet.write_sheets(tmp_path / layout, tmp_path / "sheets" / layout, with_stages=True)
-        sheets.append([file.read_bytes() for file in drawn.files])
+        sheets.append([png(file) for file in drawn.files])
 
     assert len(sheets[0]) == 2
-    assert sheets[0] == sheets[1]
+    for mosaic_sheet, packed_sheet in zip(*sheets, strict=True):
+        np.testing.assert_array_equal(mosaic_sheet, packed_sheet)
 
 
 def test_float_frames_are_shown_in_dn(gray_world: Path, make: Make, tmp_path: Path) -> None:
@@ -379,6 +381,43 @@ def test_preview_writes_the_sheets_of_the_keys(few: Path, run_main: RunMain, tmp
     assert done.out == "4 pictures in sheets\n"
     names = {path.name for path in (tmp_path / "sheets").iterdir()}
     assert names == {f"{key}{kind}.png" for key in ("00000000", "00000003") for kind in ("", ".stages")}
+
+
+def test_preview_replaces_its_own_sheets(few: Path, run_main: RunMain, tmp_path: Path) -> None:
+    for keys in ("0", "3", "0"):
+        assert run_main("preview", few, "--keys", keys, "--to", "sheets").code == 0
+    with Image.open(tmp_path / "sheets/00000003.png") as sheet:
+        sheet.load()
+        assert sheet.info["unprocess_gen"] == f"manifest_sha256={file_sha256(few / 'manifest.csv')}"
+
+
+@pytest.mark.parametrize("name", ["00000000.png", "00000012-p0007-l01d02.stages.png"])
+def test_preview_refuses_a_folder_with_other_sheets(
+    name: str, few: Path, gray_world: Path, run_main: RunMain, tmp_path: Path
+) -> None:
+    (tmp_path / "sheets").mkdir()
+    (tmp_path / "sheets/photograph.png").write_bytes(b"not a sheet")
+    shutil.copy(gray_world / "a.png", tmp_path / "sheets" / name)
+    before = (tmp_path / "sheets" / name).read_bytes()
+    done = run_main("preview", few, "--to", "sheets")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        f"gen-dataset: --to sheets: {name} is not a sheet of {few}; expected a folder without sheets of other "
+        "datasets; choose another folder, or remove them\n"
+    )
+    assert sorted(path.name for path in (tmp_path / "sheets").iterdir()) == sorted([name, "photograph.png"])
+    assert (tmp_path / "sheets" / name).read_bytes() == before
+
+
+def test_preview_refuses_sheets_of_another_dataset(
+    few: Path, gray_world: Path, make: Make, run_main: RunMain, tmp_path: Path
+) -> None:
+    make(gray_world, tmp_path / "other", "sensor.pattern=GBRG", "seed=1")
+    assert run_main("preview", "other", "--keys", "0", "--to", "sheets").code == 0
+    done = run_main("preview", few, "--keys", "3", "--to", "sheets")
+    assert done.code == 2
+    assert "00000000.png is not a sheet of" in done.err
+    assert not (tmp_path / "sheets/00000003.png").exists()
 
 
 Spoil = Callable[[Path], None]

@@ -25,14 +25,12 @@ from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
 from unprocess_gen.config.schema import GROUPS
-from unprocess_gen.core.errors import ConfigError, UnprocessGenError
+from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
 from unprocess_gen.core.limits import prepare_libraries
 from unprocess_gen.core.suggestions import did_you_mean
 
 OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
 """OpenCV refuses pictures above these limits if the environment sets them; here `source.max_pixels` decides."""
-
-KEPT = "finished shards are kept; rerun to resume"
 
 
 def main() -> int:
@@ -171,5 +169,5 @@ def _report_signal(number: int, arguments: Sequence[str]) -> int:
     except ConfigError:
         resumes = False
     what = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-    report(f"{what}; {KEPT}" if resumes else what, logging.WARNING)
+    report(f"{what}; {RESUME}" if resumes else what, logging.WARNING)
     return 128 + number

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.core.object_store import is_url
 
@@ -168,7 +168,7 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
         with _locked(out):  # several processes may sweep into one folder
             _update_table(out / "sweep.csv", jobs)
     except OSError as error:
-        from unprocess_gen.core.files import RESUME, machine_error  # imports NumPy, too slow for --help
+        from unprocess_gen.core.files import machine_error  # imports NumPy, too slow for --help
 
         raise machine_error(error, out, RESUME) from error
 

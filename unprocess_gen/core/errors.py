@@ -14,6 +14,9 @@ a traceback (exit code 1). Each exception here takes strings only, so that it ca
 
 from __future__ import annotations
 
+RESUME = "finished shards are kept; run the same command again to resume"
+"""What to do after a run ended early, for messages. It is also true of one part of a run."""
+
 REASONS = {
     "empty": "the file has no bytes, or the video no frame",
     "unreadable": "the file cannot be opened or read, or leads outside `source.root`",

@@ -17,9 +17,6 @@ from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import DESCRIPTIONS, Frame
 
-RESUME = "finished shards are kept; rerun to resume"
-"""What to do after a run failed: the advice that `machine_error` appends."""
-
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors for which the free space of the disk is worth reporting."""
 

@@ -20,7 +20,8 @@ channel by channel, so bright colours shift; white stays white. WhiteLevel is th
 saturates below it.
 
 The XMP packet contains the row as JSON (properties Frame and Row of ``urn:unprocess-gen:manifest#``), which converters
-keep. Files contain no time: equal rows and frames give equal bytes. Decisions: ``docs/design/dataset_format.md``.
+keep. Columns that version 0.1 lacked are left out if they are empty, as in ``KEY.json``. Files contain no time: equal
+rows and frames give equal bytes. Decisions: ``docs/design/dataset_format.md``.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
-from unprocess_gen.dataset.manifest import plan_from_row
+from unprocess_gen.dataset.manifest import plan_from_row, without_empty
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
 from unprocess_gen.simulation.reference.cfa import CHANNELS
@@ -300,7 +301,7 @@ def _rationals(values: Iterable[float]) -> tuple[int, ...]:
 
 def xmp(row: Row, name: str) -> bytes:
     """Return the XMP packet (ISO 16684-1) with the row as JSON and the name of the frame."""
-    text = escape(json.dumps(dict(row), separators=(",", ":")))
+    text = escape(json.dumps(without_empty(row), separators=(",", ":")))
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
         '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'

@@ -23,7 +23,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source, Value
-from unprocess_gen.dataset.columns import COLUMNS, FIRST, HEADERS, NAMES, Record, columns_of
+from unprocess_gen.dataset.columns import COLUMNS, FIRST, HEADERS, NAMES, Column, Record, columns_of
 from unprocess_gen.dataset.keys import key_text
 
 JSON_BYTES = 5632
@@ -367,7 +367,7 @@ def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = NAMES
     names : sequence of str
         Header. `read_header` returns the one of an older manifest, whose bytes are thereby restored.
     """
-    csv.writer(stream, lineterminator="\n").writerow(names)
+    stream.write(header_text(names))
     _write_lines(stream, rows, names)
 
 
@@ -393,15 +393,20 @@ def rows_text(rows: Iterable[Row]) -> str:
     return stream.getvalue()
 
 
-def header_text() -> str:
+def header_text(names: Sequence[str] = NAMES) -> str:
     """Return the first line of a manifest.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of its columns; none needs quotes.
 
     Returns
     -------
     str
-        The names of all columns.
+        The line with its end.
     """
-    return ",".join(NAMES) + "\n"
+    return ",".join(names) + "\n"
 
 
 def current_lines(lines: bytes, columns: int) -> bytes:
@@ -656,20 +661,33 @@ def row_json(rows: Sequence[Row]) -> bytes:
     ValueError
         If the text is longer than that.
     """
-    first, *others = (
-        {
-            column.name: row[column.name]
-            for column in _JSON_COLUMNS
-            if column.since == FIRST or row[column.name] != column.empty
-        }
-        for row in rows
-    )
+    first, *others = (without_empty(row, _JSON_COLUMNS) for row in rows)
     content = {**first, OTHERS: others} if others else first
     text = json.dumps(content, separators=(",", ":")).encode("ascii")
     size = json_size(str(first["source"]), len(rows))
     if len(text) >= size:
         raise ValueError(f"row {first['key']} takes {len(text)} bytes as JSON, more than the {size} set aside")
     return text.ljust(size - 1) + b"\n"
+
+
+def without_empty(row: Row, columns: Sequence[Column] = COLUMNS) -> dict[str, Value]:
+    """Return the cells of a row that a file of version 0.1 would have, and those of later columns that apply.
+
+    Parameters
+    ----------
+    row : Row
+        A row with all columns.
+    columns : sequence of Column
+        Columns to return.
+
+    Returns
+    -------
+    dict
+        Values by the names of their columns.
+    """
+    return {
+        column.name: row[column.name] for column in columns if column.since == FIRST or row[column.name] != column.empty
+    }
 
 
 def rows_of_json(content: bytes) -> list[Row]:

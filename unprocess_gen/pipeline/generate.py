@@ -257,7 +257,7 @@ def follow(reports: Iterable[ShardReport], progress: Progress) -> tuple[int, Sta
     warned, rows, clip_sizes, times = False, 0, ClipSizes(), StageTimes()
     for report in reports:
         if report.killer is not None:
-            progress.warn(f"{report.killer}; rerun to retry it")
+            progress.warn(f"{report.killer}; run the same command again to retry it")
         if report.self_test and not warned:
             warned = True
             progress.warn(f"the self-test failed: {report.self_test}; continuing because of self_test=go_on")

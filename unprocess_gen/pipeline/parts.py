@@ -20,8 +20,8 @@ from functools import partial
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
-from unprocess_gen.core.files import RESUME, machine_error
+from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
+from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.object_store import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze, read_plan
@@ -299,8 +299,8 @@ def merge(out: str) -> tuple[Summary, int]:
     if status.left:
         raise MachineError(
             f"merge: {out}: parts left: {left_text(status.left)} (of {status.parts}), "
-            f"{status.shards - status.committed} of {status.shards} shards; make them with gen-dataset part; "
-            "nothing was written"
+            f"{status.shards - status.committed} of {status.shards} shards; run gen-dataset part {out} K for each, "
+            "then merge again; nothing was written"
         )
     run = FrozenRun(out)
     with Workspace(out, run.storage.read("config.yaml")) as workspace:

@@ -127,8 +127,8 @@ class ShardRecords:
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise DamageError(
-                f"{self._place}/{record_name(shard)}: cannot be read ({error_in_one_line(error)}); delete the file and "
-                "rerun to make its shard"
+                f"{self._place}/{record_name(shard)}: cannot be read ({error_in_one_line(error)}); delete the file; "
+                "gen-dataset, or gen-dataset part, then generates its shard"
             ) from error
 
     def _read(self, shard: int) -> tuple[dict[str, Any], bytes]:

@@ -20,8 +20,8 @@ from pathlib import Path
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.errors import MachineError, SourceError
-from unprocess_gen.core.files import RESUME, array_xxh3, machine_error
+from unprocess_gen.core.errors import RESUME, MachineError, SourceError
+from unprocess_gen.core.files import array_xxh3, machine_error
 from unprocess_gen.core.object_store import any_path
 from unprocess_gen.core.types import Pair, Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
@@ -175,7 +175,7 @@ def make_image(
         if error.reason == "unreadable" and source.reason is None and not _exists(config, source):
             raise MachineError(
                 f"source.root={config.source.root}: {source.name} was deleted or moved after listing; expected the "
-                f"listed files; restore it and rerun"
+                "listed files; restore it and run the same command again"
             ) from error
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text)]
     rule = patch_rule(config.source)

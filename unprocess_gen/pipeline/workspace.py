@@ -32,8 +32,8 @@ from yaml import YAMLError
 
 from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.files import RESUME, file_sha256, machine_error
+from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
+from unprocess_gen.core.files import file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath, any_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset import parquet

@@ -48,7 +48,7 @@ def effect_sentences(config: Config, predictions: Predictions) -> list[str]:
     left_out = [one for one in effects if not one.count and not one.missing]
     small = [f"{one.name} ({one.size_text})" for one in left_out if not one.shows]
     visible = [f"{one.name} ({one.size_text}; {one.strongest.reason})" for one in left_out if one.shows]
-    missing = [f"{one.name} ({one.missing})" for one in effects if one.missing]
+    missing = [_with_key(one.name, one.missing) for one in effects if one.missing]
     sentences = [
         f"Simulated: {_listed(simulated)}.",
         f"Left out, too small to see: {_listed(small)}.",
@@ -57,6 +57,11 @@ def effect_sentences(config: Config, predictions: Predictions) -> list[str]:
     if sampled:
         sentences.append(f"Contained in the dark frames: read, {_listed(sampled)}.")
     return [*sentences, f"Left out, as the profile gives no number: {_listed(missing)}."] if missing else sentences
+
+
+def _with_key(effect: str, key: str) -> str:
+    """Return an effect with the key of its number, unless both have the same name."""
+    return effect if key == effect else f"{effect} ({key})"
 
 
 def _listed(texts: Iterable[str]) -> str:

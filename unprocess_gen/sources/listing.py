@@ -675,8 +675,8 @@ def _opened_object(root: str, source: Source, max_bytes: int | None) -> Iterator
             yield stream
     except ObjectChangedError:
         raise MachineError(
-            f"source {source.name} changed since it was listed: its ETag differs; rerun when nothing writes to "
-            "source.root"
+            f"source {source.name} changed since it was listed: its ETag differs; restore it, or choose another out "
+            "when nothing writes to source.root"
         ) from None
 
 
@@ -695,7 +695,7 @@ def _check_size(source: Source, size_bytes: int, when: str) -> None:
     if size_bytes != source.size_bytes:
         raise MachineError(
             f"source {source.name} changed {when}: {source.size_bytes} bytes then, {size_bytes} now; "
-            "rerun when nothing writes to source.root"
+            "restore it, or choose another out when nothing writes to source.root"
         )
 
 

@@ -161,7 +161,7 @@ def _check_digest(source: Source, digest: str) -> None:
     if source.sha256 not in (None, digest):
         raise MachineError(
             f"source {source.name} has other bytes than when it was listed; expected unchanged sources; "
-            "rerun with another out"
+            "restore it, or choose another out"
         )
 
 

@@ -46,8 +46,7 @@ from distributed.versions import VersionMismatchWarning
 
 from unprocess_gen.config.schema import ExecutorConfig
 from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError, UnprocessGenError
-from unprocess_gen.core.files import RESUME
+from unprocess_gen.core.errors import RESUME, ConfigError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.pipeline.deaths import forget_deaths
 from unprocess_gen.pipeline.executors.chunks import Chunk, ChunkQueue, Ranges, ranges_of, shards_of
 from unprocess_gen.pipeline.executors.local import interrupts_ignored
@@ -100,11 +99,14 @@ TRIES = 3
 AVOID_S = 60.0
 """Time in which a worker that reported a system error gets no tasks if there are others."""
 
+IDLE_S = 60
+"""Time between two measurements or reports of a cluster that the run does not use."""
+
 QUIET = {
-    "distributed.admin.tick.interval": "60 s",
-    "distributed.admin.tick.cycle": "60 s",
-    "distributed.admin.system-monitor.interval": "60 s",
-    "distributed.client.scheduler-info-interval": "60 s",
+    "distributed.admin.tick.interval": f"{IDLE_S} s",
+    "distributed.admin.tick.cycle": f"{IDLE_S} s",
+    "distributed.admin.system-monitor.interval": f"{IDLE_S} s",
+    "distributed.client.scheduler-info-interval": f"{IDLE_S} s",
     "distributed.scheduler.active-memory-manager.start": False,
     "distributed.worker.profile.enabled": False,
 }
@@ -122,9 +124,6 @@ ALLOCATION = {
 
 Arenas of threads return freed memory to the system, so a run with large arrays takes a quarter longer without them.
 """
-
-IDLE_S = 60
-"""Time between two updates of cluster information that the run does not use."""
 
 LOST = (KilledWorker, OSError, asyncio.CancelledError, concurrent.futures.CancelledError)
 """Exceptions of a task whose workers, or whose result, were lost; TimeoutError is an OSError."""

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
 
-from unprocess_gen.core.errors import ConfigError, UnprocessGenError
-from unprocess_gen.core.files import RESUME, machine_error
+from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
+from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.object_store import Item, ObjectPath, Result, any_path
 
 WORK = ".work"

@@ -7,10 +7,15 @@ site.
 Two stretches are used. ``own`` maps the least and greatest DN of a frame to the full range, as the article's demo
 does, so frames cannot be compared. ``common`` maps the black to the white level, square root, for every frame of a
 scene.
+
+Each PNG file contains the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
+because their names are keys: sheets of two datasets would replace each other or be mixed.
 """
 
 from __future__ import annotations
 
+import re
+import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,10 +23,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.files import file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.dataset.manifest import read_header
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs, sheet_heading
 from unprocess_gen.reports.sheets.panels import (
     PANEL_PX,
@@ -42,6 +49,12 @@ from unprocess_gen.reports.sheets.stages_sheet import stages_sheet
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
 
 PNG = (cv2.IMWRITE_PNG_COMPRESSION, 3)
+
+PNG_HEADER_BYTES = 33
+"""Bytes of the signature and the first chunk of a PNG file, behind which text may follow (PNG specification, 5.6)."""
+
+SHEET_NAME = re.compile(r"\d{8,}(-p\d+)?(-l\d+d\d+)?(\.stages)?\.png")
+"""Names of sheets: the key of a pair, and what they show."""
 
 
 class SheetFiles(NamedTuple):
@@ -79,18 +92,21 @@ def write_sheets(
     Raises
     ------
     ConfigError
-        If ``to`` is inside a dataset or is not a folder, and as for `contact_sheet`.
+        If ``to`` is inside a dataset, is not a folder or contains sheets of another dataset, and as for
+        `contact_sheet`.
     DamageError
         As for `contact_sheet`.
     MachineError
         If a file cannot be written.
     """
     check_output_folder(to, f"--to {to}")
+    mark = _mark(folder)
+    _check_sheets(to, mark, folder)
     for pair in selected_pairs(folder, keys, source):
         pictures = {f"{pair.key}.png": pair_sheet(pair)}
         if with_stages and pair.source is not None:
             pictures[f"{pair.key}.stages.png"] = stages_sheet(pair)
-        files = tuple(_write(picture, to / name) for name, picture in pictures.items())
+        files = tuple(_write(picture, to / name, mark) for name, picture in pictures.items())
         yield SheetFiles(pair.key, str(pair.row["source"]), files, pair.missing_source)
 
 
@@ -122,11 +138,40 @@ def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | N
     return np.vstack([_strip(pair) for pair in selected_pairs(folder, keys, source)])
 
 
-def _write(picture: Picture, path: Path) -> Path:
-    _, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]), PNG)
+def _mark(folder: AnyPath) -> bytes:
+    """Return the text chunk of a PNG file (PNG specification, 11.3.3.2) that identifies a dataset."""
+    manifest = folder / "manifest.csv"
+    read_header(manifest)  # DamageError if it cannot be read
+    body = f"tEXtunprocess_gen\0manifest_sha256={file_sha256(manifest)}".encode("ascii")
+    return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
+
+
+def _check_sheets(to: Path, mark: bytes, folder: AnyPath) -> None:
+    """Raise ConfigError if a file named like a sheet is not one of this dataset."""
+    names = sorted(path.name for path in to.iterdir() if SHEET_NAME.fullmatch(path.name)) if to.is_dir() else []
+    for name in names:
+        if not _is_marked(to / name, mark):
+            raise ConfigError(
+                f"--to {to}: {name} is not a sheet of {folder}; expected a folder without sheets of other datasets; "
+                "choose another folder, or remove them"
+            )
+
+
+def _is_marked(path: Path, mark: bytes) -> bool:
+    try:
+        with path.open("rb") as stream:
+            stream.seek(PNG_HEADER_BYTES)
+            return stream.read(len(mark)) == mark
+    except OSError:
+        return False
+
+
+def _write(picture: Picture, path: Path, mark: bytes) -> Path:
+    _, encoded = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]), PNG)
+    content = encoded.tobytes()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.tobytes())
+        path.write_bytes(content[:PNG_HEADER_BYTES] + mark + content[PNG_HEADER_BYTES:])
     except OSError as error:
         raise machine_error(error, path) from error
     return path
