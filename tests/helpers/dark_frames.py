@@ -20,8 +20,8 @@ class DarkPixelsInMemory:
         """Return the frame with this name."""
         return self.frames[sha256]
 
-    def mean(self, sha256: str) -> np.ndarray:
-        """Return the mean of all frames."""
+    def shading(self, sha256: str) -> np.ndarray:
+        """Return the mean of all frames, whatever the digest."""
         return np.mean(list(self.frames.values()), axis=0).astype(np.float32)
 
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from unprocess_gen.pipeline.replay import ReplayResult
     from unprocess_gen.pipeline.verify import Damage
     from unprocess_gen.reports.estimate import RunEstimate
+    from unprocess_gen.sources.dark_frames import DarkPlaces
 
 # ------------------------------------------------------------------------------------------- verbs that take settings
 
@@ -320,8 +321,9 @@ def run_again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.config.serialization import read_dataset_yaml
     from unprocess_gen.config.validation import validate_config
-    from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, dark_root, source_root
+    from unprocess_gen.pipeline.replay import check_source_digests, check_source_sizes, source_root
     from unprocess_gen.pipeline.verify import have_same_rows
+    from unprocess_gen.sources.dark_frames import set_dark_places
 
     folder = _dataset("again", call)
     config, kind = read_dataset_yaml(folder / "config.yaml")
@@ -343,7 +345,8 @@ def run_again(call: Call) -> int:
                 "that folder; give source.root=…"
             )
     config.out, config.source.root = call.values["out"], root
-    config.noise.dark_frames = dark_root(folder / "manifest.csv", call.values.get("dark_frames"))
+    _refuse_unused_places(config, call, folder)
+    set_dark_places(config, _dark_places(folder / "manifest.csv", call))
     config.n_jobs = call.values.get("n_jobs", config.n_jobs)
     config.source.max_failed = call.values.get("max_failed", config.source.max_failed)
     config.executor = _executor(call)
@@ -363,6 +366,23 @@ def run_again(call: Call) -> int:
     else:
         print_result(f"the same rows as {folder}, in its columns; {new} has columns of a later version too")
     return code
+
+
+def _refuse_unused_places(config: Config, call: Call, folder: AnyPath) -> None:
+    """Raise ConfigError if a call of ``again`` names dark frames or a map that the dataset does not have."""
+    for name, key in (("dark_frames", "dark_frames_sha256"), ("dark_shading", "dark_shading_sha256")):
+        if name in call.values and getattr(config.noise, key) is None:
+            what = "dark frames" if name == "dark_frames" else "dark-shading map"
+            raise ConfigError(
+                f"again: noise.{name}={call.values[name]}: {folder} was generated without {what}; leave it out"
+            )
+
+
+def _dark_places(manifest: AnyPath, call: Call) -> DarkPlaces:
+    """Return where the dark frames of a dataset and their map are, by the call or by ``dataset.json``."""
+    from unprocess_gen.pipeline.replay import dark_places
+
+    return dark_places(manifest, call.values.get("dark_frames"), call.values.get("dark_shading"))
 
 
 def _is_same_folder(one: AnyPath, other: AnyPath) -> bool:
@@ -399,17 +419,17 @@ def run_verify(call: Call) -> int:
 def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -> int:
     """Report the damage of a dataset; repair, regenerate and check the noise as the flags ask; return the exit code."""
     from unprocess_gen.pipeline.repair import repair
-    from unprocess_gen.pipeline.replay import dark_root, evenly_spaced_rows, replay, source_root
+    from unprocess_gen.pipeline.replay import evenly_spaced_rows, replay, source_root
     from unprocess_gen.pipeline.verify import verify
 
     manifest, root = folder / "manifest.csv", call.values.get("source")
-    dark_frames = dark_root(manifest, call.values.get("dark_frames"))
+    dark = _dark_places(manifest, call)
     codes: list[int] = []
     damages = _reported(folder, found)
     if damages and "repair" in call.values:
         if not isinstance(folder, Path):
             raise ConfigError(f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset")
-        for step in repair(folder, source_root(manifest, root), dark_frames):
+        for step in repair(folder, source_root(manifest, root), dark):
             if step.repaired:
                 print_result(step)
             else:
@@ -419,11 +439,11 @@ def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -
     count, regenerated = call.values.get("regenerate", 0), 0
     if count and not damages:
         rows = evenly_spaced_rows(manifest, count)
-        replayed = list(replay(rows, source_root(manifest, root), dark_frames=dark_frames))
+        replayed = list(replay(rows, source_root(manifest, root), dark=dark))
         regenerated, codes = len(replayed), [result.exit_code for result in replayed]
         damages += _reported(folder, (_complaint(result) for result in replayed if result.complaint))
     if "noise" in call.values and not damages:
-        damages += _check_noise(folder, dark_frames, call)
+        damages += _check_noise(folder, dark, call)
     if damages:
         return worst(codes) or DamageError.exit_code
     print_result(
@@ -436,18 +456,16 @@ def _complaint(result: ReplayResult) -> str:
     return f"{result.key} ({result.source}): {result.complaint}"
 
 
-def _check_noise(folder: AnyPath, dark_frames: str | None, call: Call) -> list[str]:
+def _check_noise(folder: AnyPath, dark: DarkPlaces, call: Call) -> list[str]:
     """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
     from unprocess_gen.reports import photon_transfer
-    from unprocess_gen.sources.dark_frames import dark_folder
 
     to, access = call.values.get("to"), None
-    if dark_frames is not None:
-        try:
-            access = dark_folder(dark_frames)
-        except ConfigError:  # without the recorded folder, the pairs are counted as not checked
-            if "dark_frames" in call.values:
-                raise
+    try:
+        access = dark.open()
+    except ConfigError:  # without the recorded files, the pairs are counted as not checked
+        if {"dark_frames", "dark_shading"} & call.values.keys():
+            raise
     found = photon_transfer.examine_dataset(folder, access)
     checks = found.checks
     if not checks.count:
@@ -485,7 +503,7 @@ def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
 def run_replay(call: Call) -> int:
     """Regenerate rows of a manifest, and compare or write their arrays."""
     from unprocess_gen.dataset.selection import select_rows
-    from unprocess_gen.pipeline.replay import dark_root, replay, source_root
+    from unprocess_gen.pipeline.replay import replay, source_root
 
     if {"rows", "keys"} <= call.values.keys():
         raise ConfigError("replay: --rows and --keys exclude each other; expected one of them")
@@ -495,8 +513,7 @@ def run_replay(call: Call) -> int:
     skipped: list[Row] = []
     rows = select_rows(manifest, call.values.get("rows"), call.values.get("keys"), skipped)
     codes, written = [], False
-    dark_frames = dark_root(manifest, call.values.get("dark_frames"))
-    for result in replay(rows, source_root(manifest, _root(call)), to, dark_frames):
+    for result in replay(rows, source_root(manifest, _root(call)), to, _dark_places(manifest, call)):
         codes.append(result.exit_code)
         written |= result.written
         if result.complaint:
@@ -521,8 +538,11 @@ def run_report(call: Call) -> int:
 
     folder = _dataset("report", call)
     to, root = call.values.get("to"), _root(call)
+    dark = _dark_places(folder / "manifest.csv", call)
+    if {"dark_frames", "dark_shading"} & call.values.keys():
+        dark.open()  # refuses places that the user names and that do not exist
     print_result(
-        write_dataset_report(folder, None if to is None else Path(to), None if root is None else any_path(root))
+        write_dataset_report(folder, None if to is None else Path(to), None if root is None else any_path(root), dark)
     )
     return 0
 
@@ -635,6 +655,12 @@ DARK_FRAMES = Argument(
     "FOLDER",
     completes="folders",
 )
+DARK_SHADING = Argument(
+    ("--dark-shading", "noise.dark_shading"),
+    "dark-shading map, or folder of maps, if it is not the recorded one",
+    "PATH",
+    completes="files",
+)
 DATASET = Place("DIR", "the folder of a dataset")
 KEYS = Argument(
     ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
@@ -740,6 +766,7 @@ VERBS: dict[str, Verb] = {
             (
                 SOURCE,
                 DARK_FRAMES,
+                DARK_SHADING,
                 Argument(
                     ("--regenerate",), "regenerate N pairs and compare them", "N", _count, "an integer of 0 or more"
                 ),
@@ -756,6 +783,7 @@ VERBS: dict[str, Verb] = {
             (
                 SOURCE,
                 DARK_FRAMES,
+                DARK_SHADING,
                 Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
                 KEYS,
                 Argument(("--to",), "write the arrays to FOLDER", "FOLDER", completes="folders"),
@@ -766,7 +794,12 @@ VERBS: dict[str, Verb] = {
             "report",
             "write an HTML page about a dataset",
             run_report,
-            (Argument(("--to",), "write FILE instead of DIR/report.html", "FILE", completes="files"), SOURCE),
+            (
+                Argument(("--to",), "write FILE instead of DIR/report.html", "FILE", completes="files"),
+                SOURCE,
+                DARK_FRAMES,
+                DARK_SHADING,
+            ),
             DATASET,
         ),
         Verb(
@@ -800,6 +833,7 @@ VERBS: dict[str, Verb] = {
             (
                 SOURCE,
                 DARK_FRAMES,
+                DARK_SHADING,
                 Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True),
                 _whole_number(("n_jobs",), "number of worker processes; -1: all cores"),
                 Argument(("executor",), "what runs the workers: local or dask", "NAME"),

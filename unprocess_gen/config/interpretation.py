@@ -14,6 +14,7 @@ from unprocess_gen.config.limits import (
     DEQUANTIZE,
     GAIN,
     INVERSE_GAIN,
+    ISO,
     LEVELS,
     MAX_LEVELS,
     MAX_PATCH,
@@ -37,6 +38,9 @@ from unprocess_gen.config.schema import (
 from unprocess_gen.config.values import is_integer, is_number, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
+
+SHADING_WORDS = ("keep", "remove")
+"""Values of ``noise.dark_shading`` that are no path of a map."""
 
 # ---------------------------------------------------------------------------------------------------- distributions
 
@@ -309,6 +313,39 @@ def uses_dark_frames(noise: NoiseConfig) -> bool:
     return noise.dark_frames is not None or noise.dark_frames_sha256 is not None
 
 
+def shading_place(noise: NoiseConfig) -> str | None:
+    """Return the place of the dark-shading map.
+
+    Parameters
+    ----------
+    noise : NoiseConfig
+        The profile.
+
+    Returns
+    -------
+    str or None
+        A file or folder; None if ``noise.dark_shading`` is one of `SHADING_WORDS`.
+    """
+    return None if noise.dark_shading in SHADING_WORDS else noise.dark_shading
+
+
+def run_iso(config: Config) -> float:
+    """Return the ISO of a run with dark frames, which has only one.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration, with ``noise.dark_frames``.
+
+    Returns
+    -------
+    float
+        ``noise.iso``, or that of the scene.
+    """
+    iso = config.scene.iso if config.noise.iso is None else config.noise.iso
+    return parse_drawn("iso", iso, ISO).numbers[0]
+
+
 def without_dark_frames(config: Config) -> Config:
     """Return a copy of a configuration with the noise of the profile in place of dark frames.
 
@@ -323,7 +360,12 @@ def without_dark_frames(config: Config) -> Config:
         For measurements that need no real dark frames, such as times.
     """
     noise = dataclasses.replace(
-        config.noise, dark_frames=None, dark_frames_sha256=None, dark_frames_black_dn=None, dark_shading="keep"
+        config.noise,
+        dark_frames=None,
+        dark_frames_sha256=None,
+        dark_frames_black_dn=None,
+        dark_shading="keep",
+        dark_shading_sha256=None,
     )
     return dataclasses.replace(config, noise=noise)
 

@@ -369,8 +369,17 @@ class NoiseConfig:
     )
     dark_shading: str = key(
         "keep",
-        "mean of the dark frames at each site (dark shading): keep adds it to the noisy frames, remove subtracts it",
-        Choice(("keep", "remove")),
+        "mean of dark frames at each site (dark shading): keep adds it to the noisy frames, remove subtracts the mean "
+        "of the frames of dark_frames, a path subtracts a map of your own; config.yaml has its digest, not the path",
+        Text("keep, remove, a map (NPY, PNG, TIFF or raw), or a folder of maps with names such as iso1600.npy"),
+        section=CHOSEN,
+        since="0.2",
+    )
+    dark_shading_sha256: Optional[str] = key(
+        None,
+        "SHA-256 of the dark-shading map, which a run records; another map is refused",
+        Described("64 hexadecimal digits"),
+        null="any map, or none",
         section=CHOSEN,
         since="0.2",
     )

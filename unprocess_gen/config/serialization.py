@@ -13,7 +13,13 @@ from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hin
 
 import yaml
 
-from unprocess_gen.config.interpretation import canonical_patch, has_float_clean, saturated_as, uses_assumed
+from unprocess_gen.config.interpretation import (
+    canonical_patch,
+    has_float_clean,
+    saturated_as,
+    shading_place,
+    uses_assumed,
+)
 from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
@@ -90,6 +96,8 @@ def dataset_yaml(config: Config) -> str:
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["sensor"]["saturated"] = saturated_as(config)
     settings["source"]["patch"] = canonical_patch(config.source)
+    if shading_place(config.noise) is not None:
+        settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
     if not has_float_clean(config):

@@ -23,6 +23,7 @@ from unprocess_gen.config.interpretation import (
     missing_number,
     noise_levels,
     patch_rule,
+    shading_place,
     uses_dark_frames,
     uses_physics,
 )
@@ -253,14 +254,19 @@ def _check_levels(config: Config) -> None:
 def _check_dark_frames(config: Config) -> None:
     noise, name = config.noise, value_text(config.noise.dark_frames or config.noise.dark_frames_sha256)
     if not uses_dark_frames(noise):
-        for key, default in (("dark_shading", "keep"), ("dark_frames_black_dn", None)):
+        for key, default in (("dark_shading", "keep"), ("dark_shading_sha256", None), ("dark_frames_black_dn", None)):
             if getattr(noise, key) != default:
                 value = value_text(getattr(noise, key))
                 raise ConfigError(f"noise.{key}={value}: there are no dark frames; give noise.dark_frames=FOLDER")
         return
-    if noise.dark_frames_sha256 is not None and not _DIGEST.fullmatch(noise.dark_frames_sha256):
-        value = value_text(noise.dark_frames_sha256)[:80]
-        raise ConfigError(f"noise.dark_frames_sha256={value}: expected 64 hexadecimal digits, or null")
+    for key in ("dark_frames_sha256", "dark_shading_sha256"):
+        digest = getattr(noise, key)
+        if digest is not None and not _DIGEST.fullmatch(digest):
+            raise ConfigError(f"noise.{key}={value_text(digest)[:80]}: expected 64 hexadecimal digits, or null")
+    if noise.dark_shading == "remove" and noise.dark_shading_sha256 is not None:
+        raise ConfigError(
+            "noise.dark_shading=remove: noise.dark_shading_sha256 names a map; expected its place, or no digest"
+        )
     if not is_physical(noise):
         raise ConfigError(
             f"noise.dark_frames={name}: noise={noise.name} gives no DN per electron, from which shot noise follows; "
@@ -286,7 +292,7 @@ def _check_dark_frames(config: Config) -> None:
 
 
 def _check_dark_folder(noise: NoiseConfig) -> None:
-    """Raise ConfigError if the dark frames of a recorded config are not given, or the folder does not exist."""
+    """Raise ConfigError if dark frames or the map of a recorded config are not given, or do not exist."""
     if noise.dark_frames is None and noise.dark_frames_sha256 is not None:
         raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
     if is_url(noise.dark_frames):
@@ -295,6 +301,15 @@ def _check_dark_folder(noise: NoiseConfig) -> None:
         )
     if noise.dark_frames is not None and not Path(noise.dark_frames).is_dir():
         raise ConfigError(f"noise.dark_frames={noise.dark_frames}: no such folder; expected a folder of dark frames")
+    place = shading_place(noise)
+    if place is None and noise.dark_shading_sha256 is not None:
+        raise ConfigError("noise.dark_shading is missing; expected the place of the recorded dark-shading map")
+    if is_url(place):
+        raise ConfigError(f"noise.dark_shading={place}: maps are read from a local folder only; copy them to one")
+    if place is not None and not Path(place).exists():
+        raise ConfigError(
+            f"noise.dark_shading={place}: no such file or folder; expected keep, remove, or a dark-shading map"
+        )
 
 
 # ------------------------------------------------------------------------------------------------ effects and output

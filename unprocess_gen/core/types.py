@@ -140,8 +140,8 @@ class DarkPixels(Protocol):
     def frame(self, sha256: str) -> Raw:
         """Return the mosaic of the dark frame whose file has this SHA-256, [H, W] with even sides."""
 
-    def mean(self, sha256: str) -> NDArray[np.float32]:
-        """Return the mean of all frames of the set with this SHA-256, [H, W]."""
+    def shading(self, sha256: str) -> NDArray[np.float32]:
+        """Return the dark-shading map with this SHA-256, [H, W] with the sides of the dark frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +151,28 @@ class DarkFrame:
     sha256: str
     height: int
     width: int
+
+
+@dataclass(frozen=True, slots=True)
+class DarkShading:
+    """Dark-shading map that is subtracted from dark frames.
+
+    Attributes
+    ----------
+    sha256 : str
+        SHA-256 of its file, or of the set of dark frames whose mean it is.
+    black_dn : float
+        Value that is subtracted besides the map, DN of the frames: their black level for a map above black, else 0.
+    file : str
+        Name of its file; empty for the mean of the frames.
+    residual_dn : float
+        Median of the frames after the subtraction, DN of the frames.
+    """
+
+    sha256: str
+    black_dn: float = 0.0
+    file: str = ""
+    residual_dn: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,13 +186,13 @@ class DarkFrames:
     sha256 : str
         SHA-256 of the list of all their SHA-256, which identifies the set.
     black_dn : float
-        Value that is subtracted from all frames, DN of the frames.
+        Black level of the frames, DN of the frames.
     scale : float
         DN of the sensor per DN of the frames.
     variance_dn2 : float
         Variance of their noise with dither, DN² of the sensor.
-    shading : bool
-        Whether the mean of all frames is subtracted at each site.
+    shading : DarkShading or None
+        Map that is subtracted at each site; None to subtract the black level alone.
     """
 
     frames: tuple[DarkFrame, ...]
@@ -178,7 +200,7 @@ class DarkFrames:
     black_dn: float
     scale: float
     variance_dn2: float
-    shading: bool = False
+    shading: DarkShading | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,7 +386,8 @@ class Plan:
     dark_black_dn, dark_scale : float
         Value that is subtracted from the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
     dark_shading : str
-        SHA-256 of the set of dark frames whose mean is subtracted in place of ``dark_black_dn``; empty to keep it.
+        SHA-256 of the dark-shading map that is subtracted too: of its file, or of the set of dark frames whose mean it
+        is. Empty without a map.
     """
 
     seed: int

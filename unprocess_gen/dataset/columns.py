@@ -465,16 +465,17 @@ COLUMNS = (
         for axis, side in (("y", "row"), ("x", "column"))
     ),
     Column(
-        "dark_black_dn", float, "black level of the dark frame", Range(0, 65535), Plan, unit="DN of the dark frame",
-        since="0.2", empty_if="there is no dark frame, or it is 0",
+        "dark_black_dn", float, "value that is subtracted from all sites of the dark frame: its black level, or 0 if "
+        "the map of dark_shading contains that", Range(0, 65535), Plan, unit="DN of the dark frame", since="0.2",
+        empty_if="there is no dark frame, or it is 0",
     ),
     Column(
         "dark_scale", float, "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), Plan, since="0.2",
         empty_if="there is no dark frame, or it is 1",
     ),
     Column(
-        "dark_shading", str, "SHA-256 of the set of dark frames whose mean is subtracted from the dark frame", HEX_256,
-        Plan, since="0.2", empty_if="the mean is kept",
+        "dark_shading", str, "SHA-256 of the dark-shading map that is subtracted from the dark frame: of its file, or "
+        "of the set of dark frames whose mean it is", HEX_256, Plan, since="0.2", empty_if="no map is subtracted",
     ),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""

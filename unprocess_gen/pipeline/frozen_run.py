@@ -21,6 +21,7 @@ from functools import lru_cache
 from importlib.metadata import version
 from typing import Any
 
+from unprocess_gen.config.interpretation import shading_place
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.config.validation import check_values
@@ -35,6 +36,7 @@ from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
 from unprocess_gen.pipeline.worker import ShardLog, make_and_commit, make_image
 from unprocess_gen.pipeline.workspace import Workspace
+from unprocess_gen.sources.dark_frames import DarkPlaces, set_dark_places
 from unprocess_gen.sources.listing import Listing, absolute_root
 
 PACKAGE = "unprocess_gen"
@@ -81,6 +83,8 @@ class FrozenPlan:
         Digest of its rows.
     dark_frames : str or None
         Absolute place of the dark frames; None without them.
+    dark_shading : str or None
+        Absolute place of the dark-shading map, or of the folder of maps; None without a map.
     """
 
     version: str
@@ -97,6 +101,7 @@ class FrozenPlan:
     canary_source: int | None
     canary_sha256: str
     dark_frames: str | None = None
+    dark_shading: str | None = None
 
     @property
     def shards(self) -> int:
@@ -180,7 +185,8 @@ def _new_plan(workspace: Workspace, config: Config, listing: Listing, on_compili
         skipped_links=listing.skipped_links,
         canary_source=canary[0],
         canary_sha256=canary[1],
-        dark_frames=None if config.noise.dark_frames is None else os.path.abspath(config.noise.dark_frames),
+        dark_frames=absolute_root(config.noise.dark_frames),
+        dark_shading=absolute_root(shading_place(config.noise)),
     )
 
 
@@ -321,7 +327,7 @@ class FrozenRun:
         except (ValueError, ConfigError) as error:
             raise DamageError(f"{self.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
         config.out, config.source.root = self.out, root or plan.root
-        config.noise.dark_frames = plan.dark_frames
+        set_dark_places(config, DarkPlaces(plan.dark_frames, plan.dark_shading))
         config.source.max_failed, config.n_jobs, config.self_test = plan.max_failed, plan.n_jobs, plan.self_test
         return config
 

@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
+from unprocess_gen.config.interpretation import shading_place
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.errors import ConfigError, MachineError
@@ -319,18 +320,20 @@ def machine() -> dict[str, Any]:
 
 
 def _dark_facts(config: Config) -> dict[str, Any]:
-    """Return what ``dataset.json`` records about dark frames: their place, number, sizes and noise."""
-    root = absolute_root(config.noise.dark_frames)
+    """Return what ``dataset.json`` records about dark frames: their place, number, sizes, noise and map."""
+    root, shading = absolute_root(config.noise.dark_frames), absolute_root(shading_place(config.noise))
     if root is None:
         return {}
+    places = {"root": root} | ({} if shading is None else {"shading": shading})
     try:
-        _, dark_frames, _ = open_dark_frames(config)
+        _, dark_frames, folder = open_dark_frames(config)
     except (ConfigError, MachineError):  # parts of a run may be merged where the frames are not
-        return {"dark_frames": {"root": root}}
-    assert dark_frames is not None
+        return {"dark_frames": places}
+    assert dark_frames is not None and folder is not None
     return {
         "dark_frames": {
-            "root": root,
+            **places,
+            **({} if shading is None else {"shading": absolute_root(folder.shading_place)}),
             "count": len(dark_frames.frames),
             "sizes": sorted({f"{frame.width}x{frame.height}" for frame in dark_frames.frames}),
             "black_dn": dark_frames.black_dn,

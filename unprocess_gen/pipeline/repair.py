@@ -62,7 +62,7 @@ from unprocess_gen.pipeline.workspace import (
     fingerprint,
     read_dataset,
 )
-from unprocess_gen.sources.dark_frames import open_dark_frames
+from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces, open_dark_frames, set_dark_places
 from unprocess_gen.sources.loader import list_photographs, load_source
 
 Facts = dict[str, Any]
@@ -95,7 +95,7 @@ class RepairStep:
         return f"{self.file}: {self.what}"
 
 
-def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> Iterator[RepairStep]:
+def repair(folder: Path, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) -> Iterator[RepairStep]:
     """Restore every damaged file of a dataset.
 
     Parameters
@@ -104,8 +104,8 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
         Folder of the dataset.
     root : str or None
         Folder of the sources; None for built-in scenes, or if no source is needed.
-    dark_frames : str or None
-        Folder of the dark frames, if rows name any.
+    dark : DarkPlaces
+        Where the dark frames and their map are, if rows name any.
 
     Yields
     ------
@@ -128,20 +128,20 @@ def repair(folder: Path, root: str | None, dark_frames: str | None = None) -> It
     storage = LocalStorage(folder)
     try:
         storage.hold()
-        yield from _repair(folder, root, storage.scratch, dark_frames)
+        yield from _repair(folder, root, storage.scratch, dark)
     except OSError as error:
         raise machine_error(error, folder) from error
     finally:
         storage.close()
 
 
-def _repair(folder: Path, root: str | None, temporary: Path, dark_frames: str | None) -> Iterator[RepairStep]:
+def _repair(folder: Path, root: str | None, temporary: Path, dark: DarkPlaces) -> Iterator[RepairStep]:
     facts = _intact_facts(folder)
     text, step = _settings(folder, facts, temporary)
     yield from step
     config = _config(folder / "config.yaml", root)
-    config.noise.dark_frames = dark_frames
-    regenerator = PairRegenerator(root, dark_frames)
+    set_dark_places(config, dark)
+    regenerator = PairRegenerator(root, dark)
     yield from _manifest(folder, facts, config, temporary)
     names = set()
     for number, rows in shard_rows(folder / "manifest.csv"):

@@ -25,7 +25,7 @@ from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_r
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.sources import listing
-from unprocess_gen.sources.dark_frames import DarkFolder, dark_folder
+from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import crop_patch
 
@@ -83,28 +83,33 @@ def source_root(manifest: AnyPath, root: str | None) -> str | None:
     return root if root is not None else _recorded_root(manifest, "source")
 
 
-def dark_root(manifest: AnyPath, folder: str | None) -> str | None:
-    """Return the folder of the dark frames.
+def dark_places(manifest: AnyPath, frames: str | None = None, shading: str | None = None) -> DarkPlaces:
+    """Return where the dark frames of a dataset and their dark-shading map are.
 
     Parameters
     ----------
-    manifest : Path
+    manifest : Path or ObjectPath
         The manifest, next to its ``dataset.json``.
-    folder : str or None
-        The folder that the user names; None for the recorded one.
+    frames : str or None
+        The folder of the dark frames that the user names; None for the recorded one.
+    shading : str or None
+        The map, or folder of maps, that the user names; None for the recorded one.
 
     Returns
     -------
-    str or None
-        ``folder``, or the folder that ``dataset.json`` records; None without a record.
+    DarkPlaces
+        What the user names, or ``dataset.json`` records; None without a record.
     """
-    return folder if folder is not None else _recorded_root(manifest, "dark_frames")
+    return DarkPlaces(
+        frames if frames is not None else _recorded_root(manifest, "dark_frames"),
+        shading if shading is not None else _recorded_root(manifest, "dark_frames", "shading"),
+    )
 
 
-def _recorded_root(manifest: AnyPath, what: str) -> str | None:
-    """Return the folder that ``dataset.json`` records for ``source`` or ``dark_frames``."""
+def _recorded_root(manifest: AnyPath, what: str, key: str = "root") -> str | None:
+    """Return the place that ``dataset.json`` records for ``source`` or ``dark_frames``."""
     try:
-        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))[what]["root"]
+        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))[what][key]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return None if recorded is None else str(recorded)
@@ -191,7 +196,7 @@ def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
 
 
 def replay(
-    rows: Iterable[Row], root: str | None, to: Path | None = None, dark_frames: str | None = None
+    rows: Iterable[Row], root: str | None, to: Path | None = None, dark: DarkPlaces = NO_DARK_FRAMES
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
@@ -203,8 +208,8 @@ def replay(
         Folder of the sources; None if all rows are of built-in scenes.
     to : Path, optional
         Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
-    dark_frames : str or None
-        Folder of the dark frames; None if no row names one.
+    dark : DarkPlaces
+        Where the dark frames and their map are, if rows name any.
 
     Yields
     ------
@@ -220,7 +225,7 @@ def replay(
     """
     if to is not None:
         check_output_folder(to, f"--to {to}")
-    regenerator = PairRegenerator(root, dark_frames)
+    regenerator = PairRegenerator(root, dark)
     for row in rows:
         if row["status"] == "ok":
             yield _replay(row, regenerator, to)
@@ -246,12 +251,12 @@ def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayRe
 class PairRegenerator:
     """Regenerate pairs from rows and the folder of their sources, ``root``; built-in scenes need none.
 
-    ``dark_frames`` is the folder of the dark frames that rows name. The last photograph stays decoded, because rows of
-    one image are consecutive.
+    ``dark`` has the places of the dark frames and of the map that rows name. The last photograph stays decoded, because
+    rows of one image are consecutive.
     """
 
-    def __init__(self, root: str | None, dark_frames: str | None = None) -> None:
-        self._root, self._dark_frames = root, dark_frames
+    def __init__(self, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) -> None:
+        self._root, self._dark = root, dark
         self._kept: tuple[SourceConfig, Source, str, Photograph] | None = None
 
     def regenerate(self, row: Row) -> Pair:
@@ -283,13 +288,13 @@ class PairRegenerator:
         """Return access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
         if not plan.dark_frame:
             return None
-        if self._dark_frames is None:
+        if self._dark.frames is None:
             raise SourceChangedError(
                 f"noise.dark_frames is missing: the row names the dark frame {plan.dark_frame}; expected the folder of "
                 "the dark frames; give noise.dark_frames=…"
             )
         try:
-            return dark_folder(self._dark_frames)
+            return self._dark.open()
         except ConfigError as error:
             raise SourceChangedError(str(error)) from error
 

@@ -206,13 +206,14 @@ def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: i
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
+    shading = dark_frames.shading
     return replace(
         plan,
         dark_frame=frame.sha256,
         dark_shift=shift,
-        dark_black_dn=0.0 if dark_frames.shading else dark_frames.black_dn,
+        dark_black_dn=dark_frames.black_dn if shading is None else shading.black_dn,
         dark_scale=dark_frames.scale,
-        dark_shading=dark_frames.sha256 if dark_frames.shading else "",
+        dark_shading="" if shading is None else shading.sha256,
     )
 
 

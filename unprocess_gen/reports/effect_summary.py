@@ -362,12 +362,22 @@ def dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:
     Returns
     -------
     str
-        Number, sizes, black level, and standard deviation of the noise with dither, DN of the sensor.
+        Number, sizes, what is subtracted, and standard deviation of the noise with dither, DN of the sensor.
     """
     sizes = sorted({f"{frame.width} x {frame.height}" for frame in dark_frames.frames})
-    shading = "their mean is subtracted" if dark_frames.shading else f"black level {dark_frames.black_dn:g} DN"
     text = (
         f"{counted(len(dark_frames.frames), 'dark frame')} in {config.noise.dark_frames}: {', '.join(sizes)} pixels, "
-        f"{shading}, standard deviation {math.sqrt(dark_frames.variance_dn2):.4g} DN"
+        f"{_subtracted(dark_frames)}, standard deviation {math.sqrt(dark_frames.variance_dn2):.4g} DN"
     )
     return text if dark_frames.scale == 1 else f"{text} on this sensor (times {dark_frames.scale:.6g})"
+
+
+def _subtracted(dark_frames: DarkFrames) -> str:
+    """Return what is subtracted from dark frames: their black level, their mean, or a map and what that leaves."""
+    shading, black = dark_frames.shading, f"black level {dark_frames.black_dn:g} DN"
+    if shading is None:
+        return black
+    if not shading.file:
+        return "their mean is subtracted"
+    content = f"in DN above the {black}" if shading.black_dn else "in DN with the black level"
+    return f"the map {shading.file} ({content}) is subtracted, which leaves a median of {shading.residual_dn:.3g} DN"

@@ -2,35 +2,37 @@
 
 A dark frame is a mosaic that a camera recorded without light. All files of the folder are read once at the start:
 their digests, one black level, and the variance of their noise. Workers read the pixels of a frame when a pair needs
-it: NPY files are mapped into memory, other files are decoded, and the last `DECODED` frames are kept.
+it: NPY files are mapped into memory, other files are decoded, and the last `DECODED` frames are kept. `dark_shading`
+has the map that may be subtracted from them.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from unprocess_gen.config.interpretation import uses_dark_frames
+from unprocess_gen.config.interpretation import run_iso, shading_place, uses_dark_frames
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
-from unprocess_gen.core.files import file_sha256
-from unprocess_gen.core.types import DarkFrame, DarkFrames, Raw
+from unprocess_gen.core.types import DarkFrame, DarkFrames, DarkShading, Raw
+from unprocess_gen.sources import dark_shading
+from unprocess_gen.sources.mosaics import (
+    SUFFIXES,
+    Mosaic,
+    check_sha256,
+    even_sides,
+    map_mosaic,
+    mosaic_sha256,
+    read_mosaic,
+)
 
-PICTURES = (".png", ".tif", ".tiff")
-RAW_FILES = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2")
-"""Suffixes that LibRaw decodes (extra ``raw``)."""
-SUFFIXES = (".npy", *PICTURES, *RAW_FILES)
+KEY = "noise.dark_frames"
 
 LEAST_SIDE = 64
 """Least height and width of a dark frame, pixels."""
@@ -43,27 +45,6 @@ MAPPED = 256
 BRIGHTEST_MEDIAN = 0.05
 """Largest median of dark frames above black, as a fraction of the range of the sensor. Chosen: brighter is light."""
 
-FARTHEST = 1e-4
-"""Fraction of the sites at each end, such as hot pixels, that is left out of the variance. It lowers that of normal
-noise by 0.3 %."""
-
-STEPS_PER_DN = 16
-"""Steps in which differences from the mean of the frames are counted."""
-FARTHEST_STEPS = 2**18
-
-BLOCK_SITES = 2**20
-
-Counts = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Mosaic:
-    """Decoded dark frame, with the black level and the CFA pattern that a raw file states."""
-
-    pixels: Raw
-    black_dn: float | None = None
-    pattern: str | None = None
-
 
 @dataclass(frozen=True)
 class DarkFolder:
@@ -75,10 +56,13 @@ class DarkFolder:
         The folder.
     files : mapping of str to str
         Name of each file by its SHA-256; of twins the last by name.
+    shading_place : str or None
+        Dark-shading map, or folder of such maps; None to know only the mean of the frames.
     """
 
     folder: str
     files: Mapping[str, str] = field(default_factory=dict)
+    shading_place: str | None = None
 
     @property
     def sha256(self) -> str:
@@ -109,16 +93,15 @@ class DarkFolder:
                 f"noise.dark_frames={self.folder}: no file has the SHA-256 {sha256}; expected the dark frames of the "
                 "dataset; restore the file, or give their folder"
             )
-        pixels = (_mapped if name.lower().endswith(".npy") else _decoded)(str(Path(self.folder) / name), sha256)
-        return pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
+        return even_sides((_mapped if name.lower().endswith(".npy") else _decoded)(Path(self.folder) / name, sha256))
 
-    def mean(self, sha256: str) -> NDArray[np.float32]:
-        """Return the mean of all frames.
+    def shading(self, sha256: str) -> NDArray[np.float32]:
+        """Return the map that is subtracted from the frames.
 
         Parameters
         ----------
         sha256 : str
-            SHA-256 of the set (`DarkFolder.sha256`).
+            SHA-256 of the set (`DarkFolder.sha256`) for the mean of all frames, or of the file of a map.
 
         Returns
         -------
@@ -128,26 +111,31 @@ class DarkFolder:
         Raises
         ------
         SourceChangedError
-            If the folder has another set of frames.
+            If the folder has another set of frames, and there is no map with this digest.
         """
-        if sha256 != self.sha256:
-            raise SourceChangedError(
-                f"noise.dark_frames={self.folder}: the set of frames has the SHA-256 {self.sha256}; expected {sha256}, "
-                "whose mean was subtracted; restore the files, or give their folder"
-            )
-        return _mean(self.folder, tuple(sorted(self.files)), self)
+        if sha256 == self.sha256:
+            return _mean(self.folder, tuple(sorted(self.files)), self)
+        if self.shading_place is not None:
+            return dark_shading.shading_map(dark_shading.find_map(self.shading_place, sha256), sha256)
+        raise SourceChangedError(
+            f"noise.dark_frames={self.folder}: the set of frames has the SHA-256 {self.sha256}; expected {sha256}, "
+            "whose mean was subtracted; restore the files, or give their folder; if a map was subtracted, give "
+            "noise.dark_shading=FILE"
+        )
 
     def __hash__(self) -> int:
-        return hash((self.folder, self.sha256))
+        return hash((self.folder, self.sha256, self.shading_place))
 
 
-def dark_folder(folder: str) -> DarkFolder:
+def dark_folder(folder: str, shading_place: str | None = None) -> DarkFolder:
     """Return access to the dark frames of a folder.
 
     Parameters
     ----------
     folder : str
         The folder.
+    shading_place : str or None
+        Dark-shading map, or folder of such maps.
 
     Returns
     -------
@@ -163,7 +151,7 @@ def dark_folder(folder: str) -> DarkFolder:
     """
     try:
         names = sorted(path.name for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
-        files = {_digest(Path(folder) / name): name for name in names}
+        files = {mosaic_sha256(Path(folder) / name): name for name in names}
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(f"noise.dark_frames={folder}: no such folder; expected a folder of dark frames") from None
     except OSError as error:
@@ -172,18 +160,50 @@ def dark_folder(folder: str) -> DarkFolder:
         raise ConfigError(
             f"noise.dark_frames={folder}: contains no dark frame; expected files with a suffix of {', '.join(SUFFIXES)}"
         )
-    return DarkFolder(folder, files)
+    return DarkFolder(folder, files, shading_place)
 
 
-def _digest(path: Path) -> str:
-    status = path.stat()
-    return _digest_of(path, status.st_size, status.st_mtime_ns)
+@dataclass(frozen=True, slots=True)
+class DarkPlaces:
+    """Name where the dark frames of a dataset are, and their dark-shading map; None for what is unknown or not used."""
+
+    frames: str | None = None
+    shading: str | None = None
+
+    def open(self) -> DarkFolder | None:
+        """Return access to the dark frames, None without a folder.
+
+        Raises
+        ------
+        ConfigError
+            As `dark_folder`, or if the place of the map does not exist.
+        MachineError
+            As `dark_folder`.
+        """
+        if self.frames is None:
+            return None
+        if self.shading is not None and not Path(self.shading).exists():
+            raise ConfigError(f"noise.dark_shading={self.shading}: no such file or folder; expected a dark-shading map")
+        return dark_folder(self.frames, self.shading)
 
 
-@functools.lru_cache(maxsize=4096)
-def _digest_of(path: Path, size: int, modified_ns: int) -> str:
-    """Return the SHA-256 of a file; a program that makes many pairs hashes its dark frames once."""
-    return file_sha256(path)
+NO_DARK_FRAMES = DarkPlaces()
+"""For datasets without dark frames."""
+
+
+def set_dark_places(config: Config, places: DarkPlaces) -> None:
+    """Add the places of dark frames and of their map to a recorded configuration, which has their digests.
+
+    Parameters
+    ----------
+    config : Config
+        Configuration from a ``config.yaml``; it is changed.
+    places : DarkPlaces
+        Where they are. The place of the map is ignored if the configuration records no map.
+    """
+    config.noise.dark_frames = places.frames
+    if config.noise.dark_shading_sha256 is not None and places.shading is not None:
+        config.noise.dark_shading = places.shading
 
 
 def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFolder | None]:
@@ -197,7 +217,7 @@ def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFol
     Returns
     -------
     config : Config
-        The configuration with the digest of the set, which ``config.yaml`` records.
+        The configuration with the digests of the set and of the map, which ``config.yaml`` records.
     dark_frames : DarkFrames or None
         What plans need; None without ``noise.dark_frames``.
     folder : DarkFolder or None
@@ -206,9 +226,9 @@ def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFol
     Raises
     ------
     ConfigError
-        If a file is no dark frame of this camera.
+        If a file is no dark frame of this camera, or there is no map for the ISO of the run, or it does not fit.
     SourceChangedError
-        If the configuration records another set of frames.
+        If the configuration records another set of frames, or another map.
     MachineError
         If a file cannot be read.
     """
@@ -223,6 +243,9 @@ def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFol
             f"noise.dark_frames={folder.folder}: the set of frames has the SHA-256 {folder.sha256}; expected "
             f"{recorded}, as recorded; restore the files, or give their folder"
         )
+    shading_map = _shading_map(config)
+    if shading_map is not None:
+        folder = replace(folder, shading_place=str(shading_map[0]))
     noise, sensor = config.noise, config.sensor
     assert noise.white_level_dn is not None and noise.black_level_dn is not None and noise.bits is not None
     rules = _Rules(
@@ -232,14 +255,35 @@ def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFol
         sensor.pattern,
         noise.dark_frames_black_dn,
         noise.dark_shading == "remove",
+        shading_map,
     )
     dark_frames = _described(folder, rules)
-    return replace(config, noise=replace(noise, dark_frames_sha256=folder.sha256)), dark_frames, folder
+    noise = replace(noise, dark_frames_sha256=folder.sha256, dark_shading_sha256=shading_map and shading_map[1])
+    return replace(config, noise=noise), dark_frames, folder
+
+
+def _shading_map(config: Config) -> tuple[Path, str] | None:
+    """Return file and SHA-256 of the dark-shading map; None if the config has no map."""
+    place, recorded = shading_place(config.noise), config.noise.dark_shading_sha256
+    if place is None:
+        if recorded is not None:
+            raise ConfigError("noise.dark_shading is missing; expected the place of the recorded dark-shading map")
+        return None
+    if recorded is not None:
+        return dark_shading.find_map(place, recorded), recorded
+    path = dark_shading.choose_map(place, run_iso(config))
+    try:
+        return path, mosaic_sha256(path)
+    except OSError as error:
+        raise MachineError(f"noise.dark_shading={place}: cannot be read ({error.strerror})") from error
 
 
 @dataclass(frozen=True, slots=True)
 class _Rules:
-    """Hold what dark frames must fit: bits and range of the profile, DN of the sensor per DN, pattern, black level."""
+    """Hold what dark frames must fit: bits and range of the profile, DN of the sensor per DN, pattern, black level.
+
+    ``remove`` is true if their mean is subtracted; ``shading_map`` is the file and the SHA-256 of a map.
+    """
 
     bits: int
     span_dn: int
@@ -247,6 +291,7 @@ class _Rules:
     pattern: str
     black_dn: float | None
     remove: bool
+    shading_map: tuple[Path, str] | None
 
 
 @functools.lru_cache(maxsize=8)
@@ -256,27 +301,66 @@ def _described(folder: DarkFolder, rules: _Rules) -> DarkFrames:
     counts = np.zeros(2**16, dtype=np.int64)
     blacks: set[float | None] = set()
     for sha256, name in sorted(folder.files.items()):
-        mosaic = read_mosaic(Path(folder.folder) / name)
+        mosaic = read_mosaic(Path(folder.folder) / name, KEY)
         _check(folder, name, mosaic, rules)
         blacks.add(mosaic.black_dn)
         pixels = folder.frame(sha256)
         frames.append(DarkFrame(sha256, *pixels.shape))
-        for rows in _blocks(pixels.shape):
+        for rows in dark_shading.blocks(pixels.shape):
             counts += np.bincount(pixels[rows].reshape(-1), minlength=2**16)
-    median_dn = _median(counts)
+    median_dn = dark_shading.median_of(counts)
     black_dn = rules.black_dn if rules.black_dn is not None else _black_level(folder, blacks, median_dn)
     if abs(median_dn - black_dn) > BRIGHTEST_MEDIAN * rules.span_dn:
         raise ConfigError(
             f"noise.dark_frames={folder.folder}: the median of the frames is {median_dn} DN, and black is {black_dn:g} "
             "DN; expected frames without light; noise.dark_frames_black_dn sets the black level"
         )
-    variance = _trimmed_variance(counts, 1)
+    variance, shading = dark_shading.trimmed_variance(counts, 1), None
     if rules.remove:
-        variance = _variance_around_mean(folder, frames)
+        variance, shading = _around_mean(folder, frames)
+    elif rules.shading_map is not None:
+        variance, shading = _around_map(folder, frames, rules, black_dn)
     dither = 1 / 12
     return DarkFrames(
-        tuple(frames), folder.sha256, black_dn, rules.scale, rules.scale**2 * (variance + dither), rules.remove
+        tuple(frames), folder.sha256, black_dn, rules.scale, rules.scale**2 * (variance + dither), shading
     )
+
+
+def _around_mean(folder: DarkFolder, frames: Sequence[DarkFrame]) -> tuple[float, DarkShading]:
+    """Return the variance of the frames around their mean, and that mean as a map."""
+    if len(frames) < 2:
+        raise ConfigError("noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several")
+    differences = _differences(folder, frames, folder.shading(folder.sha256), 0.0)
+    return differences.variance_dn2, DarkShading(folder.sha256)
+
+
+def _around_map(
+    folder: DarkFolder, frames: Sequence[DarkFrame], rules: _Rules, black_dn: float
+) -> tuple[float, DarkShading]:
+    """Return the variance of the frames around a map, and the map; ConfigError if the map does not fit the frames."""
+    assert rules.shading_map is not None
+    path, sha256 = rules.shading_map
+    values = folder.shading(sha256)
+    for frame in frames:
+        if values.shape != (frame.height, frame.width):
+            raise ConfigError(
+                f"noise.dark_shading={path}: the map has {values.shape[1]} x {values.shape[0]} pixels; expected those "
+                f"of every dark frame; {folder.files[frame.sha256]} has {frame.width} x {frame.height}"
+            )
+    subtracted_dn = black_dn if dark_shading.is_above_black(values, black_dn) else 0.0
+    differences = _differences(folder, frames, values, subtracted_dn)
+    median_dn, variance_dn2 = differences.median_dn, differences.variance_dn2
+    dark_shading.check_residual(path, median_dn, variance_dn2)
+    return variance_dn2, DarkShading(sha256, subtracted_dn, path.name, median_dn)
+
+
+def _differences(
+    folder: DarkFolder, frames: Sequence[DarkFrame], values: NDArray[np.float32], black_dn: float
+) -> dark_shading.Differences:
+    differences = dark_shading.Differences(values, black_dn)
+    for frame in frames:
+        differences.add(folder.frame(frame.sha256))
+    return differences
 
 
 def _check(folder: DarkFolder, name: str, mosaic: Mosaic, rules: _Rules) -> None:
@@ -315,104 +399,18 @@ def _black_level(folder: DarkFolder, stated: set[float | None], median_dn: int) 
 # ------------------------------------------------------------------------------------------------------------- pixels
 
 
-def read_mosaic(path: Path) -> Mosaic:
-    """Read a dark frame.
-
-    Parameters
-    ----------
-    path : Path
-        NPY, PNG, TIFF or raw file.
-
-    Returns
-    -------
-    Mosaic
-        Pixels [H, W] of uint16; black level and pattern of raw files.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be decoded, is no mosaic of 16-bit integers, or needs an extra that is not installed.
-    """
-    suffix = path.suffix.lower()
-    try:
-        content = path.read_bytes()
-        if suffix in RAW_FILES:
-            return _read_raw(path, content)
-        if suffix == ".npy":
-            pixels: Any = np.load(io.BytesIO(content), allow_pickle=False)
-        else:
-            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, EOFError, cv2.error) as error:
-        raise ConfigError(f"noise.dark_frames: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
-    if pixels is None:
-        raise ConfigError(f"noise.dark_frames: {path} cannot be decoded; expected {suffix[1:].upper()}")
-    _check_mosaic(path, pixels)
-    return Mosaic(np.ascontiguousarray(pixels, dtype=np.uint16))
-
-
-def _check_mosaic(path: Path, pixels: NDArray[Any]) -> None:
-    """Raise ConfigError unless an array is a mosaic of 16-bit integers."""
-    if pixels.dtype != np.uint16 or pixels.ndim != 2:
-        raise ConfigError(
-            f"noise.dark_frames: {path} is {pixels.dtype} {list(pixels.shape)}; expected a mosaic [H, W] of uint16"
-        )
-
-
-def _read_raw(path: Path, content: bytes) -> Mosaic:
-    """Decode a raw file with LibRaw: the visible part of the mosaic."""
-    if find_spec("rawpy") is None:
-        raise ConfigError(
-            f"noise.dark_frames: {path} is a raw file, which needs rawpy; in the source folder, run: "
-            "pip install '.[raw]', or convert the frames to NPY"
-        )
-    import rawpy
-
-    try:
-        with rawpy.imread(io.BytesIO(content)) as raw:
-            pixels, colours = raw.raw_image_visible.copy(), raw.raw_colors_visible[:2, :2].ravel()
-            names = raw.color_desc.decode("ascii")
-            blacks = {int(raw.black_level_per_channel[colour]) for colour in colours}
-    except rawpy.LibRawError as error:
-        raise ConfigError(f"noise.dark_frames: {path} cannot be decoded ({error})") from error
-    if pixels.ndim != 2 or pixels.dtype != np.uint16:
-        raise ConfigError(f"noise.dark_frames: {path} holds no Bayer mosaic; expected one")
-    if len(blacks) > 1:
-        raise ConfigError(
-            f"noise.dark_frames: {path} states the black levels {', '.join(map(str, sorted(blacks)))}; expected one; "
-            "convert the frames to NPY, and set noise.dark_frames_black_dn"
-        )
-    pattern = "".join("G" if names[colour] == "G" else names[colour] for colour in colours)
-    return Mosaic(pixels, float(blacks.pop()), pattern)
-
-
 @functools.lru_cache(maxsize=MAPPED)
-def _mapped(path: str, sha256: str) -> Raw:
+def _mapped(path: Path, sha256: str) -> Raw:
     """Return the array of an NPY file, mapped into memory."""
-    _check_digest(path, sha256)
-    try:
-        pixels: Raw = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError) as error:  # an edited row can name any file of the folder
-        raise ConfigError(f"noise.dark_frames: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
-    _check_mosaic(Path(path), pixels)
-    return pixels
+    check_sha256(path, "dark frame", sha256)
+    return map_mosaic(path, KEY)
 
 
 @functools.lru_cache(maxsize=DECODED)
-def _decoded(path: str, sha256: str) -> Raw:
+def _decoded(path: Path, sha256: str) -> Raw:
     """Return the pixels of another file."""
-    _check_digest(path, sha256)
-    return read_mosaic(Path(path)).pixels
-
-
-def _check_digest(path: str, sha256: str) -> None:
-    try:
-        found = file_sha256(Path(path))
-    except OSError as error:
-        raise SourceChangedError(f"dark frame {path}: cannot be read ({error.strerror}); restore it") from error
-    if found != sha256:
-        raise SourceChangedError(f"dark frame {path}: has the SHA-256 {found}; expected {sha256}; restore it")
+    check_sha256(path, "dark frame", sha256)
+    return read_mosaic(path, KEY).pixels
 
 
 @functools.lru_cache(maxsize=1)
@@ -431,47 +429,6 @@ def _mean(folder: str, digests: tuple[str, ...], frames: DarkFolder) -> NDArray[
         total += pixels
     assert total is not None
     mean = np.empty(total.shape, dtype=np.float32)
-    for rows in _blocks(total.shape):
+    for rows in dark_shading.blocks(total.shape):
         mean[rows] = total[rows] / np.float64(len(digests))
     return mean
-
-
-# --------------------------------------------------------------------------------------------------------- statistics
-
-
-def _blocks(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield the rows of blocks of about `BLOCK_SITES`, so that wider types take little memory."""
-    step = max(1, BLOCK_SITES // shape[1])
-    return (slice(top, top + step) for top in range(0, shape[0], step))
-
-
-def _median(counts: Counts) -> int:
-    """Return the lower median of counted integers."""
-    return int(np.searchsorted(np.cumsum(counts), (int(counts.sum()) + 1) // 2))
-
-
-def _trimmed_variance(counts: Counts, steps: int) -> float:
-    """Return the variance of counted integers in units of ``steps``, without the `FARTHEST` at both ends; exact."""
-    cut = int(int(counts.sum()) * FARTHEST)
-    ascending = np.cumsum(counts)
-    kept = np.diff(np.clip(ascending, cut, int(ascending[-1]) - cut), prepend=cut)
-    pairs = [(int(value), int(kept[value])) for value in np.flatnonzero(kept)]
-    count = sum(times for _, times in pairs)
-    first = sum(value * times for value, times in pairs)
-    second = sum(value * value * times for value, times in pairs)
-    return float(Fraction(count * second - first * first, count * count * steps * steps))
-
-
-def _variance_around_mean(folder: DarkFolder, frames: Sequence[DarkFrame]) -> float:
-    """Return the variance of the differences from the mean of all frames, DN²."""
-    if len(frames) < 2:
-        raise ConfigError("noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several")
-    mean = folder.mean(folder.sha256)
-    counts = np.zeros(2 * FARTHEST_STEPS + 1, dtype=np.int64)
-    for frame in frames:
-        pixels = folder.frame(frame.sha256)
-        for rows in _blocks(mean.shape):
-            steps = np.rint((pixels[rows] - mean[rows]) * np.float32(STEPS_PER_DN)).astype(np.int64)
-            places = np.clip(steps, -FARTHEST_STEPS, FARTHEST_STEPS) + FARTHEST_STEPS
-            counts += np.bincount(places.reshape(-1), minlength=counts.size)
-    return _trimmed_variance(counts, STEPS_PER_DN)

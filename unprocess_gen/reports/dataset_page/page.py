@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 import cv2
 import yaml
 
-from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
 from unprocess_gen.core.object_store import AnyPath, folder_name
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.columns import COLUMNS
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_rows
@@ -42,6 +43,7 @@ from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.noise_check.checks import Alarm, failed_checks, pair_scores, pair_sums, threshold
 from unprocess_gen.reports.report_files import require_libraries
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
+from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
 from unprocess_gen.sources.listing import encode_name
 
 PAIRS_FITTED = 8
@@ -51,7 +53,9 @@ JPEG_QUALITY = 88
 MEANINGS = {column.name: ", ".join(filter(None, (column.meaning, column.unit))) for column in COLUMNS}
 
 
-def write_dataset_report(folder: AnyPath, to: Path | None = None, source: AnyPath | None = None) -> Path:
+def write_dataset_report(
+    folder: AnyPath, to: Path | None = None, source: AnyPath | None = None, dark: DarkPlaces = NO_DARK_FRAMES
+) -> Path:
     """Write the HTML report of a finished dataset.
 
     Parameters
@@ -62,6 +66,8 @@ def write_dataset_report(folder: AnyPath, to: Path | None = None, source: AnyPat
         File to write; ``report.html`` in the dataset's folder by default. Required for a URL.
     source : Path or ObjectPath, optional
         Folder of the photographs, for the contact sheet; the recorded one by default.
+    dark : DarkPlaces
+        Where the dark frames and their map are, for the check of the noise.
 
     Returns
     -------
@@ -81,7 +87,7 @@ def write_dataset_report(folder: AnyPath, to: Path | None = None, source: AnyPat
     require_libraries("report")
     _check_finished(folder)
     to = _file_to_write(folder, to)
-    content = dataset_page(folder, source).encode()
+    content = dataset_page(folder, source, dark).encode()
     temporary = to.with_name(to.name + ".part")
     try:
         temporary.write_bytes(content)
@@ -104,7 +110,7 @@ def _file_to_write(folder: AnyPath, to: Path | None) -> Path:
     return to
 
 
-def dataset_page(folder: AnyPath, source: AnyPath | None = None) -> str:
+def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlaces = NO_DARK_FRAMES) -> str:
     """Return the HTML report of a finished dataset; DamageError as for `write_dataset_report`."""
     facts = _checked_facts(folder)
     statistics = ManifestStatistics.of_rows(read_rows(folder / "manifest.csv"))
@@ -129,7 +135,7 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None) -> str:
             "effects": _effects(statistics),
             "parameters": _parameters(statistics),
             "clipping": _clipping(facts, statistics),
-            "noise": _noise_check(folder),
+            "noise": _noise_check(folder, dark),
             "snippets": snippets(folder, facts["shards"], statistics.first_pair, is_one_size),
         }
     return render_page("dataset.html", title=f"Dataset {name}", **sections)
@@ -221,6 +227,7 @@ def _dark_frames(facts: Mapping[str, Any]) -> dict[str, str]:
     return {
         "dark frames": f"{facts['count']:,} in {facts['root']}, {', '.join(facts['sizes'])} pixels, black level "
         f"{facts['black_dn']:g} DN, standard deviation {facts['std_dn']:.4g} DN of the sensor"
+        + (f", minus the dark-shading map {facts['shading']}" if "shading" in facts else "")
     }
 
 
@@ -304,24 +311,56 @@ def _clipping(facts: Mapping[str, Any], statistics: ManifestStatistics) -> dict[
     }
 
 
-def _noise_check(folder: AnyPath) -> dict[str, Any]:
-    """Return the photon transfer fits, and the failed checks, of a few evenly spaced pairs."""
+def _noise_check(folder: AnyPath, dark: DarkPlaces) -> dict[str, Any]:
+    """Return checks and photon transfer fits of a few evenly spaced pairs, or why pairs with dark frames have none."""
     pairs = RawPairs(folder)
     numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
-    found: list[photon_transfer.NoiseFit] = []
+    fits: list[photon_transfer.NoiseFit] = []
     failed: list[Alarm] = []
+    checked, missing, dark_pixels = 0, "", None
     for number in numbers:
         clean, noisy, row = pairs[number]
-        sums = pair_sums(clean, noisy, row)
+        try:
+            dark_pixels = dark_pixels or _dark_frames_of(row, dark)
+            sums = pair_sums(clean, noisy, row, dark_pixels)
+        except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
+            missing = str(error)
+            break
         if sums is None:
             continue
+        checked += 1
         fit = photon_transfer.fit_sums(str(row["key"]), sums)
-        found += [] if fit is None else [fit]
+        fits += [] if fit is None else [fit]
         failed += failed_checks(str(row["key"]), pair_scores(sums), threshold(len(numbers)))[:1]
-    if not found:
-        return {"count": len(numbers), "table": None}
+    verdict = (
+        f"The noise of {len(failed)} of them differs from the manifest: {'; '.join(map(str, failed))}. "
+        "gen-dataset verify --noise checks every pair."
+        if failed
+        else "All agree with the manifest."
+    )
+    return {
+        "count": len(numbers),
+        "checked": checked,
+        "verdict": verdict,
+        "missing": missing,
+        "fits": _fits(fits) if fits else None,
+    }
+
+
+def _dark_frames_of(row: Row, dark: DarkPlaces) -> DarkFolder | None:
+    """Return access to the dark frames that a row names; ConfigError if there is none."""
+    if not row["dark_frame"]:
+        return None
+    found = dark.open()
+    if found is None:
+        raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
+    return found
+
+
+def _fits(fits: list[photon_transfer.NoiseFit]) -> dict[str, Any]:
+    """Return number, figure and table of photon transfer fits."""
     figure = io.BytesIO()
-    photon_transfer.draw_fits(found, figure)
+    photon_transfer.draw_fits(fits, figure)
     lines = [
         (
             fit.key,
@@ -331,17 +370,11 @@ def _noise_check(folder: AnyPath) -> dict[str, Any]:
             f"{fit.expected[1]:.5g}",
             f"{fit.deviation:.1f}",
         )
-        for fit in found
+        for fit in fits
     ]
     headings = ("pair", "a fitted, DN", "a expected", "b fitted, DN²", "b expected", "difference, standard errors")
     return {
-        "count": len(found),
-        "verdict": (
-            f"The noise of {len(failed)} of them differs from the manifest: {'; '.join(map(str, failed))}. "
-            "gen-dataset verify --noise checks every pair."
-            if failed
-            else "All agree with the manifest."
-        ),
+        "count": len(fits),
         "figure": data_uri(figure.getvalue()),
         "table": PageTable(headings, lines, range(1, len(headings))),
     }

@@ -415,7 +415,7 @@ def dark_frame_offsets(
     Returns
     -------
     ndarray of float32, [H, W]
-        Value of the dark frame above its black level, or above the mean of all frames, DN of the sensor.
+        (frame - black level - dark-shading map) · scale, in DN of the sensor; without a map if the plan names none.
 
     Raises
     ------
@@ -430,11 +430,13 @@ def dark_frame_offsets(
         np.float32(plan.dark_black_dn),
         np.float32(plan.dark_scale),
     )
-    mean = dark_pixels.mean(plan.dark_shading) if plan.dark_shading else None
+    shading = dark_pixels.shading(plan.dark_shading) if plan.dark_shading else None
     for y, from_y, rows in _runs(origin[0] + plan.dark_shift[0], shape[0], frame.shape[0]):
         for x, from_x, columns in _runs(origin[1] + plan.dark_shift[1], shape[1], frame.shape[1]):
             part, source = out[y : y + rows, x : x + columns], np.s_[from_y : from_y + rows, from_x : from_x + columns]
-            np.subtract(frame[source], black if mean is None else mean[source], out=part, dtype=np.float32)
+            np.subtract(frame[source], black, out=part, dtype=np.float32)
+            if shading is not None:
+                part -= shading[source]
             if scale != 1:
                 part *= scale
     return out
