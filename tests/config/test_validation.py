@@ -61,7 +61,7 @@ TWO_NUMBERS = {"a", "b", "negative_variance"}
 UNPUBLISHED = {"row_correlation", "gain_by_colour", "lens_shading"}
 """Keys that no published calibration gives, so no profile has them."""
 PHYSICAL = {"branches", "assumed", "provenance", *PHYSICAL_NUMBERS} - UNPUBLISHED
-DARK = {"dark_frames", "dark_frames_sha256", "dark_frames_black_dn", "dark_shading"}
+DARK = {"dark_frames", "dark_frames_sha256", "dark_frames_black_dn", "dark_shading", "dark_shading_sha256"}
 CHOSEN = {"iso", "law", "levels", "draws", "scatter", *DARK}
 """Keys that users set; of these, profiles set only ``scatter``."""
 SHA256 = "0" * 64

@@ -25,7 +25,7 @@ from unprocess_gen.pipeline.replay import PairRegenerator
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
 from unprocess_gen.reports.noise_check.checks import failed_checks, pair_scores, pair_sums, threshold
-from unprocess_gen.sources.dark_frames import open_dark_frames
+from unprocess_gen.sources.dark_frames import DarkPlaces, open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "camera=identity", "gains=unity")
 SCALE = (16383 - 1024) / (16300 - 512)
@@ -289,6 +289,63 @@ def test_report_describes_the_frames(made: Path, run_main: RunMain, tmp_path: Pa
     assert "dark_frame" in page
 
 
+@pytest.fixture
+def reported(make: Make, tmp_path: Path, darks: Path) -> Path:
+    """Return a dataset with dark frames that may be moved, and enough sites for a check of the noise."""
+    shutil.copytree(darks, tmp_path / "darks")
+    overrides = *NOISE, f"noise.dark_frames={tmp_path / 'darks'}", "source.limit=1", "source.patch=[grid, 256]"
+    make(None, tmp_path / "ds", *overrides, "scene.exposure_ratio=50")
+    return tmp_path / "ds"
+
+
+def page_of(dataset: Path, run_main: RunMain, *words: object) -> str:
+    """Return the text of the report that the command writes."""
+    done = run_main("report", dataset, *words)
+    assert (done.code, done.err) == (0, "")
+    return " ".join((dataset / "report.html").read_text(encoding="utf-8").split())
+
+
+def test_report_checks_pairs_with_dark_frames(reported: Path, run_main: RunMain) -> None:
+    page = page_of(reported, run_main)
+    count = len(rows(reported))
+    assert f"The noise of {count} evenly spaced pairs was compared with the manifest. All agree" in page
+    assert f"fitted for {count} of these pairs" in page
+    draws = np.random.default_rng(0)
+    replace_noisy_frames(
+        reported, lambda clean, noisy, row: np.rint(noisy + draws.normal(0, 4, noisy.shape)).astype(np.uint16)
+    )
+    assert f"The noise of {count} of them differs from the manifest: noise of 00000000-p0000: variance" in page_of(
+        reported, run_main
+    )
+
+
+def test_report_states_why_dark_frames_are_not_checked(reported: Path, run_main: RunMain, tmp_path: Path) -> None:
+    (tmp_path / "darks").rename(tmp_path / "moved")
+    page = page_of(reported, run_main)
+    assert f"Pairs with dark frames are not checked: noise.dark_frames={tmp_path}/darks: no such folder" in page
+    assert "All agree" not in page and "enough sites" not in page
+    for words in ([f"noise.dark_frames={tmp_path}/moved"], ["--dark-frames", tmp_path / "moved"]):
+        assert "All agree" in page_of(reported, run_main, *words)
+    save_frames(tmp_path / "darks", 1, std=5.0)
+    assert "not checked: noise.dark_frames=" in page_of(reported, run_main)
+    assert run_main("report", reported, f"noise.dark_frames={tmp_path}/none").code == 2
+
+
+def test_report_needs_the_map_too(make: Make, run_main: RunMain, tmp_path: Path, darks: Path) -> None:
+    np.save(tmp_path / "map.npy", np.full((70, 90), 512, np.float32))
+    places = f"noise.dark_frames={darks}", f"noise.dark_shading={tmp_path / 'map.npy'}"
+    make(None, tmp_path / "ds", *NOISE, *places, "source.limit=1", "source.patch=[grid, 256]")
+    page = page_of(tmp_path / "ds", run_main)
+    assert "All agree" in page
+    assert f"minus the dark-shading map {tmp_path / 'map.npy'}" in page
+    (tmp_path / "map.npy").rename(tmp_path / "moved.npy")
+    page = page_of(tmp_path / "ds", run_main)
+    assert f"not checked: noise.dark_shading={tmp_path / 'map.npy'}: no such file or folder" in page
+    assert "All agree" in page_of(tmp_path / "ds", run_main, f"noise.dark_shading={tmp_path / 'moved.npy'}")
+    done = run_main("verify", "ds", "--noise")
+    assert (done.code, "dark frames that are not available" in done.out) == (0, True)
+
+
 def test_noise_of_dark_frames_is_checked_with_their_folder(make: Make, run_main: RunMain, tmp_path: Path) -> None:
     save_frames(tmp_path / "darks", 3)
     overrides = *NOISE, f"noise.dark_frames={tmp_path / 'darks'}", "source.limit=2", "source.patch=[grid, 256]"
@@ -376,12 +433,12 @@ def test_removed_shading_replays_with_the_same_set_only(
 ) -> None:
     make(pictures, tmp_path / "ds", *NOISE, f"noise.dark_frames={shaded}", "noise.dark_shading=remove")
     row = rows(tmp_path / "ds")[0]
-    PairRegenerator(str(pictures), str(shaded)).regenerate_exactly(row)  # type: ignore[arg-type]
+    PairRegenerator(str(pictures), DarkPlaces(str(shaded))).regenerate_exactly(row)  # type: ignore[arg-type]
     less = Path(shutil.copytree(shaded, tmp_path / "less"))
     other = next(path for path in less.iterdir() if path.name not in frame_names(less, str(row["dark_frame"])))
     other.unlink()
     with pytest.raises(MachineError, match="whose mean was subtracted"):
-        PairRegenerator(str(pictures), str(less)).regenerate_exactly(row)  # type: ignore[arg-type]
+        PairRegenerator(str(pictures), DarkPlaces(str(less))).regenerate_exactly(row)  # type: ignore[arg-type]
 
 
 def frame_names(folder: Path, digest: str) -> list[str]:

@@ -30,7 +30,7 @@ ONLY_IN = {
     "cv2": {
         *(
             "sources.image.decode",
-            "sources.dark_frames",
+            "sources.mosaics",
             "reports.dataset_page.page",
             "reports.sheets.contact_sheet",
             "reports.sheets.panels",

@@ -471,7 +471,7 @@ def _check_noise(folder: AnyPath, dark: DarkPlaces, call: Call) -> list[str]:
     if not checks.count:
         print_result(
             f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
-            "noise.dark_frames=FOLDER names their folder"
+            "noise.dark_frames=FOLDER names their folder, noise.dark_shading=PATH their map"
         )
         return []
     if found.worst is not None:

@@ -379,5 +379,5 @@ def _subtracted(dark_frames: DarkFrames) -> str:
         return black
     if not shading.file:
         return "their mean is subtracted"
-    content = f"in DN above the {black}" if shading.black_dn else "in DN with the black level"
+    content = f"its DN are above the {black}" if shading.black_dn else "its DN include the black level"
     return f"the map {shading.file} ({content}) is subtracted, which leaves a median of {shading.residual_dn:.3g} DN"

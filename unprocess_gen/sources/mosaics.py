@@ -1,0 +1,216 @@
+"""Read mosaics that a camera recorded: NPY, 16-bit PNG and TIFF, and raw files (extra ``raw``)."""
+
+from __future__ import annotations
+
+import functools
+import io
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
+from unprocess_gen.core.files import file_sha256
+
+PICTURES = (".png", ".tif", ".tiff")
+RAW_FILES = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".pef", ".raf", ".rw2")
+"""Suffixes that LibRaw decodes (extra ``raw``)."""
+SUFFIXES = (".npy", *PICTURES, *RAW_FILES)
+
+
+@dataclass(frozen=True, slots=True)
+class Mosaic:
+    """Decoded mosaic [H, W], with the black level and the CFA pattern that a raw file states."""
+
+    pixels: NDArray[Any]
+    black_dn: float | None = None
+    pattern: str | None = None
+
+
+def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
+    """Read a mosaic.
+
+    Parameters
+    ----------
+    path : Path
+        NPY, PNG, TIFF or raw file.
+    key : str
+        Setting that names the file, for messages.
+    numbers : bool
+        Whether integers and floats of other sizes than 16 bits are allowed.
+
+    Returns
+    -------
+    Mosaic
+        Pixels [H, W], uint16 unless ``numbers`` allows others; black level and pattern of raw files.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be decoded, is no mosaic of an allowed dtype, or needs an extra that is not installed.
+    MachineError
+        If the file cannot be read.
+    """
+    suffix = path.suffix.lower()
+    try:
+        content = path.read_bytes()
+        if suffix in RAW_FILES:
+            return _read_raw(path, key, content)
+        if suffix == ".npy":
+            pixels: Any = np.load(io.BytesIO(content), allow_pickle=False)
+        else:
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, EOFError, cv2.error) as error:
+        raise ConfigError(f"{key}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
+    if pixels is None:
+        raise ConfigError(f"{key}: {path} cannot be decoded; expected {suffix[1:].upper()}")
+    _check_array(path, key, pixels, numbers)
+    return Mosaic(np.ascontiguousarray(pixels))
+
+
+def map_mosaic(path: Path, key: str, numbers: bool = False) -> NDArray[Any]:
+    """Map the mosaic of an NPY file into memory.
+
+    Parameters
+    ----------
+    path : Path
+        NPY file.
+    key : str
+        Setting that names the file, for messages.
+    numbers : bool
+        As in `read_mosaic`.
+
+    Returns
+    -------
+    ndarray, [H, W]
+        Read-only.
+
+    Raises
+    ------
+    ConfigError
+        If the file is no mosaic of an allowed dtype.
+    MachineError
+        If it cannot be read.
+    """
+    try:
+        pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, EOFError) as error:  # an edited row can name any file of the folder
+        raise ConfigError(f"{key}: {path} cannot be decoded ({str(error).splitlines()[0]})") from error
+    _check_array(path, key, pixels, numbers)
+    return pixels
+
+
+def even_sides(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Return a mosaic without its last row or column if their number is odd.
+
+    Parameters
+    ----------
+    pixels : ndarray, [H, W]
+        The mosaic.
+
+    Returns
+    -------
+    ndarray, [H, W]
+        Part of ``pixels``, whose tiles are complete.
+    """
+    return pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
+
+
+def _check_array(path: Path, key: str, pixels: NDArray[Any], numbers: bool) -> None:
+    """Raise ConfigError unless an array is a mosaic of 16-bit integers, or with ``numbers`` of integers or floats."""
+    allowed = pixels.dtype.kind in "iuf" if numbers else pixels.dtype == np.uint16
+    if not allowed or pixels.ndim != 2:
+        raise ConfigError(
+            f"{key}: {path} is {pixels.dtype} {list(pixels.shape)}; expected a mosaic [H, W] of "
+            + ("integers or floats" if numbers else "uint16")
+        )
+
+
+def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
+    """Decode a raw file with LibRaw: the visible part of the mosaic."""
+    if find_spec("rawpy") is None:
+        raise ConfigError(
+            f"{key}: {path} is a raw file, which needs rawpy; in the source folder, run: "
+            "pip install '.[raw]', or convert the frames to NPY"
+        )
+    import rawpy
+
+    try:
+        with rawpy.imread(io.BytesIO(content)) as raw:
+            pixels, colours = raw.raw_image_visible.copy(), raw.raw_colors_visible[:2, :2].ravel()
+            names = raw.color_desc.decode("ascii")
+            blacks = {int(raw.black_level_per_channel[colour]) for colour in colours}
+    except rawpy.LibRawError as error:
+        raise ConfigError(f"{key}: {path} cannot be decoded ({error})") from error
+    if pixels.ndim != 2 or pixels.dtype != np.uint16:
+        raise ConfigError(f"{key}: {path} holds no Bayer mosaic; expected one")
+    if len(blacks) > 1:
+        raise ConfigError(
+            f"{key}: {path} states the black levels {', '.join(map(str, sorted(blacks)))}; expected one; "
+            "convert the frames to NPY, and set noise.dark_frames_black_dn"
+        )
+    pattern = "".join("G" if names[colour] == "G" else names[colour] for colour in colours)
+    return Mosaic(pixels, float(blacks.pop()), pattern)
+
+
+# ------------------------------------------------------------------------------------------------------------ digests
+
+
+def mosaic_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file; a program that makes many pairs hashes each file once.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+    status = path.stat()
+    return _sha256_of(path, status.st_size, status.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4096)
+def _sha256_of(path: Path, size: int, modified_ns: int) -> str:
+    return file_sha256(path)
+
+
+def check_sha256(path: Path, what: str, sha256: str) -> None:
+    """Compare the bytes of a file with a digest.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    what : str
+        Name of the file in messages, such as ``dark frame``.
+    sha256 : str
+        Expected SHA-256.
+
+    Raises
+    ------
+    SourceChangedError
+        If the file cannot be read, or has another digest.
+    """
+    try:
+        found = file_sha256(path)
+    except OSError as error:
+        raise SourceChangedError(f"{what} {path}: cannot be read ({error.strerror}); restore it") from error
+    if found != sha256:
+        raise SourceChangedError(f"{what} {path}: has the SHA-256 {found}; expected {sha256}; restore it")
