@@ -162,7 +162,7 @@ class DarkShading:
     sha256 : str
         SHA-256 of its file, or of the set of dark frames whose mean it is.
     black_dn : float
-        Value that is subtracted besides the map, DN of the frames: their black level for a map above black, else 0.
+        Value that is subtracted too, DN of the frames: their black level for a map above black, else 0.
     file : str
         Name of its file; empty for the mean of the frames.
     residual_dn : float

@@ -264,7 +264,7 @@ class Differences:
     values : ndarray of float32, [H, W]
         The map.
     black_dn : float
-        Value that is subtracted besides the map.
+        Value that is subtracted too.
     """
 
     def __init__(self, values: Map, black_dn: float) -> None:
