@@ -86,6 +86,18 @@ def test_quantile_is_within_its_error(uniform: float, error: int, sign: int) -> 
         assert abs(number(found[0]) - exact) * ONE <= found[1] - QUANTILE_ERROR
 
 
+@pytest.mark.parametrize("node_number", [*range(0, 537, 13), 536])
+def test_reach_of_a_node_covers_half_the_way_to_its_neighbours(node_number: int) -> None:
+    node = fixed_point._node(node_number)
+    with mpmath.workdps(DIGITS):
+        z = mpmath.mpf(node_number) / fixed_point.NODES
+        assert node.quantile == z * ONE
+        for side in (-1, 1):
+            half, end = z + side * mpmath.mpf(0.5) / fixed_point.NODES, z + side * mpmath.mpf(fixed_point.REACH)
+            assert abs(mpmath.ncdf(-half) * ONE - node.tail) < node.reach
+            assert node.reach < abs(mpmath.ncdf(-end) * ONE - node.tail) + (ONE >> 60)
+
+
 @pytest.mark.parametrize("shift", [-1, 1])
 def test_any_node_within_reach_gives_the_quantile(shift: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The last bits of libm may select another node, so the selection must not matter."""

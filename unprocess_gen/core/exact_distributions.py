@@ -70,8 +70,8 @@ def normal_cdf(z: Decimal) -> Decimal:
         decimal context.
     """
     term = total = z
-    k = 1
-    while abs(term) > Decimal(10) ** -(DIGITS + 2):
+    k, least = 1, Decimal(10) ** -(DIGITS + 2)
+    while abs(term) > least:
         k += 2
         term = term * z * z / k
         total += term

@@ -79,7 +79,7 @@ def nearest_inverse(number: int, error: int) -> float | None:
 
 # -------------------------------------------------------------------------------------------- exponential and logarithm
 
-with localcontext(prec=2 * DIGITS):
+with localcontext(prec=DIGITS + 10):
     LN2 = fixed(Decimal(2).ln())
 
 STEP_BITS = 8
@@ -96,14 +96,14 @@ MAX_EXPONENT, MAX_EXPONENT_ERROR = 700 * ONE, ONE >> 32
 @functools.cache
 def _exp_of_step(step: int) -> int:
     """Return e**(step / 256) within one unit."""
-    with localcontext(prec=2 * DIGITS):
+    with localcontext(prec=DIGITS + 10):
         return fixed((Decimal(step) / (1 << STEP_BITS)).exp())
 
 
 @functools.cache
 def _ln_of_step(step: int) -> int:
     """Return ln(step / 256) within one unit."""
-    with localcontext(prec=2 * DIGITS):
+    with localcontext(prec=DIGITS + 10):
         return fixed((Decimal(step) / (1 << STEP_BITS)).ln())
 
 
@@ -186,13 +186,13 @@ def logarithm(x: float) -> tuple[int, int]:
 NODES = 64
 """Nodes for each standard deviation."""
 
-REACH = Decimal(1) / 80
+REACH = 1 / 80
 """Distance from a node up to which its series is used: more than half of the distance between nodes."""
 
 MAX_QUANTILE = 8.4
 """Largest magnitude of a quantile. At most 8.3 belongs to a uniform of 53 bits."""
 
-_SERIES_ERROR = Decimal(1) / (1 << 80)
+_SERIES_ERROR = 2.0**-80
 _NORMAL = NormalDist()
 
 
@@ -234,33 +234,38 @@ def _derivative(order: int) -> tuple[int, ...]:
     return tuple((n + 1) * before[n + 1] + ((order - 1) * before[n - 1] if n else 0) for n in range(len(before) - 1))
 
 
-def _evaluate(coefficients: tuple[int, ...], z: Decimal) -> Decimal:
-    """Return the value of a polynomial, constant first."""
-    total = Decimal(0)
-    for coefficient in reversed(coefficients):
-        total = total * z + coefficient
+def _scaled_derivative(order: int, number: int) -> int:
+    """Return P(number / `NODES`) · `NODES`**(order - 1), an integer, where P is the polynomial of `_derivative`."""
+    total, scale = 0, 1
+    for coefficient in reversed(_derivative(order)):
+        total, scale = total * number + coefficient * scale, scale * NODES
     return total
 
 
 @functools.cache
 def _node(number: int) -> _Node:
-    """Return the series at the quantile ``number / 64``, with so many terms that they lack at most 2**-80."""
+    """Return the series at the quantile ``number / 64``, with so many terms that they lack at most 2**-80.
+
+    P increases, so its value at the next node, which is beyond `REACH`, limits the first term that is left out. The
+    density at the distance `REACH` is φ(z) · e**-x with x = `REACH` · (z + `REACH` / 2); 1 - x is less than e**-x.
+    """
     with localcontext(prec=DIGITS + 10):
         z = Decimal(number) / NODES
-        coefficients, order, factorial, power = [], 1, 1, REACH
-        while _evaluate(_derivative(order), z + REACH) * power > _SERIES_ERROR * factorial:
-            coefficients.append(_evaluate(_derivative(order), z) / factorial)
-            order, factorial, power = order + 1, factorial * (order + 1), power * REACH
-        density = normal_density(z)
-        return _Node(
-            quantile=fixed(z),
-            tail=fixed(normal_cdf(-z)),
-            density=fixed(density),
-            reach=fixed(REACH * normal_density(z + REACH)),
-            coefficients=tuple(map(fixed, reversed(coefficients))),
-            error=fixed(_SERIES_ERROR) + 8,
-            error_of_unit=int(2 / density) + 1,
-        )
+        tail, density = fixed(normal_cdf(-z)), fixed(normal_density(z))
+    coefficients, order, divisor = [], 1, 1
+    while _scaled_derivative(order, number + 1) * REACH**order > _SERIES_ERROR * divisor:
+        coefficients.append(_scaled_derivative(order, number) * ONE // divisor)
+        order += 1
+        divisor *= order * NODES
+    return _Node(
+        quantile=number * ONE // NODES,
+        tail=tail,
+        density=density,
+        reach=times(density, REACH * (1 - REACH * (number / NODES + REACH / 2))),
+        coefficients=tuple(reversed(coefficients)),
+        error=times(ONE, _SERIES_ERROR) + 8,
+        error_of_unit=2 * ONE // density + 1,
+    )
 
 
 def normal_quantile(p: int, error: int) -> tuple[int, int] | None:
