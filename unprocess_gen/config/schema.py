@@ -363,7 +363,7 @@ class NoiseConfig:
         "black level of the dark frames",
         Numbers(0, 65535),
         unit="DN of the profile",
-        null="the black level in the raw files, else the median of all pixels",
+        null="the black level in the raw files, else the median of all pixels, minus a map above black if there is one",
         section=CHOSEN,
         since="0.2",
     )

@@ -309,7 +309,8 @@ def _described(folder: DarkFolder, rules: _Rules) -> DarkFrames:
         for rows in dark_shading.blocks(pixels.shape):
             counts += np.bincount(pixels[rows].reshape(-1), minlength=2**16)
     median_dn = dark_shading.median_of(counts)
-    black_dn = rules.black_dn if rules.black_dn is not None else _black_level(folder, blacks, median_dn)
+    stated_dn = rules.black_dn if rules.black_dn is not None else _black_level(folder, blacks)
+    black_dn = float(median_dn) if stated_dn is None else stated_dn
     if abs(median_dn - black_dn) > BRIGHTEST_MEDIAN * rules.span_dn:
         raise ConfigError(
             f"noise.dark_frames={folder.folder}: the median of the frames is {median_dn} DN, and black is {black_dn:g} "
@@ -319,7 +320,8 @@ def _described(folder: DarkFolder, rules: _Rules) -> DarkFrames:
     if rules.remove:
         variance, shading = _around_mean(folder, frames)
     elif rules.shading_map is not None:
-        variance, shading = _around_map(folder, frames, rules, black_dn)
+        variance, shading = _around_map(folder, frames, rules.shading_map, black_dn, stated_dn is not None)
+        black_dn = shading.black_dn or black_dn
     dither = 1 / 12
     return DarkFrames(
         tuple(frames), folder.sha256, black_dn, rules.scale, rules.scale**2 * (variance + dither), shading
@@ -335,11 +337,14 @@ def _around_mean(folder: DarkFolder, frames: Sequence[DarkFrame]) -> tuple[float
 
 
 def _around_map(
-    folder: DarkFolder, frames: Sequence[DarkFrame], rules: _Rules, black_dn: float
+    folder: DarkFolder, frames: Sequence[DarkFrame], shading_map: tuple[Path, str], black_dn: float, is_stated: bool
 ) -> tuple[float, DarkShading]:
-    """Return the variance of the frames around a map, and the map; ConfigError if the map does not fit the frames."""
-    assert rules.shading_map is not None
-    path, sha256 = rules.shading_map
+    """Return the variance of the frames around a map, and the map; ConfigError if the map does not fit the frames.
+
+    The median of the frames, ``black_dn`` without a stated black level, contains the median of the shading. For a map
+    above black, the black level is then the median of the frames minus the map.
+    """
+    path, sha256 = shading_map
     values = folder.shading(sha256)
     for frame in frames:
         if values.shape != (frame.height, frame.width):
@@ -347,9 +352,12 @@ def _around_map(
                 f"noise.dark_shading={path}: the map has {values.shape[1]} x {values.shape[0]} pixels; expected those "
                 f"of every dark frame; {folder.files[frame.sha256]} has {frame.width} x {frame.height}"
             )
-    subtracted_dn = black_dn if dark_shading.is_above_black(values, black_dn) else 0.0
+    is_above_black = dark_shading.is_above_black(values, black_dn)
+    subtracted_dn = black_dn if is_above_black else 0.0
     differences = _differences(folder, frames, values, subtracted_dn)
     median_dn, variance_dn2 = differences.median_dn, differences.variance_dn2
+    if is_above_black and not is_stated and subtracted_dn + median_dn > 0:
+        return variance_dn2, DarkShading(sha256, subtracted_dn + median_dn, path.name)
     dark_shading.check_residual(path, median_dn, variance_dn2)
     return variance_dn2, DarkShading(sha256, subtracted_dn, path.name, median_dn)
 
@@ -381,10 +389,8 @@ def _check(folder: DarkFolder, name: str, mosaic: Mosaic, rules: _Rules) -> None
         )
 
 
-def _black_level(folder: DarkFolder, stated: set[float | None], median_dn: int) -> float:
-    """Return the black level that all files state; without one, the median."""
-    if stated == {None}:
-        return float(median_dn)
+def _black_level(folder: DarkFolder, stated: set[float | None]) -> float | None:
+    """Return the black level that all files state; None if no file states one."""
     if len(stated) > 1:
         levels = ", ".join("none" if one is None else f"{one:g}" for one in sorted(stated, key=str))
         raise ConfigError(
@@ -392,7 +398,6 @@ def _black_level(folder: DarkFolder, stated: set[float | None], median_dn: int) 
             "set noise.dark_frames_black_dn"
         )
     (level,) = stated
-    assert level is not None
     return level
 
 

@@ -33,7 +33,7 @@ ISO_IN_NAME = re.compile(r"iso[ _-]?(\d+)", re.IGNORECASE)
 
 LARGEST_RESIDUAL_DN = 2.0
 """Largest median of dark frames minus their map that is accepted whatever their noise. Chosen: the black error of a
-Sony A7S II is 1.7 DN at ISO 100 (PMN), and a map above black may contain it."""
+Sony A7S II is 1.7 DN at ISO 100 (PMN), and a map above black may lack it."""
 
 KEPT_MAPS = 2
 """Maps that a process keeps: 0.1 GB for 24 megapixels each, except NPY files of float32, which are mapped."""
