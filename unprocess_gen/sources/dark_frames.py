@@ -183,7 +183,10 @@ class DarkPlaces:
         if self.frames is None:
             return None
         if self.shading is not None and not Path(self.shading).exists():
-            raise ConfigError(f"noise.dark_shading={self.shading}: no such file or folder; expected a dark-shading map")
+            raise ConfigError(
+                f"noise.dark_shading={self.shading}: no such file or folder; expected the recorded dark-shading map; "
+                "restore it, or give its place"
+            )
         return dark_folder(self.frames, self.shading)
 
 

@@ -274,7 +274,7 @@ class Differences:
     def add(self, pixels: NDArray[Any]) -> None:
         """Count the differences of a frame, which has the shape of the map."""
         for rows in blocks(pixels.shape):
-            difference = np.subtract(pixels[rows], self._black, dtype=np.float32) - self._values[rows]
+            difference = np.subtract(pixels[rows], self._values[rows], dtype=np.float32) - self._black
             steps = np.rint(difference * np.float32(STEPS_PER_DN)).astype(np.int64)
             places = np.clip(steps, -FARTHEST_STEPS, FARTHEST_STEPS) + FARTHEST_STEPS
             self._counts += np.bincount(places.reshape(-1), minlength=self._counts.size)

@@ -434,9 +434,9 @@ def dark_frame_offsets(
     for y, from_y, rows in _runs(origin[0] + plan.dark_shift[0], shape[0], frame.shape[0]):
         for x, from_x, columns in _runs(origin[1] + plan.dark_shift[1], shape[1], frame.shape[1]):
             part, source = out[y : y + rows, x : x + columns], np.s_[from_y : from_y + rows, from_x : from_x + columns]
-            np.subtract(frame[source], black, out=part, dtype=np.float32)
-            if shading is not None:
-                part -= shading[source]
+            np.subtract(frame[source], black if shading is None else shading[source], out=part, dtype=np.float32)
+            if shading is not None and black != 0:
+                part -= black
             if scale != 1:
                 part *= scale
     return out
