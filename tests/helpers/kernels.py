@@ -150,9 +150,8 @@ def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
 def normalised_values(values_dn: Float, black_dn: float, span_dn: float, limits_dn: tuple[float, float]) -> Float32:
     """Return DN as the read-out of float32 frames clips and normalises them."""
     out, padded = np.empty(values_dn.size, dtype=np.float32), np.resize(values_dn, -(-values_dn.size // STRIP) * STRIP)
-    readout = Normalised(
-        np.array([[*limits_dn, np.inf, np.inf]]), False, black_dn, span_dn, 1.0, False, np.zeros(4, dtype=np.int64)
-    )
+    limits, planes = np.array([[*limits_dn, np.inf, np.inf]]), np.zeros(4, dtype=np.int64)
+    readout = Normalised(limits, np.zeros((1, 2)), False, black_dn, span_dn, 1.0, False, planes)
     _fill_normalised(padded, readout, limits_dn, scratch_of_thread(), out)
     return out
 
@@ -249,6 +248,6 @@ def _fill_of_one_rate(words: Words, smallest: int, ranks: np.ndarray, scratch: S
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)
-        fill_counts_of_one_rate(SIZE, buffers.words, smallest, of, ranks.size, buffers.dark)
+        fill_counts_of_one_rate(SIZE, buffers.words, np.float32(smallest), of, ranks.size, buffers.dark)
         for n in range(length):
             out[start + n] = buffers.dark[n]

@@ -189,13 +189,13 @@ def _fill_signal(codes: Pointer, strip: Strip, scene: Any, signal: Pointer) -> N
 
 @inner
 def _gray_mask64(scene: Scene, total: float) -> tuple[float, float]:
-    m = max(total / 3.0 - scene.highlight_threshold, 0.0) / (1.0 - scene.highlight_threshold)
+    m = maximum(total / 3.0 - scene.highlight_threshold, 0.0) / (1.0 - scene.highlight_threshold)
     return m * m, 1.0 - m * m
 
 
 @inner
 def _gray_mask32(scene: Scene32, total: np.float32) -> tuple[np.float32, np.float32]:
-    m = max(total / np.float32(3) - scene.highlight_threshold, _ZERO32) * scene.steepness
+    m = maximum(total / np.float32(3) - scene.highlight_threshold, _ZERO32) * scene.steepness
     return m * m, _ONE32 - m * m
 
 
@@ -217,7 +217,7 @@ def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Any, out: Pointe
         mask, rest = _gray_mask(scene, (red + green) + blue)
         c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
         i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * max(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
+        out[x] = i * maximum(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
 
 
 # ------------------------------------------------------------------------------------------------- float64 and float32

@@ -237,7 +237,6 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
     most_dark_dn = _gains_of(plan, origin[0]).highest * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
     lowest_root, highest_root = count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
     fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
-    a_dn, b_dn2 = plan.variance_line
     numbers = FrameNumbers(
         shot=float("shot" in on),
         dark_e=dark_e,
@@ -250,8 +249,6 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         row_std_dn=0.0 if _has_correlated_rows(plan) else row_std_dn,
         lowest_root=lowest_root,
         highest_root=highest_root,
-        a_dn=a_dn,
-        b_dn2=b_dn2,
     )
     dark_ranks = _NO_RANKS if ranks is None else np.resize(ranks, MAX_STEPS)
     return numbers, purpose_of_read, quantiles, offsets, dark_ranks
@@ -287,8 +284,6 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
         error_dn=_error_dn(read_std_dn, quantiles, float(plan.black_level_dn), 0.0),
         lowest_root=lowest_root,
         highest_root=highest_root,
-        a_dn=a_dn,
-        b_dn2=b_dn2,
     )
     offsets = _offsets(float(plan.black_level_dn), columns, (0, 0), None, 0.0, _NO_ERRORS)
     return numbers, HETEROSCEDASTIC, quantiles, offsets, _NO_RANKS

@@ -23,7 +23,6 @@ from unprocess_gen.simulation.kernels.normal import (
     exact_values,
     fill_rows,
     fill_values_by_lines,
-    value_by_line,
 )
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, first_word
 from unprocess_gen.simulation.kernels.poisson import (
@@ -100,8 +99,6 @@ class FrameNumbers(NamedTuple):
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
     lowest_root: float  # roots of the mean electrons between which shot noise is counted
     highest_root: float
-    a_dn: float  # variance line
-    b_dn2: float
     dark_e: float = 0.0
     dark_steps: float = 0.0  # thresholds of the dark signal; below 0 if it has too many
     fewest_dark: float = 0.0  # smallest count of the dark signal
@@ -116,7 +113,7 @@ NUMBERS = len(FrameNumbers._fields)
 @inner
 def _load_numbers(noise: Electrons, n: int) -> FrameNumbers:
     v = pointer_to(noise.numbers, np.uint64(n * NUMBERS))
-    return FrameNumbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11], v[12])
+    return FrameNumbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10])
 
 
 # -------------------------------------------------------------------------------------------------- counts of electrons
@@ -124,7 +121,7 @@ def _load_numbers(noise: Electrons, n: int) -> FrameNumbers:
 
 @inner
 def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, and all words."""
+    """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, all words, and normals."""
     of, tables = _load_numbers(noise, n), noise.tables
     for stream in range(3 if of.dark_e > 0.0 else 2):  # loops, so that machine code contains each function once
         purpose_word, words = SHOT, workspace.words
@@ -136,27 +133,27 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, work
     row_dn = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
     workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
     limit = np.float32(of.highest_root * of.highest_root * (1 + 4 * FLOAT32_RATE))
-    for stream in range(2 if of.dark_steps < 0.0 else 1):
+    for stream in range(0 if of.dark_steps < 0.0 else 1, 2):  # light last: its normals are kept
         if stream == 0:
-            has_high = _fill_rates(noise, n, strip, workspace)
-            words, out, error = workspace.words, workspace.electrons, workspace.error_e
-        else:
-            has_high, limit = True, _INFINITY32
+            has_high, limit_of_stream = True, _INFINITY32
             words, out, error = workspace.dark_words, workspace.dark, workspace.dark_error_e
             for x in range(strip.total):
                 workspace.rates[x] = of.dark_e
-        fill_counts(strip.total, words, workspace.rates, has_high, limit, tables, workspace, out, error)
-        if stream == 0 and of.shot == 0.0:
-            for x in range(strip.total):
-                out[x] = workspace.rates[x]
-                error[x] = workspace.rates[x] * _RATE_ERROR32
-        elif stream == 0 and (of.lowest_root > 0.0 or of.highest_root < np.inf):
-            if not has_high:
-                fill_values_by_lines(strip.total, words, tables.lines, workspace.lines, workspace.normals)
-            _replace_by_normals(strip.total, of, limit, workspace)
+        else:
+            has_high, limit_of_stream = _fill_rates(noise, n, strip, workspace), limit
+            words, out, error = workspace.words, workspace.electrons, workspace.error_e
+        fill_counts(strip.total, words, workspace.rates, has_high, limit_of_stream, tables, workspace, out, error)
+    if of.shot == 0.0:
+        for x in range(strip.total):
+            workspace.electrons[x] = workspace.rates[x]
+            workspace.error_e[x] = workspace.rates[x] * _RATE_ERROR32
+    elif of.lowest_root > 0.0 or of.highest_root < np.inf:
+        if not has_high:
+            fill_values_by_lines(strip.total, workspace.words, tables.lines, workspace.lines, workspace.normals)
+        _replace_by_normals(strip.total, of, limit, workspace)
     if of.dark_e > 0.0:
         _add_dark_signal(noise, n, of, strip, workspace)
-    first, after = _defects_of(noise.body, strip)
+    first, after = _mark_defects(noise.body, strip, workspace)
     if first < after:
         _draw_defects(noise, key, first, after, strip, workspace)
 
@@ -207,8 +204,9 @@ def _replace_by_normals(count: int, of: FrameNumbers, limit: np.float32, workspa
 def _add_dark_signal(noise: Electrons, n: int, of: FrameNumbers, strip: Strip, workspace: Workspace) -> None:
     """Fill ``total_e`` with the counts of light and of the dark signal, less its mean if the camera subtracts it."""
     if of.dark_steps >= 0.0:
-        ranks, steps = pointer_to(noise.dark_ranks, n * MAX_STEPS), int(of.dark_steps)
-        fill_counts_of_one_rate(strip.total, workspace.dark_words, int(of.fewest_dark), ranks, steps, workspace.dark)
+        ranks, steps = pointer_to(noise.dark_ranks, n * MAX_STEPS), np.int64(of.dark_steps)
+        fewest = np.float32(of.fewest_dark)
+        fill_counts_of_one_rate(strip.total, workspace.dark_words, fewest, ranks, steps, workspace.dark)
         for x in range(strip.total):
             workspace.dark_error_e[x] = 0.0
     removed_e = np.float32(of.removed_e)
@@ -227,41 +225,47 @@ def _defects_of(body: Body, strip: Strip) -> tuple[int, int]:
 
 
 @inner
+def _mark_defects(body: Body, strip: Strip, workspace: Workspace) -> tuple[int, int]:
+    """Fill ``defects`` with the means of hot pixels, less than 0 at dead ones; return the range of the defects."""
+    if body.strips > 0:  # otherwise no strip has filled it
+        for x in range(strip.total):
+            workspace.defects[x] = 0.0
+    first, after = _defects_of(body, strip)
+    for d in range(first, after):
+        workspace.defects[body.positions[d]] = body.means_e[d]
+    return first, after
+
+
+@inner
 def _draw_defects(noise: Electrons, key: PhiloxKey, first: int, after: int, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``defects`` with the counts of hot pixels, and -1 at dead ones."""
+    """Replace the means of hot pixels in ``defects`` with counts."""
     fill_word_blocks(key, strip, HOT, workspace.scratch)
     for d in range(first, after):
         x, mean_e = noise.body.positions[d], noise.body.means_e[d]
-        workspace.defects[x] = exact_count(workspace.scratch[x], mean_e, noise.tables) if mean_e >= 0.0 else -1.0
+        if mean_e >= 0.0:
+            workspace.defects[x] = exact_count(workspace.scratch[x], mean_e, noise.tables)
 
 
 @inner
-def list_defects(noise: Electrons, strip: Strip, found: int, workspace: Workspace) -> int:
-    """Append the strip's defects to ``uncertain``; return the length."""
+def _list_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> int:
+    """List the strip's defects as uncertain; return their number."""
     first, after = _defects_of(noise.body, strip)
     for d in range(first, after):
-        workspace.uncertain[found + d - first] = np.uint32(noise.body.positions[d])
-    return int(found + after - first)
-
-
-@inner
-def clear_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
-    """Set ``defects`` to 0 again."""
-    first, after = _defects_of(noise.body, strip)
-    for d in range(first, after):
-        workspace.defects[noise.body.positions[d]] = 0.0
+        workspace.uncertain[d - first] = np.uint32(noise.body.positions[d])
+    return after - first
 
 
 # ------------------------------------------------------------------------------------------------------------------ DN
 
 
 @inner
-def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> Pointer:
-    """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them: zeros."""
-    of = _load_numbers(noise, n)
-    fill_values_by_lines(
-        strip.total, workspace.read_words, pointer_to(noise.read_lines, n * 4097), workspace.lines, workspace.normals
-    )
+def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
+    """Fill ``noise_dn`` and ``error_dn``, in float32, and list defects as uncertain.
+
+    Return the base to which the read-out adds the noise, zeros, and the number of defects.
+    """
+    of, lines = _load_numbers(noise, n), pointer_to(noise.read_lines, n * 4097)
+    fill_values_by_lines(strip.total, workspace.read_words, lines, workspace.lines, workspace.noise_dn)
     f, lanes = np.float32, pointer_to(noise.gains32, 24 * (2 * n + (strip.y & 1)))
     per_e, full_well_e, std, margin = load(lanes, _0), load(lanes, _16), f(of.read_std_dn), f(of.error_dn)
     row_dn = f(workspace.row_dn[0])
@@ -273,11 +277,11 @@ def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspac
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         dn = minimum(load(electrons, x), full_well_e) * per_e + (
-            load(workspace.normals, x) * std + (load(base, x) + load(dark_dn, x) + row_dn)
+            load(workspace.noise_dn, x) * std + (load(base, x) + load(dark_dn, x) + row_dn)
         )
         store(workspace.noise_dn, x, dn)
         store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (load(error_e, x) * per_e + margin))
-    return workspace.zeros
+    return workspace.zeros, _list_defects(noise, strip, workspace)
 
 
 @inner
@@ -301,7 +305,7 @@ def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace
         electrons = electrons + (dark - of.removed_e)
     electrons = electrons + workspace.defects[x]
     gains = pointer_to(noise.gains, 16 * row + (x & 1))
-    dn = min(electrons, gains[8]) * gains[0] + noise.black_dn
+    dn = minimum(electrons, gains[8]) * gains[0] + noise.black_dn
     dn = dn + of.read_std_dn * exact_value(workspace.read_words[x], pointer_to(noise.read_quadratics, n * 4096))
     offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
     dn = dn + (offset_dn + noise.errors_dn[8 * row + (x & 1)])
@@ -317,15 +321,17 @@ def _exact_shot(noise: Electrons, of: FrameNumbers, n: int, x: int, strip: Strip
     rate = (workspace.unrounded_dn[x] - noise.black_dn) / noise.gains[16 * (2 * n + (strip.y & 1)) + (x & 1)] * response
     if of.shot == 0.0:
         return float(rate)
-    root, word = np.sqrt(np.float32(rate)), workspace.words[x]
+    root = np.sqrt(np.float32(rate))
     if root > np.float32(of.lowest_root) and root < np.float32(of.highest_root):
-        return float(exact_count(word, rate, noise.tables))
+        return float(exact_count(workspace.words[x], rate, noise.tables))
     rounded = (rate + ROUND) - ROUND
-    return float(np.float32(rounded) + (np.float32(rate - rounded) + root * value_by_line(word, noise.tables.lines)))
+    return float(np.float32(rounded) + (np.float32(rate - rounded) + root * workspace.normals[x]))
 
 
 @inner
-def fill_exact_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def fill_exact_electrons(
+    readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace
+) -> tuple[Pointer, int]:
     """Return ``exact_dn``, filled with the noisy DN of all sites: of certain counts in loops, then of the others."""
     of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
     fill_rows(strip.total, workspace.read_words, workspace.scratch)
@@ -339,7 +345,7 @@ def fill_exact_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, w
     dn_per_e, full_well_e, row_dn = load(gains, _0), load(gains, _8), workspace.row_dn[0]
     columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + strip.x + strip.lead)
     dark_frame_dn = _dark_frame_of(noise, n, strip)
-    found = 0
+    found = _list_defects(noise, strip, workspace)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         read = exact_values(workspace.read_words, workspace.scratch, x, quadratics)
@@ -348,31 +354,21 @@ def fill_exact_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, w
         dn = dn + ((load(columns_dn, x) + row_dn) + errors_dn)
         store(out, x, dn + to_float64(load(dark_frame_dn, x)))
         found = list_lanes(less_than(_ZERO32, load(error_e, x)), x, found, workspace)
-    found = list_defects(noise, strip, found, workspace)
     for m in range(found):
         at = np.int64(workspace.uncertain[m])
         out[at] = exact_electrons_dn(noise, n, at, strip, workspace)
-    return out
-
-
-@inner
-def electrons_line(noise: Electrons, n: int) -> tuple[float, float, float]:
-    """Return a, b and black of frame ``n``."""
-    of = _load_numbers(noise, n)
-    return of.a_dn, of.b_dn2, noise.black_dn
+    return out, found
 
 
 @inner
 def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
     """Add the fixed patterns to the unrounded clean frame, as `reference.noise.average`."""
     of, clean_dn, body = _load_numbers(noise, np.int64(0)), workspace.unrounded_dn, noise.body
-    first, after = _defects_of(body, strip)
-    for d in range(first, after):
-        workspace.defects[body.positions[d]] = body.means_e[d]
+    _mark_defects(body, strip, workspace)
     for x in range(strip.total):
         gain = noise.gains[16 * (strip.y & 1) + (x & 1)]
         dn = (clean_dn[x] + workspace.defects[x] * gain) + of.kept_dark_e * gain
-        dn = min(dn, noise.full_dn)
+        dn = minimum(dn, noise.full_dn)
         offset_dn = 0.0 + noise.fixed_columns_dn[strip.x + strip.lead + x]
         dn = dn + (offset_dn + noise.errors_dn[8 * (strip.y & 1) + (x & 1)])
         clean_dn[x] = dn if workspace.defects[x] >= 0.0 else 0.0

@@ -39,6 +39,7 @@ from unprocess_gen.simulation.kernels.simd import (
     less_than,
     load,
     maximum,
+    minimum,
     square_root,
     store,
     to_bits,
@@ -71,17 +72,20 @@ class Gaussian32(NamedTuple):
     black_dn: NDArray[np.float32]  # [SIZE] equal values
 
 
+def variance_lines(plans: Sequence[Plan], dtype: Any = np.float64) -> NDArray[Any]:
+    """Return the variance lines of the plans' frames, [N, 2]."""
+    with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
+        return np.array([plan.variance_line for plan in plans]).astype(dtype)
+
+
 def gaussian_noise(plans: Sequence[Plan]) -> Gaussian:
     """Return the noise of the plans' frames."""
-    lines = np.array([plan.variance_line for plan in plans])
-    return Gaussian(lines, float(plans[0].black_level_dn), normal_quantiles().quadratics)
+    return Gaussian(variance_lines(plans), float(plans[0].black_level_dn), normal_quantiles().quadratics)
 
 
 def gaussian_noise32(plans: Sequence[Plan]) -> Gaussian32:
     """Return the noise of the plans' frames in float32."""
-    with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
-        lines = np.array([plan.variance_line for plan in plans]).astype(np.float32)
-    return Gaussian32(lines, np.full(SIZE, plans[0].black_level_dn, dtype=np.float32))
+    return Gaussian32(variance_lines(plans, np.float32), np.full(SIZE, plans[0].black_level_dn, dtype=np.float32))
 
 
 @inner
@@ -91,11 +95,11 @@ def draw_gaussian(noise: Gaussian | Gaussian32, n: int, key: PhiloxKey, strip: S
 
 
 @inner
-def add_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def add_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
     """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them."""
     fill_depths(strip.total, workspace.words, workspace.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
-    cancellation = np.float32(abs(b) * CANCELLATION_FRACTION if min(a, b) < 0.0 else 0.0)
+    cancellation = np.float32(abs(b) * CANCELLATION_FRACTION if minimum(a, b) < 0.0 else 0.0)
     a32, b32, black = np.float32(a), np.float32(b), np.float32(noise.black_dn)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
@@ -106,19 +110,21 @@ def add_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace:
         store(workspace.noise_dn, x, residual + apply_signs(std * normal, load(workspace.words, x)))
         cancelled = less_than(from_bits(to_bits(variance) & _WITHOUT_SIGN), cancellation) & _ONE_BITS32
         store(workspace.error_dn, x, maximum(std * RELATIVE_NOISE_ERROR + RESIDUAL_ERROR_DN, from_bits(cancelled)))
-    return workspace.rounded_dn
+    return workspace.rounded_dn, 0
 
 
 @inner
 def exact_gaussian_dn(noise: Gaussian, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
     """Return the noisy DN of one site, in the reference's order of operations."""
     a, b, clean_dn = noise.line[2 * n], noise.line[2 * n + 1], workspace.unrounded_dn[x]
-    std = np.sqrt(max(a * (clean_dn - noise.black_dn) + b, 0.0))
+    std = np.sqrt(maximum(a * (clean_dn - noise.black_dn) + b, 0.0))
     return float(clean_dn + std * exact_value(workspace.words[x], noise.quadratics))
 
 
 @inner
-def fill_exact_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def fill_exact_gaussian(
+    readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace
+) -> tuple[Pointer, int]:
     """Return ``exact_dn``, filled with the noisy DN of all sites."""
     fill_rows(strip.total, workspace.words, workspace.scratch)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
@@ -128,17 +134,11 @@ def fill_exact_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, wor
         std = square_root(maximum((clean_dn - noise.black_dn) * a + b, 0.0))
         normal = exact_values(workspace.words, workspace.scratch, x, noise.quadratics)
         store(workspace.exact_dn, x, clean_dn + std * normal)
-    return workspace.exact_dn
+    return workspace.exact_dn, 0
 
 
 @inner
-def gaussian_line(noise: Gaussian, n: int) -> tuple[float, float, float]:
-    """Return a, b and black of frame ``n``."""
-    return noise.line[2 * n], noise.line[2 * n + 1], noise.black_dn
-
-
-@inner
-def add_gaussian32(readout: Any, noise: Gaussian32, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+def add_gaussian32(readout: Any, noise: Gaussian32, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
     """Fill ``noise_dn`` with clean and noise, in float32; return the base to which the read-out adds it: black."""
     fill_coarse_depths(strip.total, workspace.words, workspace.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
@@ -148,10 +148,4 @@ def add_gaussian32(readout: Any, noise: Gaussian32, n: int, strip: Strip, worksp
         std = square_root(maximum(clean_dn * a + b, _ZERO32))
         normal = coarse_normal(load(workspace.depths, x))
         store(workspace.noise_dn, x, clean_dn + apply_signs(std * normal, load(workspace.words, x)))
-    return noise.black_dn
-
-
-@inner
-def gaussian_line32(noise: Gaussian32, n: int) -> tuple[np.float32, np.float32, np.float32]:
-    """Return a and b of frame ``n``, and 0: values count from the black level."""
-    return noise.line[2 * n], noise.line[2 * n + 1], _ZERO32
+    return noise.black_dn, 0

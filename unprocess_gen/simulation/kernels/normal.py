@@ -53,16 +53,13 @@ FLOAT32_ERROR = 2.0**-21
 """Error that float32 adds, relative to the farthest quantile and to a line's rise over its octave."""
 
 _LOW31, _SIGN, _HALF = np.uint32(0x7FFFFFFF), np.uint32(0x80000000), np.float32(0.5)
-_VECTOR_WIDTH = np.uint64(VECTOR_WIDTH)
+_VECTOR_WIDTH, _1, _2, _32 = (np.uint64(number) for number in (VECTOR_WIDTH, 1, 2, 32))
 _LINE_SHIFT = np.uint32(23 - _LINE_BITS)
 _FIRST_LINE = np.uint32(126 << _LINE_BITS)
 
-_LOW32, _32 = np.uint64(0xFFFFFFFF), np.uint64(32)
-_LOW31_64, _SIGN_64, _1, _2 = np.uint64(0x7FFFFFFF), np.uint64(0x80000000), np.uint64(1), np.uint64(2)
-_TWO52_BITS, _TWO52, _ONE_BITS = np.uint64(0x4330000000000000), 2.0**52, np.uint64(0x3FF0000000000000)
 _POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
 _POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
-_FIRST_ROW, _FIRST_ROW_OF_F = np.uint64(1023 * SEGMENTS), np.uint64(1022 * SEGMENTS)
+_ONE_BITS, _FIRST_ROW = np.uint64(0x3FF0000000000000), np.uint64(1022 * SEGMENTS)
 
 
 class Quantiles(NamedTuple):
@@ -117,7 +114,7 @@ def build_quantiles(table: Float) -> Quantiles:
 
 
 def pack_lines(start: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArray[np.uint64]:
-    """Store two float32 in the low and high half of a uint64, so that one load gets both; `unpack_line` undoes it."""
+    """Store two float32 in the low and high half of a uint64, so that one load gets both."""
     return start.view(np.uint32).astype(np.uint64) | slope.view(np.uint32).astype(np.uint64) << _32
 
 
@@ -127,12 +124,11 @@ def pack_lines(start: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArra
 @inner
 def exact_value(word: np.uint32, quadratics: Pointer) -> float:
     """Return the quantile of one word, bit for bit as `reference.noise.by_inverse_cdf`."""
-    odd = np.uint64(((np.uint64(word) & _LOW31_64) << _1 | _1) | _TWO52_BITS).view(np.float64) - _TWO52
-    bits = np.float64(odd).view(np.uint64)
+    bits = to_bits(np.float64(np.int64(word & _LOW31)) + 0.5)
     row = ((bits >> _POSITION_BITS) - _FIRST_ROW) << _2
-    t = np.uint64((bits & _POSITION_MASK) | _ONE_BITS).view(np.float64) - 1.0
-    z: float = quadratics[row] + t * (quadratics[row + _1] + t * quadratics[row + _2])
-    return np.uint64(np.float64(z).view(np.uint64) ^ (np.uint64(word) & _SIGN_64) << _32).view(np.float64)
+    t = from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
+    z = quadratics[row] + t * (quadratics[row + _1] + t * quadratics[row + _2])
+    return float(from_bits(to_bits(z) ^ np.uint64(word & _SIGN) << _32))
 
 
 @inner
@@ -141,7 +137,7 @@ def fill_rows(count: int, words: Pointer, rows: Pointer) -> None:
     for n in range(count // VECTOR_WIDTH):
         x = np.uint64(n) * _VECTOR_WIDTH
         bits = to_bits(to_float64(load(words, x) & _LOW31) + 0.5)
-        store(rows, x, to_uint32(((bits >> _POSITION_BITS) - _FIRST_ROW_OF_F) << _2))
+        store(rows, x, to_uint32(((bits >> _POSITION_BITS) - _FIRST_ROW) << _2))
 
 
 @inner
@@ -156,32 +152,17 @@ def exact_values(words: Pointer, rows: Pointer, x: np.uint64, quadratics: Pointe
 
 
 @inner
-def unpack_line(packed: np.uint64) -> tuple[np.float32, np.float32]:
-    """Return the two float32 that `pack_lines` stored."""
-    return np.uint32(packed & _LOW32).view(np.float32), np.uint32(packed >> _32).view(np.float32)
-
-
-@inner
 def fill_values_by_lines(count: int, words: Pointer, lines: Pointer, buffer: Pointer, out: Pointer) -> None:
     """Fill ``out`` (float32) with the quantiles of ``words`` by lines; ``buffer`` (uint64) is scratch space."""
     for n in range(count):
         out[n] = np.float32(np.int32(words[n] & _LOW31)) + _HALF
     for n in range(count):
-        buffer[n] = lines[np.uint64((np.float32(out[n]).view(np.uint32) >> _LINE_SHIFT) - _FIRST_LINE)]
+        buffer[n] = lines[np.uint64((to_bits(out[n]) >> _LINE_SHIFT) - _FIRST_LINE)]
     for n in range(count):
-        start, slope = unpack_line(buffer[n])
+        start, slope = from_bits(np.uint32(buffer[n])), from_bits(np.uint32(buffer[n] >> _32))
         out[n] = start + slope * out[n]
     for n in range(count):
-        out[n] = np.uint32(np.float32(out[n]).view(np.uint32) ^ (words[n] & _SIGN)).view(np.float32)
-
-
-@inner
-def value_by_line(word: np.uint32, lines: Pointer) -> np.float32:
-    """Return the quantile of one word by lines, bit for bit as `fill_values_by_lines`."""
-    f = np.float32(np.int32(word & _LOW31)) + _HALF
-    start, slope = unpack_line(lines[np.uint64((np.float32(f).view(np.uint32) >> _LINE_SHIFT) - _FIRST_LINE)])
-    bits = np.uint32(np.float32(start + slope * f).view(np.uint32) ^ (word & _SIGN))
-    return np.float32(bits.view(np.float32))
+        out[n] = from_bits(np.uint32(to_bits(out[n]) ^ (words[n] & _SIGN)))
 
 
 # ------------------------------------------------------------------------------------------------------- by polynomials

@@ -149,7 +149,7 @@ def count_thresholds(rate: float) -> tuple[int, NDArray[np.uint32]]:
 
 @inner
 def fill_counts_of_one_rate(
-    count: int, words: Pointer, smallest: int, last_ranks: Pointer, steps: int, out: Pointer
+    count: int, words: Pointer, smallest: np.float32, last_ranks: Pointer, steps: int, out: Pointer
 ) -> None:
     """Fill ``out`` (float32) with the counts of ``words`` by the ``steps`` ranks of `count_thresholds`."""
     for n in range(count // VECTOR_WIDTH):
@@ -158,7 +158,7 @@ def fill_counts_of_one_rate(
         rank = word ^ (((word >> _TOP_BIT) - _ONE_BIT) | _SIGN32)
         for k in range(steps):
             above = above - less_than(last_ranks[k], rank)
-        store(out, x, to_float32(above) + np.float32(smallest))
+        store(out, x, to_float32(above) + smallest)
 
 
 # ------------------------------------------------------------------------------------------------------------ all sites
@@ -258,8 +258,8 @@ def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Poi
     store(scratch, 0, highest)
     most = _0F
     for lane in range(VECTOR_WIDTH):
-        most = max(most, scratch[lane])
-    return int(most + np.float32(3.1) * np.sqrt(most)) + 1
+        most = maximum(scratch[lane], most)
+    return np.int64(most + np.float32(3.1) * np.sqrt(most)) + 1
 
 
 @inner
@@ -361,7 +361,7 @@ def _bounds_by_first_terms(rate: float, z: float) -> tuple[float, float]:
 @inner
 def _refine_normal(tail: float, z: float, tails: Pointer) -> float:
     """Return the upper normal quantile of ``tail`` by one Newton step from ``z``, in the reference's order."""
-    cell = int(z * TAIL_CELLS)
+    cell = np.int64(z * TAIL_CELLS)
     offset, at = z - (cell + 0.5) / TAIL_CELLS, cell * (ORDER + 1)
     value, slope = tails[at + ORDER], tails[at + ORDER] * ORDER
     for n in range(ORDER - 1, 0, -1):

@@ -21,12 +21,9 @@ from unprocess_gen.simulation.kernels.electrons import (
     Electrons,
     add_electrons,
     average_electrons,
-    clear_defects,
     count_electrons,
-    electrons_line,
     exact_electrons_dn,
     fill_exact_electrons,
-    list_defects,
 )
 from unprocess_gen.simulation.kernels.gaussian import (
     Gaussian,
@@ -36,8 +33,7 @@ from unprocess_gen.simulation.kernels.gaussian import (
     draw_gaussian,
     exact_gaussian_dn,
     fill_exact_gaussian,
-    gaussian_line,
-    gaussian_line32,
+    variance_lines,
 )
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
@@ -69,8 +65,9 @@ class ReadOut(NamedTuple):
     """Hold what the read-out of N frames needs; a subclass selects the compiled code."""
 
     limits_dn: Float  # [N, 4]: lowest and highest DN, pinned level, and clean value from which sites are pinned
+    variance_lines: NDArray[Any]  # [N, 2]: a and b
     averaged: bool  # whether the clean frame contains the fixed patterns
-    black_dn: float
+    black_dn: Any  # in the unrounded clean frame
     span_dn: float
     white: float  # clean value of saturated sites
     packed: bool
@@ -103,7 +100,6 @@ def readout_of(
 ) -> ReadOut:
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
-    black_dn = float(first.black_level_dn)
     limits_dn = [
         noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip) + _pinned_dn(plan, counts_from_black)
         for plan in plans
@@ -113,9 +109,10 @@ def readout_of(
     kind = Normalised if first.normalised else FloatClean if first.clean_normalised else Integers
     return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
+        variance_lines=variance_lines(plans, np.float32 if counts_from_black else np.float64),
         averaged=first.averaged,
-        black_dn=black_dn,
-        span_dn=float(first.white_level_dn) - black_dn,
+        black_dn=np.float32(0) if counts_from_black else float(first.black_level_dn),
+        span_dn=float(first.white_level_dn - first.black_level_dn),
         white=1.0 if first.clean_normalised else float(first.white_level_dn),
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
@@ -144,12 +141,7 @@ def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:
 
 @inner
 def _do_nothing(noise: Any, strip: Strip, workspace: Workspace) -> None:
-    """Do nothing: the noise has no defects and no fixed patterns."""
-
-
-@inner
-def _keep_list(noise: Any, strip: Strip, found: int, workspace: Workspace) -> int:
-    return found
+    """Do nothing: the noise has no fixed patterns."""
 
 
 @inner
@@ -183,13 +175,11 @@ sample_noise = by_class(
 )
 """Compute the noise of a strip of frame n in DN, as its read-out needs it: approximately, or with the clean frame.
 
-Arguments: read-out, noise, n, strip, workspace. Return what the first argument of `read_noisy` after the noise needs.
+Arguments: read-out, noise, n, strip, workspace. Return what `read_noisy` takes: values, or the base to which it adds
+noise, and how many sites are listed as uncertain.
 """
 _needs_exact_sites = by_class({Gaussian: _is_approximate, Gaussian32: _is_final, Electrons: _is_approximate})
 _exact_dn = by_class({Gaussian: exact_gaussian_dn, Gaussian32: _exact_gaussian32_dn, Electrons: exact_electrons_dn})
-_line = by_class({Gaussian: gaussian_line, Gaussian32: gaussian_line32, Electrons: electrons_line})
-_list_defects = by_class({Gaussian: _keep_list, Gaussian32: _keep_list, Electrons: list_defects})
-clear_defects_of = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Electrons: clear_defects})
 average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Electrons: average_electrons})
 """Replace the unrounded clean frame of a strip with the average of many frames; arguments: noise, strip, workspace."""
 
@@ -198,16 +188,16 @@ average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Ele
 
 
 @inner
-def _read_integers(readout: Any, noise: Any, base: Pointer, output: Output, strip: Strip, workspace: Workspace) -> None:
+def _read_integers(
+    readout: Any, noise: Any, base: Pointer, listed: int, output: Output, strip: Strip, workspace: Workspace
+) -> None:
     n, limits_dn = output.n, pointer_to(readout.limits_dn, np.uint64(4 * output.n))
     low, high = np.float32(limits_dn[0]), np.float32(limits_dn[1])
-    found, has_clipped = _round_and_list(noise, base, low, high, strip, workspace)
-    found = _list_defects(noise, strip, found, workspace)
+    found, has_clipped = _round_and_list(noise, base, listed, low, high, strip, workspace)
     for m in range(found):
         at = np.int64(workspace.uncertain[m])  # as below: Numba compiles a function for each type of index
         dn = np.float32((_exact_dn(noise, n, at, strip, workspace) + ROUND) - ROUND)
         has_clipped = _replace(at, dn, low, high, workspace) or has_clipped
-    clear_defects_of(noise, strip, workspace)
     if output.may_saturate and limits_dn[3] < np.inf:
         dn = np.float32((limits_dn[2] + ROUND) - ROUND)
         for x in range(strip.first, strip.after):
@@ -222,13 +212,13 @@ def _read_integers(readout: Any, noise: Any, base: Pointer, output: Output, stri
 
 @inner
 def _round_and_list(
-    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
+    noise: Any, base: Pointer, listed: int, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
 ) -> tuple[int, bool]:
     """Round half to even, clip and cast to uint16; list sites whose error bound reaches a rounding boundary.
 
-    Return how many sites are uncertain, and whether any was clipped.
+    Return how many sites are listed then, and whether any was clipped.
     """
-    found = 0
+    found = listed
     clipped_bits = uint32_zeros()
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
@@ -249,7 +239,7 @@ def _round_and_list(
 def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace) -> bool:
     """Replace a noisy value with a rounded DN; return whether it is clipped."""
     workspace.noisy_dn[x] = dn
-    workspace.noisy[x] = np.uint16(np.int64(min(max(dn, low), high)))
+    workspace.noisy[x] = np.uint16(np.int64(minimum(maximum(dn, low), high)))
     return bool(dn < low or dn > high)
 
 
@@ -260,7 +250,7 @@ def _write_integers(readout: Integers, output: Output, strip: Strip, workspace: 
         low, high = readout.limits_dn[0], readout.limits_dn[1]
         for x in range(strip.total):
             dn = (workspace.unrounded_dn[x] + ROUND) - ROUND
-            clean[x] = np.uint16(np.int32(min(max(dn, low), high)))
+            clean[x] = np.uint16(np.int32(minimum(maximum(dn, low), high)))
     if output.may_saturate:
         output.counts[4] += _count_equal(strip, clean, np.uint16(readout.white))
     _write(readout, strip, clean, output.sites)
@@ -279,9 +269,8 @@ def _count_equal(strip: Strip, values: Pointer, value: Any) -> int:
 
 @inner
 def _read_normalised(
-    readout: Normalised, noise: Any, noisy_dn: Pointer, output: Output, strip: Strip, workspace: Workspace
+    readout: Normalised, noise: Any, noisy_dn: Pointer, listed: int, output: Output, strip: Strip, workspace: Workspace
 ) -> None:
-    clear_defects_of(noise, strip, workspace)
     limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * output.n))
     noisy = output.sites if _is_direct(readout, strip) else workspace.normalised
     if output.may_saturate and limits_dn[3] < np.inf:
@@ -360,20 +349,20 @@ def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
 
 
 @inner
-def count_zero_variance(noise: Any, n: int, strip: Strip, workspace: Workspace, counts: Pointer) -> None:
+def count_zero_variance(readout: Any, n: int, strip: Strip, workspace: Workspace, counts: Pointer) -> None:
     """Count sites with a·(clean - black) + b <= 0."""
-    a, b, black = _line(noise, n)
-    if min(a, b) <= 0.0:
+    a, b = readout.variance_lines[2 * n], readout.variance_lines[2 * n + 1]
+    if minimum(a, b) <= 0.0:
         count = 0
         for x in range(strip.first, strip.after):
-            count += a * (workspace.unrounded_dn[x] - black) + b <= 0.0
+            count += a * (workspace.unrounded_dn[x] - readout.black_dn) + b <= 0.0
         counts[5] += count
 
 
 read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised, FloatClean: _read_integers})
 """Read out a strip of a noisy frame, and count its clipped sites.
 
-Arguments: read-out, noise, what `sample_noise` returned, output, strip, workspace.
+Arguments: read-out, noise, the two values of `sample_noise`, output, strip, workspace.
 """
 write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
 """Read out the clean frame of a strip; arguments: read-out, output, strip, workspace."""

@@ -28,7 +28,6 @@ from unprocess_gen.simulation.kernels.readout import (
     Output,
     ReadOut,
     average_patterns,
-    clear_defects_of,
     count_zero_variance,
     draw_noise,
     read_noisy,
@@ -176,12 +175,11 @@ def _render(
             may_saturate = fill_clean(light, source, strip, buffers, all_counts)
             for n in range(noisy.shape[0]):
                 draw_noise(sampler, n, load_key(key_words, n), strip, buffers)
-                values, of_frame = sample_noise(frames, sampler, n, strip, buffers), pointer_to(all_counts, 6 * n)
+                values, listed = sample_noise(frames, sampler, n, strip, buffers)
+                of_frame = pointer_to(all_counts, 6 * n)
                 output = Output(n, pointer_to(noisy_sites, n * sites + at), of_frame, may_saturate)
-                read_noisy(frames, sampler, values, output, strip, buffers)
-                count_zero_variance(sampler, n, strip, buffers, of_frame)
+                read_noisy(frames, sampler, values, listed, output, strip, buffers)
+                count_zero_variance(frames, n, strip, buffers, of_frame)
             if readout.averaged:
                 average_patterns(sampler, strip, buffers)
             write_clean(frames, Output(0, target, all_counts, may_saturate or readout.averaged), strip, buffers)
-            if readout.averaged:
-                clear_defects_of(sampler, strip, buffers)

@@ -80,13 +80,13 @@ def locate(origin: tuple[int, int], y: int, x: int, length: int) -> Strip:
 
 
 class Workspace(NamedTuple):
-    """Point to the scratch memory of one strip. The first three are float64, or float32 for the tier ``fast``."""
+    """Point to the scratch memory of one strip. The first four are float64, or float32 for the tier ``fast``."""
 
     signal: Any  # before white balance and highlights
+    defects: Any  # electrons of hot pixels; negative at dead pixels, 0 at others
     bright_light: Any  # normalised light in bright blocks, 0 elsewhere
     unrounded_dn: Any  # clean frame
     exact_dn: Float  # noisy frame before rounding
-    defects: Float  # electrons of hot pixels; negative at dead pixels, 0 at others
     row_dn: Float  # [1]: offset of the row
     rounded_dn: Float32  # clean frame, rounded
     residual_dn: Float32  # unrounded_dn - rounded_dn
@@ -95,7 +95,7 @@ class Workspace(NamedTuple):
     noisy_dn: Float32  # rounded, not clipped
     normalised: Float32
     depths: Float32  # see `normal.fill_depths`
-    normals: Float32
+    normals: Float32  # of shot noise
     errors: Float32
     rates: Float32  # mean electrons
     electrons: Float32  # shot noise
@@ -157,12 +157,12 @@ def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
     """Return the scratch memory of this thread for frames in float64 or float32; allocating it takes 20 µs.
 
     Its signal is zero: a bright number in the padding would slow down its block, and in float32 change the rounding of
-    the sites in its vector. No result depends on its other content.
+    the sites in its vector. So are its defects, which only frames with defects fill. No result depends on the rest.
     """
     scratch = _threads.scratch.get(dtype)
     if scratch is None:
         scratch = _threads.scratch[dtype] = allocate_scratch(dtype)
-    scratch[: BLOCK + SIZE].fill(0)
+    scratch[: 2 * (BLOCK + SIZE)].fill(0)
     return scratch
 
 
@@ -205,7 +205,7 @@ def list_lanes(lanes: Vector, x: np.uint64, found: int, workspace: Workspace) ->
     """
     mask = movemask(lanes)
     store(workspace.uncertain, found, load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
-    return found + int(workspace.count_by_mask[mask])
+    return found + np.int64(workspace.count_by_mask[mask])
 
 
 @inner
