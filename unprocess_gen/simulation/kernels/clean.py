@@ -231,7 +231,8 @@ def _linear_dn64(scene: Scene, signal: Vector, gains: Vector) -> Vector:
 
 @inner
 def _linear_dn32(scene: Scene32, signal: Vector, gains: Vector) -> Vector:
-    return maximum(signal, _ZERO32)
+    dn: Vector = maximum(signal, _ZERO32)
+    return dn
 
 
 @inner

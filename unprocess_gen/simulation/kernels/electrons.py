@@ -252,7 +252,8 @@ def _list_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> int:
     first, after = _defects_of(noise.body, strip)
     for d in range(first, after):
         workspace.uncertain[d - first] = np.uint32(noise.body.positions[d])
-    return after - first
+    count: int = after - first
+    return count
 
 
 # ------------------------------------------------------------------------------------------------------------------ DN

@@ -147,8 +147,9 @@ def exact_values(words: Pointer, rows: Pointer, x: np.uint64, quadratics: Pointe
     bits = to_bits(to_float64(of_words & _LOW31) + 0.5)
     t = from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
     start, slope, curvature = load_columns(quadratics, rows, x)
-    z: Vector = start + t * (slope + t * curvature)
-    return from_bits(to_bits(z) ^ (to_uint64(of_words & _SIGN) << _32))
+    z = start + t * (slope + t * curvature)
+    signed: Vector = from_bits(to_bits(z) ^ (to_uint64(of_words & _SIGN) << _32))
+    return signed
 
 
 @inner
@@ -270,4 +271,5 @@ def coarse_normal(depths: Vector) -> Vector:
 @inner
 def apply_signs(x: Vector, words: Vector) -> Vector:
     """Negate the float32 lanes whose word has its top bit set."""
-    return from_bits(to_bits(x) ^ (words & _SIGN))
+    signed: Vector = from_bits(to_bits(x) ^ (words & _SIGN))
+    return signed

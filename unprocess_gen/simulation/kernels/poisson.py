@@ -248,7 +248,7 @@ def _count_low_rates(
 
 
 @inner
-def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Pointer) -> int:
+def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Pointer) -> np.int64:
     """Return how many terms of the distribution function the rates below `LOW_RATE` need."""
     rate = load(rates, first)
     highest = from_bits(less_than(rate, _LOW) & to_bits(rate))
@@ -270,7 +270,8 @@ def _exp_of_minus(x: Vector) -> Vector:
     f = t - (shifted - ROUND32)
     c, f2 = _EXP2, f * f
     power = (f * c[1] + c[0]) + f2 * ((f * c[3] + c[2]) + f2 * (f * c[5] + c[4]))
-    return from_bits(to_bits(power) + (to_bits(shifted) << _23))
+    scaled: Vector = from_bits(to_bits(power) + (to_bits(shifted) << _23))
+    return scaled
 
 
 NORMAL_REACH2 = 9.0, 0.5

@@ -318,13 +318,13 @@ def load_columns(table: Pointer, starts: Pointer, at: Index) -> tuple[Vector, Ve
 
 
 @_lanewise(lambda builder, llvm_type, x, y: builder.select(builder.fcmp_ordered(">", x, y), x, y))
-def maximum(x: Vector, y: Any) -> Vector:
+def maximum(x: Any, y: Any) -> Any:
     """Return ``x`` where x > y, else ``y``, per lane or of two floats; ``y`` if either is NaN."""
     return np.where(x > y, x, y).astype(np.result_type(x))[()]
 
 
 @_lanewise(lambda builder, llvm_type, x, y: builder.select(builder.fcmp_ordered("<", x, y), x, y))
-def minimum(x: Vector, y: Any) -> Vector:
+def minimum(x: Any, y: Any) -> Any:
     """Return ``x`` where x < y, else ``y``, per lane or of two floats; ``y`` if either is NaN."""
     return np.where(x < y, x, y).astype(np.result_type(x))[()]
 
@@ -401,13 +401,13 @@ def absolute(x: Vector) -> Vector:
 
 
 @_lanewise(lambda builder, llvm_type, x: builder.bitcast(x, llvm_type), lambda x: _UNSIGNED[x])
-def to_bits(x: Vector) -> Vector:
+def to_bits(x: Any) -> Any:
     """Return the bits of float lanes, or of a float, as unsigned integers of the same width."""
     return x.view(_unsigned_dtype(x))
 
 
 @_lanewise(lambda builder, llvm_type, bits: builder.bitcast(bits, llvm_type), lambda bits: _FLOATS[bits])
-def from_bits(bits: Vector) -> Vector:
+def from_bits(bits: Any) -> Any:
     """Return the float lanes, or the float, of the same width that have these bits."""
     return bits.view(f"float{8 * bits.itemsize}")
 

@@ -205,7 +205,8 @@ def list_lanes(lanes: Vector, x: np.uint64, found: int, workspace: Workspace) ->
     """
     mask = movemask(lanes)
     store(workspace.uncertain, found, load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
-    return found + np.int64(workspace.count_by_mask[mask])
+    length: int = found + workspace.count_by_mask[mask]
+    return length
 
 
 @inner
