@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs, __version__
+from unprocess_gen.cli import verbs
 from unprocess_gen.cli.arguments import STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.help import global_help
@@ -69,6 +72,7 @@ REFUSED = [
     (["plan", "--al"], r"--al: no such flag; expected --all, .*; did you mean --all\?"),
     (["camera=sony_a7"], r"camera=sony_a7: no such option; .*; did you mean sony_a7r\?"),
     (["nois=none"], r"nois=none: no such key; .*; did you mean noise\?"),
+    (["sourc.root=p"], r"sourc.root=p: no such key; expected one of source, .*; did you mean source\?"),
     (["verify", "ds", "--regenrate", "2"], r"verify: --regenrate: no such flag; .*; did you mean --regenerate\?"),
     (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
     (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
@@ -94,6 +98,7 @@ REFUSED = [
     (["-m", "camera=nope"], r"camera=nope: camera=nope: no such option"),
     (["-m", "seed=choice(1"], r".*choice"),
     (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
+    (["--cfg"], r"--cfg: expected job, hydra, all"),
     (["again"], r"again: expected the folder of a dataset"),
     (["again", "out=x"], r"again: expected the folder of a dataset"),
     (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
@@ -127,6 +132,26 @@ def test_flag_with_a_wrong_value_is_refused_in_one_line(arguments: tuple[str, ..
     assert (done.code, done.err.count("\n")) == (2, 1)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "job"), [(("verify", "ds"), ""), (("seed=1",), ""), (("-m", "seed=1"), "seed=1: ")]
+)
+def test_place_without_permission_gives_one_line_and_exit_code_5(
+    arguments: tuple[str, ...], job: str, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object, **__: object) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied", "ds/dataset.json")
+
+    monkeypatch.setattr("unprocess_gen.cli.verbs._dataset", refused)
+    monkeypatch.setattr("unprocess_gen.pipeline.generate.generate", refused)
+    message = "ds/dataset.json: Permission denied; expected read and write permissions"
+    assert run_main(*arguments) == (5, "", f"gen-dataset: {job}{message}\n")
+
+
+@pytest.mark.parametrize(("count", "text"), [(0, "0.000%"), (1, "under 0.001%"), (49, "under 0.001%"), (50, "0.001%")])
+def test_few_sites_are_not_rounded_to_none(count: int, text: str) -> None:
+    assert verbs._percent(count, 10_000_000) == text
+
+
 def test_process_reports_a_mistake_in_one_line(cli: Cli, tmp_path: Path) -> None:
     done = cli("camera=nope", "out=there")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
@@ -148,7 +173,9 @@ def test_empty_folder_is_refused_and_nothing_written(run_main: RunMain, tmp_path
 def test_out_below_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
     (tmp_path / "file").touch()
     done = run_main(f"source.root={photos}", "out=file/ds")
-    assert (done.code, done.err) == (2, "gen-dataset: out=file/ds: cannot be written (Not a directory)\n")
+    message = "out=file/ds: cannot be written (Not a directory); choose another out"
+    assert (done.code, done.err) == (2, f"gen-dataset: {message}\n")
+    assert run_main("out=file").err == "gen-dataset: out=file: is a file; expected a folder; choose another out\n"
     assert os.listdir(tmp_path) == ["file"]
 
 

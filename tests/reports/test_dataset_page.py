@@ -11,6 +11,7 @@ import html
 import itertools
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -447,6 +448,20 @@ def test_wrong_arguments_give_one_line(
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert done.err.startswith(f"gen-dataset: {sentence}")
     assert not (copy / "report.html").exists()
+
+
+def test_folder_that_cannot_be_written_is_refused(
+    copy: Path, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "locked").mkdir()
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked" and access(path, mode))
+    done = run_main("report", copy, "--to", "locked/page.html")
+    assert done == (
+        2,
+        "",
+        "gen-dataset: --to locked/page.html: cannot be written (Permission denied); choose another folder\n",
+    )
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,14 @@ from helpers.photographs import fill
 from hypothesis import given
 from hypothesis import strategies as st
 
+from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.schema import AccuracyConfig
+from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import Source
 from unprocess_gen.reports.estimate import COMMIT_SECONDS, SAMPLE, estimate_run, format_estimate
+from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.reference.noise import EFFECTS
 
 
@@ -271,6 +275,22 @@ def test_compiling_kernels_is_announced_unless_they_are_compiled(
     caplog.set_level("INFO", "unprocess_gen")
     estimate_run(settings("source.limit=1"), 1, True)
     assert caplog.messages == ([] if compiled else ["compiling kernels, once per machine and version"])
+
+
+def test_second_plan_announces_no_compiling(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Kernels of the tiers are recorded, too: those of the tier fast differ from those of the run."""
+    known: set[str] = set()
+    monkeypatch.setattr("unprocess_gen.simulation.self_test.has_run", known.__contains__)
+    monkeypatch.setattr("unprocess_gen.simulation.self_test.note_run", known.add)
+    self_test.failures.cache_clear()
+    caplog.set_level("INFO", "unprocess_gen")
+    config = settings("source.limit=1")
+    tiers = {"fast": read_option(conf_dir() / "accuracy/fast.yaml", AccuracyConfig)}
+    for _ in range(2):
+        estimate_run(config, 1, True, tiers)
+    assert caplog.messages == ["compiling kernels, once per machine and version"]
 
 
 def test_failed_source_is_listed_with_its_explanation(settings: Settings, tmp_path: Path) -> None:

@@ -263,7 +263,8 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
         words = _take_settings(verb, [*rest, *after], values)
         return Call(values, overrides=_overrides(verb, words, values))
     for word in rest:
-        if word.startswith("-") and word != "-":
+        is_number = verb.extra is not None and word[1:].isdecimal()
+        if word.startswith("-") and word != "-" and not is_number:
             raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}")
     return _assign_words(verb, [*rest, *after], values)
 

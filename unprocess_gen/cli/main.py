@@ -150,7 +150,7 @@ def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:
     except Exception as error:
         if SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
             return _report_signal(SIGNALS.received, arguments)
-        if isinstance(error, UnprocessGenError):
+        if isinstance(error, UnprocessGenError | PermissionError):
             return report_error(error)
         if LOGGER.handlers:
             RESULTS.error("unexpected error", exc_info=error)

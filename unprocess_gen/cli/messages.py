@@ -53,6 +53,8 @@ def report_error(error: BaseException, job: str = "") -> int:
     int
         The exit code.
     """
+    if isinstance(error, PermissionError) and error.filename is not None:
+        error = _no_permission(error)
     if isinstance(error, UnprocessGenError):
         report(f"{job}{error}", logging.ERROR)
         return error.exit_code
@@ -60,6 +62,11 @@ def report_error(error: BaseException, job: str = "") -> int:
     if LOGGER.handlers:
         RESULTS.error("%sunexpected error", job, exc_info=error)
     return 1
+
+
+def _no_permission(error: PermissionError) -> MachineError:
+    """Return the error of a file or folder that the user may not read or write, wherever it was opened."""
+    return MachineError(f"{os.fsdecode(error.filename)}: {error.strerror}; expected read and write permissions")
 
 
 def report(message: str, level: int = logging.WARNING) -> None:

@@ -94,13 +94,18 @@ def _counts_text(summary: Summary, max_failed: int) -> str:
 
 def _clipping_line(sites: dict[str, int]) -> str:
     """Return the shares of clipped and saturated sites, so that clipping does not go unnoticed in training data."""
-    share = {name: f"{count / sites['all']:.3%}" for name, count in sites.items()}
+    share = {name: _percent(count, sites["all"]) for name, count in sites.items()}
     return (
         f"of {sites['all']:,} sites, clean: {share['clean_clipped_low']} were clipped at black, "
         f"{share['clean_clipped_high']} at white, {share['saturated']} are saturated; "
         f"noisy: {share['noisy_clipped_low']} were clipped low, {share['noisy_clipped_high']} high; "
         f"{share['zero_variance']} have zero noise variance"
     )
+
+
+def _percent(count: int, total: int) -> str:
+    """Return a share with three decimals; a few sites of many are not rounded to none."""
+    return f"{count / total:.3%}" if count == 0 or count / total >= 5e-6 else "under 0.001%"
 
 
 # --------------------------------------------------------------------------------------------------- a run in parts
@@ -142,7 +147,7 @@ def run_part(call: Call) -> int:
         raise ConfigError(
             f"part: its number is missing; expected it after {out}, or in one of {', '.join(PART_VARIABLES)}"
         )
-    made = make_part(out, part, call.values.get("n_jobs"), call.values.get("source"))
+    made = make_part(out, part, call.values.get("n_jobs"), _root(call))
     if made is None:
         print_result(f"{out} is complete; nothing to do")
         return DONE

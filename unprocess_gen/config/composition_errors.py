@@ -98,8 +98,11 @@ def unknown_option(group: str, name: str, options: Sequence[str]) -> str:
 
 
 def assignment(key: str, overrides: Sequence[str]) -> str:
-    """Return ``key=value`` as the user wrote it, or the key alone if no override names it."""
-    return next((one.lstrip("+~") for one in overrides if one.lstrip("+~").split("=")[0] == key), key)
+    """Return ``key=value`` as the user wrote it, or the key alone if no override names it or a key below it."""
+    written = [one.lstrip("+~") for one in overrides]
+    exact = (one for one in written if one.split("=")[0] == key)
+    below = (one for one in written if one.split("=")[0].startswith(f"{key}."))
+    return next((one for ones in (exact, below) for one in ones), key)
 
 
 EXPECTED = {

@@ -81,11 +81,14 @@ def check_output_file(file: Path, option: str, expected: str, *marks: bytes) -> 
     Raises
     ------
     ConfigError
-        If the file is inside a dataset, its folder does not exist, or another file of that name exists.
+        If the file is inside a dataset, its folder does not exist or cannot be written, or another file of that name
+        exists.
     """
     _refuse_dataset(file, option, "file")
     if file.is_dir() or not file.parent.is_dir():
         raise ConfigError(f"{option}: expected the name of a file in a folder that exists")
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        raise ConfigError(f"{option}: cannot be written (Permission denied); choose another folder")
     beginning = _first_bytes(file, option).lower() if file.is_file() else b""
     if beginning and not any(mark in beginning for mark in marks):
         raise ConfigError(f"{option}: exists and is not {expected}; choose another name, or remove the file")

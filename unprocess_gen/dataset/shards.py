@@ -317,6 +317,8 @@ def read_index(path: AnyPath) -> dict[str, Member]:
                     raise ValueError(f"member {info.name} has {info.size} bytes")
                 index[info.name] = Member(stream.tell(), info.size)
                 stream.seek(info.size + _padding(info.size), io.SEEK_CUR)
+    except PermissionError as error:
+        raise DamageError(f"{path}: cannot be read ({error.strerror})") from error
     except (tarfile.HeaderError, OSError, ValueError, OverflowError) as error:
         raise DamageError(f"{path}: not a complete shard ({error})") from error
     return index

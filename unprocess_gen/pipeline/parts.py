@@ -19,6 +19,7 @@ from functools import partial
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import machine_error
@@ -205,13 +206,16 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
     Raises
     ------
     ConfigError
-        If ``out`` was not prepared, or by another version or with other settings; if there is no such part.
+        If ``out`` was not prepared, or by another version or with other settings; if there is no such part, or
+        ``n_jobs`` is not allowed.
     CanaryError
         If this host makes other bytes than the host that prepared the run.
     MachineError
         If the self-test fails, a file cannot be read or written, or a source was changed or deleted.
     """
     started = time.monotonic()
+    if n_jobs is not None:
+        settings_of(Config)["n_jobs"].check("n_jobs", n_jobs)
     if _is_complete(out):
         return None
     run = FrozenRun(out, root)

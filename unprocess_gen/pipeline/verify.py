@@ -92,7 +92,7 @@ def _verify(folder: AnyPath) -> list[Damage]:
     if not (folder / "dataset.json").exists() and not (folder / "manifest.csv").exists():
         raise DamageError(
             f"{folder}: contains neither dataset.json nor manifest.csv; expected a finished dataset; "
-            "check the folder, or rerun gen-dataset to finish it"
+            "check the folder, or run the command that began it again"
         )
     damages: list[Damage] = []
     facts: dict[str, Any] = {}

@@ -623,10 +623,11 @@ def _check_not_lost(root: str, path: str, error: OSError | None) -> None:
 
 
 def _unreadable_folder(root: str, folder: str, error: OSError) -> ConfigError:
-    where = encode_name(folder) or "the folder itself"
+    name = encode_name(folder)
+    ways_out = "change its permissions, move it, or set source.recursive=false" if name else "change its permissions"
     return ConfigError(
-        f"source.root={root}: {where} cannot be read ({error.strerror}); expected readable folders; "
-        "change its permissions, move it, or set source.recursive=false"
+        f"source.root={root}: {name or 'the folder itself'} cannot be read ({error.strerror}); expected readable "
+        f"folders; {ways_out}"
     )
 
 

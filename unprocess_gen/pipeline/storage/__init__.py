@@ -89,7 +89,9 @@ def cannot_write(error: OSError, out: str) -> UnprocessGenError:
     """Return the error of a place that cannot be begun: MachineError for a full disk, else ConfigError."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return machine_error(error, any_path(out), RESUME)
-    return ConfigError(f"out={out}: cannot be written ({error.strerror})")
+    if error.errno == errno.EEXIST:
+        return ConfigError(f"out={out}: is a file; expected a folder; choose another out")
+    return ConfigError(f"out={out}: cannot be written ({error.strerror}); choose another out")
 
 
 def open_storage(out: str) -> Storage:
