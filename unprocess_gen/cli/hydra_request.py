@@ -153,9 +153,8 @@ def _read_flag(argument: str, remaining: Iterator[str]) -> list[str]:
         return [flag]
     value = value if equals else next(remaining, "")
     if not value or (allowed != ANY_VALUE and value not in allowed):
-        raise ConfigError(
-            f"{f'{flag} {value}'.rstrip()}: expected {'a value' if allowed == ANY_VALUE else ', '.join(allowed)}"
-        )
+        written = f"{flag} {value}".rstrip()
+        raise ConfigError(f"{written}: expected {'a value' if allowed == ANY_VALUE else ', '.join(allowed)}")
     return [flag, value]
 
 
