@@ -91,24 +91,24 @@ def _correlated_rows(plans: Sequence[Plan], top: int, height: int) -> Float:
 @functools.lru_cache(maxsize=8)
 def _electron_noise(plans: tuple[Plan, ...], columns: int, origin: tuple[int, int], counts_all: bool) -> Electrons:
     """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
-    frames = [_frame(plan, origin, columns, counts_all) for plan in plans]
-    numbers, purposes, quantiles, offsets, ranks = ([*members] for members in zip(*frames, strict=True))
-    gains, first = [_gains_of(plan, origin[0]) for plan in plans], plans[0]
+    frames, first = [_frame(plan, origin, columns, counts_all) for plan in plans], plans[0]
+    numbers, quantiles, offsets, ranks = ([*members] for members in zip(*frames, strict=True))
+    sites = [
+        np.stack([*_gains_of(plan, origin[0]), each.errors_dn], axis=1)
+        for plan, each in zip(plans, offsets, strict=True)
+    ]
     fixed = offsets[0].columns_dn
     if "column_temporal" in first.effects:
         fixed = _fixed_offsets(first, columns, origin).columns_dn
     return Electrons(
         numbers=np.array(numbers),
-        read_purposes=np.array(purposes),
         read_lines=_stack([each.lines for each in quantiles]),
         read_quadratics=_stack([each.quadratics for each in quantiles]),
-        gains=_stack([each.sites for each in gains]),
-        gains32=_stack([each.sites32 for each in gains]),
+        sites=_stack(sites),
         rows_dn=_INDEPENDENT_ROWS,
         rows_step=0,
         columns_dn=_stack([each.columns_dn for each in offsets]),
         fixed_columns_dn=fixed,
-        errors_dn=_stack([each.errors_dn for each in offsets]),
         base_dn=_stack([each.base_dn for each in offsets]),
         dark_frames_dn=np.zeros(columns, dtype=np.float32),
         dark_frames_steps=(0, 0),
@@ -126,21 +126,11 @@ def _stack(arrays: list[NDArray[Any]]) -> NDArray[Any]:
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-class _Gains(NamedTuple):
-    """Hold `Electrons.gains` and `Electrons.gains32` of one frame, and the highest gain, DN per electron."""
-
-    sites: Float
-    sites32: Float32
-    highest: float
-
-
 @functools.lru_cache(maxsize=16)
-def _gains(dn_per_e: float, relative: tuple[float, ...], full_well_e: float) -> _Gains:
-    """Return the gains of the sites (0, 0), (0, 1), (1, 0), (1, 1) with these gains relative to ``dn_per_e``."""
+def _gains(dn_per_e: float, relative: tuple[float, ...], full_well_e: float) -> tuple[Float, Float]:
+    """Return DN per electron and full wells of the sites of a tile with these gains relative to ``dn_per_e``."""
     tile = _sites_of_rows(relative)
-    gains, full_wells_e = dn_per_e * tile, full_well_e / tile
-    sites32 = np.stack([gains, 1 / gains, full_wells_e], axis=1).astype(np.float32)
-    return _Gains(np.stack([gains, full_wells_e], axis=1), sites32, float(gains.max()))
+    return dn_per_e * tile, full_well_e / tile
 
 
 def _sites_of_rows(of_tile: Sequence[float]) -> Float:
@@ -148,8 +138,8 @@ def _sites_of_rows(of_tile: Sequence[float]) -> Float:
     return np.tile(np.array(of_tile, dtype=np.float64).reshape(2, 2), VECTOR_WIDTH // 2)
 
 
-def _gains_of(plan: Plan, top: int) -> _Gains:
-    """Return the gains of a frame whose first row is ``top``."""
+def _gains_of(plan: Plan, top: int) -> tuple[Float, Float]:
+    """Return DN per electron and full wells of a frame whose first row is ``top``."""
     if plan.physics is None:
         return _gains(plan.a_dn, _EQUAL, math.inf)
     relative: tuple[float, ...] = _EQUAL
@@ -166,7 +156,7 @@ def _full_well_e(plan: Plan) -> float:
 
 
 class _Offsets(NamedTuple):
-    """Hold the offsets of a frame: members of `Electrons`, and the largest offset from black, DN."""
+    """Hold the offsets of the columns and the sites of a frame, and the largest offset from black, DN."""
 
     columns_dn: Float
     errors_dn: Float
@@ -209,7 +199,7 @@ def _column_normals(body_key: int, part: int) -> Float:
     return np.asarray(reference_noise.normals(of_part)[0])
 
 
-_Frame = tuple[FrameNumbers, np.uint64, Quantiles, _Offsets, NDArray[np.uint32]]
+_Frame = tuple[FrameNumbers, Quantiles, _Offsets, NDArray[np.uint32]]
 _NO_ERRORS = (0.0, 0.0, 0.0, 0.0)
 _NO_RANKS = np.zeros(MAX_STEPS, dtype=np.uint32)
 
@@ -234,11 +224,12 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         counts_all = True
     offset_dn = plan.black_level_dn + 6.4 * row_std_dn + offsets.farthest_dn
     counts_all = counts_all or "gain_by_colour" in on  # the limits between counts and normals hold for one gain
-    most_dark_dn = _gains_of(plan, origin[0]).highest * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
+    most_dark_dn = float(_gains_of(plan, origin[0])[0].max()) * (dark_e + 8 * math.sqrt(dark_e) + 40) if dark_e else 0.0
     lowest_root, highest_root = count_roots(plan, read_std_dn / physics.dn_per_e, counts_all)
     fewest_dark, ranks = count_thresholds(dark_e) if dark_e <= MAX_THRESHOLD_RATE else (0, None)
     numbers = FrameNumbers(
         shot=float("shot" in on),
+        read_purpose=float(purpose_of_read),
         dark_e=dark_e,
         dark_steps=-1.0 if ranks is None else len(ranks),
         fewest_dark=fewest_dark,
@@ -251,7 +242,7 @@ def _frame(plan: Plan, origin: tuple[int, int], columns: int, counts_all: bool) 
         highest_root=highest_root,
     )
     dark_ranks = _NO_RANKS if ranks is None else np.resize(ranks, MAX_STEPS)
-    return numbers, purpose_of_read, quantiles, offsets, dark_ranks
+    return numbers, quantiles, offsets, dark_ranks
 
 
 def _fixed_offsets(plan: Plan, columns: int, origin: tuple[int, int]) -> _Offsets:
@@ -280,13 +271,14 @@ def _two_parameter_frame(plan: Plan, columns: int, counts_all: bool) -> _Frame:
     lowest_root, highest_root = count_roots(plan, read_std_dn / a_dn, counts_all)
     numbers = FrameNumbers(
         shot=1.0,
+        read_purpose=float(HETEROSCEDASTIC),
         read_std_dn=read_std_dn,
         error_dn=_error_dn(read_std_dn, quantiles, float(plan.black_level_dn), 0.0),
         lowest_root=lowest_root,
         highest_root=highest_root,
     )
     offsets = _offsets(float(plan.black_level_dn), columns, (0, 0), None, 0.0, _NO_ERRORS)
-    return numbers, HETEROSCEDASTIC, quantiles, offsets, _NO_RANKS
+    return numbers, quantiles, offsets, _NO_RANKS
 
 
 def _error_dn(read_std_dn: float, quantiles: Quantiles, offset_dn: float, most_dark_dn: float) -> float:

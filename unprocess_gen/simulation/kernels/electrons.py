@@ -48,6 +48,7 @@ from unprocess_gen.simulation.kernels.simd import (
     select,
     square_root,
     store,
+    to_float32,
     to_float64,
 )
 from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, list_lanes
@@ -70,16 +71,13 @@ class Electrons(NamedTuple):
     """Hold the effects of N frames of one body; P columns are those of complete blocks."""
 
     numbers: Float  # [N, NUMBERS]: see `FrameNumbers`
-    read_purposes: NDArray[np.uint64]  # [N]
     read_lines: NDArray[np.uint64]  # [N, 4097]
     read_quadratics: Float  # [N, 4096]
-    gains: Float  # [N, 2, 2, 8]: of eight sites of an even and of an odd row, DN per electron and full well
-    gains32: Float32  # [N, 2, 3, 8]: of the same sites, DN per electron, electrons per DN and full well
+    sites: Float  # [N, 2, 3, 8]: DN per electron, full well and black-level error of sites of even and odd rows
     rows_dn: Float  # [N, H]: offsets of correlated rows; else one 0
     rows_step: int  # H; 0 if rows are independent
     columns_dn: Float  # [N, P]
     fixed_columns_dn: Float  # [P]: without the part that is new in every frame
-    errors_dn: Float  # [N, 2, 8]: black-level errors of the same sites
     base_dn: Float32  # [N, 2, P]: black level, column and black-level error
     dark_frames_dn: Float32  # [N, H, P]: values of dark frames above black; [P] zeros without them
     dark_frames_steps: tuple[int, int]  # elements from frame to frame and from row to row; 0 without dark frames
@@ -95,6 +93,7 @@ class FrameNumbers(NamedTuple):
     """Hold the numbers of one frame; comments and defaults give the values that switch an effect off."""
 
     shot: float  # 0
+    read_purpose: float  # word of the random words of read noise
     read_std_dn: float  # 0
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
     lowest_root: float  # roots of the mean electrons between which shot noise is counted
@@ -113,7 +112,13 @@ NUMBERS = len(FrameNumbers._fields)
 @inner
 def _load_numbers(noise: Electrons, n: int) -> FrameNumbers:
     v = pointer_to(noise.numbers, np.uint64(n * NUMBERS))
-    return FrameNumbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10])
+    return FrameNumbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11])
+
+
+@inner
+def _sites_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
+    """Return the gains, full wells and black-level errors of eight sites of the strip's row."""
+    return pointer_to(noise.sites, 24 * (2 * n + (strip.y & 1)))
 
 
 # -------------------------------------------------------------------------------------------------- counts of electrons
@@ -123,13 +128,17 @@ def _load_numbers(noise: Electrons, n: int) -> FrameNumbers:
 def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
     """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, all words, and normals."""
     of, tables = _load_numbers(noise, n), noise.tables
-    for stream in range(3 if of.dark_e > 0.0 else 2):  # loops, so that machine code contains each function once
-        purpose_word, words = SHOT, workspace.words
+    first, after = _mark_defects(noise.body, strip, workspace)
+    for stream in range(4):  # loops, so that machine code contains each function once
+        purpose_word, words, is_needed = SHOT, workspace.words, True
         if stream == 1:
-            purpose_word, words = noise.read_purposes[n], workspace.read_words
+            purpose_word, words = np.uint64(of.read_purpose), workspace.read_words
         elif stream == 2:
-            purpose_word, words = DARK, workspace.dark_words
-        fill_word_blocks(key, strip, purpose_word, words)
+            purpose_word, words, is_needed = DARK, workspace.dark_words, of.dark_e > 0.0
+        elif stream == 3:
+            purpose_word, words, is_needed = HOT, workspace.hot_words, first < after
+        if is_needed:
+            fill_word_blocks(key, strip, purpose_word, words)
     row_dn = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
     workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
     limit = np.float32(of.highest_root * of.highest_root * (1 + 4 * FLOAT32_RATE))
@@ -153,9 +162,7 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, work
         _replace_by_normals(strip.total, of, limit, workspace)
     if of.dark_e > 0.0:
         _add_dark_signal(noise, n, of, strip, workspace)
-    first, after = _mark_defects(noise.body, strip, workspace)
-    if first < after:
-        _draw_defects(noise, key, first, after, strip, workspace)
+    _draw_defects(noise, first, after, workspace)
 
 
 @inner
@@ -164,7 +171,7 @@ def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) ->
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
-    black, e_per_dn = np.float32(noise.black_dn), load(pointer_to(noise.gains32, 24 * (2 * n + (strip.y & 1))), _8)
+    black, e_per_dn = np.float32(noise.black_dn), to_float32(1.0 / load(_sites_of(noise, n, strip), _0))
     row, column = noise.body.response_steps
     response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
     highest = load(workspace.rounded_dn, _0) - load(workspace.rounded_dn, _0)
@@ -237,13 +244,12 @@ def _mark_defects(body: Body, strip: Strip, workspace: Workspace) -> tuple[int, 
 
 
 @inner
-def _draw_defects(noise: Electrons, key: PhiloxKey, first: int, after: int, strip: Strip, workspace: Workspace) -> None:
+def _draw_defects(noise: Electrons, first: int, after: int, workspace: Workspace) -> None:
     """Replace the means of hot pixels in ``defects`` with counts."""
-    fill_word_blocks(key, strip, HOT, workspace.scratch)
     for d in range(first, after):
         x, mean_e = noise.body.positions[d], noise.body.means_e[d]
         if mean_e >= 0.0:
-            workspace.defects[x] = exact_count(workspace.scratch[x], mean_e, noise.tables)
+            workspace.defects[x] = exact_count(workspace.hot_words[x], mean_e, noise.tables)
 
 
 @inner
@@ -267,9 +273,9 @@ def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspac
     """
     of, lines = _load_numbers(noise, n), pointer_to(noise.read_lines, n * 4097)
     fill_values_by_lines(strip.total, workspace.read_words, lines, workspace.lines, workspace.noise_dn)
-    f, lanes = np.float32, pointer_to(noise.gains32, 24 * (2 * n + (strip.y & 1)))
-    per_e, full_well_e, std, margin = load(lanes, _0), load(lanes, _16), f(of.read_std_dn), f(of.error_dn)
-    row_dn = f(workspace.row_dn[0])
+    sites, f = _sites_of(noise, n, strip), np.float32
+    per_e, full_well_e = to_float32(load(sites, _0)), to_float32(load(sites, _8))
+    std, margin, row_dn = f(of.read_std_dn), f(of.error_dn), f(workspace.row_dn[0])
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
     dark_dn = _dark_frame_of(noise, n, strip)
     has_dark = of.dark_e > 0.0
@@ -295,7 +301,7 @@ def _dark_frame_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
 @inner
 def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
     """Return the noisy DN of one site, in the reference's order of operations."""
-    of, row = _load_numbers(noise, n), 2 * n + (strip.y & 1)
+    of, sites = _load_numbers(noise, n), pointer_to(_sites_of(noise, n, strip), x & 1)
     electrons = np.float64(workspace.electrons[x])
     if workspace.error_e[x] > _ZERO32:
         electrons = _exact_shot(noise, of, n, x, strip, workspace)
@@ -305,11 +311,10 @@ def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace
             dark = exact_count(workspace.dark_words[x], of.dark_e, noise.tables)
         electrons = electrons + (dark - of.removed_e)
     electrons = electrons + workspace.defects[x]
-    gains = pointer_to(noise.gains, 16 * row + (x & 1))
-    dn = minimum(electrons, gains[8]) * gains[0] + noise.black_dn
+    dn = minimum(electrons, sites[8]) * sites[0] + noise.black_dn
     dn = dn + of.read_std_dn * exact_value(workspace.read_words[x], pointer_to(noise.read_quadratics, n * 4096))
     offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
-    dn = dn + (offset_dn + noise.errors_dn[8 * row + (x & 1)])
+    dn = dn + (offset_dn + sites[16])
     dn = dn + np.float64(_dark_frame_of(noise, n, strip)[x])
     return float(dn) if workspace.defects[x] >= 0.0 else 0.0
 
@@ -319,7 +324,7 @@ def _exact_shot(noise: Electrons, of: FrameNumbers, n: int, x: int, strip: Strip
     """Return the electrons of light: a count, a normal in its place, or the mean."""
     row, column = noise.body.response_steps
     response = np.float64(noise.body.response[strip.y * row + (strip.x + strip.lead + x) * column])
-    rate = (workspace.unrounded_dn[x] - noise.black_dn) / noise.gains[16 * (2 * n + (strip.y & 1)) + (x & 1)] * response
+    rate = (workspace.unrounded_dn[x] - noise.black_dn) / _sites_of(noise, n, strip)[x & 1] * response
     if of.shot == 0.0:
         return float(rate)
     root = np.sqrt(np.float32(rate))
@@ -336,14 +341,14 @@ def fill_exact_electrons(
     """Return ``exact_dn``, filled with the noisy DN of all sites: of certain counts in loops, then of the others."""
     of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
     fill_rows(strip.total, workspace.read_words, workspace.scratch)
-    has_dark, row = of.dark_e > 0.0, 2 * n + (strip.y & 1)
+    has_dark, sites = of.dark_e > 0.0, _sites_of(noise, n, strip)
     dark, error_e = workspace.dark, workspace.error_e
     if has_dark:
         error_e = workspace.total_error_e
     else:
         dark = workspace.zeros  # adding 0 - 0 changes no bit
-    gains, errors_dn = pointer_to(noise.gains, 16 * row), load(pointer_to(noise.errors_dn, 8 * row), _0)
-    dn_per_e, full_well_e, row_dn = load(gains, _0), load(gains, _8), workspace.row_dn[0]
+    dn_per_e, full_well_e, errors_dn = load(sites, _0), load(sites, _8), load(sites, _16)
+    row_dn = workspace.row_dn[0]
     columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + strip.x + strip.lead)
     dark_frame_dn = _dark_frame_of(noise, n, strip)
     found = _list_defects(noise, strip, workspace)
@@ -366,10 +371,11 @@ def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> N
     """Add the fixed patterns to the unrounded clean frame, as `reference.noise.average`."""
     of, clean_dn, body = _load_numbers(noise, np.int64(0)), workspace.unrounded_dn, noise.body
     _mark_defects(body, strip, workspace)
+    sites = _sites_of(noise, np.int64(0), strip)
     for x in range(strip.total):
-        gain = noise.gains[16 * (strip.y & 1) + (x & 1)]
+        gain = sites[x & 1]
         dn = (clean_dn[x] + workspace.defects[x] * gain) + of.kept_dark_e * gain
         dn = minimum(dn, noise.full_dn)
         offset_dn = 0.0 + noise.fixed_columns_dn[strip.x + strip.lead + x]
-        dn = dn + (offset_dn + noise.errors_dn[8 * (strip.y & 1) + (x & 1)])
+        dn = dn + (offset_dn + sites[16 + (x & 1)])
         clean_dn[x] = dn if workspace.defects[x] >= 0.0 else 0.0

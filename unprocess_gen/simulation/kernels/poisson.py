@@ -41,6 +41,7 @@ from unprocess_gen.simulation.kernels.simd import (
     maximum,
     minimum,
     movemask,
+    pointer_to,
     select,
     square_root,
     store,
@@ -90,18 +91,17 @@ class CountTables(NamedTuple):
         Approximate normals (`normal.Quantiles`).
     quadratics : ndarray of float64
         Exact normals.
-    tails, cdf, first, smallest, largest, middle, guess : ndarray
-        Columns of `reference.poisson.Tables`, contiguous.
+    tails, cdf, guess : ndarray
+        Members of `reference.poisson.Tables`.
+    cells : ndarray of float64, [81, 4]
+        Its ``first``, ``least``, ``most`` and ``middle``.
     """
 
     lines: NDArray[np.uint64]
     quadratics: Float
     tails: Float
     cdf: Float
-    first: NDArray[np.int64]
-    smallest: NDArray[np.int64]
-    largest: NDArray[np.int64]
-    middle: Float
+    cells: Float
     guess: NDArray[np.int8]
 
 
@@ -109,10 +109,8 @@ class CountTables(NamedTuple):
 def count_tables() -> CountTables:
     """Return the tables, computed once per process."""
     normal, exact = normal_quantiles(), poisson_tables()
-    return CountTables(
-        normal.lines, normal.quadratics, exact.tails.ravel(), exact.cdf.ravel(), exact.first, exact.least, exact.most,
-        exact.middle, exact.guess.ravel(),
-    )  # fmt: skip
+    cells = np.stack([exact.first, exact.least, exact.most, exact.middle], axis=1)
+    return CountTables(normal.lines, normal.quadratics, exact.tails, exact.cdf, cells, exact.guess)
 
 
 # -------------------------------------------------------------------------------------------------- one rate everywhere
@@ -399,14 +397,16 @@ def _count_by_cdf(word: np.uint32, rate: float, z: float, tables: CountTables) -
     In the first cell, where counts are almost always 0, the guess is 0 and more comparisons may follow.
     """
     root = np.sqrt(rate)
-    cell = np.uint64(np.int64(root * RATE_CELLS))
-    at = cell * np.uint64(_GUESSES) + np.uint64(np.int64((z - LEAST_NORMAL) * NORMAL_CELLS))
-    k = np.int64(rate + root * z + tables.guess[at] * GUESS_UNIT + 0.5) - 1
-    k = min(max(k, tables.smallest[cell]), tables.largest[cell]) if cell > 0 else np.int64(0)
+    cell = np.int64(root * RATE_CELLS)
+    of_cell = pointer_to(tables.cells, 4 * cell)
+    first, least, most, middle = of_cell[0], of_cell[1], of_cell[2], of_cell[3]
+    at = np.uint64(cell * _GUESSES + np.int64((z - LEAST_NORMAL) * NORMAL_CELLS))
+    guess = np.floor(rate + root * z + tables.guess[at] * GUESS_UNIT + 0.5) - 1.0
+    k = np.int64(minimum(maximum(guess, least), most)) if cell > 0 else np.int64(0)
     # rank of the word by its normal: invert the top bit, and the other bits too if it was 0
     bits = np.uint64(word)
     uniform = (np.float64(bits ^ (_SIGN | (((bits >> _31) - _1) & _LOW31))) + 0.5) * 2.0**-32
-    row, offset = tables.first[cell] + k, rate - tables.middle[cell]
+    row, offset = np.int64(first) + k, rate - middle
     if uniform > _cdf_at(tables.cdf, row, offset):
         k += 1
         while cell == 0 and uniform > _cdf_at(tables.cdf, k, offset):

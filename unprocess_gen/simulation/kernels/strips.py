@@ -108,6 +108,7 @@ class Workspace(NamedTuple):
     words: Indices
     read_words: Indices
     dark_words: Indices
+    hot_words: Indices
     scratch: Indices
     uncertain: Indices  # [2 SIZE]: sites to recompute exactly
     lines: Lines  # scratch of look-ups
