@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.commands import RunMain, environment
+from helpers.commands import RunMain, environment, messages
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
 from helpers.processes import WAIT_S
@@ -243,6 +243,27 @@ main()
 
 
 @pytest.mark.linux_only("kills a process by a signal")
+def test_sweep_into_a_dataset_changes_nothing(
+    run_main: RunMain, make: Make, source: Path, tree_hash: TreeHash, tmp_path: Path
+) -> None:
+    make(source, tmp_path / "ds")
+    before = tree_hash(tmp_path / "ds")
+    done = run_main("-m", "seed=1,2", f"source.root={source}", "out=ds")
+    assert (done.code, done.err.count("is inside the dataset")) == (2, 2)
+    assert tree_hash(tmp_path / "ds") == before
+    assert not (tmp_path / "ds/sweep.csv").exists()
+
+
+def test_repair_of_a_sweep_leaves_jobs_without_a_dataset(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    run_main("-m", "seed=1,x", f"source.root={source}", "out=sweep", "n_jobs=1")
+    done = run_main("verify", "sweep", "--repair")
+    assert (done.code, done.out) == (4, "sweep/seed=1 is intact\nsweep: 1 of 2 datasets are intact\n")
+    assert messages(done.err) == [
+        "gen-dataset: sweep/seed=x: dataset.json: is missing: the job ended with exit code 2; rerun the sweep to "
+        "finish it"
+    ]
+
+
 def test_rerun_finishes_a_killed_sweep(run_main: RunMain, make: Make, tree_hash: TreeHash, tmp_path: Path) -> None:
     source = fill(tmp_path / "p", 12)
     arguments = (*TWO_BY_TWO, "n_jobs=1", "output.pairs_per_shard=1")

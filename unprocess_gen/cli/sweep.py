@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.core.object_store import is_url
+from unprocess_gen.core.output_paths import enclosing_dataset
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -144,7 +145,7 @@ def worst(exit_codes: Iterable[int]) -> int:
 
 
 def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
-    """Write ``sweep.csv`` in the sweep's folder, if the folder exists.
+    """Write ``sweep.csv`` in the sweep's folder, if the folder exists and is not inside a dataset.
 
     Earlier rows keep their places, so that the indices of `RawPairs` do not change; new rows follow them.
 
@@ -162,7 +163,7 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
     MachineError
         If it cannot be read or written.
     """
-    if not out.is_dir():
+    if not out.is_dir() or enclosing_dataset(out) is not None:  # every job was refused
         return
     try:
         with _locked(out):  # several processes may sweep into one folder

@@ -431,7 +431,8 @@ def _finish_verification(folder: AnyPath, found: Iterable[Damage], call: Call) -
     dark = _dark_places(manifest, call)
     codes: list[int] = []
     damages = _reported(folder, found)
-    if damages and "repair" in call.values:
+    is_finished = any((folder / name).exists() for name in ("dataset.json", "manifest.csv"))  # not so in a sweep
+    if damages and is_finished and "repair" in call.values:
         if not isinstance(folder, Path):
             raise ConfigError(f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset")
         for step in repair(folder, source_root(manifest, root), dark):
@@ -524,12 +525,17 @@ def run_replay(call: Call) -> int:
         if result.complaint:
             report(_complaint(result), logging.ERROR)
     same = codes.count(0)
+    others = len(codes) - same
     print_result(
-        f"{counted(same, 'pair')} {'is' if same == 1 else 'are'} the same, bit for bit; {len(codes) - same} are not"
+        f"{counted(same, 'pair')} {_are(same)} the same, bit for bit; {others} {_are(others)} not"
         + (f"; arrays in {to}" if written else "")
         + _skipped(len(skipped))
     )
     return worst(codes)
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"
 
 
 def _skipped(failed: int) -> str:

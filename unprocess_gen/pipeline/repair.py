@@ -393,7 +393,8 @@ def _shard(
     if path.exists() and not path.is_file():
         _move_aside(folder, path)
     _place(part, path)
-    yield RepairStep(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs regenerated, the others kept")
+    others = ", the others kept" if kept else ""
+    yield RepairStep(f"shards/{path.name}", f"{len(rows) - kept} of {len(rows)} pairs regenerated{others}")
 
 
 def _repair_sample(

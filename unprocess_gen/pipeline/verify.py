@@ -97,13 +97,17 @@ def _verify(folder: AnyPath) -> list[Damage]:
     damages: list[Damage] = []
     facts: dict[str, Any] = {}
     try:
-        facts = read_dataset(folder / "dataset.json")
+        if (folder / "dataset.json").exists():
+            facts = read_dataset(folder / "dataset.json")
+        else:
+            damages.append(Damage("dataset.json", "is missing"))
     except DamageError as error:
         damages.append(Damage("dataset.json", _without_path(error)))
     damages += _check_files(folder, facts)
     listed = {number: entry for number, entry in enumerate(facts.get("shards", [])) if entry["file"] is not None}
     try:
-        return damages + _check_shards(folder, listed, shard_rows(folder / "manifest.csv"))
+        if (folder / "manifest.csv").exists():
+            return damages + _check_shards(folder, listed, shard_rows(folder / "manifest.csv"))
     except DamageError as error:
         damages.append(Damage("manifest.csv", _without_path(error)))
     return damages + _check_shards(folder, listed, iter(()))
@@ -197,6 +201,9 @@ def _check_files(folder: AnyPath, facts: dict[str, Any]) -> Iterator[Damage]:
     for name, field in files:
         try:
             found = file_sha256(folder / name)
+        except FileNotFoundError:
+            yield Damage(name, "is missing")
+            continue
         except OSError as error:
             yield Damage(name, f"cannot be read ({error.strerror})")
             continue

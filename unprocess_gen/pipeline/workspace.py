@@ -122,7 +122,10 @@ class Workspace:
         """Return the contents of ``dataset.json``, None without one; raise DamageError if it is damaged."""
         if self.storage.size("dataset.json") is None:
             return None
-        return parse_dataset(self.storage.read("dataset.json"), f"{self.out}/dataset.json")
+        try:
+            return parse_dataset(self.storage.read("dataset.json"), f"{self.out}/dataset.json")
+        except DamageError as error:
+            raise DamageError(f"{error}; gen-dataset verify {self.out} --repair restores it") from error
 
     def check_begun(self, sources: Sequence[Source], root: str | None) -> None:
         """Raise ConfigError if an earlier run began ``out`` with other settings or sources; name the differences.
