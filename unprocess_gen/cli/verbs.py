@@ -694,6 +694,17 @@ def _whole_number(names: tuple[str, ...], text: str, metavar: str = "N") -> Argu
     return Argument(names, text, metavar, int, "an integer")
 
 
+def _local_path(text: str) -> str:
+    if "://" in text:  # it would become a folder named after the scheme
+        raise ValueError
+    return text
+
+
+def _to(text: str, metavar: str, *, required: bool = False) -> Argument:
+    kind = metavar.lower()
+    return Argument(("--to",), text, metavar, _local_path, f"a local {kind}", f"{kind}s", required)
+
+
 PREPARED = Place("OUT", "the folder of a prepared run")
 PART = Argument(("part",), "number of the part, from 0", "K", _count, "an integer of 0 or more")
 
@@ -781,7 +792,7 @@ VERBS: dict[str, Verb] = {
                 Argument(
                     ("--regenerate",), "regenerate N pairs and compare them", "N", _count, "an integer of 0 or more"
                 ),
-                Argument(("--to",), "with --noise: draw the fits in FILE (PNG)", "FILE", completes="files"),
+                _to("with --noise: draw the fits in FILE (PNG)", "FILE"),
                 Argument(("--repair",), "restore damaged files to the same bytes"),
                 Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
             ),
@@ -797,7 +808,7 @@ VERBS: dict[str, Verb] = {
                 DARK_SHADING,
                 Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
                 KEYS,
-                Argument(("--to",), "write the arrays to FOLDER", "FOLDER", completes="folders"),
+                _to("write the arrays to FOLDER", "FOLDER"),
             ),
             Place("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
         ),
@@ -806,7 +817,7 @@ VERBS: dict[str, Verb] = {
             "write an HTML page about a dataset",
             run_report,
             (
-                Argument(("--to",), "write FILE instead of DIR/report.html", "FILE", completes="files"),
+                _to("write FILE instead of DIR/report.html", "FILE"),
                 SOURCE,
                 DARK_FRAMES,
                 DARK_SHADING,
@@ -819,7 +830,7 @@ VERBS: dict[str, Verb] = {
             run_preview,
             (
                 KEYS,
-                Argument(("--to",), "write the pictures to FOLDER", "FOLDER", completes="folders", required=True),
+                _to("write the pictures to FOLDER", "FOLDER", required=True),
                 SOURCE,
                 Argument(("--stages",), "draw each processing step too"),
             ),
@@ -831,7 +842,7 @@ VERBS: dict[str, Verb] = {
             run_dng,
             (
                 replace(KEYS, required=True),
-                Argument(("--to",), "write the files to FOLDER", "FOLDER", completes="folders", required=True),
+                _to("write the files to FOLDER", "FOLDER", required=True),
                 Argument(("--noisy",), "only noisy frames"),
                 Argument(("--clean",), "only clean frames"),
             ),

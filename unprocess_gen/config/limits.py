@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unprocess_gen.config.values import in_range, is_integer, is_number, value_text
+from unprocess_gen.core.object_store import is_url
 
 
 class Limit(ABC):
@@ -191,6 +192,19 @@ class Text(Limit):
     def shown(self, value: Any) -> str:
         """Return the text in quotes."""
         return repr(value)
+
+
+@dataclass(frozen=True)
+class OutputPlace(Text):
+    """A local path, or the URL of an object store; another URL would become a folder named after its scheme."""
+
+    def allows(self, value: Any) -> bool:
+        """Return whether the text is not empty, and no URL of another kind."""
+        return bool(value) and ("://" not in value or is_url(value))
+
+    def shown(self, value: Any) -> str:
+        """Return the text, in quotes if it is empty."""
+        return value or repr(value)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from unprocess_gen.config.limits import (
     Name,
     NumberOrWord,
     Numbers,
+    OutputPlace,
     Text,
 )
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
@@ -716,7 +717,7 @@ class Config:
         "ds",
         "folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the "
         "datasets",
-        Text("the name of a folder"),
+        OutputPlace("the name of a folder or a URL s3://, gs:// or az://"),
         decides_data=False,
     )
     n_jobs: int = key(
