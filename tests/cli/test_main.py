@@ -284,6 +284,8 @@ def test_help_of_a_word_describes_the_verb_or_group(run_main: RunMain) -> None:
     both = run_main("-h", "accuracy").out
     assert both.startswith(run_main("accuracy", "--help").out) and "Keys of accuracy" in both
     assert run_main("--help", "nothing").out == HELP
+    for setting in ("noise.iso", "noise=sony_a7s2"):
+        assert run_main("--help", setting) == run_main("--help", "noise")
 
 
 def test_help_and_errors_name_the_same_exit_codes() -> None:

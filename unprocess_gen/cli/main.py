@@ -86,10 +86,14 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
-    """Return the help of the verb; without one, of the verb or group after ``--help``; else that of the program."""
+    """Return the help of the verb; without one, of the verb or group after ``--help``; else that of the program.
+
+    The group may be that of a setting, such as ``noise.iso``.
+    """
     if verb:
         return verb
-    name = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "")
+    word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "")
+    name = re.split("[.=]", word)[0]
     parts = [verb_help(VERBS[name])] if name in VERBS else []
     parts += [group_help(name, conf_dir())] if name in GROUPS or name in ADDED_GROUPS else []
     return "\n".join(parts) or global_help(VERBS, conf_dir())
