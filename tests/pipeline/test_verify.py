@@ -220,6 +220,22 @@ def test_replay_needs_only_the_row_and_the_source(intact: Path, run_main: RunMai
         assert np.array_equal(np.load(tmp_path / f"arrays/{sample.row['key']}.noisy.npy"), sample.noisy)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "same", "failed"),
+    [((), "1 pair is", 2), (("--keys", "0"), "0 pairs are", 1), (("--rows", "1:3"), "1 pair is", 1)],
+)
+def test_replay_counts_failed_rows(
+    arguments: tuple[str, ...], same: str, failed: int, make: Make, run_main: RunMain, tmp_path: Path
+) -> None:
+    folder = fill(tmp_path / "p", 3)
+    for name in ("000.png", "001.png"):
+        (folder / name).write_bytes(b"no picture")
+    make(folder, tmp_path / "ds", "source.max_failed=2")
+    rows = "rows" if failed > 1 else "row"
+    done = run_main("replay", "ds", *arguments)
+    assert (done.code, done.out) == (0, f"{same} the same, bit for bit; 0 are not; {failed} failed {rows} skipped\n")
+
+
 def changed(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[-20] ^= 1

@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -517,7 +517,7 @@ def run_replay(call: Call) -> int:
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(call.values["to"]) if "to" in call.values else None
     skipped: list[Row] = []
-    rows = select_rows(manifest, call.values.get("rows"), call.values.get("keys"), skipped)
+    rows = _ok_rows(select_rows(manifest, call.values.get("rows"), call.values.get("keys"), skipped), skipped)
     codes, written = [], False
     for result in replay(rows, source_root(manifest, _root(call)), to, _dark_places(manifest, call)):
         codes.append(result.exit_code)
@@ -534,12 +534,21 @@ def run_replay(call: Call) -> int:
     return worst(codes)
 
 
+def _ok_rows(rows: Iterable[Row], failed: list[Row]) -> Iterator[Row]:
+    """Yield the rows of pairs; append failed rows to a list."""
+    for row in rows:
+        if row["status"] == "ok":
+            yield row
+        else:
+            failed.append(row)
+
+
 def _are(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
 def _skipped(failed: int) -> str:
-    """Return the end of a verb's result that counts failed rows inside ranges of ``--keys``."""
+    """Return the end of a verb's result that counts failed rows."""
     return f"; {counted(failed, 'failed row')} skipped" if failed else ""
 
 
