@@ -233,13 +233,17 @@ def _defects_of(body: Body, strip: Strip) -> tuple[int, int]:
 
 @inner
 def _mark_defects(body: Body, strip: Strip, workspace: Workspace) -> tuple[int, int]:
-    """Fill ``defects`` with the means of hot pixels, less than 0 at dead ones; return the range of the defects."""
+    """Fill ``defects`` with the means of hot pixels, less than 0 at dead ones, and list them as uncertain.
+
+    Return their range in the lists of the body.
+    """
     if body.strips > 0:  # otherwise no strip has filled it
         for x in range(strip.total):
             workspace.defects[x] = 0.0
     first, after = _defects_of(body, strip)
     for d in range(first, after):
         workspace.defects[body.positions[d]] = body.means_e[d]
+        workspace.uncertain[d - first] = np.uint32(body.positions[d])
     return first, after
 
 
@@ -252,24 +256,14 @@ def _draw_defects(noise: Electrons, first: int, after: int, workspace: Workspace
             workspace.defects[x] = exact_count(workspace.hot_words[x], mean_e, noise.tables)
 
 
-@inner
-def _list_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> int:
-    """List the strip's defects as uncertain; return their number."""
-    first, after = _defects_of(noise.body, strip)
-    for d in range(first, after):
-        workspace.uncertain[d - first] = np.uint32(noise.body.positions[d])
-    count: int = after - first
-    return count
-
-
 # ------------------------------------------------------------------------------------------------------------------ DN
 
 
 @inner
 def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
-    """Fill ``noise_dn`` and ``error_dn``, in float32, and list defects as uncertain.
+    """Fill ``noise_dn`` and ``error_dn``, in float32.
 
-    Return the base to which the read-out adds the noise, zeros, and the number of defects.
+    Return the base to which the read-out adds the noise, zeros, and the number of defects, which are listed already.
     """
     of, lines = _load_numbers(noise, n), pointer_to(noise.read_lines, n * 4097)
     fill_values_by_lines(strip.total, workspace.read_words, lines, workspace.lines, workspace.noise_dn)
@@ -288,7 +282,8 @@ def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspac
         )
         store(workspace.noise_dn, x, dn)
         store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (load(error_e, x) * per_e + margin))
-    return workspace.zeros, _list_defects(noise, strip, workspace)
+    first, after = _defects_of(noise.body, strip)
+    return workspace.zeros, after - first
 
 
 @inner
@@ -351,7 +346,8 @@ def fill_exact_electrons(
     row_dn = workspace.row_dn[0]
     columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + strip.x + strip.lead)
     dark_frame_dn = _dark_frame_of(noise, n, strip)
-    found = _list_defects(noise, strip, workspace)
+    first, after = _defects_of(noise.body, strip)
+    found = after - first
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         read = exact_values(workspace.read_words, workspace.scratch, x, quadratics)
