@@ -409,6 +409,17 @@ def test_preview_refuses_a_folder_with_other_sheets(
     assert (tmp_path / "sheets" / name).read_bytes() == before
 
 
+@pytest.mark.parametrize("inside", ["", "sheets"])
+def test_preview_refuses_the_folder_of_the_photographs(
+    inside: str, few: Path, gray_world: Path, run_main: RunMain
+) -> None:
+    before = sorted(gray_world.rglob("*"))
+    done = run_main("preview", few, "--to", gray_world / inside)
+    assert done.code == 2
+    assert done.err.startswith(f"gen-dataset: --to {gray_world / inside}: is inside the folder of the photographs, ")
+    assert sorted(gray_world.rglob("*")) == before
+
+
 def test_preview_refuses_sheets_of_another_dataset(
     few: Path, gray_world: Path, make: Make, run_main: RunMain, tmp_path: Path
 ) -> None:

@@ -580,15 +580,29 @@ def run_preview(call: Call) -> int:
     if "keys" in call.values:
         selected = select_pairs(folder / "manifest.csv", call.values["keys"])
         keys, failed = [str(row["key"]) for row in selected.rows.values()], selected.failed
-    code, has_root = 0, source_root(folder / "manifest.csv", root) is not None
+    photographs = source_root(folder / "manifest.csv", root)
+    _check_not_among_photographs(to, photographs)
+    code = 0
     for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), with_stages):
         files += len(sheet.files)
         if sheet.missing_source:
-            code = SourceChangedError.exit_code if has_root else code
+            code = SourceChangedError.exit_code if photographs is not None else code
             omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
             report(f"{sheet.key} ({sheet.source}): {omitted} omitted: {sheet.missing_source}")
     print_result(f"{counted(files, 'picture')} in {to}{_skipped(failed)}")
     return code
+
+
+def _check_not_among_photographs(to: Path, root: str | None) -> None:
+    """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
+    if root is None or is_url(root) or not Path(root).is_dir():
+        return
+    place = Path(os.path.realpath(root))
+    if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
+        raise ConfigError(
+            f"--to {to}: is inside the folder of the photographs, {root}; expected a folder outside of it, because "
+            "runs would read the pictures; choose another folder"
+        )
 
 
 def run_dng(call: Call) -> int:
