@@ -252,11 +252,12 @@ def _node(number: int) -> _Node:
     with localcontext(prec=DIGITS + 10):
         z = Decimal(number) / NODES
         tail, density = fixed(normal_cdf(-z)), fixed(normal_density(z))
-    coefficients, order, divisor = [], 1, 1
-    while _scaled_derivative(order, number + 1) * REACH**order > _SERIES_ERROR * divisor:
+    coefficients, order, divisor, power = [], 1, 1, REACH
+    while _scaled_derivative(order, number + 1) * power > _SERIES_ERROR * divisor:
         coefficients.append(_scaled_derivative(order, number) * ONE // divisor)
         order += 1
         divisor *= order * NODES
+        power *= REACH
     return _Node(
         quantile=number * ONE // NODES,
         tail=tail,
