@@ -1,7 +1,8 @@
-"""Measure the cost of accuracy and update docs/accuracy.md: python .readme/draw_accuracy.py [overrides].
+"""Measure the cost of accuracy and update its pages: python .readme/draw_accuracy.py [overrides].
 
 Run `gen-dataset accuracy` with the overrides (source.root=photos). Save its figure as accuracy.png in this folder, and
-its conclusion and tables between the marks in docs/accuracy.md. It takes about a minute; stop other programs meanwhile.
+its conclusion and tables between the marks in docs/accuracy.md (errors) and docs/performance.md (times). It takes some
+minutes; stop other programs meanwhile.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from typing import Any
 
 from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
 from unprocess_gen.reports.benchmark.measure import Measurement
-from unprocess_gen.reports.benchmark.tables import markdown_table, method_table, recommendation_table, run_table
+from unprocess_gen.reports.benchmark.report import RECOMMENDATIONS, method_table, run_table
+from unprocess_gen.reports.html_pages import PageTable
 
 HERE = Path(__file__).parent
-PAGE = HERE.parent / "docs" / "accuracy.md"
+ERRORS, TIMES = (HERE.parent / "docs" / name for name in ("accuracy.md", "performance.md"))
 CONCLUSION = re.compile(r"^In a complete run of .*?(?=\n\n)", re.MULTILINE | re.DOTALL)
 TEXTS = ("stage", "method", "tier", "error_unit", "setting", "noise")
 
@@ -34,12 +36,20 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         ]
 
 
-def replace_part(page: str, name: str, content: str) -> str:
-    """Return the page with other content between the marks of a part."""
+def markdown(table: PageTable, left_out: tuple[str, ...] = ()) -> str:
+    """Return a table in Markdown without some of its columns."""
+    kept = [index for index, heading in enumerate(table.headings) if heading not in left_out]
+    rule = "|".join("--:" if index in table.numeric else "---" for index in kept)
+    lines = [f"| {' | '.join(line[index] for index in kept)} |" for line in (table.headings, *table.lines)]
+    return "\n".join([lines[0], f"|{rule}|", *lines[1:]])
+
+
+def replace_part(path: Path, name: str, content: str) -> None:
+    """Replace the content between the marks of a part of a page."""
     part = re.compile(rf"(<!-- accuracy {name}: [^>]*-->\n).*?(<!-- end of accuracy {name} -->)", re.DOTALL)
-    changed, count = part.subn(lambda found: f"{found[1]}{content}\n{found[2]}", page)
-    assert count == 1, f"{PAGE} has no part {name}"
-    return changed
+    changed, count = part.subn(lambda found: f"{found[1]}{content}\n{found[2]}", path.read_text(encoding="utf-8"))
+    assert count == 1, f"{path} has no part {name}"
+    path.write_text(changed, encoding="utf-8")
 
 
 def main() -> None:
@@ -53,15 +63,15 @@ def main() -> None:
         runs = [RunMeasurement(**row) for row in read_rows(report / "accuracy_runs.csv")]
     conclusion = CONCLUSION.search(printed)
     assert conclusion is not None
-    page = PAGE.read_text(encoding="utf-8")
-    for name, content in (
-        ("conclusion", conclusion[0]),
-        ("runs", markdown_table(run_table(runs))),
-        ("recommendations", markdown_table(recommendation_table())),
-        ("methods", markdown_table(method_table(methods))),
-    ):
-        page = replace_part(page, name, content)
-    PAGE.write_text(page, encoding="utf-8")
+    times = ("of exact", "ns per pixel", "decode", "simulate", "write")
+    errors = ("noise", "changed", "max DN", "RMS DN", "max σ", "RMS σ")
+    replace_part(TIMES, "conclusion", conclusion[0])
+    replace_part(TIMES, "runs", markdown(run_table(runs), errors))
+    replace_part(ERRORS, "recommendations", markdown(RECOMMENDATIONS))
+    with_errors = [run for run in runs if run.noisy_changed_share]
+    replace_part(ERRORS, "runs", markdown(run_table(with_errors), times))
+    inexact = [method for method in methods if method.error_max]
+    replace_part(ERRORS, "methods", markdown(method_table(inexact), ("ns per pixel", "of reference")))
 
 
 if __name__ == "__main__":

@@ -13,26 +13,28 @@ from unprocess_gen import RawPairs
 from unprocess_gen.sources.scenes import synthetic
 
 SCENE = "highlights-0"
-CROP = (slice(260, 340), slice(100, 220))  # rows and columns; even starts keep the CFA pattern
+CROP = (slice(260, 308), slice(130, 202))  # rows and columns; even starts keep the CFA pattern
 SIZE = (360, 240)
 
 
-def display_level(raw: np.ndarray, black: int, white: int) -> np.ndarray:
-    """Return DN as display values in [0, 1], square root."""
-    return np.sqrt(np.clip((raw.astype(float) - black) / (white - black), 0, 1))
+def balanced(raw: np.ndarray, row: dict) -> np.ndarray:
+    """Return the light of each RGGB site after white balance and brightening; 1 is white."""
+    light = np.maximum(raw.astype(float) - row["black_level_dn"], 0) / (row["white_level_dn"] - row["black_level_dn"])
+    light[0::2, 0::2] *= row["red_gain"]
+    light[1::2, 1::2] *= row["blue_gain"]
+    return light / row["inverse_rgb_gain"]
 
 
 def developed(raw: np.ndarray, row: dict) -> np.ndarray:
-    """Return one white-balanced RGB pixel for each RGGB tile; without interpolation the noise is not smoothed."""
-    light = np.maximum(raw.astype(float) - row["black_level_dn"], 0) / (row["white_level_dn"] - row["black_level_dn"])
-    red, blue = light[0::2, 0::2] * row["red_gain"], light[1::2, 1::2] * row["blue_gain"]
+    """Return one RGB pixel for each RGGB tile; without interpolation the noise is not smoothed."""
+    light = balanced(raw, row)
     green = (light[0::2, 1::2] + light[1::2, 0::2]) / 2
-    return np.sqrt(np.clip(np.dstack([red, green, blue]) / row["inverse_rgb_gain"], 0, 1))
+    return np.sqrt(np.clip(np.dstack([light[0::2, 0::2], green, light[1::2, 1::2]]), 0, 1))
 
 
 def sites(raw: np.ndarray, row: dict) -> np.ndarray:
-    """Return each site of a mosaic in the colour of its filter."""
-    bright = display_level(raw, row["black_level_dn"], row["white_level_dn"])
+    """Return each site of a mosaic in the colour of its filter, twice as bright because each shows one channel."""
+    bright = np.sqrt(np.clip(2 * balanced(raw, row), 0, 1))
     picture = np.zeros((*raw.shape, 3))
     for (y, x), channel in {(0, 0): 0, (0, 1): 1, (1, 0): 1, (1, 1): 2}.items():
         picture[y::2, x::2, channel] = bright[y::2, x::2]

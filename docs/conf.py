@@ -1,10 +1,21 @@
 """Configure the Sphinx site: ``sphinx-build -W --keep-going docs OUT`` (extra ``docs``)."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
+from docutils import nodes
 from numpydoc.xref import DEFAULT_LINKS
+from sphinx import addnodes
+from sphinx.application import Sphinx
 
 import unprocess_gen
 
-RECORDS = ("core.types.Counts", "core.types.Physics", "pipeline.generate.Summary", "pipeline.replay.ReplayResult")
+RECORDS = (
+    "core.types.Counts",
+    "simulation.effects.Physics",
+    "pipeline.generate.Summary",
+    "pipeline.replay.ReplayResult",
+)
 RECORDS += ("pipeline.verify.Damage",)
 """Types that public functions return, and that are documented where they are defined."""
 
@@ -45,3 +56,30 @@ html_theme_options = {
     "secondary_sidebar_items": ["page-toc"],
     "show_toc_level": 2,
 }
+html_search_scorer = str(Path(__file__).with_name("scorer.js"))
+
+
+def index_keys(app: Sphinx, doctree: nodes.document) -> None:
+    """Give each key and column of the reference an anchor and an index entry, which the search finds first."""
+    if app.env.docname not in ("reference/settings", "reference/columns"):
+        return
+    for row in list(doctree.findall(nodes.row)):
+        literal = row.children[0].next_node(nodes.literal)
+        if literal is None:
+            continue
+        sections = [node for node in _ancestors(row) if isinstance(node, nodes.section)]
+        group = sections[-2].next_node(nodes.title).next_node(nodes.literal) if len(sections) > 1 else None
+        name = f"{group.astext()}.{literal.astext()}" if group is not None else literal.astext()
+        target = nodes.target("", "", ids=[nodes.make_id(f"key-{name}")])
+        literal.parent.insert(0, [addnodes.index(entries=[("single", name, target["ids"][0], "", None)]), target])
+
+
+def _ancestors(node: nodes.Node) -> Iterator[nodes.Element]:
+    while node.parent is not None:
+        node = node.parent
+        yield node
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the index of keys."""
+    app.connect("doctree-read", index_keys)

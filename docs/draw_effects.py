@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import unprocess_gen as ug
 from unprocess_gen.config.schema import Config
-from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.sources.scenes.synthetic import scene
 
 FIGURE = Path(__file__).parent / "reference" / "effects.png"

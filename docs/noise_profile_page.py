@@ -13,12 +13,12 @@ import yaml
 
 from unprocess_gen.config.interpretation import branch_of, row_of_stop
 from unprocess_gen.config.option_files import conf_dir, option_summary
-from unprocess_gen.config.schema import Config, NoiseConfig
+from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.core.types import Physics
+from unprocess_gen.planning.draws import COUNT
 from unprocess_gen.planning.noise_profile import PhysicalNoise
-from unprocess_gen.planning.plan import PARAMETERS
+from unprocess_gen.simulation.effects import Physics
 
 SOURCES = Path(__file__).parent / "noise_sources.yaml"
 
@@ -62,10 +62,10 @@ def profile_at(noise: NoiseConfig, iso: float) -> Physics | None:
     """Return the numbers of a profile at an ISO, in DN of its calibration, without scatter; None without a branch."""
     if branch_of(noise, iso) is None:
         return None
-    config = Config(noise=replace(noise, iso=iso, scatter="off"))
-    levels = noise.bits, noise.black_level_dn, noise.white_level_dn
-    config.sensor.bits, config.sensor.black_level_dn, config.sensor.white_level_dn = levels  # type: ignore[assignment]
-    return PhysicalNoise(config).draw(dict.fromkeys(PARAMETERS, 0.5), 0, 0)
+    assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
+    sensor = SensorConfig(noise.bits, noise.black_level_dn, noise.white_level_dn)
+    config = Config(noise=replace(noise, iso=iso, scatter="off"), sensor=sensor)
+    return PhysicalNoise(config).draw([0.5] * COUNT, 0, 0)
 
 
 def by_colour(physics: Physics) -> tuple[float, ...]:
@@ -76,7 +76,7 @@ def by_colour(physics: Physics) -> tuple[float, ...]:
 
 def number_at(form: Any, iso: float, gain: float | None) -> Any:
     """Evaluate a published number at an ISO and a gain; None if the source has none there."""
-    if not isinstance(form, list):
+    if not isinstance(form, list | tuple):
         return form
     kind, *numbers = form
     if kind == "per_iso":

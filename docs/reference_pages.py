@@ -14,13 +14,13 @@ from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.forms import spelled as spelled_form
-from unprocess_gen.config.interpretation import BRANCH_NUMBERS, EFFECT_NUMBERS
+from unprocess_gen.config.interpretation import needed_numbers
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.core.errors import REASONS
-from unprocess_gen.core.types import Physics
 from unprocess_gen.dataset.columns import COLUMNS, FIRST
+from unprocess_gen.simulation.effects import EFFECTS, Physics
 
 GENERATED_NOTE = "<!-- from the code: python docs/update_reference.py -->"
 
@@ -155,8 +155,8 @@ def _forms(forms: Mapping[str, object]) -> str:
 
 
 def _effect_numbers() -> str:
-    keys = {**BRANCH_NUMBERS, **EFFECT_NUMBERS, "heteroscedastic": ("a", "b")}
-    effects = [name for name in settings_of(GROUPS["effects"]) if name in keys]
+    keys = {effect.name: needed_numbers(effect.name) for effect in EFFECTS} | {"heteroscedastic": ("a", "b")}
+    effects = [name for name in settings_of(GROUPS["effects"]) if keys.get(name)]
     return table(["effect", "keys of `noise`"], [[code(name), ", ".join(map(code, keys[name]))] for name in effects])
 
 

@@ -13,10 +13,10 @@ from unprocess_gen.config.schema import Config, NoiseConfig, SceneConfig, Sensor
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.types import Facts
 from unprocess_gen.planning.dark_scene import physical_profiles
-from unprocess_gen.planning.effect_contributions import OUTLIERS
 from unprocess_gen.planning.effect_selection import Prediction
 from unprocess_gen.planning.plan import plan_levels
 from unprocess_gen.reports.formatting import short_number
+from unprocess_gen.simulation.effects import BY_NAME
 
 FACTS = Facts(width=6000, height=4000, codes=256, dark_code=0, bright_code=255)
 """A photograph of 24 megapixels with black and white in it."""
@@ -74,7 +74,7 @@ def _scene(name: str) -> SceneConfig:
     """Return a scene whose light is divided by the mean of its range."""
     scene = read_option(conf_dir() / "scene" / f"{name}.yaml", SceneConfig)
     ratio = scene.exposure_ratio
-    return replace(scene, exposure_ratio=(ratio[1] + ratio[2]) / 2) if isinstance(ratio, list) else scene
+    return replace(scene, exposure_ratio=(ratio[1] + ratio[2]) / 2) if isinstance(ratio, tuple) else scene
 
 
 def predictions_of(scene: str, profile: str) -> tuple[Prediction, ...] | None:
@@ -90,8 +90,8 @@ def predictions_of(scene: str, profile: str) -> tuple[Prediction, ...] | None:
 
 
 def _entry(profile: str, one: Prediction) -> str:
-    size = short_number(one.outliers if one.effect in OUTLIERS else one.ratio, 2)
-    if one.effect in OUTLIERS:
+    size = short_number(one.outliers if BY_NAME[one.effect].has_outliers else one.ratio, 2)
+    if BY_NAME[one.effect].has_outliers:
         size = f"{size if one.outliers >= 1e-6 else 0} pixels"
     return f"{one.effect}{'*' if assumed_numbers(_profile(profile), one.effect) else ''} {size}"
 

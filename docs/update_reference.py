@@ -1,4 +1,4 @@
-"""Write the parts of the documentation that follow from the code: reference, packages, table of promises.
+"""Write the parts of documentation and help that follow from the code: reference, packages, listed keys.
 
 ``python docs/update_reference.py`` rewrites the text between the markers ``<!-- NAME: from the code -->`` and
 ``<!-- end of NAME -->`` of each page, and the files of `GENERATED_FILES`; a test compares them with the code.
@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Callable
@@ -14,9 +15,10 @@ from pathlib import Path
 
 import grimp
 
+from unprocess_gen.cli.help import described_keys
+
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "tests")]
-from helpers.promises import evidence_table  # noqa: E402
+sys.path.insert(0, str(ROOT / "docs"))
 from reference_pages import PAGES  # noqa: E402
 
 PACKAGE = "unprocess_gen"
@@ -38,7 +40,7 @@ PACKAGES = tuple(package for layer in LAYERS for package in layer)
 @cache
 def package_imports() -> dict[str, list[str]]:
     """Return the packages that each package imports, in the order of `LAYERS`."""
-    graph = grimp.build_graph(PACKAGE, cache_dir=None)
+    graph = grimp.build_graph(PACKAGE, cache_dir=None, exclude_type_checking_imports=True)
     return {
         importer: [
             imported
@@ -53,13 +55,10 @@ def package_imports() -> dict[str, list[str]]:
 
 
 def package_table() -> str:
-    """Return the table of the packages: purpose, imported packages and modules."""
-    lines = ["| package | purpose | imports | modules |", "|---|---|---|---|"]
+    """Return the table of the packages: purpose and imported packages."""
+    lines = ["| package | purpose | imports |", "|---|---|---|"]
     for package, imported in package_imports().items():
-        folder = ROOT / PACKAGE / package
-        paths = sorted(path for path in folder.rglob("*.py") if path.name != "__init__.py")
-        names = [f"`{'.'.join(path.relative_to(folder).with_suffix('').parts)}`" for path in paths]
-        lines.append(f"| `{package}` | {purpose(package)} | {', '.join(imported) or '–'} | {', '.join(names)} |")
+        lines.append(f"| `{package}` | {purpose(package)} | {', '.join(imported) or '–'} |")
     return "\n".join(lines)
 
 
@@ -104,6 +103,11 @@ def _reachable(package: str) -> set[str]:
     return {*imported, *(further for one in imported for further in _reachable(one))}
 
 
+def keys_of_help() -> str:
+    """Return the JSON text of the keys that ``gen-dataset --help`` lists."""
+    return json.dumps(described_keys(), indent=1) + "\n"
+
+
 def purpose(package: str) -> str:
     """Return the docstring of a package in one line."""
     text = (ROOT / PACKAGE / package / "__init__.py").read_text(encoding="utf-8")
@@ -112,11 +116,14 @@ def purpose(package: str) -> str:
 
 GENERATED: dict[str, tuple[str, Callable[[], str]]] = {
     "packages": ("docs/design/architecture.md", package_table),
-    "promises": ("docs/evidence.md", evidence_table),
 }
 """Generated parts: name of the markers, page, function that returns the text."""
 
-GENERATED_FILES: dict[str, Callable[[], str]] = {"docs/design/packages.svg": package_drawing, **PAGES}
+GENERATED_FILES: dict[str, Callable[[], str]] = {
+    "docs/design/packages.svg": package_drawing,
+    "conf/keys.json": keys_of_help,
+    **PAGES,
+}
 """Generated files, and the functions that return their text."""
 
 

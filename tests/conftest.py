@@ -33,6 +33,7 @@ from PIL import Image
 from unprocess_gen.cli import main as entry_point
 from unprocess_gen.config import composition
 from unprocess_gen.config.option_files import conf_dir
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.pipeline import generate as runner
@@ -198,7 +199,9 @@ def make(settings: Settings) -> Make:
 
     def made(root: Path | None, out: Path, *overrides: str, n_jobs: int = 1) -> runner.Summary:
         config = settings(*overrides)
-        config.source.root, config.out, config.n_jobs = None if root is None else str(root), str(out), n_jobs
+        config = replaced(
+            config, {"source.root": None if root is None else str(root), "out": str(out), "n_jobs": n_jobs}
+        )
         validate_config(config)
         return runner.generate(config)
 

@@ -191,12 +191,6 @@ def test_config_is_not_changed(config: ug.Config) -> None:
     assert pickle.dumps(config) == before
 
 
-def test_pair_of_several_levels_and_draws_is_the_first() -> None:
-    config = ug.load_config(["noise.draws=2", "noise.levels=[{a: 1, b: 2}, {a: 3, b: 4}]"])
-    plan = ug.make_pair(SRGB, config).plan
-    assert (plan.level, plan.draw, plan.a_dn) == (0, 0, 1.0)
-
-
 # Refused --------------------------------------------------------------------------------------------------------------
 
 
@@ -342,3 +336,25 @@ def test_everything_works_inside_a_hydra_application(tmp_path: Path) -> None:
     )
     assert done.stdout.splitlines()[-1:] == ["sony_a7r 6 1 own"], done.stderr
     assert [row["status"] for row in read_rows(tmp_path / "ds" / "manifest.csv")] == ["ok"]
+
+
+@pytest.mark.parametrize(("setting", "value"), [("noise.levels", "[1600,6400]"), ("noise.draws", "2")])
+def test_several_pairs_of_an_array_are_refused(setting: str, value: str) -> None:
+    config = ug.load_config(["noise=imx385", "noise.iso=1600", f"{setting}={value}"])
+
+    with pytest.raises(ug.ConfigError, match=f"{setting}=.*: 2 pairs of an image; expected one; call make_pair once"):
+        ug.make_pair(np.zeros((4, 4, 3), np.uint8), config)
+
+
+def test_rows_of_pairs_and_of_datasets_have_one_type(dataset: Path) -> None:
+    pair = ug.make_pair(np.zeros((4, 4, 3), np.uint8), ug.load_config())
+    assert type(pair.row) is type(ug.RawPairs(dataset)[0].row) is dict
+
+
+def test_develop_states_how_light_is_converted_to_dn() -> None:
+    pair = ug.make_pair(np.zeros((4, 4, 3), np.uint8), ug.load_config())
+
+    with pytest.raises(ValueError, match=r"raw is float32; expected uint16, .* np\.rint\(light \* \(white - black\)"):
+        ug.develop(ug.to_light(pair.noisy, pair.row), pair.row)
+    with pytest.raises(TypeError, match=r"row is ndarray; expected a manifest row or a plan: develop\(raw, row\)"):
+        ug.develop(pair.row, pair.noisy)

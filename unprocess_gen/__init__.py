@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     )
     from unprocess_gen.core.types import Plan
     from unprocess_gen.dataset.reader import RawPairs, Sample
+    from unprocess_gen.dataset.training import noise_std, pack, random_crop, to_light
 
 __version__ = "0.2.0"
 
@@ -47,8 +48,12 @@ __all__ = [
     "generate",
     "load_config",
     "make_pair",
+    "noise_std",
+    "pack",
     "plan_image",
+    "random_crop",
     "replay",
+    "to_light",
     "verify",
 ]
 
@@ -61,6 +66,7 @@ _MODULES = {
     ),
     "core.types": ("Plan",),
     "dataset.reader": ("RawPairs", "Sample"),
+    "dataset.training": ("noise_std", "pack", "random_crop", "to_light"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

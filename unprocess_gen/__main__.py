@@ -9,13 +9,7 @@ import sys
 
 
 def main() -> int:
-    """Import the command and run it with the arguments of this process.
-
-    Returns
-    -------
-    int
-        The exit code; see ``gen-dataset --help``.
-    """
+    """Import the command and run it with the arguments of this process."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # otherwise the caller ignores it
         signal.signal(signal.SIGINT, _end)
     from unprocess_gen.cli import main as command

@@ -13,15 +13,18 @@ import os
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
+from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
-from unprocess_gen.core.object_store import any_path
+from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import PACKED, Frame, Pair, Patch, Plan, Row, Source, Srgb, Value
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row
@@ -30,14 +33,11 @@ from unprocess_gen.dataset.selection import select_rows
 from unprocess_gen.pipeline import generate as _generate
 from unprocess_gen.pipeline import replay as _replay
 from unprocess_gen.pipeline import verify as _verify
-from unprocess_gen.planning import plan as _plan
-from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.simulation import pair as _pair
+from unprocess_gen.pipeline.pairs import PairSettings, PlannedImage, plan_pixels
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.reference import isp
-from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
 from unprocess_gen.sources.loader import downscaled
-from unprocess_gen.sources.patches import crop_patch, list_patches
+from unprocess_gen.sources.patches import list_patches
 
 ARRAY_NAME = "array"
 """The column ``source`` of a pair made from an array."""
@@ -56,7 +56,7 @@ class RawPair:
         All parameters of the pair.
     counts : Counts
         Sites that were clipped, saturated or have no variance.
-    row : mapping
+    row : dict
         Manifest row of the pair: value by column. ``source_sha256`` is the digest of the array, or of ``key``. Built on
         first access.
     """
@@ -70,15 +70,15 @@ class RawPair:
         self._patch = patch
 
     @cached_property
-    def row(self) -> Row:
+    def row(self) -> dict[str, Any]:
         """Return the manifest row of the pair."""
         pair = Pair(self.clean, self.noisy, self.counts)
         digests = array_xxh3(self.clean), array_xxh3(self.noisy)
         identity = self._source.sha256 or ""
-        return pair_row(key_text(0), self._source, identity, 1, 0, self.plan, pair, digests, self._patch)
+        return dict(pair_row(key_text(0), self._source, identity, 1, 0, self.plan, pair, digests, self._patch))
 
     def __repr__(self) -> str:
-        return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise})"
+        return f"RawPair({self.clean.dtype} {list(self.clean.shape)}, noise={self.plan.noise.name})"
 
 
 def array_identity(srgb: Srgb) -> str:
@@ -137,11 +137,11 @@ def plan_image(srgb: ArrayLike, config: Config, *, seed: int | None = None, key:
     >>> srgb = np.full((64, 96, 3), 128, np.uint8)
     >>> plan = ug.plan_image(srgb, ug.load_config(), seed=7)
     >>> darker = ug.make_pair(srgb // 2, plan)
-    >>> darker.row["red_gain"] == plan.red_gain
+    >>> darker.row["red_gain"] == plan.camera.red_gain
     True
     """
     pixels = _pixels_of(srgb)
-    return _planned(pixels, _identity(pixels, key), config, seed)[0]
+    return _planned(pixels, _identity(pixels, key), config, seed).plans[0]
 
 
 def make_pair(
@@ -192,21 +192,19 @@ def make_pair(
     """
     pixels = _pixels_of(srgb)
     identity = _identity(pixels, key)
-    dark_folder: DarkFolder | None = None
     if not isinstance(config, Plan):
-        plan, dark_folder = _planned(pixels, identity, config, seed)
-    elif config.dark_frame:
+        image = _planned(pixels, identity, config, seed)
+    elif config.noise.dark.sha256:
         raise ConfigError("make_pair: the plan names a dark frame, whose folder it lacks; expected a config")
     elif seed is None and key is None:
-        plan = config
+        recorded = _downscaled(pixels, config.source.downscale)
+        image = PlannedImage(recorded, (config,), _full_frame(recorded, config.output.layout))
     else:
         raise ConfigError("make_pair: a plan has its own seed and key; expected them with a config only")
     if isinstance(config, Plan) or config.self_test == "stop":
-        self_test.check(self_test.kernels(plan))
-    recorded = _downscaled(pixels, plan.downscale)
-    patch = _full_frame(recorded, plan.layout)
-    pair = _pair.make_pair(crop_patch(recorded, patch), plan, dark_pixels=dark_folder)
-    return RawPair(pair, plan, Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=identity), patch)
+        self_test.check(self_test.kernels(image.plans[0]))
+    patch, plan, pair = next(dataclasses.replace(image, plans=image.plans[:1]).pairs())
+    return RawPair(pair, plan, _array_source(pixels, identity), patch)
 
 
 def generate(config: Config) -> _generate.Summary:
@@ -368,8 +366,10 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
     ------
     DamageError
         If the row is not the row of a pair.
+    TypeError
+        If ``row`` is neither a mapping nor a plan.
     ValueError
-        If the frame has fewer than 2 x 2 sites or another shape.
+        If the frame has fewer than 2 x 2 sites, or another shape or dtype than the row states.
 
     Examples
     --------
@@ -379,18 +379,26 @@ def develop(raw: Frame, row: Mapping[str, Value] | Plan) -> NDArray[np.uint8]:
     >>> ug.develop(pair.noisy, pair.row).shape
     (64, 96, 3)
     """
+    if not isinstance(row, (Mapping, Plan)):
+        raise TypeError(f"row is {type(row).__name__}; expected a manifest row or a plan: develop(raw, row)")
     plan = row if isinstance(row, Plan) else plan_from_row(row)
     recorded: Row = {
-        "pattern": plan.pattern,
-        "layout": plan.layout,
-        "dtype": plan.dtype,
-        "clean_dtype": plan.clean_dtype,
-        "black_level_dn": plan.black_level_dn,
-        "white_level_dn": plan.white_level_dn,
+        "pattern": plan.sensor.pattern,
+        "layout": plan.output.layout,
+        "dtype": plan.output.dtype,
+        "clean_dtype": plan.output.clean_dtype,
+        "black_level_dn": plan.sensor.black_level_dn,
+        "white_level_dn": plan.sensor.white_level_dn,
     }
-    dimensions = 3 if plan.layout == PACKED else 2
+    dimensions = 3 if plan.output.layout == PACKED else 2
     if np.ndim(raw) != dimensions:
-        raise ValueError(f"raw has {np.ndim(raw)} dimensions, expected {dimensions} for layout={plan.layout}")
+        raise ValueError(f"raw has {np.ndim(raw)} dimensions, expected {dimensions} for layout={plan.output.layout}")
+    expected = [np.dtype(name) for name in (plan.output.dtype, plan.output.clean_dtype) if name]
+    if raw.dtype not in expected:
+        raise ValueError(
+            f"raw is {raw.dtype}; expected {' or '.join(map(str, expected))}, as the row states; convert light back "
+            "with np.rint(light * (white - black) + black).clip(0, 2**bits - 1).astype(np.uint16)"
+        )
     return isp.to_codes(isp.develop(mosaic_dn(raw, recorded), plan)).astype(np.uint8)
 
 
@@ -403,11 +411,22 @@ def _pixels_of(srgb: ArrayLike) -> Srgb:
     return np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
 
 
-def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> tuple[Plan, DarkFolder | None]:
-    """Return the plan of an array, and access to the dark frames of the config."""
-    config, dark_frames, dark_folder = open_dark_frames(_config_for_arrays(config, seed))
-    facts = facts_for(config, _downscaled(pixels, config.source.downscale))
-    return _plan.plan_pairs(config, identity, facts=facts, dark_frames=dark_frames)[0], dark_folder
+def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> PlannedImage:
+    """Plan the pairs of an array; ConfigError if there are several."""
+    settings = PairSettings.read(_config_for_arrays(config, seed))
+    for key, pairs in (("levels", len(noise_levels(config.noise))), ("draws", config.noise.draws)):
+        if pairs > 1:
+            raise ConfigError(
+                f"noise.{key}={getattr(config.noise, key)}: {pairs} pairs of an image; expected one; call make_pair "
+                "once for each level or seed, or generate a dataset"
+            )
+    recorded = _downscaled(pixels, config.source.downscale)
+    _full_frame(recorded, config.output.layout)
+    return plan_pixels(settings, recorded, _array_source(pixels, identity), identity)
+
+
+def _array_source(pixels: Srgb, identity: str) -> Source:
+    return Source(0, ARRAY_NAME, ARRAY_NAME, pixels.nbytes, sha256=identity)
 
 
 def _identity(pixels: Srgb, key: str | int | None) -> str:
@@ -424,10 +443,10 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
     _check_complete(config)
     if config.source.patch is not None:
         raise ConfigError(
-            f"source.patch={config.source.patch}: make_pair returns complete frames; expected null; "
+            f"source.patch={value_text(config.source.patch)}: make_pair returns complete frames; expected null; "
             "cut the arrays of the pair at even rows and columns"
         )
-    source = dataclasses.replace(config.source, root=None, limit=None, clips=False, include=["*"])
+    source = dataclasses.replace(config.source, root=None, limit=None, clips=False, include=("*",))
     config = dataclasses.replace(config, source=source, seed=config.seed if seed is None else seed)
     validate_config(config)
     return config
@@ -456,10 +475,9 @@ def _downscaled(pixels: Srgb, downscale: int) -> Srgb:
     return pixels if downscale == 1 else downscaled(pixels, downscale)
 
 
-def _full_frame(recorded: Srgb, layout: str) -> Patch:
-    """Return the part of the pixels that a pair shows: all, except the last row or column of odd packed planes."""
+def _full_frame(recorded: Srgb, layout: str) -> tuple[Patch, ...]:
+    """Cut what a pair shows: all pixels, except the last row or column of odd packed planes."""
     height, width = recorded.shape[:2]
     if layout == PACKED and min(height, width) < 2:
         raise ConfigError(f"output.layout=packed: srgb is {list(recorded.shape)}; expected at least 2 x 2 sites")
-    (patch,) = list_patches(None, 0, height, width, layout)
-    return patch
+    return list_patches(None, 0, height, width, layout)

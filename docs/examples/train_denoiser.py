@@ -1,8 +1,8 @@
 """Train a small raw denoiser on pairs of unprocess_gen, and compare it with filters: the example of docs/tutorial.md.
 
 ``python train_denoiser.py`` uses the built-in scenes; ``--photos FOLDER`` uses the photographs of a folder. It needs
-PyTorch, and writes the dataset ``denoiser_data`` and the picture ``denoiser.jpg`` below ``--out``. The last fifth of
-the photographs is not trained on; all figures come from it.
+PyTorch, and writes a dataset (``denoiser_scenes`` or ``denoiser_photos``) and the picture ``denoiser.jpg`` below
+``--out``. The last fifth of the photographs is not trained on; all figures come from it.
 """
 
 from __future__ import annotations
@@ -29,34 +29,20 @@ WIDTH = 32
 """Channels of the hidden layers."""
 
 
-def pack(mosaic: np.ndarray, pattern: str) -> np.ndarray:
-    """Return the planes R, G of the red rows, G of the blue rows, B of a mosaic: [4, H // 2, W // 2]."""
-    red, blue = divmod(pattern.index("R"), 2), divmod(pattern.index("B"), 2)
-    sites = red, (red[0], 1 - red[1]), (blue[0], 1 - blue[1]), blue
-    even = mosaic[: mosaic.shape[0] // 2 * 2, : mosaic.shape[1] // 2 * 2]
-    return np.stack([even[y::2, x::2] for y, x in sites])
-
-
 def unpack(planes: np.ndarray, pattern: str) -> np.ndarray:
-    """Return the mosaic [2 H, 2 W] of four planes [4, H, W]; the inverse of `pack`."""
-    red, blue = divmod(pattern.index("R"), 2), divmod(pattern.index("B"), 2)
+    """Return the mosaic [2 H, 2 W] of four planes [4, H, W]; the inverse of `ug.pack`."""
     mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), planes.dtype)
-    for plane, (y, x) in zip(planes, (red, (red[0], 1 - red[1]), (blue[0], 1 - blue[1]), blue), strict=True):
-        mosaic[y::2, x::2] = plane
+    places = ug.pack(np.arange(mosaic.size).reshape(mosaic.shape), pattern)
+    mosaic.flat[places] = planes
     return mosaic
 
 
-def to_light(dn: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
-    """Return DN as float32: 0 at the black level, 1 at the white level; noise below black stays negative."""
-    black, white = np.float32(row["black_level_dn"]), np.float32(row["white_level_dn"])
-    return (dn.astype(np.float32) - black) / (white - black)
-
-
-def noise_std(light: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
-    """Return the standard deviation of the noise at each site, on the scale of ``light``, from the noisy frame."""
-    span = row["white_level_dn"] - row["black_level_dn"]
-    variance = row["a_dn"] / span * np.maximum(light, 0) + row["b_dn2"] / span**2
-    return np.sqrt(np.maximum(variance, 0), dtype=np.float32)  # a fitted b_dn2 may be below 0
+def light_and_std(noisy: np.ndarray, row: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return planes and noise map of a frame or crop, 0 at black and 1 at white, float32 [4, H // 2, W // 2]."""
+    even = noisy[: noisy.shape[0] // 2 * 2, : noisy.shape[1] // 2 * 2]
+    signal = np.maximum(even, row["black_level_dn"])  # the law would give deviations near 0 far below black
+    std = ug.noise_std(signal, row) / np.float32(row["white_level_dn"] - row["black_level_dn"])
+    return ug.pack(ug.to_light(even, row), row["pattern"]), ug.pack(std, row["pattern"])
 
 
 class RandomCrops(Dataset):
@@ -74,12 +60,10 @@ class RandomCrops(Dataset):
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, ...]:
         clean, noisy, row = self.pairs[index]
-        height, width = clean.shape
-        y = 2 * int(torch.randint((height - self.side) // 2 + 1, ()))
-        x = 2 * int(torch.randint((width - self.side) // 2 + 1, ()))
-        crop = np.s_[y : y + self.side, x : x + self.side]
-        planes = [to_light(pack(frame[crop], row["pattern"]), row) for frame in (noisy, clean)]
-        return *map(torch.from_numpy, planes), torch.from_numpy(noise_std(planes[0], row))
+        clean, noisy = ug.random_crop([clean, noisy], self.side, lambda count: int(torch.randint(count, ())))
+        light, std = light_and_std(noisy, row)
+        truth = ug.pack(ug.to_light(clean, row), row["pattern"])
+        return torch.from_numpy(light), torch.from_numpy(truth), torch.from_numpy(std)
 
 
 class Denoiser(nn.Module):
@@ -125,8 +109,7 @@ def by_planes(filtered: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Filte
     """Return a filter of mosaics from one of planes (light and noise map to light)."""
 
     def denoised(noisy: np.ndarray, row: Mapping[str, Any]) -> np.ndarray:
-        light = to_light(pack(noisy, row["pattern"]), row)
-        mosaic = unpack(filtered(light, noise_std(light, row)), row["pattern"])
+        mosaic = unpack(filtered(*light_and_std(noisy, row)), row["pattern"])
         return mosaic * np.float32(row["white_level_dn"] - row["black_level_dn"]) + np.float32(row["black_level_dn"])
 
     return denoised
@@ -194,10 +177,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
     options = parser.parse_args()
     torch.manual_seed(0)
+    torch.set_num_threads(1)  # convolutions this small are slower with several threads
 
-    data = options.out / "denoiser_data"
-    source = f"source.root={options.photos}" if options.photos else f"source.limit={options.scenes}"
-    ug.generate(ug.load_config([source, f"noise={NOISE}", f"out={data}"]))
+    name, source = (
+        ("photos", f"source.root={options.photos}") if options.photos else ("scenes", f"source.limit={options.scenes}")
+    )
+    data = options.out / f"denoiser_{name}"
+    try:
+        ug.generate(ug.load_config([source, f"noise={NOISE}", f"out={data}"]))
+    except ug.UnprocessGenError as error:
+        raise SystemExit(f"{parser.prog}: {error}") from error
     pairs = ug.RawPairs(data)
     held_out = max(len(pairs) // 5, 1)
     known, new = pairs[:-held_out], pairs[-held_out:]

@@ -6,7 +6,6 @@ import os
 import pty
 import select
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -16,11 +15,8 @@ from pathlib import Path
 import pytest
 from helpers.commands import COMMAND, RunMain
 
-from unprocess_gen.cli.completion import FILES, FOLDERS, SHELLS, WORDS, complete
+from unprocess_gen.cli.completion import FILES, FOLDERS, SCRIPTS, WORDS, complete
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.option_files import option_summary
-from unprocess_gen.config.schema import Config
-from unprocess_gen.config.settings import settings_of
 
 CANDIDATES = [
     ("gen-dataset ver", ["verify"]),
@@ -50,7 +46,7 @@ CANDIDATES = [
 
 @pytest.mark.parametrize(("line", "candidates"), CANDIDATES)
 def test_words_are_completed(line: str, candidates: list[str]) -> None:
-    assert complete(line, VERBS) == (WORDS, candidates)
+    assert complete(line) == (WORDS, candidates)
 
 
 @pytest.mark.parametrize(
@@ -69,13 +65,13 @@ def test_words_are_completed(line: str, candidates: list[str]) -> None:
     ],
 )
 def test_names_of_files_and_folders_are_left_to_the_shell(line: str, kind: str) -> None:
-    assert complete(line, VERBS) == (kind, [])
+    assert complete(line) == (kind, [])
 
 
 def test_every_verb_and_its_flags_are_completed() -> None:
-    assert set(VERBS) <= set(complete("gen-dataset ", VERBS)[1])
+    assert set(VERBS) <= set(complete("gen-dataset ")[1])
     for verb in VERBS.values():
-        flags = complete(f"gen-dataset {verb.name} -", VERBS)[1]
+        flags = complete(f"gen-dataset {verb.name} -")[1]
         assert {flag for argument in verb.arguments for flag in argument.flags} <= set(flags)
         assert {"--help", "--quiet"} <= set(flags)
 
@@ -84,22 +80,7 @@ def test_options_below_config_dir_are_completed(tmp_path: Path) -> None:
     (tmp_path / "noise").mkdir()
     (tmp_path / "noise/quiet.yaml").touch()
     for flag in (f"--config-dir {tmp_path}", f"-cd={tmp_path}"):
-        assert complete(f"gen-dataset {flag} noise=qu", VERBS) == (WORDS, ["noise=quiet"])
-
-
-def test_candidates_are_described_as_in_the_help(run_main: RunMain) -> None:
-    lines = {
-        "gen-dataset ver": ("verify", VERBS["verify"].summary),
-        "gen-dataset noise=imx385_iso16": ("noise=imx385_iso1600", option_summary("noise", "imx385_iso1600")),
-        "gen-dataset -m camera=sony_a7r,nex": ("camera=sony_a7r,nexus_6p", option_summary("camera", "nexus_6p")),
-        "gen-dataset +experiment=ipol": ("+experiment=ipol_demo", option_summary("experiment", "ipol_demo")),
-        "gen-dataset see": ("seed=", settings_of(Config)["seed"].meaning),
-        "gen-dataset verify --rep": ("--repair", "restore damaged files to the same bytes"),
-        "gen-dataset --mul": ("--multirun", "sweep over comma-separated values"),
-        "gen-dataset output.dtype=u": ("output.dtype=uint16", ""),
-    }
-    for line, (candidate, text) in lines.items():
-        assert run_main("completion", "describe", line).out == f"words\n{candidate}\t{text}\n", line
+        assert complete(f"gen-dataset {flag} noise=qu") == (WORDS, ["noise=quiet"])
 
 
 @pytest.mark.parametrize("arguments", [(), ("fish",), ("bash", "zsh"), ("bsh",)])
@@ -110,39 +91,6 @@ def test_unknown_shell_is_refused_in_one_line(arguments: tuple[str, ...], run_ma
 
 
 # Real shells ----------------------------------------------------------------------------------------------------------
-
-BASH = """
-eval "$({command} completion bash)"
-COMP_LINE=$1 COMP_POINT=${{#1}}
-IFS=' ' read -ra COMP_WORDS <<< "${{1//=/ = }}"
-[[ $1 == *[\\ =] ]] && COMP_WORDS+=('')
-COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
-compopt() {{ :; }}  # only valid while bash itself completes
-_gen_dataset {command}
-printf '%s\\n' "${{COMPREPLY[@]}}"
-"""
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-@pytest.mark.parametrize(
-    ("line", "reply"),
-    [
-        ("gen-dataset ver", ["verify"]),
-        ("gen-dataset camera=sony", ["sony_a7r", "sony_rx100"]),
-        ("gen-dataset isp=", ["gamma22", "linear", "smoothstep_gamma22", "srgb"]),
-        ("gen-dataset verify --re", ["--regenerate", "--repair"]),
-        ("gen-dataset verify som", ["some folder"]),
-        ("gen-dataset replay some", ["some file", "some folder"]),
-    ],
-)
-def test_bash_function_completes(line: str, reply: list[str], tmp_path: Path) -> None:
-    (tmp_path / "some folder").mkdir()
-    (tmp_path / "some file").touch()
-    script = BASH.format(command=COMMAND)
-    done = subprocess.run(
-        ["bash", "--norc", "-c", script, "bash", line], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert (sorted(done.stdout.splitlines()), done.stderr) == (reply, "")
 
 
 class Terminal:
@@ -172,7 +120,7 @@ class Terminal:
         os.close(self._at)
 
 
-@pytest.fixture(params=SHELLS)
+@pytest.fixture(params=SCRIPTS)
 def terminal(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Terminal]:
     """Return an interactive shell that evaluated its completion script."""
     shell = str(request.param)

@@ -18,14 +18,13 @@ import numpy as np
 import pytest
 import yaml
 from helpers.cases import slow_except
-from helpers.commands import COMMAND, Cli, RunMain, messages
+from helpers.commands import Cli, RunMain, messages
 from helpers.datasets import Make
 from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen import RawPairs, __version__
-from unprocess_gen.cli import verbs
 from unprocess_gen.cli.arguments import STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.cli.help import global_help
@@ -37,46 +36,34 @@ from unprocess_gen.core.errors import SourceError, UnprocessGenError
 
 REFUSED = [
     (["camera=nope"], r"camera=nope: no such option; expected one of choice, convex, custom, identity, nexus_6p, "),
-    (["noise=imx386"], r"noise=imx386: no such option; expected one of brooks2019, canon_5d4, canon_700d, canon_70d, "),
-    (["gains=Fixed"], r"gains=Fixed: no such option; expected one of brooks2019, "),
     (["source.rot=photos"], r"source.rot=photos: no such key; source has root, include, recursive, limit, "),
-    (["sed=1"], r"sed=1: no such key; expected one of source, camera, gains, isp, sensor, noise, scene, effects, "),
-    (["camera.blck=3"], r"camera.blck=3: no such key; camera has name, law, xyz2cam"),
-    (["+new=1"], r"new=1: no such key; expected one of source, camera, "),
-    (["+source.new=1"], r"source.new=1: no such key; source has root, "),
-    (["++new=1"], r"new=1: no such key; expected one of source, camera, "),
     (["~camera"], r"~camera: a setting cannot be removed"),
-    (["~camera.law=convex"], r"~camera.law=convex: a setting cannot be removed"),
     (["+camera=convex"], r".*camera.*more than once"),
-    (["seed=abc"], r"seed=abc: expected an integer"),
-    (["seed=2.5"], r"seed=2.5: expected an integer"),
-    (["seed=true"], r"seed=true: expected an integer"),
-    (["seed=null"], r"seed=null: expected a value other than null"),
-    (["gains.threshold=high"], r"gains.threshold=high: expected a number"),
-    (["source.recursive=perhaps"], r"source.recursive=perhaps: expected true or false"),
-    (["source.include=a.jpg"], r"source.include=a.jpg: "),
-    (["seed=${no.such}"], r"seed=\$\{no.such\}: Interpolation key 'no.such' not found"),
     (["seed=1,2"], r"seed=1,2: several values; expected one; .*add --multirun; for a list, write seed=\[1,2\]"),
     (["word"], r"word: no such verb; expected generate, prepare, .*again, completion or settings key=value"),
-    (["camera=convex", "word"], r"word: expected a setting key=value"),
-    (["camera.name"], r"camera.name: expected a setting key=value"),
+    (["camera=convex", "word"], r"generate: word: expected a setting key=value"),
+    (["camera.name"], r"generate: camera.name: expected a setting key=value"),
     ([""], r"."),
     (["seed=[1"], r".*\[1"),
     (["a b=c"], r".*a b=c"),
-    (["--flag"], r"--flag: no such flag; expected --source, --quiet, .*--multirun, "),
-    (["-x"], r"-x: no such flag"),
-    (["-j2"], r"-j2: no such flag"),
-    (["--multirun=2"], r"--multirun=2: "),
+    (["--flag"], r"generate: --flag: no such flag; expected --source, --quiet, .*--multirun, "),
+    (["-x"], r"generate: -x: no such flag"),
+    (["--out", "x"], r"generate: --out: no such flag; expected .*; out is a setting: write out=…"),
+    (["plan", "--noise.draws=2"], r"plan: --noise.draws=2: no such flag; .*: write noise.draws=2"),
+    (["again", "ds", "--out", "x"], r"again: --out: no such flag; .*; out is a setting: write out=…"),
+    (["preview", "ds", "sheets"], r"preview: sheets: unknown argument; .*; to write to sheets, add --to sheets"),
+    (["source.root=x", "plan"], r"plan: the verb must be the first word: gen-dataset plan source.root=x"),
+    (["--help", "verfy"], r"--help verfy: no such verb or group; expected one of generate, .*; did you mean verify"),
+    (["camera=my/own.yaml"], r"camera=my/own.yaml: .*; for a file of your own, put it in FOLDER/camera and write "),
+    (["camera=/my/own.yaml"], r"camera=/my/own.yaml: .*; for a file of your own, .* --config-dir FOLDER camera=own"),
+    (["--multirun=2"], r"generate: -m/--multirun: "),
     (["verfy", "ds"], r"verfy: no such verb; expected generate, prepare, .*; did you mean verify\?"),
-    (["--multrun", "seed=1,2"], r"--multrun: no such flag; .*; did you mean --multirun\?"),
-    (["plan", "--al"], r"--al: no such flag; expected --all, .*; did you mean --all\?"),
-    (["camera=sony_a7"], r"camera=sony_a7: no such option; .*; did you mean sony_a7r\?"),
-    (["nois=none"], r"nois=none: no such key; .*; did you mean noise\?"),
+    (["--multrun", "seed=1,2"], r"generate: --multrun: no such flag; .*; did you mean --multirun\?"),
+    (["plan", "--al"], r"plan: --al: no such flag; expected --all, .*; did you mean --all\?"),
     (["sourc.root=p"], r"sourc.root=p: no such key; expected one of source, .*; did you mean source\?"),
     (["verify", "ds", "--regenrate", "2"], r"verify: --regenrate: no such flag; .*; did you mean --regenerate\?"),
     (["verify", "ds", "--regenerate"], r"verify: --regenerate: expected one argument"),
     (["verify", "ds", "--regenerate", "-2"], r"verify: --regenerate -2: expected an integer of 0 or more"),
-    (["verify", "ds", "--regenerate", "two"], r"verify: --regenerate two: expected an integer of 0 or more"),
     (["verify", "ds", "sorce.root=x"], r"verify: sorce.root=x: unknown argument; .*; did you mean source.root\?"),
     (["replay", "ds", "--keys="], r"replay: --keys: a value is missing"),
     (["replay", "ds", "other"], r"replay: other: unknown argument"),
@@ -85,15 +72,10 @@ REFUSED = [
     (["--source", "a", "source.root=b"], r"--source a: the source is also given by source.root=b"),
     (["plan", "--quiet", "--verbose"], r"--quiet and --verbose exclude each other"),
     (["plan", "--log-file", "/no/such/file"], r"--log-file /no/such/file: cannot be written"),
-    (["plan", "--any"], r"--any: no such flag"),
-    (["plan", "camera=nope"], r"camera=nope: no such option"),
-    (["plan", "seed=-1"], r"seed=-1: expected 0 to "),
+    (["plan", "--any"], r"plan: --any: no such flag"),
     (["--config-dir", "/no/such"], r"--config-dir /no/such: no such folder"),
     (["--config-name", "other"], r".*'other'"),
-    (["camera=custom"], r"camera.xyz2cam=null: camera=custom needs a matrix; expected nine numbers"),
-    (["noise=heteroscedastic"], r"noise.a=null: expected a finite number or a distribution"),
     (["source.root=/no/such"], r"source.root=/no/such: no such folder"),
-    (["gains.red=0"], r"gains.red=0: expected a gain above 0"),
     (["out="], r"out='': expected the name of a folder"),
     (["out=ftp://x/y"], r"out=ftp://x/y: expected the name of a folder or a URL s3://, gs:// or az://"),
     (["preview", "ds", "--to", "s3://x/y"], r"preview: --to s3://x/y: expected a local folder"),
@@ -101,8 +83,7 @@ REFUSED = [
     (["-m", "camera=nope"], r"camera=nope: camera=nope: no such option"),
     (["-m", "seed=choice(1"], r".*choice"),
     (["hydra.run.dir=there"], r"hydra.run.dir=there: Hydra's own settings are fixed"),
-    (["--cfg"], r"--cfg: expected job, hydra, all"),
-    (["again"], r"again: expected the folder of a dataset"),
+    (["--cfg"], r"generate: -c/--cfg: expected one argument; see gen-dataset generate --help"),
     (["again", "out=x"], r"again: expected the folder of a dataset"),
     (["again", "/no/such", "out=x"], r"again: /no/such: no such folder; expected the folder of a dataset"),
 ]  # fmt: skip
@@ -120,21 +101,6 @@ def test_mistake_gives_one_line_exit_code_2_and_no_files(
     figure("mistakes", f"exit code {done.code}, {done.err.count(chr(10))} line, {len(list(tmp_path.iterdir()))} files")
 
 
-GROUP_VALUES = ["camera=null", "noise=3200", "sensor=12", "gains=2.0", "isp=true"]
-
-
-@pytest.mark.parametrize("argument", GROUP_VALUES)
-def test_number_instead_of_an_option_is_refused_in_one_line(argument: str, run_main: RunMain) -> None:
-    done = run_main(argument)
-    assert (done.code, done.err.count("\n")) == (2, 1)
-
-
-@pytest.mark.parametrize("arguments", [("--cfg", "nope"), ("--cfg",), ("--info", "nope"), ("--config-name",)])
-def test_flag_with_a_wrong_value_is_refused_in_one_line(arguments: tuple[str, ...], run_main: RunMain) -> None:
-    done = run_main(*arguments)
-    assert (done.code, done.err.count("\n")) == (2, 1)
-
-
 @pytest.mark.parametrize(
     ("arguments", "job"), [(("verify", "ds"), ""), (("seed=1",), ""), (("-m", "seed=1"), "seed=1: ")]
 )
@@ -144,15 +110,10 @@ def test_place_without_permission_gives_one_line_and_exit_code_5(
     def refused(*_: object, **__: object) -> NoReturn:
         raise PermissionError(errno.EACCES, "Permission denied", "ds/dataset.json")
 
-    monkeypatch.setattr("unprocess_gen.cli.verbs._dataset", refused)
+    monkeypatch.setattr("unprocess_gen.cli.checks.dataset_folder", refused)
     monkeypatch.setattr("unprocess_gen.pipeline.generate.generate", refused)
     message = "ds/dataset.json: Permission denied; expected read and write permissions"
     assert run_main(*arguments) == (5, "", f"gen-dataset: {job}{message}\n")
-
-
-@pytest.mark.parametrize(("count", "text"), [(0, "0.000%"), (1, "under 0.001%"), (49, "under 0.001%"), (50, "0.001%")])
-def test_few_sites_are_not_rounded_to_none(count: int, text: str) -> None:
-    assert verbs._percent(count, 10_000_000) == text
 
 
 def test_process_reports_a_mistake_in_one_line(cli: Cli, tmp_path: Path) -> None:
@@ -182,33 +143,11 @@ def test_out_below_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: 
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_out_that_is_a_file_is_refused(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
-    (tmp_path / "file").write_text("mine")
-    done = run_main(f"source.root={photos}", "out=file")
-    assert (done.code, done.err.count("\n")) == (2, 1)
-    assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_own_options_are_validated(run_main: RunMain, tmp_path: Path) -> None:
-    (tmp_path / "mine/noise").mkdir(parents=True)
-    (tmp_path / "mine/noise/bad.yaml").write_text("name: bad\nblak: 3\n")
-    done = run_main("--config-dir", "mine", "noise=bad")
-    assert (done.code, done.err.count("\n")) == (2, 1)
-    assert "blak" in done.err
-
-
 def test_profile_without_units_is_refused(run_main: RunMain, tmp_path: Path) -> None:
     (tmp_path / "mine/noise").mkdir(parents=True)
     (tmp_path / "mine/noise/bare.yaml").write_text("name: bare\nunits: null\na: 1\nb: 1\n")
     done = run_main("--config-dir=mine", "noise=bare", "noise.black=subtracted")
     assert (done.code, done.err) == (2, "gen-dataset: noise.units=null: expected one of dn, normalized\n")
-
-
-def test_invalid_yaml_is_refused_in_one_line(run_main: RunMain, tmp_path: Path) -> None:
-    (tmp_path / "mine/noise").mkdir(parents=True)
-    (tmp_path / "mine/noise/broken.yaml").write_text("name: [")
-    done = run_main("--config-dir", "mine", "noise=broken")
-    assert (done.code, done.err.count("\n")) == (2, 1)
 
 
 def test_own_options_are_used(run_main: RunMain, tmp_path: Path, photos: Path) -> None:
@@ -245,26 +184,10 @@ def test_every_verb_answers_help_with_its_own_arguments(verb: Verb, run_main: Ru
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_names_every_verb_group_and_option() -> None:
-    for verb in VERBS:
-        assert f"gen-dataset {verb}" in HELP
-    for folder in conf_dir().glob("*/"):
-        listed = re.search(rf"^  {folder.name} +(.*(?:\n {{13}}.*)*)$", HELP, re.MULTILINE)
-        assert listed is not None, folder.name
-        assert {file.stem for file in folder.glob("*.yaml")} - {"default"} <= set(re.findall(r"\w+", listed[1]))
-
-
 def test_help_names_every_group_and_top_level_setting() -> None:
     listed = [re.match(r"  (\w+)(?: |=)", line) for line in HELP.splitlines()]
     names = [match[1] for match in listed if match]
     assert [name for name in names if hasattr(Config(), name)] == [*GROUPS, *settings_of(Config)]
-
-
-def test_help_names_every_key_of_a_group() -> None:
-    for group, kind in GROUPS.items():
-        listed = re.search(rf"^  {group} +(.*(?:\n {{13}}.*)*)$", HELP, re.MULTILINE)
-        assert listed is not None
-        assert set(settings_of(kind)) <= set(re.findall(r"\w+", listed[1]))
 
 
 @pytest.mark.parametrize("group", [*GROUPS, *ADDED_GROUPS])
@@ -283,7 +206,7 @@ def test_help_of_a_word_describes_the_verb_or_group(run_main: RunMain) -> None:
     assert run_main("--help", "verify") == run_main("verify", "--help")
     both = run_main("-h", "accuracy").out
     assert both.startswith(run_main("accuracy", "--help").out) and "Keys of accuracy" in both
-    assert run_main("--help", "nothing").out == HELP
+    assert run_main("--help", "-q").out == HELP
     for setting in ("noise.iso", "noise=sony_a7s2"):
         assert run_main("--help", setting) == run_main("--help", "noise")
 
@@ -294,11 +217,7 @@ def test_help_and_errors_name_the_same_exit_codes() -> None:
     assert {error.exit_code for error in errors if error is not SourceError} <= codes
     assert {128 + number for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)} <= codes
     for one in EXIT_CODES:
-        assert f"{', '.join(map(str, one.codes))} {one.summary}" in HELP
-
-
-def test_help_fits_a_hundred_columns() -> None:
-    assert max(map(len, HELP.splitlines())) <= 100
+        assert f"{', '.join(map(str, one.codes))} {one.summary}" in " ".join(HELP.split())
 
 
 def test_help_imports_nothing_slow() -> None:
@@ -361,10 +280,7 @@ def test_hydra_completion_scripts_name_the_command(shell: str, run_main: RunMain
 
 def check_built_in_scenes(out: str, folder: Path) -> None:
     """Check the results that a run with the default settings prints, and the files that it writes."""
-    made, limits = out.splitlines()
-    rows = "10 of 10 rows generated in this run"
-    assert re.fullmatch(rf"ds: 10 pairs in 2 shards, [\d.]+ MB, 0 failed; {rows}, [\d.]+ s", made)
-    assert re.match(r"of 3,725,623 sites, clean: 0\.\d{3}% were clipped at black, ", limits)
+    assert re.fullmatch(r"ds: 10 pairs, [\d.]+ MB, [\d.]+ s, 0 failed; next: gen-dataset report ds\n", out)
     assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) == [
         "ds", "ds/config.yaml", "ds/dataset.json", "ds/manifest.csv", "ds/shards", "ds/shards/shard-00000.tar",
         "ds/shards/shard-00001.tar",
@@ -388,7 +304,7 @@ def test_failed_photographs_give_exit_code_3_and_are_counted(run_main: RunMain, 
     (fill(tmp_path / "p", 2) / "empty.png").touch()
     done = run_main("source.root=p", "n_jobs=1")
     assert done.code == 3
-    assert "2 pairs in 1 shard" in done.out
+    assert "2 pairs, " in done.out
     assert "1 failed (1 empty; see ds/manifest.csv), more than source.max_failed=0; " in done.out
 
 
@@ -449,7 +365,7 @@ def test_plan_estimates_bytes_from_a_sample(run_main: RunMain, make: Make, tmp_p
     about = re.search(r"^bytes +about ([\d,]+)", done.out, re.MULTILINE)
     assert about is not None, done.out
     real = sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
-    assert int(about[1].replace(",", "")) == pytest.approx(real, rel=0.1)
+    assert int(about[1].replace(",", "")) == real
 
 
 def test_plan_names_failing_photographs_and_reasons(run_main: RunMain, tmp_path: Path) -> None:
@@ -604,14 +520,6 @@ def test_source_has_two_spellings_in_every_verb(
     assert run_main(verb, *spelling, moved, *(word.replace("copy", "copy2") for word in TAKES_SOURCE[verb])).code == 0
 
 
-@pytest.mark.parametrize("spelling", SPELLINGS, ids=" ".join)
-@pytest.mark.parametrize("verb", ["generate", "plan"])
-def test_source_has_two_spellings_with_settings(
-    verb: str, spelling: tuple[str, ...], moved: Path, run_main: RunMain
-) -> None:
-    assert run_main(verb, *spelling, "n_jobs=1", "out=new", "source.max_failed=1").code == 0
-
-
 @pytest.mark.parametrize("verb", TAKES_SOURCE)
 def test_recorded_source_is_the_default(verb: str, moved: Path, run_main: RunMain, tmp_path: Path) -> None:
     (tmp_path / "moved").rename(tmp_path / "photos")
@@ -658,6 +566,9 @@ def test_verify_of_a_sweep_verifies_every_dataset(run_main: RunMain, tmp_path: P
     done = run_main("verify", "sweep", "--regenerate", "1", "--source", "p")
     assert (done.code, "sweep: 1 of 2 datasets are intact" in done.out) == (4, True)
     assert done.err.startswith("gen-dataset: sweep/seed=1: ")
+    assert messages(done.err)[-1] == (
+        "gen-dataset: sweep/seed=1: to restore damaged files, run gen-dataset verify sweep/seed=1 --repair"
+    )
 
 
 # Order and kind of words ----------------------------------------------------------------------------------------------
@@ -779,15 +690,12 @@ def test_folder_without_a_dataset_is_refused(
 ) -> None:
     (tmp_path / "empty").mkdir()
     done = run_main(verb, folder)
-    assert (done.code, done.out, done.err.count("\n")) == (2 if verb == "again" else 4, "", 1)
+    code = 4 if folder == "empty" and verb != "again" else 2
+    assert (done.code, done.out, done.err.count("\n")) == (code, "", 1)
     assert done.err.startswith(f"gen-dataset: {verb}: {folder}: {sentence}")
 
 
 # Installation ---------------------------------------------------------------------------------------------------------
-
-
-def test_console_script_is_installed_next_to_python() -> None:
-    assert COMMAND.is_file()
 
 
 def test_dataset_json_records_absolute_source_root(run_main: RunMain, tmp_path: Path) -> None:

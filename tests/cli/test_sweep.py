@@ -17,7 +17,7 @@ from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
 from helpers.processes import WAIT_S
 
-from unprocess_gen.cli.sweep import SHARES, folder_name, overrides_text
+from unprocess_gen.cli.sweep import SHARES, folder_name, named_overrides
 
 PATHS = os.pathsep.join(filter(None, sys.path))
 
@@ -326,9 +326,22 @@ def test_unreadable_sweep_csv_ends_in_one_line(
 
 def test_names_omit_keys_of_the_executor() -> None:
     overrides = ["seed=1", "executor=dask", "executor.address=x", "append=true", "+experiment=e", "output.dtype=uint16"]
-    assert overrides_text(overrides) == "+experiment=e,output.dtype=uint16,seed=1"
+    assert named_overrides(overrides) == ["+experiment=e", "output.dtype=uint16", "seed=1"]
 
 
 def test_names_encode_slashes_and_percent_signs() -> None:
-    assert folder_name("a=b/c%") == "a=b%2Fc%25"
-    assert folder_name("") == "default"
+    assert folder_name(["a=b/c%"]) == "a=b%2Fc%25"
+    assert folder_name([]) == "default"
+
+
+def test_shortened_name_begins_with_the_swept_keys(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    globs = ",".join(f"*{number:020d}" for number in range(9))
+    run = ("-m", "source.limit=1,2", f"source.include=['*.png',{globs}]", "source.root=p", "out=sweep", "n_jobs=1")
+    assert run_main(*run).code == 0
+    row, other = table(tmp_path / "sweep")
+    assert [row["folder"].partition(",")[0] for row in (row, other)] == ["source.limit=1", "source.limit=2"]
+
+    folder_of_0_2 = row["overrides"][:180] + row["folder"][-17:]
+    (tmp_path / "sweep" / row["folder"]).rename(tmp_path / "sweep" / folder_of_0_2)
+    assert run_main(*run).out.count("nothing to do") == 2
+    assert not (tmp_path / "sweep" / row["folder"]).exists()

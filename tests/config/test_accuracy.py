@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from decimal import localcontext
+from typing import Any
 
 import numpy as np
 import pytest
-from helpers.cases import slow_except
 from helpers.datasets import Settings
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,21 +18,18 @@ from unprocess_gen.config.accuracy import (
     STAGES,
     Budget,
     choose_methods,
-    method,
     methods_of_stage,
 )
 from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.core.types import Facts, Plan
+from unprocess_gen.core.types import NEAR_NORMAL
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.kernels.electron_records import count_roots
 from unprocess_gen.simulation.pair import make_pair, reference_pair
-from unprocess_gen.simulation.reference.poisson import core_share, gaussian_distance, gaussian_from
 from unprocess_gen.sources.scenes import synthetic
 
+METHODS_BY_NAME = {method.spelled: method for method in METHODS}
 EXACT = Budget("exact", False, 0.0, 0.0, 1e-6, 0.0)
 ALL = Budget("anything", False, math.inf, 1.0, math.inf, 1.0)
 
@@ -59,9 +55,12 @@ def test_unlimited_budget_chooses_cheapest_method_of_every_stage() -> None:
     )
 
 
-def test_normals_replace_counts_if_the_budget_allows() -> None:
-    assert "shot:gaussian_where_near" in choose_methods(ALL, counts_electrons=True)
-    assert "shot:inversion" in choose_methods(replace(ALL, law_distance=0.0), counts_electrons=True)
+@pytest.mark.parametrize(
+    ("changes", "method"),
+    [({}, "shot:inversion"), ({"normal_shot": True}, NEAR_NORMAL), ({"law_distance": 0.0}, "shot:inversion")],
+)
+def test_normals_replace_counts_only_if_the_settings_ask_for_it(changes: dict[str, Any], method: str) -> None:
+    assert method in choose_methods(replace(ALL, **changes), counts_electrons=True)
 
 
 @given(
@@ -72,7 +71,7 @@ def test_normals_replace_counts_if_the_budget_allows() -> None:
 )
 def test_chosen_methods_fit_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
     some = Budget("some", False, dn, share, normal, distance)
-    chosen = [method(*spelled.split(":")) for spelled in choose_methods(some, counts_electrons=False)]
+    chosen = [METHODS_BY_NAME[spelled] for spelled in choose_methods(some, counts_electrons=False)]
     cheaper = IMPLEMENTATIONS[: IMPLEMENTATIONS.index(chosen[0].implementation)]
 
     assert len({one.implementation for one in chosen}) == 1
@@ -132,8 +131,8 @@ def test_plan_contains_the_methods_of_its_tier(settings: Settings, noise: str, s
     config = settings(noise, "accuracy=fast")
     plan = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
 
-    assert (plan.accuracy, plan.law_distance) == ("fast", 5e-3)
-    assert plan.methods == choose_methods(accuracy_budget(config.accuracy), noise == "noise=nikon_d850")
+    assert (plan.accuracy.name, plan.accuracy.law_distance) == ("fast", 5e-3)
+    assert plan.accuracy.methods == choose_methods(accuracy_budget(config.accuracy), noise == "noise=nikon_d850")
 
 
 @pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=sony_a7s2"])
@@ -161,117 +160,7 @@ def test_reference_tier_uses_the_exact_table_of_the_curve(
         reference_pair(scene[:4, :4], plan)
 
 
-# Normal instead of Poisson distribution -------------------------------------------------------------------------------
-
-
-@given(read_std_e=st.floats(0.0, 30.0), law_distance=st.floats(1e-4, 0.05), rate_e=st.floats(0.0, 1e6))
-def test_normals_are_used_exactly_where_distance_allows(read_std_e: float, law_distance: float, rate_e: float) -> None:
-    below, above = gaussian_from(read_std_e, law_distance)
-    within = gaussian_distance(rate_e, read_std_e) <= law_distance
-    near = any(math.isclose(rate_e, edge, rel_tol=1e-9, abs_tol=1e-9) for edge in (below, above))
-
-    assert near or within == (rate_e <= below or rate_e >= above)
-
-
-def test_budget_of_zero_uses_counts_everywhere() -> None:
-    assert gaussian_from(3.0, 0.0) == (0.0, math.inf)
-
-
-def test_strong_read_noise_allows_normals_everywhere() -> None:
-    below, above = gaussian_from(6.0, 5e-3)
-
-    assert below == above
-
-
-@pytest.mark.parametrize(("rate_e", "read_std_e"), [(20.0, 1.0), (50.0, 3.0), (200.0, 2.0), (30.0, 6.0)])
-def test_distance_is_largest_difference_of_the_two_cdfs(rate_e: float, read_std_e: float) -> None:
-    """Compare with numerical integration: a normal density for each count, and one normal density of equal variance."""
-    grid = np.linspace(rate_e - 12 * math.sqrt(rate_e + 36), rate_e + 14 * math.sqrt(rate_e + 36), 40001)
-    counts = np.arange(0, int(rate_e + 20 * math.sqrt(rate_e) + 20))
-    log_shares = counts * math.log(rate_e) - rate_e - np.array([math.lgamma(k + 1) for k in counts])
-
-    def normal(x: np.ndarray, variance: float) -> np.ndarray:
-        return np.asarray(np.exp(-x * x / (2 * variance)) / math.sqrt(2 * math.pi * variance))
-
-    with np.errstate(under="ignore"):  # far from the mean a normal comes to nothing
-        mixture = np.zeros_like(grid)
-        for k, log_share in zip(counts, log_shares, strict=True):
-            mixture += math.exp(log_share) * normal(grid - k, read_std_e**2)
-        alone = normal(grid - rate_e, rate_e + read_std_e**2)
-        distance = float(np.abs(np.cumsum(mixture - alone)).max() * (grid[1] - grid[0]))
-
-    assert gaussian_distance(rate_e, read_std_e) == pytest.approx(distance, rel=0.12)
-
-
-def tukey_cdf(x: np.ndarray, shape: float, std: float) -> np.ndarray:
-    """Return the distribution function of Tukey's lambda distribution by inverting its quantiles on a grid."""
-    tails = np.logspace(-14, -3, 2000)
-    p = np.concatenate([tails, np.linspace(1e-3, 1 - 1e-3, 8001)[1:-1], 1 - tails[::-1]])
-    quantiles = np.log(p / (1 - p)) if shape == 0 else (p**shape - (1 - p) ** shape) / shape
-    with localcontext(prec=40):
-        return np.asarray(np.interp(x, quantiles * (std / float(tukey_std(shape))), p))
-
-
-def distance_with_tukey(rate_e: float, shape: float, read_std_e: float) -> float:
-    """Return the largest CDF difference between counts and a normal with their mean and variance, both with read noise.
-
-    The difference of the distribution functions of the counts and the normal is convolved with the read noise.
-    """
-    steps, reach = 32, int(10 * math.sqrt(rate_e) + 12)
-    counts = np.arange(max(math.floor(rate_e) - reach, 0), math.floor(rate_e) + reach + 1)
-    log_shares = counts * math.log(rate_e) - rate_e - np.array([math.lgamma(k + 1) for k in counts])
-    low = math.floor(rate_e) - reach
-    x = low + (np.arange(2 * reach * steps) + 0.5) / steps
-    with np.errstate(under="ignore"):
-        cumulated = np.concatenate([[0.0], np.cumsum(np.exp(log_shares))])
-        normal = np.array([0.5 * math.erfc(-(one - rate_e) / math.sqrt(2 * rate_e)) for one in x])
-    of_counts = cumulated[np.clip(np.floor(x).astype(int) - counts[0] + 1, 0, counts.size)]
-    edges = (np.arange(int(-(12 * read_std_e + 10) * steps), int((12 * read_std_e + 10) * steps) + 2) - 0.5) / steps
-    weights = np.diff(tukey_cdf(edges, shape, read_std_e))
-    size = 2 ** math.ceil(math.log2(x.size + weights.size))
-    with np.errstate(under="ignore"):
-        spectrum = np.fft.rfft(of_counts - normal, size) * np.fft.rfft(weights, size)
-        return float(np.abs(np.fft.irfft(spectrum, size)).max())
-
-
-def law_plan(settings: Settings, law: str, shape: float, read_std_e: float, law_distance: float) -> Plan:
-    plan = plan_image(settings("noise=nikon_d850", "accuracy=fast"), "0" * 64, facts=Facts(64, 48, 256, 0, 255))
-    assert plan.physics is not None
-    physics = replace(plan.physics, read_law=law, read_shape=shape, read_std_dn=read_std_e * plan.physics.dn_per_e)
-    return replace(plan, physics=physics, effects=("shot", "read"), law_distance=law_distance)
-
-
-def limits_of(plan: Plan) -> tuple[float, float]:
-    """Return the means up to which, and from which, the kernel draws normals."""
-    assert plan.physics is not None
-    low, high = count_roots(plan, plan.physics.read_std_dn / plan.physics.dn_per_e, counts_all=False)
-    return low**2, high**2
-
-
-@pytest.mark.parametrize("law_distance", slow_except((5e-3,), (1e-3, 5e-3, 0.02)))
-@pytest.mark.parametrize("shape", [0.3, 0.1571, 0.0, -0.1, -0.2143, -0.2429, -0.3, -0.4, -0.45])
-def test_law_distance_holds_for_tukey_read_noise(settings: Settings, shape: float, law_distance: float) -> None:
-    """Test means next to the limits, from the least read noise with which normals are drawn."""
-    for core_std_e in (0.501, 0.6, 1.0, 3.0, 8.0):
-        read_std_e = core_std_e / core_share(shape)
-        below, above = limits_of(law_plan(settings, "tukey_lambda", shape, read_std_e, law_distance))
-        assert above < math.inf
-        rates = (below, 0.5 * below, above, 1.3 * above) if below < above else (0.1, 1.0, 10.0, 100.0)
-        for rate_e in rates:
-            if 1e-2 < rate_e < 5000:
-                assert distance_with_tukey(rate_e, shape, read_std_e) <= law_distance, (read_std_e, rate_e)
-
-
-def test_law_of_0_1_exceeds_the_law_distance_near_half_an_electron(settings: Settings) -> None:
-    """Its limits are those of normal read noise, on which the bytes of recorded datasets depend."""
-    below, above = limits_of(law_plan(settings, "tukey", -0.2429, 0.5, 5e-3))
-    assert (below, above) == pytest.approx(gaussian_from(0.5, 5e-3), rel=1e-12)
-    assert distance_with_tukey(above, -0.2429, 0.5) == pytest.approx(0.0068, rel=0.03)
-
-
-@pytest.mark.parametrize(("shape", "read_std_e"), [(0.31, 5.0), (1.0, 5.0), (0.0, 0.6), (-0.2429, 0.9)])
-def test_counts_are_drawn_where_no_normal_is_near(settings: Settings, shape: float, read_std_e: float) -> None:
-    assert limits_of(law_plan(settings, "tukey_lambda", shape, read_std_e, 5e-3)) == (0.0, math.inf)
+# Order of methods -----------------------------------------------------------------------------------------------------
 
 
 def test_methods_of_each_stage_are_in_order_of_cost() -> None:
@@ -293,7 +182,7 @@ def test_names_of_methods_are_unique() -> None:
 )
 def test_plans_that_amplify_rounding_errors_use_float64(settings: Settings, steep: str) -> None:
     chosen = [
-        plan_image(settings("accuracy=fast", "noise=imx385_iso3200", *words), "0" * 64).methods
+        plan_image(settings("accuracy=fast", "noise=imx385_iso3200", *words), "0" * 64).accuracy.methods
         for words in ([], steep.split())
     ]
 

@@ -180,12 +180,9 @@ def test_options_of_a_group_are_listed() -> None:
 BOMB = "".join(f"l{level}: &l{level} [{', '.join([f'*l{level - 1}' if level else '1'] * 9)}]\n" for level in range(12))
 HOSTILE = {
     "empty": ("", "the file contains no keys"),
-    "comment only": ("# nothing\n", "the file contains no keys"),
     "list": ("- a\n- b\n", "expected a YAML mapping"),
-    "text": ("word\n", "expected a YAML mapping"),
-    "alias bomb": (BOMB, "values after aliases are expanded"),
+    "alias bomb": (BOMB, "more than 32 aliases"),
     "brackets": ("a: " + "[" * 200_000, "nested more than"),
-    "open mapping": ("name: [", "not valid YAML"),
 }
 
 

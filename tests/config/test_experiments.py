@@ -135,14 +135,14 @@ def test_brooks_distributions_are_those_of_the_script(settings: Settings) -> Non
     """unprocess.py: random_gains(), random_noise_levels(), safe_invert_gains(), mosaic(); train.py: image_size."""
     config = settings(f"+{RECIPE}=brooks2019_training")
     gains, noise = config.gains, config.noise
-    assert (gains.red, gains.blue) == (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9])
-    assert gains.inverse_rgb == ["truncated_normal", 0.8, 0.1, 0.5, 1.1]  # the script: not truncated
+    assert (gains.red, gains.blue) == (("uniform", 1.9, 2.4), ("uniform", 1.5, 1.9))
+    assert gains.inverse_rgb == ("truncated_normal", 0.8, 0.1, 0.5, 1.1)  # the script: not truncated
     assert (gains.highlight, gains.threshold) == ("gray_mean", 0.9)
-    assert (noise.a, noise.b) == (["log_uniform", 0.0001, 0.012], ["log_linear_in_a", 2.18, 1.2, 0.26])
+    assert (noise.a, noise.b) == (("log_uniform", 0.0001, 0.012), ("log_linear_in_a", 2.18, 1.2, 0.26))
     assert (noise.units, noise.law) == ("normalized", "gaussian")
     assert (config.camera.law, config.isp.tone, config.isp.gamma) == ("convex", "smoothstep", 2.2)
     assert (config.sensor.pattern, config.sensor.clip) == ("RGGB", "none")
-    assert (config.source.downscale, config.source.patch[:2]) == (2, ["random", 256])
+    assert (config.source.downscale, config.source.patch[:2]) == (2, ("random", 256))
     assert (config.output.dtype, config.output.layout) == ("float32", "packed")
 
 
@@ -213,8 +213,8 @@ def test_each_crvd_like_clip_has_one_of_five_isos(run_main: RunMain, tmp_path: P
 
 def test_crvd_like_draws_from_five_isos(settings: Settings) -> None:
     config = settings(f"+{RECIPE}=crvd_like")
-    assert config.scene.iso == ["choice", *CRVD]
-    assert [branch.iso for branch in config.noise.branches] == [[iso, iso] for iso in CRVD]
+    assert config.scene.iso == ("choice", *CRVD)
+    assert [branch.iso for branch in config.noise.branches] == [(iso, iso) for iso in CRVD]
     assert (config.sensor.pattern, config.source.clips, config.noise.name) == ("GBRG", True, "imx385")
 
 

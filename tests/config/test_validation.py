@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import yaml
 from helpers.commands import RunMain
+from helpers.configs import with_branch
 from helpers.datasets import Settings
 from helpers.published import CRVD
 from hypothesis import given
@@ -26,7 +27,7 @@ from unprocess_gen.config.distributions import parse_distribution
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
 from unprocess_gen.config.limits import Choice
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
-from unprocess_gen.config.schema import PHYSICAL_NUMBERS, Config, all_settings
+from unprocess_gen.config.schema import Config, all_settings, replaced
 from unprocess_gen.config.serialization import (
     NOT_DATA,
     NOT_RECORDED,
@@ -34,9 +35,7 @@ from unprocess_gen.config.serialization import (
     differences,
     parse_dataset_yaml,
     read_dataset_yaml,
-    source_kind,
 )
-from unprocess_gen.config.settings import Setting
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import parse_yaml_mapping
 from unprocess_gen.core import tone_curves
@@ -56,14 +55,6 @@ NEEDS = {
     "noise/heteroscedastic.yaml": ["noise.a=3.5", "noise.b=12"],
     "noise/imx385.yaml": ["noise.iso=3200"],  # the ISO of scene=daylight is not calibrated
 }
-NOISE_KEYS = {"name", "units", "black", "bits", "black_level_dn", "white_level_dn"}
-TWO_NUMBERS = {"a", "b", "negative_variance"}
-UNPUBLISHED = {"row_correlation", "gain_by_colour", "lens_shading"}
-"""Keys that no published calibration gives, so no profile has them."""
-PHYSICAL = {"branches", "assumed", "provenance", *PHYSICAL_NUMBERS} - UNPUBLISHED
-DARK = {"dark_frames", "dark_frames_sha256", "dark_frames_black_dn", "dark_shading", "dark_shading_sha256"}
-CHOSEN = {"iso", "law", "levels", "draws", "scatter", *DARK}
-"""Keys that users set; of these, profiles set only ``scatter``."""
 SHA256 = "0" * 64
 
 
@@ -88,54 +79,30 @@ def test_fixture_settings_builds_what_hydra_composes(settings: Settings) -> None
         assert OmegaConf.to_object(composed) == settings(*overrides), overrides
 
 
-def test_every_option_has_all_keys_of_its_group() -> None:
-    for file in FILES:
-        group = getattr(Config(), str(file.parent))
-        written = yaml.safe_load((conf_dir() / file).read_text(encoding="utf-8"))
-        keys = {field.name for field in dataclasses.fields(group)}
-        if str(file.parent) == "noise":
-            assert keys == NOISE_KEYS | TWO_NUMBERS | PHYSICAL | CHOSEN | UNPUBLISHED
-            keys = NOISE_KEYS | (PHYSICAL | {"scatter"} if "branches" in written else TWO_NUMBERS)
-        assert set(written) == keys, file
+OPTIONS = """
+source: default
+camera: convex sony_a7r olympus_em10 sony_rx100 nexus_6p choice identity custom
+gains: brooks2019 fixed paper_min paper_max paper_literal fig6_top fig6_bottom unity
+isp: smoothstep_gamma22 gamma22 srgb linear
+sensor: imx385_12bit generic_10bit generic_12bit generic_14bit generic_16bit
+noise: imx385_iso1600 imx385_iso3200 imx385_iso6400 imx385_iso12800 imx385_iso25600 imx385_iso3200_rvdd brooks2019
+noise: heteroscedastic none imx385 sony_a7s2 nikon_d850 canon_5d4 canon_70d canon_700d oppo_reno10x
+scene: daylight indoor long_exposure low_light night video_night
+effects: default
+accuracy: reference exact fast
+output: webdataset
+executor: local dask
+experiment: ipol_demo brooks2019_training crvd_like eld_low_light
+sweep: iso_ladder cameras camera_by_iso gain_extremes paper_figure6
+"""
+"""Options that commands of users name."""
 
 
 def test_options_are_those_of_the_contract() -> None:
     options = {folder.name: {file.stem for file in folder.glob("*.yaml")} for folder in conf_dir().glob("*/")}
-    assert options == {
-        "source": {"default"},
-        "camera": {
-            "convex", "sony_a7r", "olympus_em10", "sony_rx100", "nexus_6p", "choice", "identity", "custom",
-        },
-        "gains": {
-            "brooks2019", "fixed", "paper_min", "paper_max", "paper_literal", "fig6_top", "fig6_bottom", "unity",
-        },
-        "isp": {"smoothstep_gamma22", "gamma22", "srgb", "linear"},
-        "sensor": {"imx385_12bit", "generic_10bit", "generic_12bit", "generic_14bit", "generic_16bit"},
-        "noise": {
-            "imx385_iso1600", "imx385_iso3200", "imx385_iso6400", "imx385_iso12800", "imx385_iso25600",
-            "imx385_iso3200_rvdd", "brooks2019", "heteroscedastic", "none",
-            "imx385", "sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x",
-        },
-        "scene": {"daylight", "indoor", "long_exposure", "low_light", "night", "video_night"},
-        "effects": {"default"},
-        "accuracy": {"reference", "exact", "fast"},
-        "output": {"webdataset"},
-        "executor": {"local", "dask"},
-        "experiment": {"ipol_demo", "brooks2019_training", "crvd_like", "eld_low_light"},
-        "sweep": {"iso_ladder", "cameras", "camera_by_iso", "gain_extremes", "paper_figure6"},
-    }  # fmt: skip
-
-
-def test_defaults_are_those_of_the_contract(settings: Settings) -> None:
-    config = settings()
-    assert (config.seed, config.out, config.n_jobs) == (0, "ds", -1)
-    assert (config.source.root, config.source.limit, config.source.recursive) == (None, None, True)
-    assert (config.source.max_pixels, config.source.max_failed, config.source.icc) == (2**26, 0, "ignore")
-    assert (config.camera.name, config.camera.law) == ("convex", "convex")
-    assert (config.isp.tone, config.isp.gamma) == ("smoothstep", 2.2)
-    assert (config.noise.name, config.output.dtype, config.output.layout, config.output.pairs_per_shard) == (
-        "imx385_iso3200", "uint16", "mosaic", 8,
-    )  # fmt: skip
+    for line in OPTIONS.strip().splitlines():
+        group, names = line.split(": ")
+        assert set(names.split()) <= options[group], group
 
 
 @pytest.mark.parametrize("name", ["photo.jpg", "photo.JPEG", "photo.png", "a.tif", "a.tiff", "a.webp", "a.bmp"])
@@ -147,61 +114,47 @@ def test_default_globs_match_every_image_format(name: str, settings: Settings, t
 
 
 @pytest.mark.parametrize("iso", CRVD)
-def test_imx385_profiles_have_the_numbers_of_crvd(iso: int, settings: Settings) -> None:
-    noise = settings(f"noise=imx385_iso{iso}").noise
-    assert (noise.a, noise.b) == CRVD[iso]
-    assert (noise.units, noise.black, noise.bits, noise.black_level_dn, noise.white_level_dn) == (
-        "dn", "subtracted", 12, 240, 4095,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("iso", CRVD)
 def test_imx385_profiles_are_unchanged_in_the_plan(iso: int, settings: Settings) -> None:
     plan = plan_image(settings(f"noise=imx385_iso{iso}"), SHA256)
-    assert (plan.a_dn, plan.b_dn2) == CRVD[iso]
-
-
-def test_rvdd_profile_is_the_line_of_its_author(settings: Settings) -> None:
-    noise = settings("noise=imx385_iso3200_rvdd").noise
-    assert (noise.a, noise.b, noise.black, noise.negative_variance) == (8.0034, -2043.51144, "included", "clip")
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == CRVD[iso]
 
 
 def test_rvdd_line_is_122_dn2_below_zero_at_black(settings: Settings) -> None:
     plan = plan_image(settings("noise=imx385_iso3200_rvdd"), SHA256)
-    assert plan.b_dn2 == pytest.approx(8.0034 * 240 - 2043.51144, abs=1e-9)
-    assert -plan.b_dn2 / plan.a_dn == pytest.approx(15.33, abs=0.005)
+    assert plan.noise.b_dn2 == pytest.approx(8.0034 * 240 - 2043.51144, abs=1e-9)
+    assert -plan.noise.b_dn2 / plan.noise.a_dn == pytest.approx(15.33, abs=0.005)
 
 
 def test_brooks_noise_is_the_published_distribution(settings: Settings) -> None:
     noise = settings("noise=brooks2019").noise
     assert (noise.units, noise.a, noise.b) == (
-        "normalized", ["log_uniform", 0.0001, 0.012], ["log_linear_in_a", 2.18, 1.2, 0.26],
+        "normalized", ("log_uniform", 0.0001, 0.012), ("log_linear_in_a", 2.18, 1.2, 0.26),
     )  # fmt: skip
 
 
 def test_noise_none_has_no_variance(settings: Settings) -> None:
     plan = plan_image(settings("noise=none"), SHA256)
-    assert (plan.a_dn, plan.b_dn2, plan.effects) == (0, 0, ("quantise",))
+    assert (plan.noise.a_dn, plan.noise.b_dn2, plan.noise.effects) == (0, 0, ("quantise",))
 
 
 @pytest.mark.parametrize("sensor", ["imx385_12bit", "generic_10bit", "generic_14bit", "generic_16bit"])
 def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(sensor: str, settings: Settings) -> None:
     plan = plan_image(settings(f"sensor={sensor}", "noise=heteroscedastic", "noise.a=3.5", "noise.b=12"), SHA256)
-    assert (plan.a_dn, plan.b_dn2) == (3.5, 12)
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == (3.5, 12)
 
 
 def test_profile_is_scaled_by_the_ratio_of_levels(settings: Settings) -> None:
     plan = plan_image(settings("sensor=generic_14bit", "noise=imx385_iso1600"), SHA256)
     scale = (16383 - 1024) / (4095 - 240)
-    assert (plan.a_dn, plan.b_dn2) == pytest.approx((3.513262 * scale, 11.917691 * scale**2), rel=1e-15)
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == pytest.approx((3.513262 * scale, 11.917691 * scale**2), rel=1e-15)
 
 
 GAINS = {
-    "brooks2019": (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["truncated_normal", 0.8, 0.1, 0.5, 1.1]),
+    "brooks2019": (("uniform", 1.9, 2.4), ("uniform", 1.5, 1.9), ("truncated_normal", 0.8, 0.1, 0.5, 1.1)),
     "fixed": (2.15, 1.7, 0.8),
     "paper_min": (1.9, 1.5, 1 / 0.85),
     "paper_max": (2.4, 1.9, 1 / 2.05),
-    "paper_literal": (["uniform", 1.9, 2.4], ["uniform", 1.5, 1.9], ["inverse_truncated_normal", 0.8, 0.1, 0.5, 1.1]),
+    "paper_literal": (("uniform", 1.9, 2.4), ("uniform", 1.5, 1.9), ("inverse_truncated_normal", 0.8, 0.1, 0.5, 1.1)),
     "fig6_top": (1.9, 1.5, 0.85),
     "fig6_bottom": (2.4, 1.9, 2.05),
     "unity": (1, 1, 1),
@@ -216,59 +169,18 @@ def test_gains_are_those_of_the_contract(name: str, settings: Settings) -> None:
     assert gains.threshold == 0.9
 
 
-SENSORS = {
-    "imx385_12bit": (12, 240, 4095),
-    "generic_10bit": (10, 64, 1023),
-    "generic_12bit": (12, 256, 4095),
-    "generic_14bit": (14, 1024, 16383),
-    "generic_16bit": (16, 4096, 65535),
-}
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_sensors_are_those_of_the_contract(name: str, settings: Settings) -> None:
-    sensor = settings(f"sensor={name}").sensor
-    assert (sensor.bits, sensor.black_level_dn, sensor.white_level_dn) == SENSORS[name]
-    assert (sensor.pattern, sensor.clip) == ("RGGB", "sensor")
-
-
-ISPS = {
-    "smoothstep_gamma22": ("smoothstep", 2.2),
-    "gamma22": ("none", 2.2),
-    "srgb": ("none", "srgb"),
-    "linear": ("none", 1),
-}
-
-
-@pytest.mark.parametrize("name", ISPS)
-def test_isps_are_those_of_the_contract(name: str, settings: Settings) -> None:
-    isp = settings(f"isp={name}").isp
-    assert (isp.tone, isp.gamma) == ISPS[name]
-
-
 # Refused values -------------------------------------------------------------------------------------------------------
 
 REFUSED = [
     ("seed=-1", r"seed=-1: expected 0 to 9223372036854775807"),
-    ("seed=9223372036854775808", r"seed=9223372036854775808: expected 0 to 9223372036854775807"),
     ("n_jobs=0", r"n_jobs=0: expected 1 to 1024 or -1"),
-    ("executor.kind=ray", r"executor.kind=ray: expected one of local, dask"),
-    ("executor.chunk_s=0", r"executor.chunk_s=0.0: expected more than 0, up to 86400"),
-    ("executor.window=0", r"executor.window=0: expected 1 to 1000"),
     (
         "executor.address=tcp://host:8786",
         r"executor.address=tcp://host:8786: .*connects to no scheduler; set executor=dask",
     ),
-    ("n_jobs=-2", r"n_jobs=-2: expected 1 to 1024 or -1"),
-    ("self_test=off", r"self_test=off: expected one of stop, go_on"),
     ("out=''", r"out='': expected the name of a folder"),
     ("source.root=/no/such/folder", r"source.root=/no/such/folder: no such folder"),
     ("source.include=[]", r"source.include=\[\]: expected at least one pattern"),
-    ("source.limit=0", r"source.limit=0: expected 1 to 1000000000 or null"),
-    ("source.max_pixels=0", r"source.max_pixels=0: expected 1 to "),
-    ("source.max_failed=-1", r"source.max_failed=-1: expected 0 to "),
-    ("source.icc=convert", r"source.icc=convert: expected one of ignore, refuse"),
-    ("camera.law=mean", r"camera.law=mean: expected one of fixed, convex, choice, identity, custom"),
     ("camera.law=fixed", r"camera.name=convex: expected one of nexus_6p, sony_a7r, olympus_em10, sony_rx100"),
     (
         f"camera.xyz2cam={MATRIX}",
@@ -277,115 +189,63 @@ REFUSED = [
     ("camera.law=custom", r"camera.xyz2cam=null: camera=custom needs a matrix; expected nine numbers"),
     ("camera.law=custom;camera.xyz2cam=[1,2,3]", r"camera.xyz2cam=\[1.0, 2.0, 3.0\]: .*nine"),
     ("camera.law=custom;camera.xyz2cam=[1,2,3,2,4,6,1,1,1]", r"camera.xyz2cam=\[1.0, 2.0, .*\]: .*invert"),
-    ("camera.law=custom;camera.xyz2cam=[0,0,0,0,0,0,0,0,0]", r"camera.xyz2cam=\[0.0, 0.0, .*\]: "),
     ("camera.law=custom;camera.xyz2cam=[nan,0,0,0,1,0,0,0,1]", r"camera.xyz2cam=\[nan, 0.0, .*\]: "),
-    ("camera.law=custom;camera.xyz2cam=[inf,0,0,0,1,0,0,0,1]", r"camera.xyz2cam=\[inf, 0.0, .*\]: "),
     ("gains.red=0", r"gains.red=0: expected a gain above 0"),
-    ("gains.red=1e-310", r"gains.red=1e-310: expected a gain above 0, from 0.001 to 1000"),
-    ("gains.blue=[uniform,1,1e9]", r"gains.blue=.*: expected a gain above 0, from 0.001 to 1000"),
     (
         "camera=custom;camera.name=sony_a7r;camera.xyz2cam=[1,0,0,0,1,0,0,0,1]",
         r"camera.name=sony_a7r: is the name of",
     ),
-    ("gains.blue=-1.5", r"gains.blue=-1.5: expected a gain above 0"),
-    ("gains.inverse_rgb=0.0", r"gains.inverse_rgb=0.0: expected a gain above 0"),
     ("gains.red=nan", r"gains.red=nan: expected a finite number or a distribution: \[uniform, lowest, highest\]"),
-    ("gains.red=inf", r"gains.red=inf: expected a finite number or a distribution"),
-    ("gains.red=null", r"gains.red=null: expected a finite number or a distribution"),
     ("gains.red=true", r"gains.red=True: expected a finite number or a distribution"),
-    ("gains.red=two", r"gains.red=two: expected a finite number or a distribution"),
-    ("gains.red=[]", r"gains.red=\[\]: expected a finite number or a distribution"),
     ("gains.red=[normal,2,1]", r"gains.red=\[normal, 2, 1\]: expected a finite number or a distribution: \[uniform"),
     ("gains.red=[uniform,2]", r"gains.red=\[uniform, 2\]: expected finite numbers: \[uniform, lowest, highest\]"),
-    ("gains.red=[uniform,1,nan]", r"gains.red=\[uniform, 1, nan\]: expected finite numbers"),
     ("gains.red=[uniform,2,1]", r"gains.red=\[uniform, 2, 1\]: expected the lowest value below the highest"),
-    ("gains.red=[uniform,0,2]", r"gains.red=\[uniform, 0, 2\]: expected a gain above 0"),
-    ("gains.red=[uniform,2,2]", r"gains.red=\[uniform, 2, 2\]: expected the lowest value below the highest"),
     ("gains.blue=[truncated_normal,1,0,0.5,2]", r"gains.blue=.*: expected a standard deviation above 0"),
     ("gains.blue=[truncated_normal,1,0.1,0.5,1.7]", r"gains.blue=.*: expected limits within six standard dev"),
-    ("gains.inverse_rgb=[truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: expected a gain above 0"),
     ("gains.inverse_rgb=[inverse_truncated_normal,1,1,-1,2]", r"gains.inverse_rgb=.*: expected a gain above 0"),
     ("gains.red=[inverse_truncated_normal,1,1,0.5,2]", r"gains.red=.*: expected a finite number or a distribution"),
     ("gains.highlight=clip", r"gains.highlight=clip: expected one of per_channel, gray_mean, none"),
     ("gains.threshold=1", r"gains.threshold=1.0: expected 0 up to, but not including, 1"),
-    ("gains.threshold=-0.1", r"gains.threshold=-0.1: expected 0 up to"),
-    ("gains.threshold=nan", r"gains.threshold=nan: expected 0 up to"),
-    ("isp.tone=filmic", r"isp.tone=filmic: expected one of smoothstep, none"),
     ("isp.gamma=0", r"isp.gamma=0: expected a number from 0.1 to 10, or srgb"),
-    ("isp.gamma=nan", r"isp.gamma=nan: expected a number from 0.1 to 10, or srgb"),
     ("isp.gamma=rec709", r"isp.gamma=rec709: expected a number from 0.1 to 10, or srgb"),
-    ("isp.gamma=true", r"isp.gamma=True: expected a number from 0.1 to 10, or srgb"),
-    ("sensor.bits=0", r"sensor.bits=0: expected 1 to 16"),
     ("sensor.bits=17", r"sensor.bits=17: expected 1 to 16"),
-    ("sensor.black_level_dn=-1", r"sensor.black_level_dn=-1: expected 0 to 4094"),
     ("sensor.black_level_dn=4095", r"sensor.black_level_dn=4095: expected 0 to 4094"),
     ("sensor.white_level_dn=240", r"sensor.white_level_dn=240: expected 241 to 4095 \(above the black level"),
-    ("sensor.white_level_dn=100", r"sensor.white_level_dn=100: expected 241 to 4095"),
-    ("sensor.white_level_dn=4096", r"sensor.white_level_dn=4096: expected 241 to 4095"),
-    ("sensor.pattern=RGBW", r"sensor.pattern=RGBW: expected one of RGGB, BGGR, GRBG, GBRG"),
     ("sensor.clip=none", r"sensor.clip=none: output.dtype=uint16 holds no values beyond .*; set output.dtype=float32"),
-    ("sensor.clip=white", r"sensor.clip=white: expected one of sensor, black, none"),
     ("noise.units=null", r"noise.units=null: expected one of dn, normalized"),
-    ("noise.units=electrons", r"noise.units=electrons: expected one of dn, normalized"),
-    ("noise.black=null", r"noise.black=null: expected one of subtracted, included"),
-    ("noise.negative_variance=abs", r"noise.negative_variance=abs: expected one of refuse, clip"),
     ("noise.bits=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got null, 240, 4095"),
-    ("noise.black_level_dn=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got 12, null, 4095"),
-    ("noise.white_level_dn=null", r"noise.units=dn: imx385_iso3200 needs bits, .* got 12, 240, null"),
     ("noise.white_level_dn=240", r"noise.white_level_dn=240: expected 241 to 4095"),
-    ("noise.white_level_dn=5000", r"noise.white_level_dn=5000: expected 241 to 4095"),
-    ("noise.black_level_dn=-1", r"noise.black_level_dn=-1: expected 0 to 4094"),
-    ("noise.a=null", r"noise.a=null: expected a finite number or a distribution: \[uniform, .*\]; \[log_uniform, .*\]"),
     ("noise.a=nan", r"noise.a=nan: expected a finite number"),
-    ("noise.a=inf", r"noise.a=inf: expected a finite number"),
-    ("noise.b=nan", r"noise.b=nan: expected a finite number"),
-    ("noise.b=-inf", r"noise.b=-inf: expected a finite number"),
     ("noise.a=-1", r"noise.a=-1: expected a slope of the variance of 0 or more"),
-    ("noise.a=[uniform,-1,1]", r"noise.a=\[uniform, -1, 1\]: expected a slope of the variance of 0 or more"),
     ("noise.a=[log_uniform,0,1]", r"noise.a=\[log_uniform, 0, 1\]: expected a lowest value above 0"),
     ("noise=brooks2019;noise.a=0", r"noise.a=0: expected more than 0, because noise.b depends on ln a"),
     ("noise=brooks2019;noise.b=[log_linear_in_a,2,1,-1]", r"noise.b=.*: expected a slope of -10 to 10"),
     ("noise=brooks2019;noise.black=included", r"noise.black=included: normalized units have black at 0"),
     ("noise.b=-1", r"noise.b=-1: variance at black is -1; expected 0 or more; set noise.negative_variance=clip"),
-    ("noise.b=[uniform,-1,1]", r"noise.b=\[uniform, -1, 1\]: variance at black is -1; expected 0 or more"),
-    ("noise=brooks2019;noise.b=-0.1", r"noise.b=-0.1: variance at black is -0.1; expected 0 or more"),
     ("noise=imx385_iso3200_rvdd;noise.negative_variance=refuse", r"noise.b=-2043.51144: variance at black is -122"),
-    ("output.layout=zip", r"output.layout=zip: expected one of mosaic, packed"),
-    ("output.dtype=float64", r"output.dtype=float64: expected one of uint16, float32"),
     ("output.dtype=float32;effects.quantise=on", r"effects.quantise=on: output.dtype=float32 is not rounded; set "),
     ("output.pairs_per_shard=0", r"output.pairs_per_shard=0: expected 1 to 1000000"),
-    ("output.pairs_per_shard=1000001", r"output.pairs_per_shard=1000001: expected 1 to 1000000"),
-    ("output.pairs_per_shard=8.0", r"output.pairs_per_shard=8.0: expected 1 to 1000000, or auto"),
-    ("output.pairs_per_shard=Auto", r"output.pairs_per_shard=Auto: expected 1 to 1000000, or auto"),
-    ("output.pairs_per_shard=null", r"output.pairs_per_shard=null: expected 1 to 1000000, or auto"),
     ("output.pairs_per_shard=true", r"output.pairs_per_shard=True: expected 1 to 1000000, or auto"),
     ("noise=imx385", r"scene.iso=100: noise=imx385 is calibrated for ISO 1600, 3200, .* give noise.iso="),
     ("noise=sony_a7s2;noise.iso=1800", r"noise.iso=1800: noise=sony_a7s2 is calibrated for ISO 100 to 1600, 2000 to "),
     ("noise=sony_a7s2;noise.iso=[uniform,1000,3000]", r"noise.iso=\[uniform, 1000, 3000\]: noise=sony_a7s2 is "),
     ("noise=sony_a7s2;noise.a=3", r"noise.a=3: noise=sony_a7s2 is a physical profile; expected null"),
     ("noise.iso=3200", r"noise.iso=3200: noise=imx385_iso3200 holds for one ISO"),
-    ("noise.law=laplace", r"noise.law=laplace: expected one of gaussian, poisson"),
     (
         "noise=imx385_iso3200_rvdd;noise.law=poisson",
         r"noise.law=poisson: expected noise.black=subtracted and noise.b of 0",
     ),
     ("noise=sony_a7s2;noise.prnu_std=0.6", r"noise.prnu_std=0.6: expected 0 to 0.5"),
     ("noise=sony_a7s2;noise.dark_e_per_s=1e6;scene.exposure_s=1e5", r"noise.dark_e_per_s=1000000.0: more than 1e\+09"),
-    ("noise=sony_a7s2;noise.dark_doubling_c=0.1;scene.temperature_c=150", r"noise.dark_e_per_s=2.5: more than 1e\+09"),
-    ("sensor.saturated=bright", r"sensor.saturated=bright: expected one of noisy, pinned, auto"),
-    ("sensor.dark_offset=halved", r"sensor.dark_offset=halved: expected one of removed, kept"),
     ("sensor.units=0", r"sensor.units=0: expected image, or a number of bodies"),
     ("effects.all=maybe", r"effects.all=maybe: expected one of auto, on, off"),
-    ("effects.prnu=maybe", r"effects.prnu=maybe: expected one of auto, on, off"),
     ("effects.tolerance=0", r"effects.tolerance=0.0: expected more than 0, up to 10"),
     ("effects.quantise=off", r"effects.quantise=off: integer output is always rounded and clipped"),
     ("effects.prnu=on", r"effects.prnu=on: noise=imx385_iso3200 offers heteroscedastic only"),
     ("noise=sony_a7s2;effects.heteroscedastic=on", r"effects.heteroscedastic=on: noise=sony_a7s2 offers the physical"),
     ("noise=oppo_reno10x;effects.row=on", r"effects.row=on: noise=oppo_reno10x gives no row_std_dn"),
     ("noise=nikon_d850;scene.iso=-1", r"scene.iso=-1: expected an ISO above 0, up to 1e\+07"),
-    ("noise=nikon_d850;scene.iso=x", r"scene.iso=x: expected a finite number or a distribution"),
     ("scene.exposure_ratio=0", r"scene.exposure_ratio=0: expected 0.001 to 1e\+06"),
-    ("scene.exposure_s=[uniform,1,1e6]", r"scene.exposure_s=\[uniform, 1, 1000000.0\]: expected 1e-07 to 100000"),
     ("scene.temperature_c=[choice]", r"scene.temperature_c=\[choice\]: expected at least one value"),
 ]
 
@@ -400,11 +260,9 @@ def test_bad_value_is_refused_with_key_value_and_expectation(settings: Settings)
 
 
 ACCEPTED = [
-    "seed=9223372036854775807", "n_jobs=1024", "source.limit=1", "source.max_pixels=1", "gains.red=1e-3",
-    "gains.red=[uniform,0.001,9]", "gains.threshold=0", "gains.threshold=0.999", "isp.gamma=0.1", "isp.gamma=10",
-    "sensor.bits=16", "sensor.black_level_dn=0", "sensor.black_level_dn=4094", "sensor.white_level_dn=241",
-    "noise.a=0", "noise.b=0", "noise.a=[uniform,0,1]", "output.pairs_per_shard=1", "output.pairs_per_shard=1000000",
-    "sensor.clip=black", "sensor.pattern=GBRG", "noise.bits=14",
+    "seed=9223372036854775807", "n_jobs=1024", "gains.red=1e-3", "gains.red=[uniform,0.001,9]", "gains.threshold=0",
+    "gains.threshold=0.999", "isp.gamma=10", "sensor.black_level_dn=4094", "sensor.white_level_dn=241",
+    "noise.a=[uniform,0,1]", "output.pairs_per_shard=1000000", "noise.bits=14",
 ]  # fmt: skip
 
 
@@ -451,8 +309,8 @@ def test_config_yaml_round_trip_keeps_the_text(settings: Settings, tmp_path: Pat
     seed=st.integers(0, 2**63 - 1),
 )
 def test_config_yaml_round_trip_keeps_every_bit(numbers: list[float], seed: int) -> None:
-    config = Config(seed=seed)
-    config.noise.a, config.noise.b, config.gains.threshold = numbers
+    a, b, threshold = numbers
+    config = replaced(Config(seed=seed), {"noise.a": a, "noise.b": b, "gains.threshold": threshold})
     again, _ = parse_dataset_yaml(dataset_yaml(config))
     assert repr((again.seed, again.noise.a, again.noise.b, again.gains.threshold)) == repr((seed, *numbers))
 
@@ -461,11 +319,6 @@ def test_config_yaml_contains_source_kind_but_no_path(settings: Settings, tmp_pa
     loaded = yaml.safe_load(dataset_yaml(settings(f"source.root={tmp_path}")))
     assert loaded["source"]["kind"] == "folder"
     assert str(tmp_path) not in dataset_yaml(settings(f"source.root={tmp_path}"))
-
-
-def test_source_kind_is_derived_from_root(settings: Settings) -> None:
-    assert source_kind(settings()) == "synthetic"
-    assert source_kind(settings("source.root=photos")) == "folder"
 
 
 def test_config_yaml_omits_keys_that_do_not_decide_data(settings: Settings) -> None:
@@ -516,14 +369,6 @@ def test_config_yaml_omits_the_use_of_assumed_numbers_without_any(settings: Sett
 
 
 @pytest.mark.parametrize(
-    "keys",
-    ["out=elsewhere", "n_jobs=3", "self_test=go_on", "check_disk=false", "source.max_failed=7", "executor=dask"],
-)
-def test_keys_that_do_not_decide_data_keep_the_text(keys: str, settings: Settings) -> None:
-    assert dataset_yaml(settings(keys)) == dataset_yaml(settings())
-
-
-@pytest.mark.parametrize(
     ("overrides", "decided"),
     [
         (("noise=imx385_iso3200",), "noisy"),
@@ -541,13 +386,8 @@ def test_auto_pins_saturated_sites_of_limited_physical_profiles(
     """Plans and recorded configs have the decision; 0.1 records noisy or pinned."""
     config = settings(*overrides)
     validate_config(config)
-    assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).saturated == decided
+    assert plan_image(config, "0" * 64, facts=Facts(64, 48, 256, 0, 255)).noise.saturated == decided
     assert yaml.safe_load(dataset_yaml(config))["sensor"]["saturated"] == decided
-
-
-@pytest.mark.parametrize("sensor", sorted(path.stem for path in (conf_dir() / "sensor").glob("*.yaml")))
-def test_auto_is_the_default_of_every_sensor(sensor: str, settings: Settings) -> None:
-    assert settings(f"sensor={sensor}").sensor.saturated == "auto"
 
 
 SPELLINGS = [
@@ -582,10 +422,6 @@ def test_differences_contain_key_and_both_values(settings: Settings) -> None:
         "isp.tone=none (there: smoothstep)",
         "seed=1 (there: 0)",
     ]
-
-
-def test_equal_configs_have_no_differences(settings: Settings) -> None:
-    assert differences(dataset_yaml(settings()), dataset_yaml(settings())) == []
 
 
 def test_missing_config_yaml_is_refused(tmp_path: Path) -> None:
@@ -723,8 +559,8 @@ def test_again_refuses_hostile_config_yaml_with_exit_2(run_main: RunMain, tmp_pa
 
 def test_dollar_signs_in_config_yaml_are_literal(settings: Settings) -> None:
     config = settings()
-    config.source.include = ["${oc.env:HOME}/*.jpg"]
-    assert parse_dataset_yaml(dataset_yaml(config))[0].source.include == ["${oc.env:HOME}/*.jpg"]
+    config = replaced(config, {"source.include": ["${oc.env:HOME}/*.jpg"]})
+    assert parse_dataset_yaml(dataset_yaml(config))[0].source.include == ("${oc.env:HOME}/*.jpg",)
 
 
 @pytest.mark.parametrize("number", [10**400, -(10**5000)], ids=["large", "larger"])
@@ -747,31 +583,17 @@ def test_forms_match_their_implementations() -> None:
     assert set(ISO_FORMS) == {*noise_profile.FORMS, "by_stop", "by_log_iso", "by_colour"}
 
 
-@pytest.mark.parametrize(("group", "name", "setting"), list(all_settings()), ids=lambda value: str(value)[:20])
-def test_default_value_is_allowed(group: str, name: str, setting: Setting, settings: Settings) -> None:
-    config = settings()
-    setting.check(f"{group}.{name}", getattr(getattr(config, group) if group else config, name))
+WRONG_NUMBERS = {
+    "dn_per_e": (": expected a gain above 0", [0, ["per_iso", 0.0], 1e-12]),
+    "read_shape": (": ", [-0.5, -0.7, 10, "x"]),
+    "black_error_dn": (": expected a number, four", ["x", [1.0, 2.0], ["by_log_iso", 1.0], ["by_log_iso", None], []]),
+}
 
 
-@pytest.mark.parametrize("gain", [0, ["per_iso", 0.0], 1e-12])
-def test_gain_without_electrons_is_refused(gain: Any, settings: Settings) -> None:
-    config = settings("noise=sony_a7s2")
-    config.noise.branches[0].dn_per_e = gain
-    with pytest.raises(ConfigError, match=r"noise.branches\[0\].dn_per_e=.*: expected a gain above 0"):
-        validate_config(config)
-
-
-@pytest.mark.parametrize("shape", [-0.5, -0.7, 10, "x"])
-def test_shape_without_variance_is_refused(shape: Any, settings: Settings) -> None:
-    config = settings("noise=sony_a7s2")
-    config.noise.branches[0].read_shape = shape
-    with pytest.raises(ConfigError, match=r"noise.branches\[0\].read_shape="):
-        validate_config(config)
-
-
-@pytest.mark.parametrize("error", ["x", [1.0, 2.0], ["by_log_iso"], ["by_log_iso", 1.0], ["by_log_iso", None], []])
-def test_black_error_of_unknown_form_is_refused(error: Any, settings: Settings) -> None:
-    config = settings("noise=sony_a7s2")
-    config.noise.branches[0].black_error_dn = error
-    with pytest.raises(ConfigError, match=r"noise.branches\[0\].black_error_dn=.*: expected a number, four"):
-        validate_config(config)
+@pytest.mark.parametrize("key", WRONG_NUMBERS)
+def test_wrong_number_of_a_branch_is_refused(key: str, settings: Settings) -> None:
+    sentence, values = WRONG_NUMBERS[key]
+    for value in values:
+        config = with_branch(settings("noise=sony_a7s2"), **{key: value})
+        with pytest.raises(ConfigError, match=rf"noise.branches\[0\].{key}=.*{sentence}"):
+            validate_config(config)

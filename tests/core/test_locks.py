@@ -105,7 +105,7 @@ def test_process_that_was_not_waited_for_has_ended() -> None:
 
 
 @pytest.mark.linux_only("reads the process table")
-def test_hidden_process_is_judged_by_its_heartbeat(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_process_of_an_unknown_start_is_judged_by_its_heartbeat(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locks, "process_start", lambda pid: None)
     path.write_text(json.dumps({"host": locks.host(), "pid": 1, "start": "1", "mark": "0"}))
     assert has_ended(path) is None

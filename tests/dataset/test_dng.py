@@ -151,7 +151,9 @@ def test_matrix_and_neutral_give_d65(number: int, ds: Path) -> None:
 @pytest.mark.parametrize("number", range(3))
 def test_matrix_converts_xyz_to_native_values(number: int, ds: Path) -> None:
     _, _, row, plan = pair(ds, number)
-    native = np.diag([1 / plan.red_gain, 1, 1 / plan.blue_gain]) @ np.array(plan.rgb2cam).reshape(3, 3)
+    native = np.diag([1 / plan.camera.red_gain, 1, 1 / plan.camera.blue_gain]) @ np.array(plan.camera.rgb2cam).reshape(
+        3, 3
+    )
     assert numbers(tags_of(row)["ColorMatrix1"]).reshape(3, 3) @ RGB2XYZ == pytest.approx(native, abs=1e-8)
 
 
@@ -168,8 +170,10 @@ def test_libraw_finds_the_white_balance_and_the_matrix(number: int, ds: Path) ->
     """LibRaw keeps floats; and its own copy of the sRGB matrix, of six digits, moves the inverse by some 1e-6."""
     _, noisy, row, plan = pair(ds, number)
     with rawpy.imread(io.BytesIO(dng.encode(noisy, row, "noisy"))) as raw:
-        assert raw.camera_whitebalance[:3] == pytest.approx([plan.red_gain, 1, plan.blue_gain], rel=2**-22)
-        expected = np.linalg.inv(np.array(plan.rgb2cam).reshape(3, 3))
+        assert raw.camera_whitebalance[:3] == pytest.approx(
+            [plan.camera.red_gain, 1, plan.camera.blue_gain], rel=2**-22
+        )
+        expected = np.linalg.inv(np.array(plan.camera.rgb2cam).reshape(3, 3))
         assert raw.color_matrix[:, :3] == pytest.approx(expected, abs=5e-6)
 
 
@@ -230,10 +234,12 @@ def errors(developed: np.ndarray, srgb: np.ndarray, plan: Plan) -> tuple[np.ndar
     Left out: pixels with a channel above the highlight threshold, which are kept brighter by intent, or clipped in the
     mosaic or in what LibRaw gives.
     """
-    light = linear_light(srgb, plan.tone, plan.gamma)
+    light = linear_light(srgb, plan.isp.tone, plan.isp.gamma)
     native = camera_light(srgb, plan)
-    used = (apply_gains(native, plan.inverse_gains, "none", 0.9) < plan.highlight_threshold).all(axis=-1)
-    used &= (light < plan.highlight_threshold).all(axis=-1) & (native < 1).all(axis=-1) & (native > 0).all(axis=-1)
+    used = (apply_gains(native, plan.camera.inverse_gains, "none", 0.9) < plan.camera.highlight_threshold).all(axis=-1)
+    used &= (
+        (light < plan.camera.highlight_threshold).all(axis=-1) & (native < 1).all(axis=-1) & (native > 0).all(axis=-1)
+    )
     used &= (developed > 0).all(axis=-1) & (developed < developed.max()).all(axis=-1)
     return (developed - light)[used], float(used.mean())
 
@@ -245,9 +251,9 @@ def rounding(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     balance and after the matrix: each time by up to a code, half of it on average (rows of the matrix sum to 1), 1/12
     in variance. The largest error has 1e-5 for LibRaw's single precision.
     """
-    cam2rgb = np.linalg.inv(np.array(plan.rgb2cam).reshape(3, 3))
-    of_dn = cam2rgb / np.array(plan.inverse_gains) / (plan.white_level_dn - plan.black_level_dn)
-    code = 1 / (65535 * max(plan.inverse_gains))
+    cam2rgb = np.linalg.inv(np.array(plan.camera.rgb2cam).reshape(3, 3))
+    of_dn = cam2rgb / np.array(plan.camera.inverse_gains) / (plan.sensor.white_level_dn - plan.sensor.black_level_dn)
+    code = 1 / (65535 * max(plan.camera.inverse_gains))
     variance = (of_dn**2).sum(axis=1) / 12 + (1 + ((cam2rgb**2).sum(axis=1) + 1) / 12) * code**2
     largest = np.abs(of_dn).sum(axis=1) / 2 + (np.abs(cam2rgb).sum(axis=1) + 1) * code + 1e-5
     return -10 * np.log10(variance), largest
@@ -334,7 +340,7 @@ def test_noise_profile_is_the_noise_of_the_frames(overrides: tuple[str, ...], ma
     (clean, _), (noisy, tags) = (read(tmp_path / "to" / f"{row['key']}.{name}.dng") for name in dng.FRAMES)
     profile = tags["NoiseProfile"]
     assert profile[:2] * 3 == profile  # for each of the planes
-    black, span = plan.black_level_dn, plan.white_level_dn - plan.black_level_dn
+    black, span = plan.sensor.black_level_dn, plan.sensor.white_level_dn - plan.sensor.black_level_dn
     x, y = (clean - float(black)) / span, (noisy - float(black)) / span
     used = (x > 0.02) & (x < 0.6)  # nothing is clipped there
     law = profile[0] * x[used] + profile[1] + 1 / 6 / span**2
@@ -383,8 +389,8 @@ def test_file_identifies_its_frame(ds: Path) -> None:
     assert tags["PhotometricInterpretation"] == 32803  # CFA
     assert (tags["DNGVersion"], tags["DNGBackwardVersion"]) == (bytes((1, 4, 0, 0)), bytes((1, 1, 0, 0)))
     assert (tags["CFARepeatPatternDim"], tags["CFAPattern"]) == ((2, 2), bytes((0, 1, 1, 2)))
-    assert tags["BlackLevel"] == (plan.black_level_dn,) * 4
-    assert tags["WhiteLevel"] == plan.white_level_dn
+    assert tags["BlackLevel"] == (plan.sensor.black_level_dn,) * 4
+    assert tags["WhiteLevel"] == plan.sensor.white_level_dn
     assert tags["UniqueCameraModel"] == "unprocess_gen convex"
     assert (tags["ActiveArea"], tags["DefaultCropSize"]) == ((0, 0, 65, 97), (97, 65))
 

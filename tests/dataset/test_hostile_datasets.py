@@ -6,13 +6,16 @@ import csv
 import hashlib
 import io
 import json
+import os
 import shutil
 import tarfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.photographs import fill
 
@@ -142,8 +145,8 @@ def test_source_outside_the_root_is_never_looked_up(copy: Path, monkeypatch: pyt
 
     rows = list(csv.DictReader(io.StringIO(manifest.read_text(encoding="utf-8"))))
     assert rows[1]["source"] == "../secret.png"
-    monkeypatch.setattr("unprocess_gen.sources.listing.os.open", refuse)
-    monkeypatch.setattr("unprocess_gen.sources.listing.os.stat", refuse)
+    monkeypatch.setattr("os.open", refuse)
+    monkeypatch.setattr("os.stat", refuse)
     with pytest.raises(DamageError, match=r"source='\.\./secret\.png': expected a path below the source folder"):
         list(replay(select_rows(manifest, None, "1"), str(copy.parent / "p")))
 
@@ -228,13 +231,15 @@ def test_member_of_negative_size_does_not_loop(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        ({"pairs": -1}, "pairs='-1': expected"), ({"pairs": "3"}, "pairs='3': expected"),
-        ({"shards": {}}, "shards='{}': expected a list"), ({"shards": [7]}, r"shards\[0\]: expected an object"),
-        ({"shards": [{}]}, r"shards\[0\]: file is missing"), ({"failed": []}, "failed='\\[\\]': expected"),
-        ({"source": {"kind": "folder", "root": 5}}, "source=.*expected an object with kind and root"),
-        ({"source": None}, "source='None': expected"),
-        ({"sites": {"all": 1.5}}, "sites=.*expected an object of numbers"),
-        ({"config_sha256": "x"}, "config_sha256='x': expected 64 hexadecimal digits"),
+        ({"pairs": -1}, "pairs: expected `int` >= 0"), ({"pairs": "3"}, "pairs: expected `int`, got `str`"),
+        ({"shards": {}}, "shards: expected `array`"), ({"shards": [7]}, r"shards\[0\]: expected `object`"),
+        ({"shards": [{}]}, r"shards\[0\]: object missing required field `file`"), ({"failed": []}, "failed: expected"),
+        ({"source": {"kind": "folder", "root": 5}}, "source.root: expected `str | null`"),
+        ({"source": None}, "source: expected `object`"), ({"sites": {"all": 1.5}}, "sites.*: expected `int`"),
+        ({"config_sha256": "x"}, "config_sha256: expected `str` matching regex"),
+        ({"versions": 3}, "versions: expected `object"),
+        ({"run": {"host": "x"}}, "run: object missing required field"),
+        ({"self_test": []}, "self_test: expected `str`"), ({"config": None}, "config: expected `str`"),
     ],
 )  # fmt: skip
 def test_value_of_dataset_json_is_checked(changes: dict[str, Any], problem: str, original: Path) -> None:
@@ -249,7 +254,7 @@ def test_shard_elsewhere_is_damage(name: Any, copy: Path) -> None:
     entries = json.loads((copy / "dataset.json").read_text())["shards"]
     entries[0]["file"] = name
     rehash(copy, shards=entries)
-    with pytest.raises(DamageError, match=r"shards\[0\]: file=.*expected null or shards/shard-00000\.tar"):
+    with pytest.raises(DamageError, match=r"shards\[0\]\.file"):
         read_dataset(copy / "dataset.json")
     assert "dataset.json" in {damage.file for damage in verify(copy)}
 
@@ -356,3 +361,28 @@ def test_explanation_survives_the_manifest(tmp_path: Path, original: Path) -> No
         write_rows(stream, [row])
     assert list(read_rows(tmp_path / "manifest.csv")) == [row]
     assert [at for at, _ in rows_with_offsets(tmp_path / "manifest.csv")] == [len(",".join(NAMES)) + 1]
+
+
+def replace_by_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        replace_by_pipe,
+        lambda path: path.write_text("x" * 200_000),
+        lambda path: path.write_bytes(b"\xff\xfe,1\n"),
+    ],
+    ids=["pipe", "long field", "not UTF-8"],
+)
+@pytest.mark.parametrize("verb", ["verify", "again"])
+def test_unreadable_manifest_is_damage_in_one_line(
+    verb: str, damage: Callable[[Path], None], copy: Path, original: Path, run_main: RunMain
+) -> None:
+    damage(copy / "manifest.csv")
+    arguments = (f"source.root={original.parent}/p", "out=made", "n_jobs=1") if verb == "again" else ()
+    done = run_main(verb, str(copy), *arguments)
+    assert done.code == 4
+    assert "manifest.csv" in done.err and "Traceback" not in done.err

@@ -13,14 +13,30 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.configs import with_branch
 from helpers.records import FACTS, PAIR, PATCH, PHYSICS, PLAN, SHA256, SOURCE
 from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen.config.accuracy import STAGES, methods_of_stage
-from unprocess_gen.config.schema import ASSUMABLE, PHYSICAL_NUMBERS
+from unprocess_gen.config.schema import ASSUMABLE, PHYSICAL_NUMBERS, replaced
 from unprocess_gen.core.errors import REASONS, DamageError
-from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source
+from unprocess_gen.core.types import (
+    AccuracyPlan,
+    CameraPlan,
+    Counts,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    Pair,
+    Patch,
+    Plan,
+    Row,
+    ScenePlan,
+    SensorPlan,
+    Source,
+    SourcePlan,
+)
 from unprocess_gen.dataset import columns
 from unprocess_gen.dataset.columns import COLUMNS, FIRST, NAMES, NO_VIDEO, Range
 from unprocess_gen.dataset.keys import key_text
@@ -36,10 +52,15 @@ from unprocess_gen.dataset.manifest import (
     rows_of_json,
     write_rows,
 )
-from unprocess_gen.planning.effect_contributions import STATISTICS
-from unprocess_gen.planning.effect_selection import IN_DARK_FRAMES, LATER_EFFECTS
+from unprocess_gen.planning.effect_selection import IN_DARK_FRAMES
 from unprocess_gen.planning.plan import plan_image, plan_levels
-from unprocess_gen.simulation.reference.noise import EFFECTS, REPLACED
+from unprocess_gen.simulation.effects import EFFECTS as ALL_EFFECTS
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.effects import REPLACED, Physics
+from unprocess_gen.simulation.effects.prediction import STATISTICS
+
+LATER = tuple(effect.name for effect in ALL_EFFECTS if effect.since)
+"""Effects that version 0.1 did not have."""
 
 CONTRACT = [
     "key",
@@ -94,19 +115,10 @@ CONTRACT = [
     "saturated",
 ]
 
-PHYSICAL = dataclasses.replace(
-    PLAN, effects=("prnu", "shot", "read", "quantise"), skipped=("row: hidden",), physics=PHYSICS
-)
+PHYSICAL = PLAN.replace(effects=("prnu", "shot", "read", "quantise"), skipped=("row: hidden",), physics=PHYSICS)
 
 
-DARK = dataclasses.replace(
-    PHYSICAL,
-    dark_frame="ab" * 32,
-    dark_shift=(2, 4),
-    dark_black_dn=512.0,
-    dark_scale=0.5,
-    dark_shading="cd" * 32,
-)
+DARK = PHYSICAL.replace(dark=DarkFramePlan("ab" * 32, (2, 4), 512.0, 0.5, "cd" * 32))
 
 
 def csv_text(rows: Iterable[Row]) -> str:
@@ -171,39 +183,44 @@ physics = st.builds(
     frame_size=st.tuples(st.integers(1, 2**32 - 1), st.integers(1, 2**32 - 1)),
 )
 plans = st.builds(
-    lambda sensor, **values: Plan(bits=sensor[0], black_level_dn=sensor[1], white_level_dn=sensor[2], **values),
-    sensor=st.integers(1, 16).flatmap(levels),
+    Plan,
     seed=st.integers(0, 2**63 - 1),
     stream_key=st.integers(0, 2**64 - 1),
-    downscale=st.integers(1, 64),
-    dequantize=st.sampled_from(["off", "dither", "dither_all"]),
-    level=st.integers(0, 99),
-    draw=st.integers(0, 99),
-    frame=st.integers(0, 10**9),
-    scene=word,
-    exposure_ratio=number("exposure_ratio"),
-    camera=word,
-    weights=st.tuples(*[number("w_nexus_6p")] * 4),
-    rgb2cam=st.tuples(*[number("rgb2cam_00")] * 9),
-    red_gain=number("red_gain"),
-    blue_gain=number("blue_gain"),
-    inverse_rgb_gain=number("inverse_rgb_gain"),
-    tone=st.sampled_from(["smoothstep", "none"]),
-    gamma=st.just("srgb") | st.floats(0.1, 10),
-    highlight=st.sampled_from(["per_channel", "gray_mean", "none"]),
-    highlight_threshold=number("highlight_threshold"),
-    pattern=st.sampled_from(["RGGB", "BGGR", "GRBG", "GBRG"]),
-    sensor_clip=st.sampled_from(["sensor", "black"]),
-    saturated=st.sampled_from(["noisy", "pinned"]),
-    noise=word,
-    noise_law=st.sampled_from(["gaussian", "poisson"]),
-    a_dn=number("a_dn"),
-    b_dn2=number("b_dn2"),
-    effects=st.lists(word, max_size=3).map(tuple),
-    skipped=st.lists(word, max_size=3).map(tuple),
-    accuracy=word,
-    methods=st.lists(word, max_size=3).map(tuple),
-    physics=st.none() | physics,
+    source=st.builds(SourcePlan, st.integers(1, 64), st.sampled_from(["off", "dither", "dither_all"])),
+    scene=st.builds(ScenePlan, word, number("exposure_ratio")),
+    camera=st.builds(
+        CameraPlan,
+        name=word,
+        weights=st.tuples(*[number("w_nexus_6p")] * 4),
+        rgb2cam=st.tuples(*[number("rgb2cam_00")] * 9),
+        red_gain=number("red_gain"),
+        blue_gain=number("blue_gain"),
+        inverse_rgb_gain=number("inverse_rgb_gain"),
+        highlight=st.sampled_from(["per_channel", "gray_mean", "none"]),
+        highlight_threshold=number("highlight_threshold"),
+    ),
+    isp=st.builds(IspPlan, st.sampled_from(["smoothstep", "none"]), st.just("srgb") | st.floats(0.1, 10)),
+    sensor=st.builds(
+        lambda pattern, levels: SensorPlan(pattern, *levels),
+        st.sampled_from(["RGGB", "BGGR", "GRBG", "GBRG"]),
+        st.integers(1, 16).flatmap(levels),
+    ),
+    noise=st.builds(
+        NoisePlan,
+        name=word,
+        law=st.sampled_from(["gaussian", "poisson"]),
+        a_dn=number("a_dn"),
+        b_dn2=number("b_dn2"),
+        effects=st.lists(word, max_size=3).map(tuple),
+        skipped=st.lists(word, max_size=3).map(tuple),
+        sensor_clip=st.sampled_from(["sensor", "black"]),
+        saturated=st.sampled_from(["noisy", "pinned"]),
+        physics=st.none() | physics,
+        level=st.integers(0, 99),
+        draw=st.integers(0, 99),
+        frame=st.integers(0, 10**9),
+    ),
+    accuracy=st.builds(AccuracyPlan, name=word, methods=st.lists(word, max_size=3).map(tuple)),
 )
 names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=40).filter(
     BY_NAME["source"].allowed.__contains__
@@ -226,7 +243,7 @@ def test_every_column_has_a_meaning() -> None:
 
 
 (UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
-OF_DARK_FRAMES = {column.empty_if for column in COLUMNS if column.name.startswith("dark_") and column.since != FIRST}
+OF_DARK_FRAMES = {column.empty_if for column in COLUMNS if column.name.startswith("dark_") and column.since == "0.2"}
 BY_DEFAULT = {"it is 0", "all are 1", "all are 0", "there is no lens shading", UNMEASURED, *OF_DARK_FRAMES}
 """Conditions of numbers that version 0.1 did not have."""
 
@@ -234,7 +251,7 @@ BY_DEFAULT = {"it is 0", "all are 1", "all are 0", "there is no lens shading", U
 def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
     video = dataclasses.replace(SOURCE, name="a.mp4", clip="a.mp4")
     unread = dataclasses.replace(SOURCE, size_bytes=None, reason="unreadable")
-    bare = dataclasses.replace(PLAN, effects=(), skipped=())
+    bare = PLAN.replace(effects=(), skipped=())
     conditions = {column.empty_if for column in COLUMNS} - {""}
     failed = {condition for condition in conditions if "the source failed" in condition}
     passed = {"the source did not fail"}
@@ -246,8 +263,8 @@ def test_cells_are_empty_exactly_if_their_column_states_it() -> None:
         "pair": (row_of(PHYSICAL), passed | absent),
         "measured": (measured, passed | absent - {UNMEASURED}),
         "dark frame": (row_of(DARK), passed | absent - OF_DARK_FRAMES),
-        "assumed": (row_of(dataclasses.replace(PHYSICAL, assumed=("prnu_std",))), passed | absent - {unassumed}),
-        "float clean": (row_of(dataclasses.replace(PHYSICAL, clean_dtype="float32")), passed | absent - {same}),
+        "assumed": (row_of(PHYSICAL.replace(assumed=("prnu_std",))), passed | absent - {unassumed}),
+        "float clean": (row_of(PHYSICAL.replace(clean_dtype="float32")), passed | absent - {same}),
         "without effects": (row_of(bare), passed | absent | {one for one in failed if one.startswith("no effect")}),
         "failed": (failed_row(SOURCE, SHA256, 0, 7, "corrupt", "why"), failed | absent),
         "failed frame": (failed_row(video, SHA256, 0, 7, "corrupt", "why"), (failed | absent) - {NO_VIDEO}),
@@ -284,7 +301,7 @@ def test_physical_columns_of_another_profile_are_0_or_none() -> None:
 
 @pytest.mark.parametrize(("gamma", "value"), [(2.2, 2.2), (1.0, 1), ("srgb", "srgb")])
 def test_gamma_is_a_number_or_srgb(gamma: float | str, value: float | str) -> None:
-    assert row_of(dataclasses.replace(PLAN, gamma=gamma))["gamma"] == value
+    assert row_of(PLAN.replace(gamma=gamma))["gamma"] == value
 
 
 def test_a_failed_row_has_the_columns_of_any_row() -> None:
@@ -341,7 +358,7 @@ def test_drawn_plans_survive_csv(settings: Callable[..., Any], tmp_path: Path) -
 def test_drawn_physical_plans_survive_csv(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
     for scene in ("daylight", "night"):
         plan = plan_image(settings(f"noise={noise}", f"scene={scene}"), SHA256, facts=FACTS)
-        assert plan.physics is not None
+        assert plan.noise.physics is not None
         assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
@@ -353,14 +370,14 @@ NEEDED_PHYSICAL = ["scene", "exposure_ratio", "saturated_as", "noise_law", *PHYS
 
 def test_field_of_a_later_column_keeps_its_default(monkeypatch: pytest.MonkeyPatch) -> None:
     """A row of an older version lacks the columns that hold the field."""
-    later = tuple(dataclasses.replace(one, since="9.0") if one.name == "draw" else one for one in COLUMNS)
-    row = row_of(dataclasses.replace(PLAN, draw=2)) | {"draw": None}
+    later = dataclasses.replace(BY_NAME["draw"], since="9.0")
+    row = row_of(PLAN.replace(draw=2)) | {"draw": None}
     with pytest.raises(DamageError, match="draw is empty"):
         plan_from_row(row)
-    monkeypatch.setattr(columns, "COLUMNS", later)
+    monkeypatch.setitem(columns.COLUMNS_OF[NoisePlan], "draw", (later,))
 
-    assert plan_from_row(row) == dataclasses.replace(PLAN, draw=0)
-    assert plan_from_row(row | {"draw": 2}).draw == 2
+    assert plan_from_row(row) == PLAN.replace(draw=0)
+    assert plan_from_row(row | {"draw": 2}).noise.draw == 2
 
 
 @pytest.mark.parametrize(("plan", "names"), [(PLAN, NEEDED), (PHYSICAL, NEEDED_PHYSICAL)], ids=["normal", "physical"])
@@ -402,7 +419,7 @@ def test_cells_are_quoted_only_if_needed() -> None:
 
 
 def test_floats_are_spelled_as_pythons_shortest_repr() -> None:
-    cells = csv_text([row_of(dataclasses.replace(PLAN, a_dn=0.1, b_dn2=1e22))]).splitlines()[1].split(",")
+    cells = csv_text([row_of(PLAN.replace(a_dn=0.1, b_dn2=1e22))]).splitlines()[1].split(",")
     assert {"0.1", "1e+22"} <= set(cells)
 
 
@@ -465,7 +482,7 @@ def test_json_is_typed() -> None:
 
 
 def test_json_contains_a_later_column_unless_it_is_empty() -> None:
-    plan = dataclasses.replace(PHYSICAL, assumed=("prnu_std", "dark_e_per_s"))
+    plan = PHYSICAL.replace(assumed=("prnu_std", "dark_e_per_s"))
     content = row_json([row_of(plan)])
     assert json.loads(content)["assumed"] == "prnu_std;dark_e_per_s"
     (row,) = rows_of_json(content)
@@ -498,23 +515,22 @@ def longest_reasons(settings: Callable[..., Any]) -> dict[str, str]:
     """The longest thing the planner says of each effect of a profile, of all that it has to say: what it predicts,
     that it is switched off, that a number is assumed, that a profile with the longest name gives none.
     """
+    iso = {"noise.iso": 3200}
+    half_of_heat = {"noise.name": LONGEST_NAME, "noise.hot_pixel_e_per_s": None, **iso}
+    absent = ("prnu_std", "dark_e_per_s", "hot_pixel_share", "dead_pixel_share")
+    half = replaced(settings("noise=oppo_reno10x"), half_of_heat)
     lacking = settings("noise=oppo_reno10x", "effects.tolerance=1.23456")
-    for key in ("prnu_std", "dark_e_per_s", "hot_pixel_share", "hot_pixel_e_per_s", "dead_pixel_share"):
-        setattr(lacking.noise, key, None)
-    half = settings("noise=oppo_reno10x")
-    half.noise.hot_pixel_e_per_s = None  # another number that is missing, with a longer name
-    lacking.noise.name = half.noise.name = LONGEST_NAME
+    lacking = replaced(lacking, half_of_heat | {f"noise.{key}": None for key in absent})
     all_given = settings("noise=nikon_d850", "noise.full_well_e=1e5", "noise.assumed=[]")
-    all_given.noise.branches[0].column_std_dn = all_given.noise.branches[0].column_temporal_std_dn = 1.0
-    all_given.noise.gain_by_colour, all_given.noise.lens_shading = [0.9, 1.0, 1.1], [-0.1, 0.0, 0.0]
+    all_given = with_branch(all_given, column_std_dn=1.0, column_temporal_std_dn=1.0)
+    numbers = {"noise.gain_by_colour": [0.9, 1.0, 1.1], "noise.lens_shading": [-0.1, 0.0, 0.0]}
+    all_given = replaced(all_given, numbers | iso)
     assumed = settings("noise=nikon_d850", "effects.assumed=off")
-    assumed.noise.assumed = list(PHYSICAL_NUMBERS)
-    for config in (lacking, half, all_given, assumed):
-        config.noise.iso = 3200
+    assumed = replaced(assumed, {"noise.assumed": PHYSICAL_NUMBERS, **iso})
     found: dict[str, list[str]] = {effect: [] for effect in EFFECTS}
     for config in (lacking, half, all_given, assumed, settings("noise=nikon_d850", "effects.all=off")):
         for one in plan_levels(config, SHA256, facts=FACTS)[0][1]:
-            if one.effect not in LATER_EFFECTS or "gives no" not in one.reason:  # rows do not name those
+            if one.effect not in LATER or "gives no" not in one.reason:  # rows do not name those
                 found[one.effect].append(widened(one.reason))
     return {effect: max(reasons, key=len) for effect, reasons in found.items()}
 
@@ -524,11 +540,13 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
     spelling in every column, each effect named twice, as simulated and as skipped for the longest reason.
     """
     assert len(repr(LONGEST)) == 24
-    plan = dataclasses.replace(
-        PLAN, seed=2**63 - 1, stream_key=2**64 - 1, scene=LONGEST_NAME, exposure_ratio=LONGEST, camera=LONGEST_NAME,
+    camera, noise = (dataclasses.replace(part, name=LONGEST_NAME) for part in (PLAN.camera, PLAN.noise))
+    plan = PLAN.replace(seed=2**63 - 1, stream_key=2**64 - 1, camera=camera, noise=noise)
+    plan = plan.replace(
+        scene=ScenePlan(LONGEST_NAME, LONGEST),
         weights=(LONGEST,) * 4, rgb2cam=(LONGEST,) * 9, red_gain=LONGEST, blue_gain=LONGEST, inverse_rgb_gain=LONGEST,
         gamma=2.2250738585072014, highlight_threshold=LONGEST, bits=16, black_level_dn=65534, white_level_dn=65535,
-        saturated="pinned", noise=LONGEST_NAME, a_dn=LONGEST, b_dn2=LONGEST, law_distance=LONGEST,
+        saturated="pinned", a_dn=LONGEST, b_dn2=LONGEST, law_distance=LONGEST,
         dtype="float32", layout="mosaic",
         methods=tuple(max((one.spelled for one in methods_of_stage(stage)), key=len) for stage in STAGES),
         effects=("heteroscedastic", "quantise"),
@@ -541,14 +559,14 @@ def longest_rows(settings: Callable[..., Any]) -> Iterator[Row]:
         frame_size=(2**32 - 1, 2**32 - 1),
     )  # fmt: skip
     skipped = tuple(f"{effect}: {reason}" for effect, reason in longest_reasons(settings).items())
-    physical = dataclasses.replace(plan, effects=EFFECTS, skipped=skipped, physics=physics, assumed=ASSUMABLE)
+    physical = plan.replace(effects=EFFECTS, skipped=skipped, physics=physics, assumed=ASSUMABLE)
     pair = Pair(PAIR.clean, PAIR.noisy, Counts(*[2**40] * 6))
     sampled = {effect: f"{effect}: {IN_DARK_FRAMES}" for effect in (*REPLACED, "read")}
-    dark = dataclasses.replace(
-        physical, effects=tuple("dark_frame" if effect == "read" else effect for effect in EFFECTS),
-        skipped=tuple(sampled.get(one.partition(": ")[0], one) for one in skipped), dark_frame="f" * 64,
-        dark_shift=(2**32 - 2,) * 2, dark_black_dn=LONGEST, dark_scale=LONGEST, dark_shading="f" * 64,
-    )  # fmt: skip
+    dark = physical.replace(
+        effects=tuple("dark_frame" if effect == "read" else effect for effect in EFFECTS),
+        skipped=tuple(sampled.get(one.partition(": ")[0], one) for one in skipped),
+        dark=DarkFramePlan("f" * 64, (2**32 - 2,) * 2, LONGEST, LONGEST, "f" * 64),
+    )
     for one in (plan, physical, dark):
         source, patch = Source(10**9, "", "", 2**30), Patch(2**38, 2**40, 2**40, 2, 2)
         key = f"1000000000-p{patch.number}-l99d99"

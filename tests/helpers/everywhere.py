@@ -164,7 +164,7 @@ def doubles() -> str:
     for plan in plans():
         shape, origin = codes.shape[:2], (5, 7)
         clean_dtype, dtype = (
-            np.float32 if is_float else np.uint16 for is_float in (plan.clean_normalised, plan.normalised)
+            np.float32 if is_float else np.uint16 for is_float in (plan.output.clean_normalised, plan.output.normalised)
         )
         scene, noise, readout = render._records((plan,), shape, 256, origin)
         scratch = allocate_scratch(np.float32 if uses_scene32(plan) else np.float64)
@@ -179,14 +179,14 @@ def doubles() -> str:
 
 def plans() -> list[Plan]:
     """Return plans that need all kernels."""
-    golden = [plan for plan in selftest.GOLDEN_PLANS.values() if not plan.uses_reference]
+    golden = [plan for plan in selftest.GOLDEN_PLANS.values() if not plan.accuracy.uses_reference]
     full = selftest.GOLDEN_PLANS["physical"]
-    averaged = replace(full, physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True))
-    dark = replace(selftest.GOLDEN_PLAN, a_dn=0.01, b_dn2=-1.0)
-    few = replace(selftest.GOLDEN_PLAN, noise_law="poisson", a_dn=900.0)
-    float32 = replace(selftest.GOLDEN_PLANS["float32"], highlight="gray_mean")
-    pinned = replace(full, saturated="pinned", exposure_ratio=9.0)
-    return [*golden, averaged, replace(averaged, dtype="float32"), dark, few, float32, pinned]
+    averaged = full.replace(physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True))
+    dark = selftest.GOLDEN_PLAN.replace(a_dn=0.01, b_dn2=-1.0)
+    few = selftest.GOLDEN_PLAN.replace(law="poisson", a_dn=900.0)
+    float32 = selftest.GOLDEN_PLANS["float32"].replace(highlight="gray_mean")
+    pinned = full.replace(saturated="pinned", exposure_ratio=9.0)
+    return [*golden, averaged, averaged.replace(dtype="float32"), dark, few, float32, pinned]
 
 
 # Machine code ---------------------------------------------------------------------------------------------------------

@@ -15,10 +15,26 @@ import numpy as np
 
 from helpers.datasets import Settings
 from helpers.moments import bernstein
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import Physics, Plan, Srgb
+from unprocess_gen.core.types import (
+    AccuracyPlan,
+    CameraPlan,
+    IspPlan,
+    NoisePlan,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+    Srgb,
+)
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.effects.dead_pixels import DeadPixels
+from unprocess_gen.simulation.effects.effect import Part
+from unprocess_gen.simulation.effects.hot_pixels import HotPixels
+from unprocess_gen.simulation.effects.prnu import Prnu
 from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.simulation.reference.colour import IDENTITY
 from unprocess_gen.sources.scenes import synthetic
@@ -48,13 +64,19 @@ def planned(settings: Settings, srgb: Srgb, *overrides: str, forced: bool = Fals
     """Plan a picture; ``forced`` simulates all effects, with numbers for those that a profile does not give."""
     config = settings(*overrides, *(FORCED if forced else ()))
     if forced:
-        config.noise.gain_by_colour, config.noise.lens_shading = [0.98, 1.0, 1.03], [-0.2, 0.0, -0.1]
-        config.noise.row_correlation = 0.3
-    for branch in config.noise.branches if forced else ():
-        branch.row_std_dn = branch.row_std_dn or 1.5
-        branch.column_std_dn = branch.column_std_dn or 1.25
-        branch.column_temporal_std_dn = 0.75
-        branch.black_error_dn = branch.black_error_dn or [0.5, -1.5, 2.5, -3.75]
+        noise: dict[str, object] = {"noise.gain_by_colour": [0.98, 1.0, 1.03], "noise.lens_shading": [-0.2, 0.0, -0.1]}
+        noise |= {"noise.dsnu_std_e": 0.4}
+        branches = [
+            replace(
+                branch,
+                row_std_dn=branch.row_std_dn or 1.5,
+                column_std_dn=branch.column_std_dn or 1.25,
+                column_temporal_std_dn=0.75,
+                black_error_dn=branch.black_error_dn or [0.5, -1.5, 2.5, -3.75],
+            )
+            for branch in config.noise.branches
+        ]
+        config = replaced(config, {**noise, "noise.row_correlation": 0.3, "noise.branches": branches})
     validate_config(config)
     return plan_image(config, SHA256, facts=facts_of(srgb))
 
@@ -67,8 +89,8 @@ def assert_same(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Non
 
 
 def with_physics(plan: Plan, **changes: Any) -> Plan:
-    assert plan.physics is not None
-    return replace(plan, physics=replace(plan.physics, **changes))
+    assert plan.noise.physics is not None
+    return plan.replace(physics=replace(plan.noise.physics, **changes))
 
 
 BLACK, WHITE = 4096, 65535
@@ -86,13 +108,18 @@ def plan_with(*on: str, frame: int = 0xF4A3E, **changes: Any) -> Plan:
     """Return a plan with only these effects, a 16-bit sensor, and light equal to the code divided by 65535."""
     physics = replace(SILENT, **changes)
     return Plan(
-        seed=0, stream_key=frame, downscale=1, dequantize="off", scene="flat", exposure_ratio=1.0, camera="identity",
-        weights=(0.0,) * 4,
-        rgb2cam=IDENTITY, red_gain=1.0, blue_gain=1.0, inverse_rgb_gain=1.0, tone="none", gamma=1.0, highlight="none",
-        highlight_threshold=0.9, pattern="RGGB", bits=16, black_level_dn=BLACK, white_level_dn=WHITE,
-        sensor_clip="sensor", saturated="noisy", noise="flat", noise_law="gaussian", a_dn=physics.dn_per_e,
-        b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), skipped=(), accuracy="exact", methods=(),
-        physics=physics,
+        seed=0,
+        stream_key=frame,
+        source=SourcePlan(downscale=1, dequantize="off"),
+        scene=ScenePlan("flat", exposure_ratio=1.0),
+        camera=CameraPlan("identity", (0.0,) * 4, IDENTITY, 1.0, 1.0, 1.0, "none", highlight_threshold=0.9),
+        isp=IspPlan("none", gamma=1.0),
+        sensor=SensorPlan("RGGB", bits=16, black_level_dn=BLACK, white_level_dn=WHITE),
+        noise=NoisePlan(
+            "flat", "gaussian", a_dn=physics.dn_per_e, b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"),
+            skipped=(), sensor_clip="sensor", saturated="noisy", physics=physics,
+        ),
+        accuracy=AccuracyPlan("exact", methods=()),
     )  # fmt: skip
 
 
@@ -121,3 +148,20 @@ def poisson_reach(rate: float) -> float:
     """Return the largest distance of a count from its mean: Bernstein's tail at 2**-33, the least tail probability."""
     log = 33 * math.log(2)
     return log / 3 + math.sqrt(log**2 / 9 + 2 * log * rate) + 1
+
+
+def body_part(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> Part:
+    """Return a part of a frame of a body."""
+    return Part(plan_with(), physics, shape, origin)
+
+
+def hot_pixel_means(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    return HotPixels().mean_electrons(body_part(physics, shape, origin))
+
+
+def response(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    return Prnu().response(body_part(physics, shape, origin))
+
+
+def dead(physics: Physics, shape: tuple[int, int], origin: tuple[int, int] = (0, 0)) -> np.ndarray:
+    return DeadPixels().output_dn(np.ones(shape), body_part(physics, shape, origin)) == 0

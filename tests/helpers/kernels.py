@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from unprocess_gen.core.jit import inner, kernel
@@ -21,7 +23,6 @@ from unprocess_gen.simulation.kernels.normal import (
 from unprocess_gen.simulation.kernels.normal import exact_values as kernel_exact_values
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.poisson import (
-    LOW_RATE,
     CountTables,
     count_tables,
     count_thresholds,
@@ -126,22 +127,24 @@ def _fill_by_vectors(words: Words, quadratics: Float, buffer: np.ndarray, out: F
         store(pointer_to(out, 0), x, kernel_exact_values(given, rows, x, table))
 
 
-@kernel
-def _fill_fine(words: Words, depths: Float32, out: Float32) -> None:
-    given, depth, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
-    fill_depths(words.size, given, depth)
-    for n in range(words.size // VECTOR_WIDTH):
-        x = np.uint64(n) * _WIDTH
-        store(target, x, apply_signs(fine_normal(load(depth, x)), load(given, x)))
+def _polynomial_kernel(fill: Any, normal: Any) -> Any:
+    """Return a kernel that fills ``out`` with the normals of words by the polynomials of depth and quantile."""
+
+    @kernel
+    def fill_normals(words: Words, depths: Float32, out: Float32) -> None:
+        given, depth, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
+        fill(words.size, given, depth)
+        for n in range(words.size // VECTOR_WIDTH):
+            x = np.uint64(n) * _WIDTH
+            store(target, x, apply_signs(normal(load(depth, x)), load(given, x)))
+
+    return fill_normals
 
 
-@kernel
-def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
-    given, depth, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
-    fill_coarse_depths(words.size, given, depth)
-    for n in range(words.size // VECTOR_WIDTH):
-        x = np.uint64(n) * _WIDTH
-        store(target, x, apply_signs(coarse_normal(load(depth, x)), load(given, x)))
+_fill_fine, _fill_coarse = (
+    _polynomial_kernel(fill_depths, fine_normal),
+    _polynomial_kernel(fill_coarse_depths, coarse_normal),
+)
 
 
 # Frames ---------------------------------------------------------------------------------------------------------------
@@ -231,15 +234,11 @@ def _fill_approximate(
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)
-        highest = np.float32(0)
         for n in range(SIZE):
             buffers.rates[n] = rates[start + min(n, length - 1)]
-            highest = max(highest, buffers.rates[n])
-        has_high = highest >= LOW_RATE
-        outputs = buffers.electrons, buffers.error_e
-        fill_counts(SIZE, buffers.words, buffers.rates, has_high, np.float32(np.inf), of, buffers, *outputs)
+        fill_counts(SIZE, buffers.words, buffers.rates, of, buffers, buffers.light_e, buffers.light_error_e)
         for n in range(length):
-            out[start + n], error[start + n] = buffers.electrons[n], buffers.error_e[n]
+            out[start + n], error[start + n] = buffers.light_e[n], buffers.light_error_e[n]
 
 
 @kernel
@@ -248,6 +247,6 @@ def _fill_of_one_rate(words: Words, smallest: int, ranks: np.ndarray, scratch: S
     for start in range(0, words.size, SIZE):
         length = min(SIZE, words.size - start)
         _load_words(words, start, length, buffers)
-        fill_counts_of_one_rate(SIZE, buffers.words, np.float32(smallest), of, ranks.size, buffers.dark)
+        fill_counts_of_one_rate(SIZE, buffers.words, np.float32(smallest), of, ranks.size, buffers.dark_e)
         for n in range(length):
-            out[start + n] = buffers.dark[n]
+            out[start + n] = buffers.dark_e[n]

@@ -16,7 +16,6 @@ MODULES = {
     "pipeline/test_refusals.py": "limits the address space",
     "pipeline/test_resume.py": "kills processes found in /proc, takes locks of its own",
     "project/test_everywhere.py": "replaces libraries of the Linux loader, reads /proc",
-    "project/test_platforms.py": "imitates other systems on Linux",
     "sources/test_hostile_files.py": "limits the address space",
     "sources/test_listing.py": "makes pipes, devices and links",
 }

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +24,16 @@ Fault = Callable[[NDArray[np.uint8], Frame, Plan, np.random.Generator], Frame]
 
 def unrounded(srgb: NDArray[np.uint8], plan: Plan) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return both frames of a pair in DN, not rounded and without limits."""
-    effects = tuple(effect for effect in plan.effects if effect != "quantise")
-    pair = make_pair(srgb, replace(plan, dtype="float32", sensor_clip="none", effects=effects))
-    span_dn, black_dn = plan.white_level_dn - plan.black_level_dn, plan.black_level_dn
+    effects = tuple(effect for effect in plan.noise.effects if effect != "quantise")
+    pair = make_pair(srgb, plan.replace(dtype="float32", sensor_clip="none", effects=effects))
+    span_dn, black_dn = plan.sensor.white_level_dn - plan.sensor.black_level_dn, plan.sensor.black_level_dn
     clean, noisy = (frame.astype(np.float64) * span_dn + black_dn for frame in (pair.clean, pair.noisy))
     return clean, noisy
 
 
 def rounded(value_dn: NDArray[np.float64], plan: Plan) -> Frame:
     """Round and clip a frame as the sensor does."""
-    return np.clip(np.rint(value_dn), 0, 2**plan.bits - 1).astype(np.uint16)
+    return np.clip(np.rint(value_dn), 0, 2**plan.sensor.bits - 1).astype(np.uint16)
 
 
 def black_level(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
@@ -40,10 +41,14 @@ def black_level(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.ran
     return rounded(noisy + 20.0, plan)
 
 
-def without_row_noise(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
-    """Simulate the same noise without row offsets."""
-    assert plan.physics is not None
-    return make_pair(srgb, replace(plan, physics=replace(plan.physics, row_std_dn=0.0))).noisy
+def with_numbers(**numbers: Any) -> Fault:
+    """Simulate the noise of other physical numbers than those of the plan."""
+
+    def simulate(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
+        assert plan.noise.physics is not None
+        return make_pair(srgb, plan.replace(physics=replace(plan.noise.physics, **numbers))).noisy
+
+    return simulate
 
 
 def swapped_greens(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
@@ -62,29 +67,31 @@ def swapped_red_and_blue(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draw
 
 def stripes(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
     """Add an offset to each column, with a tenth of the standard deviation of the read noise."""
-    assert plan.physics is not None
+    assert plan.noise.physics is not None
     _, exact = unrounded(srgb, plan)
-    return rounded(exact + 0.1 * plan.physics.read_std_dn * draws.standard_normal(exact.shape[1]), plan)
+    return rounded(exact + 0.1 * plan.noise.physics.read_std_dn * draws.standard_normal(exact.shape[1]), plan)
 
 
 def uniform(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
     """Replace the noise by uniform noise of the same variance."""
     clean, _ = unrounded(srgb, plan)
-    row_dn2 = plan.physics.row_std_dn**2 if plan.physics is not None and "row" in plan.effects else 0.0
-    slope, intercept = plan.variance_line
-    std = np.sqrt(slope * (clean - plan.black_level_dn) + intercept + row_dn2)
+    row_dn2 = (
+        plan.noise.physics.row_std_dn**2 if plan.noise.physics is not None and "row" in plan.noise.effects else 0.0
+    )
+    slope, intercept = plan.noise.variance_line
+    std = np.sqrt(slope * (clean - plan.sensor.black_level_dn) + intercept + row_dn2)
     return rounded(clean + std * draws.uniform(-(3**0.5), 3**0.5, clean.shape), plan)
 
 
 def more_signal(srgb: NDArray[np.uint8], noisy: Frame, plan: Plan, draws: np.random.Generator) -> Frame:
     """Add 5 % of the signal."""
     clean, exact = unrounded(srgb, plan)
-    return rounded(exact + 0.05 * (clean - plan.black_level_dn), plan)
+    return rounded(exact + 0.05 * (clean - plan.sensor.black_level_dn), plan)
 
 
 FAULTS: dict[str, Fault] = {
     "black level off by 20 DN": black_level,
-    "row noise removed": without_row_noise,
+    "row noise removed": with_numbers(row_std_dn=0.0),
     "green sites swapped": swapped_greens,
     "red and blue sites swapped": swapped_red_and_blue,
     "column stripes of a tenth of the read noise": stripes,

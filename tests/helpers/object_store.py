@@ -86,15 +86,15 @@ def upload(folder: Path, to: ObjectPath) -> None:
     """Copy the files of a folder to keys below a URL."""
     for path in sorted(folder.rglob("*")):
         if path.is_file():
-            (to / path.relative_to(folder).as_posix()).put_file(path)
+            (to / path.relative_to(folder).as_posix()).write_bytes(path.read_bytes())
 
 
 def download(prefix: ObjectPath, to: Path) -> None:
     """Copy the objects below a URL to files."""
-    for found in prefix.objects():
-        path = to / found.key
+    for entry in prefix.walk_entries():
+        path = to / entry.path
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes((prefix / found.key).read_bytes())
+        path.write_bytes((prefix / entry.path).read_bytes())
 
 
 @dataclass

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan, Srgb
-from unprocess_gen.simulation.reference import noise as effects
+from unprocess_gen.simulation.effects import order
+from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.reference.sensor import to_dn
 from unprocess_gen.simulation.reference.unprocess import unprocess
 
@@ -16,11 +15,11 @@ SCENES = ("daylight", "indoor", "low_light", "night", "video_night", "long_expos
 
 def unrounded(srgb: Srgb, plan: Plan) -> tuple[Float, Float]:
     """Return the clean and the noisy frame in DN, before rounding."""
-    light = unprocess(srgb, plan) * plan.exposure
-    if plan.averaged:
-        light = effects.respond(light, plan)
-    clean_dn = to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest)
-    return clean_dn, effects.noisy(clean_dn, plan)
+    light = unprocess(srgb, plan) * plan.scene.exposure
+    factor = order.light_factor(plan, light.shape)
+    light = light if factor is None else light * factor
+    clean_dn = to_dn(light, plan.sensor.black_level_dn, plan.sensor.white_level_dn, plan.brightest)
+    return clean_dn, order.noisy(clean_dn, plan)
 
 
 def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[str, Float]:
@@ -30,12 +29,12 @@ def omission(srgb: Srgb, everything: Plan, auto: Plan, frames: int = 1) -> dict[
     variance is that of ``auto`` at the local signal.
     """
     clean_dn = unrounded(srgb, auto)[0]
-    clips = ([unrounded(srgb, replace(plan, frame=n))[1] for n in range(frames)] for plan in (everything, auto))
+    clips = ([unrounded(srgb, plan.replace(frame=n))[1] for n in range(frames)] for plan in (everything, auto))
     with_all, with_some = (np.mean(clip, axis=0) for clip in clips)
     omitted = with_all - with_some
-    variance = effects.noise_variance(clean_dn, auto) + 1 / 12
-    if auto.physics is not None and "dark_current" in auto.effects:
-        variance = variance + auto.physics.dn_per_e**2 * auto.physics.dark_e
+    variance = noise_variance(clean_dn, auto) + 1 / 12
+    if auto.noise.physics is not None and "dark_current" in auto.noise.effects:
+        variance = variance + auto.noise.physics.dn_per_e**2 * auto.noise.physics.dark_e
     variance = variance / frames
     height, width = omitted.shape
     planes = [(omitted[y::2, x::2], variance[y::2, x::2]) for y in range(min(height, 2)) for x in range(min(width, 2))]

@@ -84,9 +84,9 @@ from unprocess_gen.pipeline import worker
 make_shard = worker.make_shard
 
 
-def slow(context, task):
+def slow(*given):
     time.sleep({seconds})
-    return make_shard(context, task)
+    return make_shard(*given)
 
 
 worker.make_shard = slow

@@ -4,7 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from unprocess_gen.core.types import Counts, Facts, Pair, Patch, Physics, Plan, Source
+from unprocess_gen.core.types import (
+    AccuracyPlan,
+    CameraPlan,
+    Counts,
+    Facts,
+    IspPlan,
+    NoisePlan,
+    Pair,
+    Patch,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    Source,
+    SourcePlan,
+)
+from unprocess_gen.simulation.effects import Physics
 
 SHA256 = "ab" * 32
 
@@ -19,12 +34,21 @@ PAIR = Pair(np.zeros((2, 3), np.uint16), np.zeros((2, 3), np.uint16), Counts(1, 
 
 
 PLAN = Plan(
-    seed=0, stream_key=0x1F, downscale=1, dequantize="off", scene="daylight", exposure_ratio=1.0, camera="convex",
-    weights=(0.1, 0.2, 0.3, 0.4), rgb2cam=(0.6, 0.3, 0.1) * 3, red_gain=2.0,
-    blue_gain=1.7, inverse_rgb_gain=0.8, tone="smoothstep", gamma=2.2, highlight="per_channel", highlight_threshold=0.9,
-    pattern="RGGB", bits=12, black_level_dn=240, white_level_dn=4095, sensor_clip="sensor", saturated="noisy",
-    noise="imx385_iso3200", noise_law="gaussian", a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"),
-    skipped=(), accuracy="exact", methods=("a:b", "c:d"),
+    seed=0,
+    stream_key=0x1F,
+    source=SourcePlan(downscale=1, dequantize="off"),
+    scene=ScenePlan("daylight", exposure_ratio=1.0),
+    camera=CameraPlan(
+        "convex", weights=(0.1, 0.2, 0.3, 0.4), rgb2cam=(0.6, 0.3, 0.1) * 3, red_gain=2.0, blue_gain=1.7,
+        inverse_rgb_gain=0.8, highlight="per_channel", highlight_threshold=0.9,
+    ),
+    isp=IspPlan("smoothstep", gamma=2.2),
+    sensor=SensorPlan("RGGB", bits=12, black_level_dn=240, white_level_dn=4095),
+    noise=NoisePlan(
+        "imx385_iso3200", "gaussian", a_dn=7.0, b_dn2=38.0, effects=("heteroscedastic", "quantise"), skipped=(),
+        sensor_clip="sensor", saturated="noisy",
+    ),
+    accuracy=AccuracyPlan("exact", methods=("a:b", "c:d")),
 )  # fmt: skip
 
 

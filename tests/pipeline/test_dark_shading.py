@@ -98,7 +98,7 @@ def black_pair(config: ug.Config, shape: tuple[int, int] = SHAPE) -> RawPair:
 def test_map_is_subtracted_at_the_place_of_its_frame(darks: Path, ramp: Path, shape: tuple[int, int]) -> None:
     """Both pairs have the same frame, place and dither, so they differ by the integer map exactly."""
     kept, removed = black_pair(with_frames(darks), shape), black_pair(with_map(darks, ramp), shape)
-    y, x = kept.plan.dark_shift
+    y, x = kept.plan.noise.dark.shift
     expected = np.tile(RAMP, (5, 5))[y : y + shape[0], x : x + shape[1]]
     difference = kept.noisy.astype(int) - removed.noisy
     # without a stated level, the black level of the frames is their median, which contains that of the shading
@@ -120,7 +120,7 @@ def test_map_above_black_equals_map_with_black(darks: Path, tmp_path: Path) -> N
     above, level = save_map(tmp_path / "above.npy", values - BLACK_DN), f"noise.dark_frames_black_dn={BLACK_DN}"
     pairs = [black_pair(with_map(darks, place, level)) for place in (save_map(tmp_path / "dn.npy", values), above)]
     np.testing.assert_array_equal(pairs[0].noisy, pairs[1].noisy)
-    assert [pair.plan.dark_black_dn for pair in pairs] == [0, BLACK_DN]
+    assert [pair.plan.noise.dark.black_dn for pair in pairs] == [0, BLACK_DN]
     assert [described(darks, above, level).shading.black_dn, described(darks, "remove").shading.black_dn] == [512, 0]  # type: ignore[union-attr]
 
 
@@ -162,8 +162,8 @@ def test_one_frame_is_enough_with_a_map(tmp_path: Path, ramp: Path) -> None:
 
 def test_map_is_scaled_like_its_frame(darks: Path, ramp: Path) -> None:
     scaled = black_pair(with_map(darks, ramp, *NARROW, "effects.dead_pixels=off"))
-    frame = shaded([sha256_of(darks / f"dark{number}.npy") for number in range(3)].index(scaled.plan.dark_frame))
-    y, x = scaled.plan.dark_shift
+    frame = shaded([sha256_of(darks / f"dark{number}.npy") for number in range(3)].index(scaled.plan.noise.dark.sha256))
+    y, x = scaled.plan.noise.dark.shift
     expected = (frame.astype(int) - RAMP - BLACK_DN)[y:, x:] * (16383 - 1024) / (16300 - 512)
     assert np.abs(scaled.noisy[: SHAPE[0] - y, : SHAPE[1] - x] - 1024.0 - expected).max() <= 1
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -31,3 +33,18 @@ def test_warnings_of_the_pool_are_hidden(message: str, monkeypatch: pytest.Monke
         warnings.simplefilter("error")
         context: Any = None
         assert [*local._run_pool(context, [], 2)] == ["report"]
+
+
+TRACKER = """
+from joblib.externals.loky.backend import resource_tracker
+from unprocess_gen.pipeline.executors import local
+
+local.start_tracker()
+resource_tracker.unregister("/unknown", "semlock")
+"""
+
+
+def test_tracker_of_the_pool_prints_no_traceback() -> None:
+    """The deaths of workers leave resources that loky's tracker no longer knows."""
+    done = subprocess.run([sys.executable, "-c", TRACKER], capture_output=True, text=True, check=True)
+    assert done.stderr == ""

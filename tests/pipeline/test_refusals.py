@@ -18,22 +18,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import COMMAND, RunMain, environment
+from helpers.commands import COMMAND, RunMain, environment, messages
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 from helpers.processes import ONE
 
 from unprocess_gen.cli.messages import logging_to
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.limits import LEAST_ADDRESS_SPACE
+from unprocess_gen.core.paths import LocalPath
 from unprocess_gen.dataset.columns import HEADERS
 from unprocess_gen.dataset.manifest import read_rows, write_rows
 from unprocess_gen.pipeline import progress as progress_module
 from unprocess_gen.pipeline.generate import generate
+from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.repair import repair
 from unprocess_gen.pipeline.replay import replay
+from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.verify import have_same_rows, verify, verify_sweep
 from unprocess_gen.pipeline.workspace import Workspace, dataset_facts, dataset_text, read_dataset
 
@@ -87,22 +91,6 @@ def test_out_inside_an_unfinished_dataset_is_refused(
 # Reasons --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("number", "exists", "wanted"),
-    [
-        (errno.EACCES, True, "Permission denied"),
-        (errno.EROFS, False, "Read-only file system"),
-        (errno.ENOENT, False, "No such file or directory ({path} was deleted or moved)"),
-        (errno.ENOENT, True, "No such file or directory"),
-        (errno.EIO, True, "Input/output error"),
-    ],
-)
-def test_file_error_reports_its_true_reason(number: int, exists: bool, wanted: str, tmp_path: Path) -> None:
-    path = tmp_path / ("" if exists else "missing")
-    error = machine_error(OSError(number, os.strerror(number)), path)
-    assert str(error) == f"{path}: {wanted.format(path=path)}"
-
-
 def test_file_error_reports_free_space_on_a_full_disk(tmp_path: Path) -> None:
     text = str(machine_error(OSError(errno.ENOSPC, "No space left on device"), tmp_path / "a/b", RESUME))
     assert text.startswith(f"{tmp_path}/a/b: No space left on device (")
@@ -110,14 +98,14 @@ def test_file_error_reports_free_space_on_a_full_disk(tmp_path: Path) -> None:
 
 
 def test_unreadable_shard_is_a_system_error(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened = Path.open
+    opened = LocalPath.open
 
-    def refuse(self: Path, *given: Any, **options: Any) -> Any:
+    def refuse(self: LocalPath, *given: Any, **options: Any) -> Any:
         if self.suffix == ".tar":
             raise PermissionError(errno.EACCES, "Permission denied", str(self))
         return opened(self, *given, **options)
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(LocalPath, "open", refuse)
     with pytest.raises(MachineError, match=r"shard-00000.tar: Permission denied$"):
         verify(copy / "ds")
 
@@ -175,18 +163,6 @@ def test_changed_source_ends_with_5_and_advice(
     assert done.code == 5
     (line,) = [line for line in done.err.splitlines() if "00000001" in line]
     assert line.endswith("; restore the file, or regenerate the dataset")
-
-
-@pytest.mark.parametrize("harm", HARMS, ids=["changed", "deleted", "cut"])
-def test_repair_with_a_changed_source_ends_with_5(
-    harm: Callable[[Path], None], copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(copy)
-    harm(copy / "p/001.png")
-    (copy / "ds/shards/shard-00001.tar").unlink()
-    done = run_main("verify", "ds", "--repair", "source.root=p")
-    assert done.code == 5
-    assert "cannot be repaired" in done.err and "restore the file, or regenerate the dataset" in done.err
 
 
 def test_edited_row_is_damage_and_no_changed_source(copy: Path) -> None:
@@ -277,6 +253,14 @@ def test_failed_row_records_its_explanation(made: Path) -> None:
     row = list(read_rows(made / "ds/manifest.csv"))[3]
     assert (row["status"], row["reason"]) == ("failed", "unsupported")
     assert row["detail"] and str(made) not in str(row["detail"])
+
+
+def test_run_names_the_first_three_sources_that_fail(run_main: RunMain, tmp_path: Path) -> None:
+    for path in sorted(fill(tmp_path / "p", 6).iterdir())[1:]:
+        path.write_bytes(b"")
+    done = run_main("source.root=p", "n_jobs=1")
+    lines = [f"gen-dataset: 00{number}.png: empty: 00{number}.png has 0 bytes" for number in (1, 2, 3)]
+    assert (done.code, messages(done.err)) == (3, lines)
 
 
 # Sweeps ---------------------------------------------------------------------------------------------------------------
@@ -381,6 +365,23 @@ def test_lines_name_the_job_of_a_sweep(capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr().err.startswith("gen-dataset: 3/20 camera=sony_a7r: 2/2 images, ")
 
 
+def test_time_left_leaves_out_compiling(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    """The first image is finished after a minute of compiling, the next two in six seconds."""
+    clock = iter((0.0, 60.0, 66.0))
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: next(clock))
+    with logging_to(), Progress(9) as progress:
+        progress.advance(1)
+        progress.advance(2)
+    assert capfd.readouterr().err == "gen-dataset: 3/9 images, 0.3 images/s, 0 failed, 18 s left\n"
+
+
+def test_progress_counts_images_inside_shards(settings: Settings, tmp_path: Path) -> None:
+    context = RunContext(PairSettings(settings("output.pairs_per_shard=8")), str(tmp_path), None)
+    for shard, image in ((0, 3), (2, 17)):
+        (tmp_path / f"{shard}.busy").write_text(str(image))
+    assert context.images_in_progress() == 3 + 1
+
+
 # Python ---------------------------------------------------------------------------------------------------------------
 
 
@@ -388,7 +389,7 @@ def test_generate_prints_nothing_and_keeps_signal_handlers(
     settings: Settings, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     config = settings(ONE)
-    config.source.root, config.out, config.n_jobs = str(fill(tmp_path / "p", 3)), str(tmp_path / "ds"), 2
+    config = replaced(config, {"source.root": str(fill(tmp_path / "p", 3)), "out": str(tmp_path / "ds"), "n_jobs": 2})
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     assert not logging.getLogger("unprocess_gen").isEnabledFor(logging.INFO)
     assert generate(config).pairs == 3
@@ -400,7 +401,7 @@ def test_generate_restores_the_threads_of_opencv(settings: Settings, tmp_path: P
     import cv2
 
     config = settings(ONE)
-    config.source.root, config.out, config.n_jobs = str(fill(tmp_path / "p", 1)), str(tmp_path / "ds"), 1
+    config = replaced(config, {"source.root": str(fill(tmp_path / "p", 1)), "out": str(tmp_path / "ds"), "n_jobs": 1})
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
     try:

@@ -6,16 +6,21 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make
+from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
+from PIL import Image
 
+from unprocess_gen.core.errors import SourceError
 from unprocess_gen.core.locks import LockFile
 from unprocess_gen.pipeline import repair
 from unprocess_gen.pipeline.verify import verify
+from unprocess_gen.sources import loader
 
 FILES = ("config.yaml", "manifest.csv", "dataset.json", *(f"shards/shard-0000{number}.tar" for number in range(4)))
 
@@ -182,6 +187,29 @@ def test_lost_manifest_needs_no_source_if_shards_are_intact(
 
     assert done.out.splitlines()[0] == "manifest.csv: restored from the rows in the shards"
     assert contents(tmp_path / "scenes") == before
+
+
+class OldSourceError(SourceError):
+    """Fail as version 0.2 did, which had no reason ``too_small``."""
+
+    def __init__(self, reason: str, *given: Any) -> None:
+        super().__init__("unsupported" if reason == "too_small" else reason, *given)
+
+
+def test_reason_of_0_2_for_small_pictures_is_kept(
+    run_main: RunMain, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.fromarray(pixels(3, 4, 4)).save(fill(tmp_path / "p", 2) / "small.png")
+    with monkeypatch.context() as patch:
+        patch.setattr(loader, "SourceError", OldSourceError)
+        make(tmp_path / "p", tmp_path / "ds", "source.patch=8", "source.max_failed=1")
+    before = contents(tmp_path / "ds")
+    (tmp_path / "ds/manifest.csv").unlink()
+
+    assert run_main("verify", tmp_path / "ds", "--repair").code == 0
+    assert contents(tmp_path / "ds") == before
+    done = run_main("again", tmp_path / "ds", f"out={tmp_path / 'new'}", "source.max_failed=1", "n_jobs=1")
+    assert (done.code, "the same rows as" in done.out) == (0, True), done.err
 
 
 def test_lost_dataset_json_is_rebuilt_and_reported(intact: Path, copy: Path, run_main: RunMain) -> None:

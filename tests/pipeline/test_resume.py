@@ -9,7 +9,6 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -41,11 +40,11 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.cli.messages import logging_to
-from unprocess_gen.core.errors import ConfigError, DamageError, LockedError, MachineError
+from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.locks import LockFile, host
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline import generate as runner
-from unprocess_gen.pipeline.storage.local import LocalStorage
+from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.workspace import read_dataset
 
 TWO = "output.pairs_per_shard=2"
@@ -136,24 +135,6 @@ def test_run_killed_around_any_rename_can_be_resumed(
     figure("resume", "same bytes after a kill before or after each rename")
 
 
-def test_every_rename_of_a_run_is_tested(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[str] = []
-
-    def placed(place: Any, old: Any, new: Any) -> None:
-        seen.append(Path(new).relative_to(tmp_path / "ds").as_posix())
-        place(old, new)
-
-    for name in ("replace", "link"):
-        monkeypatch.setattr(os, name, partial(placed, getattr(os, name)))
-    make(fill(tmp_path / "p", 5), tmp_path / "ds", TWO)
-    assert seen == [
-        ".work/sources/00000.json", ".work/listing.json", "config.yaml", "shards/shard-00000.tar",
-        ".work/rows/00000.json", "shards/shard-00001.tar", ".work/rows/00001.json", "shards/shard-00002.tar",
-        ".work/rows/00002.json", "manifest.csv", "dataset.json",
-    ]  # fmt: skip
-    assert len(seen) == FILES
-
-
 def test_files_are_synced_before_their_rename(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a loss of power no file may have its final name without its contents; its folder is synced next."""
     seen: list[tuple[str, str]] = []
@@ -168,9 +149,14 @@ def test_files_are_synced_before_their_rename(make: Make, tmp_path: Path, monkey
     monkeypatch.setattr(os, "fsync", lambda handle: seen.append(("sync", path_of(handle))))
     for name in ("replace", "link"):
         monkeypatch.setattr(os, name, partial(placed, getattr(os, name)))
-    make(fill(tmp_path / "p", 2), tmp_path / "ds", ONE)
+    make(fill(tmp_path / "p", 5), tmp_path / "ds", TWO)
     renames = [i for i, (what, _) in enumerate(seen) if what != "sync"]
-    assert len(renames) == 9
+    shards = [[f"shards/shard-{i:05d}.tar", f".work/rows/{i:05d}.json"] for i in range(3)]
+    assert [Path(seen[i][1]).relative_to(tmp_path / "ds").as_posix() for i in renames] == [
+        *(".work/sources/00000.json", ".work/listing.json", "config.yaml", *itertools.chain(*shards)),
+        *("manifest.csv", "dataset.json"),
+    ]
+    assert len(renames) == FILES
     for i in renames:
         old, new = seen[i][0].removeprefix("rename "), seen[i][1]
         assert ("sync", old) in seen[:i], old
@@ -233,13 +219,13 @@ def test_unfinished_shards_are_deleted_at_the_start(begun: Path, make: Make, mon
     left = [leave(begun / "ds/.work/tmp/host-1-a"), begun / "ds/.work/tmp/shard-00002.tar.1.1"]
     left[1].write_bytes(b"half")  # as version 0.1 left it
     there: list[bool] = []
-    count_jobs = runner.effective_jobs
+    run_tasks = runner.run_tasks
 
-    def counted(*given: Any) -> int:
+    def looking(*given: Any) -> Any:
         there.extend(path.exists() for path in left)
-        return count_jobs(*given)
+        return run_tasks(*given)
 
-    monkeypatch.setattr(runner, "effective_jobs", counted)
+    monkeypatch.setattr(runner, "run_tasks", looking)
     make(begun / "p", begun / "ds", TWO)
     assert there == [False, False]
 
@@ -254,7 +240,7 @@ def test_unfinished_files_are_deleted_at_the_end(begun: Path, make: Make) -> Non
 
 
 def test_unfinished_files_of_a_running_process_are_kept(begun: Path, make: Make, tree_hash: TreeHash) -> None:
-    other = LocalStorage(begun / "ds")
+    other = Storage(begun / "ds")
     (other.scratch / "half").write_bytes(b"half")
     make(begun / "p", begun / "ds", TWO)
     assert (other.scratch / "half").read_bytes() == b"half"
@@ -262,13 +248,22 @@ def test_unfinished_files_of_a_running_process_are_kept(begun: Path, make: Make,
     assert_complete(begun / "ds")
 
 
-@pytest.mark.parametrize("damage", [Path.unlink, lambda path: os.truncate(path, 600)], ids=["deleted", "cut off"])
-def test_incomplete_committed_shard_is_regenerated(
-    damage: Callable[[Path], Any], six: Path, begun: Path, make: Make, tree_hash: TreeHash
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("shards/shard-00000.tar", Path.unlink),
+        ("shards/shard-00000.tar", lambda path: os.truncate(path, 600)),
+        (".work/rows/00000.json", lambda path: path.write_text("{[")),
+        (".work/rows/00000.json", lambda path: os.truncate(path, path.stat().st_size - 1)),
+    ],
+)
+def test_damaged_committed_shard_is_regenerated(
+    name: str, damage: Callable[[Path], Any], six: Path, begun: Path, make: Make, tree_hash: TreeHash
 ) -> None:
-    damage(begun / "ds/shards/shard-00000.tar")
+    damage(begun / "ds" / name)
     assert make(begun / "p", begun / "ds", TWO).made == 4
     assert tree_hash(begun / "ds") == tree_hash(six / "ds")
+    assert_complete(begun / "ds")
 
 
 def test_progress_of_a_resumed_run_counts_finished_images(begun: Path, make: Make, capfd: Any) -> None:
@@ -319,14 +314,12 @@ def test_changed_settings_or_sources_are_refused_and_change_nothing(
     folder: Path = request.getfixturevalue(state)
     before = snapshot(folder / "ds")
     change(folder / "p")
-    with pytest.raises(ConfigError, match=f"^out=.*/ds: .*{sentence}.*; choose another out, or remove it$"):
+    remedy = (
+        "remove it" if state == "finished" or "sources" in sentence or "deleted" in sentence else "finish it with .*"
+    )
+    with pytest.raises(ConfigError, match=f"^out=.*/ds: .*{sentence}.*; choose another out, or {remedy}$"):
         make(folder / "p", folder / "ds", TWO, override)
     assert snapshot(folder / "ds") == before
-
-
-def test_scene_run_is_not_resumed_from_a_folder(begun: Path, make: Make) -> None:
-    with pytest.raises(ConfigError, match=r"source.kind=synthetic \(there: folder\)"):
-        make(None, begun / "ds", TWO)
 
 
 # Finished -------------------------------------------------------------------------------------------------------------
@@ -336,39 +329,25 @@ def test_rerun_of_a_finished_dataset_reports_nothing_to_do(finished: Path, run_m
     before = snapshot(finished)
     done = run_main("source.root=p", TWO)
     assert (done.code, done.err) == (0, "")
-    assert done.out.startswith("ds is complete: 6 pairs in 3 shards")
+    assert done.out.startswith("ds is complete: 6 pairs, ")
     assert done.out.endswith("; nothing to do\n")
     assert snapshot(finished) == before
 
 
-def test_finished_dataset_of_scenes_is_complete(make: Make, tmp_path: Path) -> None:
-    make(None, tmp_path / "ds", "source.limit=1")
-    assert make(None, tmp_path / "ds", "source.limit=1").made == 0
-
-
-def test_missing_shard_of_a_finished_dataset_is_damage(finished: Path, run_main: RunMain) -> None:
-    (finished / "ds/shards/shard-00001.tar").unlink()
-    done = run_main("source.root=p", TWO)
-    assert (done.code, done.err.count("\n")) == (4, 1)
-    assert "shard-00001.tar: is missing, expected " in done.err
-
-
-def test_shard_of_another_size_is_damage(finished: Path, make: Make) -> None:
-    os.truncate(finished / "ds/shards/shard-00001.tar", 700)
-    with pytest.raises(DamageError, match=r"shard-00001.tar: has 700 bytes, expected \d+ bytes"):
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("shards/shard-00001.tar", Path.unlink, r"shard-00001.tar: is missing, expected "),
+        ("shards/shard-00001.tar", lambda path: os.truncate(path, 700), r"has 700 bytes, expected \d+ bytes"),
+        ("manifest.csv", Path.unlink, r"manifest.csv: no such manifest"),
+    ],
+)
+def test_damage_of_a_finished_dataset_is_reported(
+    name: str, damage: Callable[[Path], Any], message: str, finished: Path, make: Make
+) -> None:
+    damage(finished / "ds" / name)
+    with pytest.raises(DamageError, match=message):
         make(finished / "p", finished / "ds", TWO)
-
-
-def test_finished_dataset_without_manifest_is_damage(finished: Path, make: Make) -> None:
-    (finished / "ds/manifest.csv").unlink()
-    with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
-        make(finished / "p", finished / "ds", TWO)
-
-
-def test_finished_dataset_without_config_is_damage(finished: Path, make: Make) -> None:
-    (finished / "ds/config.yaml").unlink()
-    with pytest.raises((DamageError, ConfigError)):
-        make(finished / "p", finished / "ds", TWO, "seed=1")
 
 
 @pytest.mark.parametrize(
@@ -390,34 +369,12 @@ def test_unreadable_dataset_file_is_reported_in_one_line(
     assert done.err.count("\n") == 1
 
 
-def test_committed_shard_with_unreadable_rows_is_regenerated(begun: Path, make: Make) -> None:
-    (begun / "ds/.work/rows/00000.json").write_text("{[")
-    make(begun / "p", begun / "ds", TWO)
-    assert_complete(begun / "ds")
-
-
-def test_committed_shard_with_truncated_rows_is_regenerated(
-    begun: Path, make: Make, tree_hash: Callable[[Path], str], tmp_path: Path
-) -> None:
-    record = begun / "ds/.work/rows/00000.json"
-    record.write_bytes(record.read_bytes()[:-1])
-    make(begun / "p", begun / "ds", TWO)
-    make(begun / "p", tmp_path / "other", TWO)
-    assert tree_hash(begun / "ds") == tree_hash(tmp_path / "other")
-
-
 def test_records_of_many_shards_are_deleted(begun: Path, make: Make) -> None:
     """More files than one thread deletes at a time."""
     for number in range(100, 300):
         (begun / f"ds/.work/rows/{number:05d}.json").write_text("{}")
     make(begun / "p", begun / "ds", TWO)
     assert_complete(begun / "ds")
-
-
-def test_work_folder_left_by_a_kill_is_deleted(finished: Path, make: Make) -> None:
-    (finished / "ds/.work/rows").mkdir(parents=True)
-    make(finished / "p", finished / "ds", TWO)
-    assert_complete(finished / "ds")
 
 
 # Lock and foreign files -----------------------------------------------------------------------------------------------
@@ -467,28 +424,12 @@ def test_folder_locked_by_another_run_is_refused_with_11(run_main: RunMain, tmp_
     assert list((tmp_path / "ds").rglob("*")) == [tmp_path / "ds/.work"]
 
 
-def test_locked_finished_dataset_is_refused(finished: Path, make: Make) -> None:
-    with held(finished / "ds"), pytest.raises(LockedError):
-        make(finished / "p", finished / "ds", TWO)
-
-
-def test_finished_run_releases_its_folder(finished: Path) -> None:
-    with held(finished / "ds"):
-        pass
-
-
 def test_two_runs_at_once_make_one_dataset(forty: Path, undisturbed: str, tree_hash: TreeHash, tmp_path: Path) -> None:
     arguments = (f"source.root={forty}", ONE, "n_jobs=1")
     with running(*arguments, cwd=tmp_path) as one, running(*arguments, cwd=tmp_path) as other:
         codes = sorted((one.wait(WAIT_S), other.wait(WAIT_S)))
     assert codes in ([0, 0], [0, 11])  # one may be done before the other begins
     assert tree_hash(tmp_path / "ds") == undisturbed
-
-
-def test_empty_folder_is_accepted(make: Make, tmp_path: Path) -> None:
-    (tmp_path / "ds").mkdir()
-    make(fill(tmp_path / "p", 1), tmp_path / "ds")
-    assert_complete(tmp_path / "ds")
 
 
 # Stopped --------------------------------------------------------------------------------------------------------------
@@ -541,32 +482,11 @@ def stopped(request: pytest.FixtureRequest, forty: Path, tmp_path_factory: pytes
     return Stopped(number, process.returncode, err, left, folder / "ds")
 
 
-def test_signal_ends_the_run_with_its_code(stopped: Stopped) -> None:
-    assert stopped.code == 128 + stopped.number
-
-
-def test_signal_leaves_no_process_behind(stopped: Stopped) -> None:
-    assert stopped.left == []
-
-
-def test_signal_leaves_the_dataset_unfinished(stopped: Stopped) -> None:
+def test_signal_ends_the_run_and_leaves_no_process(stopped: Stopped) -> None:
+    assert (stopped.code, stopped.left) == (128 + stopped.number, [])
     assert (stopped.out / ".work/listing.json").exists()
     assert not (stopped.out / "dataset.json").exists()
-
-
-def test_signal_prints_only_lines_of_gen_dataset(stopped: Stopped) -> None:
-    others = [line for line in stopped.err.splitlines() if not line.startswith("gen-dataset: ")]
-    assert others == []
-
-
-@pytest.mark.slow
-def test_workers_end_when_their_coordinator_is_killed(tmp_path: Path) -> None:
-    """`test_orphaned_workers_do_not_disturb_the_next_run` is the quick form."""
-    with running(*LONG, cwd=tmp_path) as process:
-        wait_for(lambda: committed(tmp_path / "ds"))
-        assert len(workers(process.pid)) == 2
-        os.kill(process.pid, signal.SIGKILL)
-        wait_for(lambda: not session(process.pid), seconds=10 * processes_per_core())
+    assert [line for line in stopped.err.splitlines() if not line.startswith("gen-dataset: ")] == []
 
 
 DEADLY = """
@@ -603,19 +523,6 @@ def twelve_undisturbed(make: Make, tree_hash: TreeHash, tmp_path_factory: pytest
     folder = tmp_path_factory.mktemp("undisturbed")
     make(fill(folder / "p", 12), folder / "ds", "output.pairs_per_shard=4")
     return tree_hash(folder / "ds")
-
-
-@pytest.mark.slow
-def test_worker_that_dies_once_changes_no_byte(
-    twelve_undisturbed: str, cli: Cli, tree_hash: TreeHash, tmp_path: Path
-) -> None:
-    """`test_killed_worker_is_noticed_within_five_seconds` is the quick form."""
-    done = run_with_deaths(cli, tmp_path, deaths=1)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "deaths").read_text() == "0"
-    assert "12 pairs in 3 shards" in done.stdout
-    assert tree_hash(tmp_path / "ds") == twelve_undisturbed
-    assert not (tmp_path / "ds/.work").exists()
 
 
 def test_source_that_kills_two_workers_is_retried_by_reruns(
@@ -665,56 +572,3 @@ def test_failed_write_ends_with_5_and_a_rerun_finishes(make: Make, tree_hash: Tr
     make(source, tmp_path / "ds", ONE)
     make(source, tmp_path / "undisturbed", ONE)
     assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")
-
-
-def test_deleted_out_is_a_system_error(make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_tasks = runner.run_tasks
-
-    def vanishing(*arguments: Any) -> Iterator[Any]:
-        for made in run_tasks(*arguments):
-            (tmp_path / "ds").rename(tmp_path / "elsewhere")
-            yield made
-
-    monkeypatch.setattr(runner, "run_tasks", vanishing)
-    with pytest.raises(MachineError, match=r"was deleted or moved"):
-        make(fill(tmp_path / "p", 1), tmp_path / "ds")
-
-
-# A million rows -------------------------------------------------------------------------------------------------------
-
-MERGE = """
-import json, os, resource, sys
-from pathlib import Path
-from unprocess_gen.dataset.columns import NAMES
-from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline.shard_records import record_name
-from unprocess_gen.pipeline.workspace import Workspace
-
-out, shards = Path(sys.argv[1]), int(sys.argv[2])
-row = next(read_rows(Path(sys.argv[3])))
-record = {"entry": {"file": None, "bytes": 0, "sha256": None}, "rows": [[row[name] for name in NAMES]] * 100}
-with Workspace(out, "seed: 0\\n") as workspace:
-    workspace.open()
-    workspace.begin([], shards)
-    first = out / record_name(0)
-    first.parent.mkdir()
-    first.write_text(json.dumps(record))
-    for shard in range(1, shards):
-        os.link(first, out / record_name(shard))
-    workspace.finish(shards, lambda tally: tally.facts())
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, sum(1 for _ in (out / "manifest.csv").open("rb")))
-"""
-
-
-@pytest.mark.slow
-def test_million_rows_are_merged_in_constant_memory(tmp_path: Path) -> None:
-    """The rows of committed shards are simulated; memory for everything else is bounded by one shard."""
-    manifest = str(Path(__file__).parents[2] / "manifests" / "scenes_imx385_iso3200.csv")
-    peaks_kib = []
-    for shards in (10, 10_000):
-        command = [sys.executable, "-c", MERGE, str(tmp_path / f"ds{shards}"), str(shards), manifest]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        peak_kib, lines = map(int, done.stdout.split())
-        assert lines == 100 * shards + 1
-        peaks_kib.append(peak_kib)
-    assert peaks_kib[1] - peaks_kib[0] < 30_000

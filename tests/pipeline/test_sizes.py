@@ -14,16 +14,16 @@ from helpers.photographs import fill
 from helpers.processes import ONE
 
 from unprocess_gen import load_config
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.pipeline import sizes
-from unprocess_gen.pipeline.generate import shard_tasks
-from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.run import shard_tasks
 from unprocess_gen.sources.loader import list_photographs
 
 
 def estimate(settings: Settings, root: Path | None, *overrides: str) -> sizes.SizeEstimate:
     config = settings(*overrides)
-    config.source.root = None if root is None else str(root)
+    config = replaced(config, {"source.root": None if root is None else str(root)})
     tasks = shard_tasks(list_photographs(config.source).sources, config.output.pairs_per_shard)
     return sizes.estimate_shards(config, tasks)
 
@@ -113,12 +113,13 @@ def test_resumed_run_needs_space_only_for_missing_shards(
 
 def test_true_free_space_is_compared(tmp_path: Path, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     config = settings(ONE)
-    config.source.root = str(fill(tmp_path / "p", 2))
+    config = replaced(config, {"source.root": str(fill(tmp_path / "p", 2))})
     tasks = shard_tasks(list_photographs(config.source).sources, 1)
-    sizes.check_free_space(config, tasks, tmp_path / "does/not/exist")
+    config = replaced(config, {"out": str(tmp_path / "does/not/exist")})
+    sizes.check_free_space(config, tasks, 1)
     monkeypatch.setattr(sizes, "estimate_shards", lambda *_: sizes.SizeEstimate(10**18, 10**18))
     with pytest.raises(MachineError, match="check_disk=false"):
-        sizes.check_free_space(config, tasks, tmp_path)
+        sizes.check_free_space(config, tasks, 1)
 
 
 # Sources per shard ----------------------------------------------------------------------------------------------------
@@ -170,15 +171,15 @@ def test_auto_without_readable_source_is_the_default(settings: Settings, tmp_pat
     (tmp_path / "p/a.png").write_bytes(b"not a photograph")
     config = settings(AUTO, f"source.root={tmp_path / 'p'}")
     sources = list_photographs(config.source).sources
-    assert sizes.with_pairs_per_shard(config, sources, open_storage(str(tmp_path))).output.pairs_per_shard == 8
+    assert sizes.resolve_pairs_per_shard(config, sources).output.pairs_per_shard == 8
 
 
 @pytest.mark.parametrize("recorded", ["", "seed: 0", "output: [", "\0"])
 def test_unreadable_record_is_left_to_other_checks(recorded: str, settings: Settings, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(recorded)
-    config = settings(AUTO, "source.limit=1")
+    config = settings(AUTO, "source.limit=1", f"out={tmp_path}")
     sources = list_photographs(config.source).sources
-    assert sizes.with_pairs_per_shard(config, sources, open_storage(str(tmp_path))).output.pairs_per_shard > 1
+    assert sizes.resolve_pairs_per_shard(config, sources).output.pairs_per_shard > 1
 
 
 def test_plan_states_the_number_of_auto(

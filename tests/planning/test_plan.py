@@ -11,6 +11,7 @@ import sys
 from collections import Counter
 from dataclasses import replace
 from fractions import Fraction
+from operator import attrgetter
 
 import mpmath
 import numpy as np
@@ -28,7 +29,9 @@ from unprocess_gen.core import fixed_point
 from unprocess_gen.core.random_streams import parameter_uniforms, stream_key
 from unprocess_gen.core.types import Distribution, Facts, Plan
 from unprocess_gen.planning import noise_profile
-from unprocess_gen.planning.plan import PARAMETERS, TwoNumberLevel, plan_camera, plan_image, plan_pairs
+from unprocess_gen.planning.draws import COUNT, EFFECT_COUNTERS, Draw
+from unprocess_gen.planning.plan import TwoNumberLevel, plan_camera, plan_image, plan_pairs
+from unprocess_gen.simulation.effects import NUMBERS
 from unprocess_gen.simulation.reference import colour
 
 SHA = hashlib.sha256(b"a photograph").hexdigest()
@@ -45,16 +48,14 @@ def plan_of(settings: Settings, *overrides: str, sha: str = SHA, occurrence: int
     return plan_image(config, sha, occurrence)
 
 
-def named(uniform: float = 0.5, **chosen: float) -> dict[str, float]:
-    return dict.fromkeys(PARAMETERS, uniform) | chosen
+def named(uniform: float = 0.5, **chosen: float) -> list[float]:
+    by_counter = {Draw[name.upper()]: value for name, value in chosen.items()}
+    return [by_counter.get(counter, uniform) for counter in range(COUNT)]  # type: ignore[call-overload]
 
 
-def images(count: int) -> list[dict[str, float]]:
+def images(count: int) -> list[list[float]]:
     """Return the draws of a number of images, without plans."""
-    return [
-        dict(zip(PARAMETERS, parameter_uniforms(stream_key(0, f"{image:064x}"), len(PARAMETERS)), strict=True))
-        for image in range(count)
-    ]
+    return [parameter_uniforms(stream_key(0, f"{image:064x}"), COUNT) for image in range(count)]
 
 
 # Distributions --------------------------------------------------------------------------------------------------------
@@ -218,58 +219,63 @@ def test_choice_is_the_quarter_that_contains_the_uniform(settings: Settings, uni
 @pytest.mark.parametrize("name", colour.CAMERAS)
 def test_fixed_camera_has_weight_1(settings: Settings, name: str) -> None:
     plan = plan_of(settings, f"camera={name}")
-    assert plan.camera == name
-    assert plan.weights == tuple(float(name == other) for other in colour.CAMERAS)
-    assert plan.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
+    assert plan.camera.name == name
+    assert plan.camera.weights == tuple(float(name == other) for other in colour.CAMERAS)
+    assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS[name])
 
 
 def test_chosen_camera_equals_the_fixed_camera(settings: Settings) -> None:
     plan = plan_of(settings, "camera=choice")
-    assert plan == plan_of(settings, f"camera={plan.camera}")
+    assert plan == plan_of(settings, f"camera={plan.camera.name}")
 
 
 def test_mixed_camera_is_named_convex(settings: Settings) -> None:
     plan = plan_of(settings)
-    assert plan.camera == "convex"
-    assert all(0 < weight < 1 for weight in plan.weights)
+    assert plan.camera.name == "convex"
+    assert all(0 < weight < 1 for weight in plan.camera.weights)
 
 
 def test_identity_has_no_weights_and_changes_nothing(settings: Settings) -> None:
     plan = plan_of(settings, "camera=identity")
-    assert (plan.camera, plan.weights, plan.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
+    assert (plan.camera.name, plan.camera.weights, plan.camera.rgb2cam) == ("identity", (0.0,) * 4, colour.IDENTITY)
 
 
 def test_custom_matrix_has_no_weights(settings: Settings) -> None:
     own = list(colour.CAMERAS["sony_a7r"])
     plan = plan_of(settings, "camera=custom", f"camera.xyz2cam={own}")
-    assert (plan.camera, plan.weights) == ("custom", (0.0,) * 4)
-    assert plan.rgb2cam == colour.rgb2cam(colour.CAMERAS["sony_a7r"])
+    assert (plan.camera.name, plan.camera.weights) == ("custom", (0.0,) * 4)
+    assert plan.camera.rgb2cam == colour.rgb2cam(colour.CAMERAS["sony_a7r"])
 
 
 # Draws and names ------------------------------------------------------------------------------------------------------
 
 
-def test_counters_of_parameters_never_change() -> None:
-    names = ("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b")
-    assert PARAMETERS[: len(names)] == names
-    assert len(set(PARAMETERS)) == len(PARAMETERS)
+def test_counters_of_draws_never_change() -> None:
+    names = "weight_0 weight_1 weight_2 weight_3 choice red blue inverse_rgb a b iso exposure_s temperature_c"
+    assert [draw.name.lower() for draw in sorted(Draw)] == [*names.split(), "exposure_ratio", "sensor_unit"]
+    assert {name: number.counter for name, number in NUMBERS.items() if number.counter >= 0} == {
+        "read_shape": 14, "read_std_dn": 15, "row_std_dn": 16, "column_std_dn": 17, "column_temporal_std_dn": 19,
+    }  # fmt: skip
+    assert sorted((*Draw, *EFFECT_COUNTERS)) == list(range(COUNT))
 
 
 def test_each_parameter_uses_the_uniform_of_its_name(settings: Settings) -> None:
     plan = plan_of(settings, "noise=brooks2019")
-    u = dict(zip(PARAMETERS, parameter_uniforms(plan.stream_key, len(PARAMETERS)), strict=True))
-    assert plan.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u["red"])
-    assert plan.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u["blue"])
-    assert plan.inverse_rgb_gain == draw(GAIN, u["inverse_rgb"])
-    a = draw(SHOT, u["a"])
-    assert plan.a_dn == a * 3855.0
-    assert plan.b_dn2 == draw(READ, u["b"], a) * 3855.0 * 3855.0
-    assert plan.weights[0] == u["weight_0"] / (u["weight_0"] + u["weight_1"] + u["weight_2"] + u["weight_3"])
+    u = parameter_uniforms(plan.stream_key, COUNT)
+    assert plan.camera.red_gain == draw(Distribution("uniform", (1.9, 2.4)), u[Draw.RED])
+    assert plan.camera.blue_gain == draw(Distribution("uniform", (1.5, 1.9)), u[Draw.BLUE])
+    assert plan.camera.inverse_rgb_gain == draw(GAIN, u[Draw.INVERSE_RGB])
+    a = draw(SHOT, u[Draw.A])
+    assert plan.noise.a_dn == a * 3855.0
+    assert plan.noise.b_dn2 == draw(READ, u[Draw.B], a) * 3855.0 * 3855.0
+    assert plan.camera.weights[0] == u[Draw.WEIGHT_0] / (
+        u[Draw.WEIGHT_0] + u[Draw.WEIGHT_1] + u[Draw.WEIGHT_2] + u[Draw.WEIGHT_3]
+    )
 
 
-GAIN_DRAWS = ("red_gain", "blue_gain", "inverse_rgb_gain")
-NOISE_DRAWS = ("a_dn", "b_dn2")
-CAMERA_DRAWS = ("camera", "weights", "rgb2cam")
+GAIN_DRAWS = ("camera.red_gain", "camera.blue_gain", "camera.inverse_rgb_gain")
+NOISE_DRAWS = ("noise.a_dn", "noise.b_dn2")
+CAMERA_DRAWS = ("camera.name", "camera.weights", "camera.rgb2cam")
 
 
 @pytest.mark.parametrize(
@@ -279,10 +285,10 @@ CAMERA_DRAWS = ("camera", "weights", "rgb2cam")
         ("camera=choice", GAIN_DRAWS + NOISE_DRAWS),
         ("camera=identity", GAIN_DRAWS + NOISE_DRAWS),
         ("gains=unity", CAMERA_DRAWS + NOISE_DRAWS),
-        ("gains.red=2.0", ("blue_gain", "inverse_rgb_gain", *CAMERA_DRAWS, *NOISE_DRAWS)),
-        ("gains.inverse_rgb=0.8", ("red_gain", "blue_gain", *CAMERA_DRAWS, *NOISE_DRAWS)),
+        ("gains.red=2.0", ("camera.blue_gain", "camera.inverse_rgb_gain", *CAMERA_DRAWS, *NOISE_DRAWS)),
+        ("gains.inverse_rgb=0.8", ("camera.red_gain", "camera.blue_gain", *CAMERA_DRAWS, *NOISE_DRAWS)),
         ("noise=none", CAMERA_DRAWS + GAIN_DRAWS),
-        ("noise.b=0.001", ("a_dn", *CAMERA_DRAWS, *GAIN_DRAWS)),
+        ("noise.b=0.001", ("noise.a_dn", *CAMERA_DRAWS, *GAIN_DRAWS)),
         ("sensor=generic_14bit", CAMERA_DRAWS + GAIN_DRAWS),
         ("isp=srgb", CAMERA_DRAWS + GAIN_DRAWS + NOISE_DRAWS),
     ],
@@ -292,10 +298,10 @@ def test_unused_draw_moves_no_other(settings: Settings, override: str, unmoved: 
     after = plan_of(settings, *([] if override.startswith("noise=") else ["noise=brooks2019"]), override)
     assert after != before
     for name in unmoved:
-        assert getattr(after, name) == getattr(before, name), name
+        assert attrgetter(name)(after) == attrgetter(name)(before), name
 
 
-DRAWN = (*GAIN_DRAWS, *NOISE_DRAWS, "weights", "stream_key")
+DRAWN = (*GAIN_DRAWS, *NOISE_DRAWS, "camera.weights", "stream_key")
 
 
 @pytest.mark.parametrize("other", ["seed", "photograph", "occurrence"])
@@ -309,7 +315,7 @@ def test_other_seed_source_or_occurrence_changes_every_draw(settings: Settings, 
         occurrence=int(other == "occurrence"),
     )
     for name in DRAWN:
-        assert getattr(after, name) != getattr(before, name), name
+        assert attrgetter(name)(after) != attrgetter(name)(before), name
 
 
 def test_equal_config_and_source_give_equal_plans(settings: Settings) -> None:
@@ -325,12 +331,12 @@ def test_draws_of_many_images_are_within_their_distributions(settings: Settings)
     config = settings("noise=brooks2019")
     for image in range(300):
         plan = plan_image(config, f"{image:064x}")
-        assert 1.9 <= plan.red_gain <= 2.4
-        assert 1.5 <= plan.blue_gain <= 1.9
-        assert 0.5 <= plan.inverse_rgb_gain <= 1.1
-        assert 0.0001 * 3855 <= plan.a_dn <= 0.012 * 3855
-        a = plan.a_dn / 3855
-        assert abs(math.log(plan.b_dn2 / 3855**2) - (2.18 * math.log(a) + 1.2)) <= 8.21 * 0.26  # of u = 2**-53
+        assert 1.9 <= plan.camera.red_gain <= 2.4
+        assert 1.5 <= plan.camera.blue_gain <= 1.9
+        assert 0.5 <= plan.camera.inverse_rgb_gain <= 1.1
+        assert 0.0001 * 3855 <= plan.noise.a_dn <= 0.012 * 3855
+        a = plan.noise.a_dn / 3855
+        assert abs(math.log(plan.noise.b_dn2 / 3855**2) - (2.18 * math.log(a) + 1.2)) <= 8.21 * 0.26  # of u = 2**-53
 
 
 # Noise ----------------------------------------------------------------------------------------------------------------
@@ -338,30 +344,30 @@ def test_draws_of_many_images_are_within_their_distributions(settings: Settings)
 
 def test_profile_is_unchanged_on_its_own_sensor(settings: Settings) -> None:
     plan = plan_of(settings, "noise=imx385_iso3200")
-    assert (plan.noise, plan.a_dn, plan.b_dn2) == ("imx385_iso3200", 6.955588, 38.117816)
+    assert (plan.noise.name, plan.noise.a_dn, plan.noise.b_dn2) == ("imx385_iso3200", 6.955588, 38.117816)
 
 
 def test_profile_is_converted_to_the_sensor_once(settings: Settings) -> None:
     """Slope times s, intercept times s², s = 15359/3855; two conversions would give s² and s⁴."""
     config = settings("noise=imx385_iso3200", "sensor=generic_14bit")
     s = Fraction(15359, 3855)
-    a, b = TwoNumberLevel(config).two_numbers(named())
+    a, b = TwoNumberLevel(config, 0).two_numbers(named())
     assert abs(Fraction(a) / (Fraction(6.955588) * s) - 1) <= Fraction(21, 10) / 2**53
     assert abs(Fraction(b) / (Fraction(38.117816) * s * s) - 1) <= Fraction(41, 10) / 2**53
     plan = plan_image(config, SHA)
-    assert (plan.a_dn, plan.b_dn2) == (a, b)
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == (a, b)
 
 
 def test_profile_with_black_included_is_converted_before_recording(settings: Settings) -> None:
     plan = plan_of(settings, "noise=imx385_iso3200_rvdd")
-    assert plan.a_dn == 8.0034
-    assert plan.b_dn2 == -2043.51144 + 8.0034 * 240
+    assert plan.noise.a_dn == 8.0034
+    assert plan.noise.b_dn2 == -2043.51144 + 8.0034 * 240
 
 
 def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> None:
     for sensor in ("imx385_12bit", "generic_10bit", "generic_16bit"):
         plan = plan_of(settings, "noise=heteroscedastic", "noise.a=1.25", "noise.b=7.5", f"sensor={sensor}")
-        assert (plan.a_dn, plan.b_dn2) == (1.25, 7.5)
+        assert (plan.noise.a_dn, plan.noise.b_dn2) == (1.25, 7.5)
 
 
 # Recorded values ------------------------------------------------------------------------------------------------------
@@ -369,21 +375,21 @@ def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> 
 
 def test_simulated_noise_is_listed_among_effects(settings: Settings) -> None:
     plan = plan_of(settings)
-    assert (plan.effects, plan.skipped) == (("heteroscedastic", "quantise"), ())
+    assert (plan.noise.effects, plan.noise.skipped) == (("heteroscedastic", "quantise"), ())
 
 
 @pytest.mark.parametrize("b", [0.0, -3.0])
 def test_noise_without_variance_is_skipped_with_reason(settings: Settings, b: float) -> None:
     plan = plan_of(settings, "noise=none", f"noise.b={b}", "noise.negative_variance=clip")
-    assert plan.effects == ("quantise",)
-    (reason,) = plan.skipped
+    assert plan.noise.effects == ("quantise",)
+    (reason,) = plan.noise.skipped
     assert reason.startswith("heteroscedastic: noise=none has no variance")
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.1), (0.1, 0.0), (0.1, -5.0)])
 def test_noise_with_any_positive_variance_is_simulated(settings: Settings, a: float, b: float) -> None:
     plan = plan_of(settings, "noise=heteroscedastic", f"noise.a={a}", f"noise.b={b}", "noise.negative_variance=clip")
-    assert "heteroscedastic" in plan.effects
+    assert "heteroscedastic" in plan.noise.effects
 
 
 def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
@@ -391,22 +397,22 @@ def test_plan_contains_the_values_of_the_config(settings: Settings) -> None:
         settings, "sensor=generic_10bit", "sensor.pattern=GBRG", "sensor.clip=black", "isp=srgb", "gains=unity",
         "gains.threshold=0.75", "gains.highlight=gray_mean",
     )  # fmt: skip
-    assert (plan.bits, plan.black_level_dn, plan.white_level_dn) == (10, 64, 1023)
-    assert (plan.pattern, plan.sensor_clip) == ("GBRG", "black")
-    assert (plan.tone, plan.gamma) == ("none", "srgb")
-    assert (plan.highlight, plan.highlight_threshold) == ("gray_mean", 0.75)
+    assert (plan.sensor.bits, plan.sensor.black_level_dn, plan.sensor.white_level_dn) == (10, 64, 1023)
+    assert (plan.sensor.pattern, plan.noise.sensor_clip) == ("GBRG", "black")
+    assert (plan.isp.tone, plan.isp.gamma) == ("none", "srgb")
+    assert (plan.camera.highlight, plan.camera.highlight_threshold) == ("gray_mean", 0.75)
 
 
 @pytest.mark.parametrize(("isp", "gamma"), [("linear", 1.0), ("gamma22", 2.2), ("srgb", "srgb")])
 def test_gamma_is_number_or_srgb(settings: Settings, isp: str, gamma: float | str) -> None:
-    found = plan_of(settings, f"isp={isp}").gamma
+    found = plan_of(settings, f"isp={isp}").isp.gamma
     assert found == gamma
     assert type(found) is type(gamma)
 
 
 def test_noise_with_negative_variance_at_all_signals_is_skipped(settings: Settings) -> None:
     plan = plan_of(settings, "noise=heteroscedastic", "noise.a=0.001", "noise.b=-1e6", "noise.negative_variance=clip")
-    assert plan.effects == ("quantise",)
+    assert plan.noise.effects == ("quantise",)
 
 
 def test_planning_imports_neither_numba_nor_opencv() -> None:

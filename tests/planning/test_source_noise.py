@@ -44,7 +44,7 @@ def noisy_gray(std: float, size: tuple[int, int] = (400, 500), seed: int = 1) ->
 
 @pytest.mark.parametrize("std", [0.5, 2, 8])
 def test_estimate_is_the_standard_deviation_of_known_noise(linear: Plan, std: float) -> None:
-    expected = std / 255 * (linear.white_level_dn - linear.black_level_dn)
+    expected = std / 255 * (linear.sensor.white_level_dn - linear.sensor.black_level_dn)
     assert source_noise_dn(noisy_gray(std), linear) == pytest.approx(expected, rel=0.1)
 
 
@@ -93,7 +93,7 @@ def test_ratio_compares_with_simulated_noise_at_the_same_signal(plan: Plan, line
     srgb = noisy_gray(2)
     tiles = tile_noise(srgb, plan)
     signal_dn = float(np.median(tiles.signal_dn))
-    expected = float(np.median(tiles.std_dn)) / np.sqrt(plan.a_dn * signal_dn + plan.b_dn2)
+    expected = float(np.median(tiles.std_dn)) / np.sqrt(plan.noise.a_dn * signal_dn + plan.noise.b_dn2)
     assert noise_ratio(srgb, plan) == pytest.approx(expected, rel=0.1)
     assert noise_ratio(srgb, linear) is None  # no noise is simulated
 

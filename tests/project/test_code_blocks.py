@@ -203,14 +203,6 @@ def test_blocks_that_do_not_run_have_a_reason() -> None:
     assert unknown == []
 
 
-def test_recipe_of_the_guide_is_that_of_the_example() -> None:
-    example = (ROOT / "docs" / "examples" / "train_denoiser.py").read_text(encoding="utf-8")
-    guide = "\n\n\n".join(block.text for block in blocks_of(ROOT / "docs" / "guides" / "loading.md"))
-    recipe = re.findall(r"^(?:def (?:pack|to_light|noise_std)|class RandomCrops)\b.*?(?=\n\n\n|\Z)", guide, re.M | re.S)
-    assert len(recipe) == 4
-    assert [part for part in recipe if part.strip() not in example] == []
-
-
 def test_blocks_are_found_with_their_comments() -> None:
     first = "<!-- not run: a, b -->\n```bash\nls\n```\n\nword\n\n"
     text = f"{first}    gen-dataset x  # y\n\n<!-- output -->\n```text\n1\n```\n"

@@ -14,14 +14,14 @@ PACKAGE = Path(unprocess_gen.__file__).parent
 
 ONLY_IN = {
     "hydra": {
-        "cli.hydra_request",
+        "cli.jobs",
         "config.composition",
         "config.composition_errors",
         "config.sweep_expansion",
         "cli.sweep_plugins",
     },
     "omegaconf": {
-        *("cli.hydra_request", "config.composition", "config.composition_errors", "config.serialization"),
+        *("cli.jobs", "config.composition", "config.composition_errors", "config.serialization"),
         *("cli.sweep_plugins", "config.sweep_expansion"),
     },
     "joblib": {"pipeline.executors.local"},
@@ -36,7 +36,6 @@ ONLY_IN = {
             "reports.sheets.panels",
         ),
         *(
-            "reports.sheets.stages_sheet",
             "reports.benchmark.complete_runs",
             "simulation.reference.isp",
             "pipeline.worker",

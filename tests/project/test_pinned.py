@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from helpers.promise_report import Figure
 
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import read_dataset_yaml
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.dataset.columns import HEADERS, NAMES
@@ -45,7 +46,7 @@ def test_pinned_manifest_without_new_columns_is_that_of_0_1(name: str) -> None:
 def test_pinned_build_gives_the_recorded_bytes(name: str, tmp_path: Path, figure: Figure) -> None:
     config, kind = read_dataset_yaml(PINNED / f"{name}.yaml")
     assert kind == "synthetic"
-    config.out, config.n_jobs = str(tmp_path / "ds"), 1
+    config = replaced(config, {"out": str(tmp_path / "ds"), "n_jobs": 1})
     validate_config(config)
 
     generate(config)

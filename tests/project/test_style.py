@@ -47,8 +47,8 @@ BAD_STARTS = re.compile(r"(As|Of|Do so|The same|By|Where|What|Whether|Which|How|
 NUMPYDOC_CODES = {"PR01", "PR02", "PR03", "RT01", "GL06", "GL07", "SS03"}
 """Parameters documented, known and in order; returns documented; sections known and in order; summary with a period."""
 
-WITHOUT_SECTIONS = ("simulation.kernels",)
-"""Packages whose functions are called by code of the same stage only: one sentence with shapes and dtypes is enough."""
+WITH_SECTIONS = ("simulation.reference", "simulation.effects")
+"""Packages that follow the article: functions that others import have sections, like the public API."""
 
 
 def python_files() -> list[Path]:
@@ -106,7 +106,7 @@ def module_of(path: Path) -> str:
 
 @cache
 def public_functions() -> tuple[str, ...]:
-    """Return the functions that another package imports, and those of the public API, by their full names."""
+    """Return the functions of the public API, and those of `WITH_SECTIONS` that other packages import."""
     import unprocess_gen
 
     functions = {
@@ -115,21 +115,16 @@ def public_functions() -> tuple[str, ...]:
         for node in ast.parse(path.read_text(encoding="utf-8")).body
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
     }
-    used = set()
+    exported = {f"{getattr(getattr(unprocess_gen, name), '__module__', '')}.{name}" for name in unprocess_gen.__all__}
+    packages = tuple(f"unprocess_gen.{package}" for package in WITH_SECTIONS)
+    imported = set()
     for path in PACKAGE.rglob("*.py"):
         own = module_of(path).split(".")[1:2]
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[1:2] != own:
-                used |= {f"{node.module}.{alias.name}" for alias in node.names}
-    for name in unprocess_gen.__all__:
-        value = getattr(unprocess_gen, name)
-        used.add(f"{getattr(value, '__module__', '')}.{name}")
-    public = functions & used
-    return tuple(
-        sorted(
-            name for name in public if not name.startswith(tuple(f"unprocess_gen.{one}" for one in WITHOUT_SECTIONS))
-        )
-    )
+                imported |= {f"{node.module}.{alias.name}" for alias in node.names}
+    shared = {name for name in functions & imported if name.startswith(packages)}
+    return tuple(sorted(shared | (functions & exported)))
 
 
 def numpydoc_errors(name: str) -> list[str]:

@@ -8,16 +8,11 @@ from __future__ import annotations
 import csv
 import gc
 import html
-import itertools
 import json
-import math
 import os
 import re
 import shutil
-import subprocess
-import sys
-import tracemalloc
-from collections.abc import Iterator
+from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -29,26 +24,24 @@ from helpers.commands import RunMain
 from helpers.datasets import Make, TreeHash
 from helpers.photographs import fill
 from helpers.promise_report import Figure
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
 from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.files import file_sha256
-from unprocess_gen.core.types import Row
-from unprocess_gen.dataset.manifest import read_rows, write_rows
+from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.verify import verify
-from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, read_dataset
-from unprocess_gen.planning import plan
-from unprocess_gen.reports import formatting, html_pages, report_files
+from unprocess_gen.pipeline.workspace import dataset_text, read_dataset
+from unprocess_gen.reports import formatting, html_pages
 from unprocess_gen.reports.dataset_page import page as dataset_report
 from unprocess_gen.reports.dataset_page.statistics import (
-    PARAMETER_COLUMNS,
-    TEXT_COLUMNS,
-    Histogram,
+    PAIRS_DRAWN,
     ManifestStatistics,
-    ValueCounts,
+    add_value,
+    read_statistics,
+    values_text,
 )
 
 HOSTILE = "<img src=x onerror=alert('&amp;')>\".png"
@@ -95,139 +88,96 @@ def cells(folder: Path, column: str) -> list[str]:
 
 # Statistics -----------------------------------------------------------------------------------------------------------
 
-NUMBERS = st.floats(-1e15, 1e15, allow_nan=False).map(lambda value: value if abs(value) > 1e-12 else 0.0)
+GAINS = st.lists(st.floats(-1e15, 1e15) | st.none(), min_size=1, max_size=40)
 
 
-@settings(max_examples=200, deadline=None)
-@given(st.lists(st.lists(NUMBERS, max_size=20), min_size=1, max_size=8))
-def test_histogram_counts_every_value_in_its_bin(batches: list[list[float]]) -> None:
-    histogram = Histogram()
-    for batch in batches:
-        histogram.add(np.array(batch, dtype=np.float64))
-    values = list(itertools.chain.from_iterable(batches))
-    width = 2.0**histogram.exponent
-    expected: dict[int, int] = {}
-    for value in values:
-        expected[math.floor(value / width)] = expected.get(math.floor(value / width), 0) + 1
-    assert histogram.counts == expected
-    assert histogram.number == len(values)
+@given(GAINS, st.integers(1, 10))
+def test_ranges_are_those_of_the_values_whatever_the_batch_size(
+    made: Path, gains: list[float | None], size: int
+) -> None:
+    pair = next(row for row in read_rows(made / "manifest.csv") if row["status"] == "ok")
+    rows = [dict(pair) | {"red_gain": gain, "key": f"{number:08d}"} for number, gain in enumerate(gains)]
+    statistics = ManifestStatistics(len(rows))
+    for start in range(0, len(rows), size):
+        statistics.add(rows[start : start + size])
+
+    values = [gain for gain in gains if gain is not None]
+    assert (statistics.rows, statistics.images) == (len(rows), len(rows))
+    assert ("red_gain" in statistics.numbers) == bool(values)
     if values:
-        assert (histogram.least, histogram.greatest) == (min(values), max(values))
-        assert max(expected) - min(expected) < Histogram.BINS
-        assert sum(histogram.bars()) == len(values)
+        column = statistics.numbers["red_gain"]
+        assert (column.least, column.greatest, column.values.tolist()) == (min(values), max(values), values)
+        assert column.mean == pytest.approx(sum(values) / len(values), rel=1e-9, abs=1e-3)
 
 
-def test_histogram_of_uniform_values_is_flat() -> None:
-    histogram = Histogram()
-    for batch in np.random.default_rng(0).random((1000, 100)):
-        histogram.add(batch)
-    bars = histogram.bars()
-    assert len(bars) == 32
-    assert max(abs(count - 100_000 / 32) for count in bars) < 5 * math.sqrt(100_000 / 32)
+@pytest.mark.parametrize("count", [PAIRS_DRAWN // 8, PAIRS_DRAWN * 2 + 7])
+def test_histograms_of_many_pairs_have_evenly_spaced_values(made: Path, count: int) -> None:
+    pair = next(row for row in read_rows(made / "manifest.csv") if row["status"] == "ok")
+    rows = ({"red_gain": float(number)} | {key: value for key, value in pair.items() if key != "red_gain"}
+            for number in range(count))  # fmt: skip
+    column = read_statistics(rows, count).numbers["red_gain"]
+    step = 1 if count <= PAIRS_DRAWN else 3
+    assert (column.least, column.greatest, column.mean) == (0, count - 1, (count - 1) / 2)
+    assert column.values.tolist() == list(range(0, count, step))
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
-def test_statistics_do_not_depend_on_batch_size(made: Path, size: int) -> None:
-    def tallied(count: int) -> ManifestStatistics:
-        tally, rows = ManifestStatistics(), list(read_rows(made / "manifest.csv"))
-        for start in range(0, len(rows), count):
-            tally.add(rows[start : start + count])
-        return tally
-
-    one, other = tallied(size), tallied(100)
-    for name, statistics in one.parameters.items():
-        assert statistics.linear.counts == other.parameters[name].linear.counts
-    assert (one.rows, one.images, one.failed, one.omitted) == (other.rows, other.images, other.failed, other.omitted)
-
-
-def test_values_are_counted_and_many_values_are_summarised() -> None:
-    few, many, different = ValueCounts(), ValueCounts(), ValueCounts()
-    for number in range(1000):
-        few.add("ab"[number % 3 == 0])
-        many.add(str(number % 70))
-        different.add(str(number % 10)) if number < 10 else None
-    assert few.summary() == "a (666), b (334)"
-    assert many.summary() == "more than 64 different values"
-    assert different.summary() == "10 different values"
-
-
-def test_every_drawn_parameter_has_a_column_in_the_report() -> None:
-    shown = {draw for one in PARAMETER_COLUMNS for draw in one.draws} | set(TEXT_COLUMNS)
-    assert set(plan.PARAMETERS) <= shown
-
-
-def test_values_are_escaped_in_text_and_attributes() -> None:
-    figure = {"title": "<&\"'>", "file": '" onerror="x', "caption": ["<b>"], "table": None}
-    page = html_pages.render_page("paper_figures.html", title="<t>", command="<c>", figures=[figure])
-
-    assert "<h2>&lt;&amp;&#34;&#39;&gt;</h2>" in page
-    assert 'src="&#34; onerror=&#34;x"' in page
-    assert "<p>&lt;b&gt;</p>" in page
-    assert "<title>&lt;t&gt;</title>" in page
-
-
-def test_missing_template_value_is_an_error() -> None:
-    with pytest.raises(UndefinedError):
-        html_pages.render_page("benchmark.html", title="x")
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ("aab", "a (2), b (1)"),
+        ("aa", "a"),
+        ("abcde", "5 different values"),
+        ("aabcdefghijklmnopqrstuvw", "more than 16 different values"),
+    ],
+)
+def test_values_are_listed_with_their_counts(values: str, text: str) -> None:
+    counts: Counter[str] = Counter()
+    for value in values:
+        add_value(counts, value)
+    assert values_text(counts) == text
 
 
 @pytest.mark.parametrize("sign", ["\x00", "\x1b", "\x85", "\u202e", "\u2066", "\u2028", "\udcff", "\uffff"])
 def test_invisible_characters_are_shown_as_escapes(sign: str) -> None:
-    page = html_pages.render_page("paper_figures.html", title=f"a{sign}b", command="", figures=[])
+    page = html_pages.render_page("base.html", title=f"a{sign}b")
     assert sign not in page
     assert f"<h1>a{sign.encode('unicode_escape').decode()}b</h1>" in page
+    with pytest.raises(UndefinedError):
+        html_pages.render_page("base.html")
 
 
 # Contents -------------------------------------------------------------------------------------------------------------
 
 
 class Reader(HTMLParser):
-    """Collect the elements, attributes, addresses and text of a page."""
+    """Collect the addresses, text and code of a page."""
 
     def __init__(self, content: str) -> None:
         super().__init__()
-        self.tags: set[str] = set()
-        self.attributes: set[str] = set()
         self.addresses: list[str] = []
         self.text = ""
+        self.code: list[str] = []
+        self._in_code = False
         self.feed(content)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.attributes |= {name for name, _ in attrs}
         self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "data", "poster", "action")]
+
+        if ("class", "code") in attrs:
+            self.code.append("")
+        self._in_code = ("class", "code") in attrs
 
     def handle_data(self, data: str) -> None:
         self.text += data + "\n"
+        if self._in_code:
+            self.code[-1] += data
+
+    def handle_endtag(self, tag: str) -> None:
+        self._in_code = False
 
 
-TAGS = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "p", "pre", "div", "span", "b"}
-TAGS |= {
-    "table",
-    "tr",
-    "th",
-    "td",
-    "dl",
-    "dt",
-    "dd",
-    "figure",
-    "figcaption",
-    "details",
-    "summary",
-    "svg",
-    "rect",
-    "img",
-    "thead",
-    "tbody",
-}
-ATTRIBUTES = {"lang", "charset", "name", "content", "class", "alt", "src", "viewbox", "preserveaspectratio", "role"}
-ATTRIBUTES |= {"aria-label", "x", "y", "width", "height", "scope"}
-
-
-def test_names_are_escaped_and_only_known_elements_occur(text: str) -> None:
+def test_names_are_escaped(text: str) -> None:
     read = Reader(text)
-    assert read.tags <= TAGS
-    assert read.attributes <= ATTRIBUTES
     assert HOSTILE in read.text
     assert "<b>&'\"{0} ds" in read.text
 
@@ -240,35 +190,25 @@ def test_report_opens_offline(text: str) -> None:
 
 def test_failures_are_listed_with_reason_and_detail(made: Path, text: str) -> None:
     rows = re.findall(r"<tr><td>(\d{8})</td><td>(.*?)</td><td>(\w+)</td><td class=\"w\">(.*?)</td></tr>", text)
-    assert {(html.unescape(source), reason) for _, source, reason, _ in rows} == {
-        (HOSTILE, "unsupported"),
-        ("empty.png", "empty"),
-    }
-    details = {str(row["source"]): str(row.get("detail") or "") for row in read_rows(made / "manifest.csv")}
-    assert all(html.unescape(detail) == details[html.unescape(source)] for _, source, _, detail in rows)
+    failed = [row for row in read_rows(made / "manifest.csv") if row["status"] != "ok"]
+    assert {row["source"] for row in failed} == {HOSTILE, "empty.png"}
+    expected = [tuple(str(row[name]) for name in ("key", "source", "reason", "detail")) for row in failed]
+    assert [tuple(map(html.unescape, row)) for row in rows] == expected
 
 
 def test_ranges_and_means_agree_with_the_manifest(made: Path, text: str) -> None:
     for column in ("red_gain", "blue_gain", "inverse_rgb_gain", "w_nexus_6p", "a_dn", "b_dn2"):
         values = [float(cell) for cell in cells(made, column)]
-        (figure,) = re.findall(rf"(?s)<figure><figcaption><b>{column}</b>.*?</figure>", text)
-        ends = [float(found) for found in re.findall(r"<span>(.*?)</span>", figure)]
-        assert ends == [float(f"{end:.4g}") for end in (min(values), max(values))]
-        assert f"mean {formatting.short_number(sum(values) / len(values), 4)}" in figure
-        assert figure.count("<rect ") >= 2
-
-
-def test_wide_ranges_have_logarithmic_histograms(text: str) -> None:
-    logarithmic = re.findall(r"<b>(\w+)</b>[^<]*, logarithmic", text)
-    assert {"a_dn", "b_dn2"} <= set(logarithmic)
-    assert not {"red_gain", "blue_gain"} & set(logarithmic)
+        (caption,) = re.findall(rf"<figcaption><b>{column}</b>(.*?)</figcaption>", text)
+        low, high, mean = (formatting.short_number(n, 4) for n in (min(values), max(values), sum(values) / len(values)))
+        assert caption.endswith(f": {low} to {high}, mean {mean}")
 
 
 def test_clipped_sites_agree_with_the_manifest(made: Path, text: str) -> None:
     sites = sum(int(w) * int(h) for w, h in zip(cells(made, "width"), cells(made, "height"), strict=True))
     for column in ("saturated", "noisy_clipped_high"):
         count = sum(map(int, cells(made, column)))
-        assert f'<td>{column}</td><td class="n">{count:,}</td><td class="n">{count / sites:.3%}</td>' in text
+        assert f'<td>{column}</td><td class="n">{count:,}</td>\n<td class="n">{count / sites:.3%}</td>' in text
 
 
 @pytest.mark.slow
@@ -289,6 +229,7 @@ def test_versions_checksums_settings_and_commands_are_listed(made: Path, text: s
         assert said in read
     assert facts["versions"]["numpy"] in read
     assert (made / "config.yaml").read_text(encoding="utf-8") in read
+    assert re.search(r"<td>noise.name</td><td>brooks2019</td>", text)
     assert "source.root=PHOTOGRAPHS out=again" in read
     assert facts["source"]["root"] in read
 
@@ -303,54 +244,48 @@ def test_noise_that_differs_from_the_manifest_is_reported(
     )
 
 
-def test_dataset_without_pairs_has_a_report(make: Make, tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos/a.png").touch()
-    make(tmp_path / "photos", tmp_path / "ds", "source.max_failed=1")
-    text = dataset_report.dataset_page(tmp_path / "ds")
+@pytest.fixture(scope="module")
+def failed(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset without pairs."""
+    top = tmp_path_factory.mktemp("failed")
+    (top / "photos").mkdir()
+    (top / "photos/a.png").touch()
+    make(top / "photos", top / "ds", "source.max_failed=1")
+    return top / "ds"
+
+
+def test_dataset_without_pairs_has_a_report(failed: Path) -> None:
+    text = dataset_report.dataset_page(failed)
     assert "0 pairs" in text and "failed rows: 1." in text
     assert "there is no pair to show" in text
-    assert '<tr><td>empty</td><td class="n">1</td></tr>' in text
+    assert "<p>empty: 1</p>" in text
 
 
 # Code that loads the data ---------------------------------------------------------------------------------------------
 
 
-def run_snippet(folder: Path, tool: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Run the code of the report in the folder that contains the dataset."""
-    monkeypatch.chdir(folder.parent)
-    first = RawPairs(folder)[0].row
-    entries = read_dataset(folder / "dataset.json")["shards"]
-    names: dict[str, Any] = {}
-    exec(dataset_report.snippets(folder, entries, (first["key"], first["shard"]), False)[tool], names)
-    return names
-
-
-@pytest.fixture(params=["hostile", "plain"])
-def loaded(request: pytest.FixtureRequest, made: Path, dataset: Path) -> Path:
-    return made if request.param == "hostile" else dataset
-
-
-def test_numpy_code_loads_the_first_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = run_snippet(loaded, "NumPy", monkeypatch)
-    clean, noisy, _ = RawPairs(loaded)[0]
-    np.testing.assert_array_equal(names["clean"], clean)
-    np.testing.assert_array_equal(names["noisy"], noisy)
-
-
 @pytest.mark.filterwarnings("ignore")  # of another library
-def test_webdataset_code_loads_every_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("webdataset")
-    names = run_snippet(loaded, "webdataset", monkeypatch)
-    assert len(list(names["samples"])) == len(RawPairs(loaded))
-    np.testing.assert_array_equal(names["noisy"], RawPairs(loaded)[len(RawPairs(loaded)) - 1].noisy)
-    gc.collect()  # closes its files while warnings are ignored
-
-
-def test_pytorch_code_loads_every_pair(loaded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("torch")
-    names = run_snippet(loaded, "PyTorch", monkeypatch)
-    assert sum(map(len, names["loader"])) == len(RawPairs(loaded))
+@pytest.mark.parametrize("library", ["numpy", "torch", "webdataset"])
+@pytest.mark.parametrize("name", ["hostile", "plain"])
+def test_code_of_the_page_loads_the_pairs(
+    name: str, library: str, made: Path, scenes: Path, text: str, scenes_page: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip(library)
+    folder, page = (made, text) if name == "hostile" else (scenes, scenes_page)
+    monkeypatch.chdir(folder.parent)
+    (code,) = (code for code in Reader(page).code if f"import {library}" in code or f"from {library}" in code)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    pairs = RawPairs(folder)
+    if library == "torch":
+        assert sum(map(len, names["loader"])) == len(pairs)
+        return
+    if library == "webdataset":
+        assert len(list(names["samples"])) == len(pairs)
+        gc.collect()  # closes its files while warnings are ignored
+    expected = pairs[0 if library == "numpy" else len(pairs) - 1]
+    np.testing.assert_array_equal(names["clean"], expected.clean)
+    np.testing.assert_array_equal(names["noisy"], expected.noisy)
 
 
 # The verb report ------------------------------------------------------------------------------------------------------
@@ -375,34 +310,19 @@ def test_report_writes_one_file_and_leaves_the_dataset_unchanged(
     assert verify(copy) == []
 
 
-def test_dataset_with_report_can_be_regenerated_repaired_and_resumed(
-    made: Path, copy: Path, run_main: RunMain, tmp_path: Path
-) -> None:
+def test_dataset_with_report_can_be_repaired_and_resumed(made: Path, copy: Path, run_main: RunMain) -> None:
     photos = made.parent / "photos"
     bare = ("source.max_failed=2", f"source.root={photos}", f"out={copy}", "n_jobs=1", *OVERRIDES)
     assert run_main("report", copy).code == 0
-    done = run_main(*bare)
-    assert (done.code, "nothing to do" in done.out) == (0, True)
-    again = run_main("again", copy, *bare[:2], "n_jobs=1", f"out={tmp_path / 'again'}")
-    assert again.code == 0
-    assert "bit for bit" in again.out
+    assert "nothing to do" in run_main(*bare).out
     (copy / "shards/shard-00001.tar").unlink()
     assert run_main("verify", copy, "--repair").code == 0
-    assert verify(copy) == []
-    assert (copy / "report.html").exists()
     (copy / "dataset.json").unlink()  # like a run that was killed
     (copy / "manifest.csv").unlink()
     shutil.rmtree(copy / "shards")
     assert run_main(*bare).code == 0
     assert verify(copy) == []
     assert (copy / "report.html").exists()
-
-
-def test_report_can_be_written_to_another_file(copy: Path, run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("report", copy, "--to", tmp_path / "page.html")
-    assert (done.code, done.out) == (0, f"{tmp_path}/page.html\n")
-    assert not (copy / "report.html").exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["ds", "page.html"]
 
 
 @pytest.mark.parametrize(
@@ -422,119 +342,89 @@ def test_report_does_not_replace_a_file_of_the_dataset(
     assert tree_hash(copy) == before
 
 
-@pytest.mark.parametrize(("content", "code"), [(b"\xff\xd8\xff a photograph", 2), (b"<!DOCTYPE html>", 0)])
-def test_report_replaces_only_an_html_page(
-    content: bytes, code: int, copy: Path, run_main: RunMain, tmp_path: Path
+@pytest.mark.parametrize(("content", "code"), [(None, 0), (b"\xff\xd8\xff a photograph", 2), (b"<!DOCTYPE html>", 0)])
+def test_report_is_written_to_another_file_unless_it_is_no_page(
+    content: bytes | None, code: int, copy: Path, run_main: RunMain, tmp_path: Path
 ) -> None:
-    (tmp_path / "page").write_bytes(content)
+    if content is not None:
+        (tmp_path / "page").write_bytes(content)
     assert run_main("report", copy, "--to", "page").code == code
-    assert ((tmp_path / "page").read_bytes() == content) == (code == 2)
+    assert (tmp_path / "page").read_bytes().startswith(content if code and content else b"<!doctype html>")
+    assert not (copy / "report.html").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         ((), "report: expected the folder of a dataset"),
-        (("--to", "x"), "report: expected the folder of a dataset"),
         (("ds", "--too", "x"), "report: --too: no such flag; expected --to, "),
         (("ds", "--to", "."), "--to .: expected the name of a file"),
         (("ds", "--to", "no/such.html"), "--to no/such.html: expected the name of a file in a folder that exists"),
+        (("ds", "--to", "locked/page.html"), "--to locked/page.html: cannot be written (Permission denied)"),
     ],
 )
 def test_wrong_arguments_give_one_line(
-    arguments: tuple[str, ...], sentence: str, copy: Path, run_main: RunMain
+    arguments: tuple[str, ...], sentence: str, copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    lock(copy.parent / "locked", monkeypatch)
     done = run_main("report", *arguments)
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert done.err.startswith(f"gen-dataset: {sentence}")
     assert not (copy / "report.html").exists()
 
 
-def test_folder_that_cannot_be_written_is_refused(
-    copy: Path, run_main: RunMain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "locked").mkdir()
+def lock(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a folder that the user may not write, also if the user is root."""
+    folder.mkdir(exist_ok=True)
     access = os.access
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked" and access(path, mode))
-    done = run_main("report", copy, "--to", "locked/page.html")
-    assert done == (
-        2,
-        "",
-        "gen-dataset: --to locked/page.html: cannot be written (Permission denied); choose another folder\n",
-    )
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != folder.name and access(path, mode))
 
 
-@pytest.mark.parametrize(
-    ("library", "purpose"), [("matplotlib", "drawing needs matplotlib"), ("jinja2", "HTML pages need jinja2")]
-)
-def test_missing_library_gives_one_line_that_names_the_extra(
-    library: str, purpose: str, copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
+def test_read_only_dataset_names_the_flag_for_another_place(
+    copy: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(report_files, "find_spec", lambda name: None if name == library else "spec")
+    lock(copy, monkeypatch)
     done = run_main("report", copy)
-    assert done.code == 2
-    assert done.err == f"gen-dataset: report: {purpose}; in the source folder, run: pip install '.[figures]'\n"
-
-
-def test_import_of_the_dataset_report_leaves_numba_out() -> None:
-    code = (
-        "import sys, unprocess_gen.reports.dataset_page.page\n"
-        "print([name for name in ('numba', 'matplotlib', 'jinja2') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert f"report: {copy} is read-only" in done.err
+    assert "give --to FILE" in done.err
 
 
 @pytest.mark.parametrize("name", ["manifest.csv", "config.yaml", "dataset.json"])
-def test_changed_dataset_is_damage(name: str, copy: Path, run_main: RunMain) -> None:
-    (copy / name).write_bytes((copy / name).read_bytes().replace(b"0", b"1", 1))
+@pytest.mark.parametrize("content", [None, b"", b"[]"])
+def test_changed_dataset_is_damage(name: str, content: bytes | None, copy: Path, run_main: RunMain) -> None:
+    changed = (copy / name).read_bytes().replace(b"0", b"1", 1) if content is None else content
+    (copy / name).write_bytes(changed)
     done = run_main("report", copy)
     assert (done.code, done.out, done.err.count("\n")) == (4, "", 1)
     assert name in done.err
     assert not (copy / "report.html").exists()
 
 
-def test_unfinished_dataset_is_damage(copy: Path, run_main: RunMain) -> None:
-    (copy / "dataset.json").unlink()
-    done = run_main("report", copy)
-    assert (done.code, done.err) == (
-        4,
-        f"gen-dataset: {copy}: dataset.json does not exist; expected a finished dataset\n",
-    )
+@pytest.mark.parametrize(
+    "key", ["run", "versions", "not_matched", "skipped_links", "self_test", "source", "sites", "failed"]
+)
+def test_odd_facts_are_shown_or_damage(key: str, failed: Path, tmp_path: Path, run_main: RunMain) -> None:
+    """Files whose digests were computed again, so that only their values are odd."""
+    shutil.copytree(failed, tmp_path / "ds")
+    facts = read_dataset(failed / "dataset.json")
+    without = {name: value for name, value in facts.items() if name != key}
+    for odd in (without, facts | {key: None}, facts | {key: "x"}, facts | {key: {"x": [1e308]}}):
+        (tmp_path / "ds/dataset.json").write_text(dataset_text(odd), encoding="ascii")
+        done = run_main("report", "ds")
+        assert done.code in (0, 4)
+        assert done.err.count("\n") <= 1
 
 
-@pytest.mark.slow
-def test_size_and_memory_do_not_grow_with_rows(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = list(read_rows(made / "manifest.csv"))
-
-    def rows(count: int) -> Iterator[Row]:
-        for number in range(count):
-            row = dict(known[number % len(known)]) | {"key": f"{number:08d}", "shard": number // 8}
-            yield row | ({"red_gain": 2 + number / count, "sensor_unit": str(number)} if row["status"] == "ok" else {})
-
-    facts = read_dataset(made / "dataset.json")
-    entries = [facts["shards"][0] | {"file": f"shards/shard-{number:05d}.tar"} for number in range(12_500)]
-    monkeypatch.setattr(
-        dataset_report, "_noise_check", lambda folder: {"count": 0, "table": None}
-    )  # no shard holds these pairs
-    monkeypatch.setattr(dataset_report, "_contact_sheet", lambda folder, source: None)
-    sizes, peaks = [], []
-    for count in (10_000, 100_000):
-        out = tmp_path / str(count)
-        out.mkdir()
-        (out / "config.yaml").write_text(facts["config"], encoding="utf-8")
-        with (out / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
-            write_rows(stream, rows(count))
-        kept = {key: value for key, value in facts.items() if key not in ("config", "shards", "manifest_sha256")}
-        signed = dataset_facts(facts["config"], file_sha256(out / "manifest.csv"), entries, kept)
-        signed["manifest_sha256"] = file_sha256(out / "manifest.csv")
-        (out / "dataset.json").write_text(dataset_text(signed), encoding="ascii")
-        tracemalloc.start()
-        sizes.append(len(dataset_report.dataset_page(out).encode()))
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert max(sizes) < 200_000
-    assert peaks[1] < 1.1 * peaks[0] < 100e6
+def test_odd_config_is_damage(copy: Path, run_main: RunMain) -> None:
+    for text in ("seed: 1\n", "- a\n", (copy / "config.yaml").read_text().replace("bits: 12", "bits: many")):
+        facts = read_dataset(copy / "dataset.json")
+        (copy / "config.yaml").write_text(text)
+        facts["config_sha256"] = file_sha256(copy / "config.yaml")
+        (copy / "dataset.json").write_text(dataset_text(facts), encoding="ascii")
+        done = run_main("report", copy)
+        assert (done.code, done.err.count("\n")) == (4, 1)
+        assert "config.yaml" in done.err
 
 
 # In a browser ---------------------------------------------------------------------------------------------------------
@@ -544,7 +434,7 @@ MEASURE = """<script>addEventListener("load", () => {
   const all = (what) => [...document.querySelectorAll(what)];
   parent.postMessage(JSON.stringify({
     wide: [document.documentElement.scrollWidth, innerWidth], high: document.documentElement.scrollHeight,
-    pictures: all("img").map((one) => [one.complete, one.naturalWidth, box(one)]), charts: all("svg").map(box),
+    pictures: all("img").map((one) => [one.complete, one.naturalWidth, box(one)]),
     cut: all("body *").filter((one) => one.clientWidth && one.scrollWidth > one.clientWidth + 1
       && getComputedStyle(one).overflowX === "visible").map((one) => one.outerHTML.slice(0, 80)),
   }), "*");
@@ -589,21 +479,9 @@ def test_browser_shows_every_picture_without_overflow(
     assert measured["wide"] == [width, width]
     assert shot.shape[:2] == (measured["high"], width)
     assert measured["cut"] == []
-    assert len(measured["pictures"]) == scenes_page.count("<img ") == 2
+    assert len(measured["pictures"]) == scenes_page.count("<img ") >= 9
     for complete, natural_width, box in measured["pictures"]:
         assert complete and natural_width > 0
-        assert colours_in(shot, [box[0], box[1], min(box[2], width - box[0]), box[3]]) > 100
-    assert len(measured["charts"]) == scenes_page.count("<svg ") >= 7
-    for box in measured["charts"]:
         assert box[2] >= min(200, width - 40) and box[3] >= 40
-        assert colours_in(shot, box) >= 2
+        assert colours_in(shot, [box[0], box[1], min(box[2], width - box[0]), box[3]]) > 20
     figure("report", f"{width} pixels: page {measured['wide'][0]} wide, {len(measured['pictures'])} pictures shown")
-
-
-@pytest.mark.slow
-def test_overflow_and_missing_pictures_are_detected(scenes_page: str, tmp_path: Path) -> None:
-    broken = scenes_page.replace(".wide { overflow-x: auto;", ".wide {").replace("pre, .wide", "pre, .narrow")
-    broken = re.sub(r'src="data:[^"]*"', 'src="gone.png"', broken)
-    measured, _ = browse(broken, 360, tmp_path)
-    assert measured["wide"][0] > 360 or measured["cut"]
-    assert [natural for _, natural, _ in measured["pictures"]] == [0] * len(measured["pictures"])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.datasets import Settings
@@ -50,13 +48,13 @@ def test_share_counts_sites_next_to_bands_by_channel(plan: Plan) -> None:
 
 
 def test_dithered_highlights_and_16_bit_codes_have_no_bands(plan: Plan) -> None:
-    assert empty_bands(gray(254), replace(plan, dequantize="dither_all")) == NONE
+    assert empty_bands(gray(254), plan.replace(dequantize="dither_all")) == NONE
     assert empty_bands(gray(254).astype(np.uint16) * 257, plan) == NONE
-    assert empty_bands(gray(254), replace(plan, dequantize="dither")).share == 1
+    assert empty_bands(gray(254), plan.replace(dequantize="dither")).share == 1
 
 
 def test_sentence_has_share_widths_and_remedy(plan: Plan) -> None:
     sentence = highlight_sentence([empty_bands(gray(254), plan), NONE])
-    assert sentence.startswith("50.00% of the sites have highlights next to an empty band")
-    assert "up to 78% in R, 53% in G, 73% in B of the raw range apart; source.dequantize=dither_all" in sentence
+    assert sentence.startswith("50 % of the sites are highlights where 8-bit codes are coarse")
+    assert "up to 78 % (R), 53 % (G), 73 % (B) of the raw range apart; source.dequantize=dither_all" in sentence
     assert highlight_sentence([NONE]) == highlight_sentence([]) == ""

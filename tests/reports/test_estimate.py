@@ -10,83 +10,58 @@ import cv2
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Settings
+from helpers.datasets import Make, Settings
 from helpers.photographs import fill
-from hypothesis import given
-from hypothesis import strategies as st
 
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import AccuracyConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.progress import COMPILING
 from unprocess_gen.reports.estimate import COMMIT_SECONDS, SAMPLE, estimate_run, format_estimate
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.reference.noise import EFFECTS
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 
 
-def listing(count: int) -> tuple[Source, ...]:
-    return tuple(Source(i, f"{i}.png", f"{i}.png", 1) for i in range(count))
+@pytest.mark.parametrize(("count", "read_all"), [(SAMPLE, False), (SAMPLE + 1, False), (SAMPLE + 1, True)])
+def test_sources_are_sampled_and_their_headers_give_the_bytes(
+    count: int, read_all: bool, settings: Settings, make: Make, tmp_path: Path
+) -> None:
+    photos = fill(tmp_path / "p", count)
+    estimate = estimate_run(settings(f"source.root={photos}", "noise.draws=2"), 1, read_all)
+    made = make(photos, tmp_path / "ds", "noise.draws=2")
+
+    is_exact = read_all or count == SAMPLE
+    assert len(estimate.source_estimates) == (count if read_all else SAMPLE)
+    assert (estimate.exact, estimate.pairs, estimate.shards) == (is_exact, 2 * count, -(-count // 8))
+    assert estimate.bytes == made.bytes
+    lines = format_estimate(settings(f"source.root={photos}"), estimate).splitlines()
+    assert lines[2].startswith(f"bytes     {'' if is_exact else 'about '}{made.bytes:,} in shards, ")
 
 
-@given(total=st.integers(1, 500), count=st.integers(1, 50))
-def test_spaced_sources_are_different_and_in_order(total: int, count: int) -> None:
-    indices = [source.index for source in evenly_spaced(listing(total), count)]
-    assert len(indices) == min(total, count)
-    assert indices == sorted(set(indices))
+def test_headers_of_large_files_are_sampled(
+    settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos = fill(tmp_path / "p", 50)
+    monkeypatch.setattr("unprocess_gen.reports.estimate.HEADER_BYTES", 1)
+    estimate = estimate_run(settings(f"source.root={photos}"), 1, read_all=False)
+    assert estimate.headers == 32
+    assert estimate.bytes == pytest.approx(estimate_run(settings(f"source.root={photos}"), 1, True).bytes, rel=0.3)
 
 
-@given(total=st.integers(1, 500), count=st.integers(1, 50))
-def test_spaced_sources_have_even_distances(total: int, count: int) -> None:
-    indices = [source.index for source in evenly_spaced(listing(total), count)]
-    gaps = [after - before for before, after in zip(indices, [*indices[1:], total], strict=True)]
-    assert max(gaps) - min(gaps) <= 1
-    assert indices[0] == 0
-
-
-def test_few_sources_are_all_read_and_bytes_are_exact(settings: Settings, tmp_path: Path) -> None:
-    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE)}"), 1, read_all=False)
-    assert (estimate.exact, len(estimate.source_estimates)) == (True, SAMPLE)
-
-
-def test_many_sources_are_sampled(settings: Settings, tmp_path: Path) -> None:
-    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=False)
-    assert (estimate.exact, len(estimate.source_estimates), estimate.sources, estimate.shards) == (
-        False,
-        SAMPLE,
-        SAMPLE + 1,
-        3,
-    )
-
-
-def test_all_sources_are_read_on_request(settings: Settings, tmp_path: Path) -> None:
-    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}"), 1, read_all=True)
-    assert (estimate.exact, len(estimate.source_estimates)) == (True, SAMPLE + 1)
-
-
-def test_sampled_estimate_says_about(settings: Settings, tmp_path: Path) -> None:
-    config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 1)}")
-    assert "about" in next(
-        line
-        for line in format_estimate(config, estimate_run(config, 1, False)).splitlines()
-        if line.startswith("bytes")
-    )
-    assert "about" not in next(
-        line for line in format_estimate(config, estimate_run(config, 1, True)).splitlines() if line.startswith("bytes")
-    )
-
-
-def test_time_of_pairs_is_divided_by_the_number_of_workers(settings: Settings, tmp_path: Path) -> None:
-    config = settings(f"source.root={fill(tmp_path / 'p', 3)}", "output.pairs_per_shard=1")
+@pytest.mark.parametrize(("per_shard", "workers"), [(1, 2), (8, 1)])
+def test_time_of_pairs_is_divided_by_the_workers_that_have_a_shard(
+    per_shard: int, workers: int, settings: Settings, tmp_path: Path
+) -> None:
+    config = settings(f"source.root={fill(tmp_path / 'p', 3)}", f"output.pairs_per_shard={per_shard}")
     estimate = estimate_run(config, 2, read_all=True)
-    assert estimate.pair_seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / 2)
+    assert estimate.n_jobs == workers
+    assert estimate.pair_seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates) / workers)
 
 
-def test_no_more_workers_are_estimated_than_shards(settings: Settings, tmp_path: Path) -> None:
-    estimate = estimate_run(settings(f"source.root={fill(tmp_path / 'p', 3)}"), 4, read_all=True)
-    assert (estimate.shards, estimate.n_jobs) == (1, 1)
-    assert estimate.pair_seconds == pytest.approx(sum(source.seconds for source in estimate.source_estimates))
+def test_reference_is_not_timed_for_comparison(settings: Settings) -> None:
+    tiers = {name: read_option(conf_dir() / f"accuracy/{name}.yaml", AccuracyConfig) for name in ("reference", "fast")}
+    assert estimate_run(settings("source.limit=1"), 1, True, tiers).tier_ns.keys() == {"exact", "fast"}
 
 
 def test_time_includes_start_up_and_disk(settings: Settings, tmp_path: Path) -> None:
@@ -98,6 +73,7 @@ def test_time_includes_start_up_and_disk(settings: Settings, tmp_path: Path) -> 
     line = next(line for line in format_estimate(config, estimate).splitlines() if line.startswith("time"))
     assert re.fullmatch(r"time      about \S+ \w+ with 1 worker: start-up .*, pairs .*, disk .*", line)
     assert list(tmp_path.iterdir()) == [tmp_path / "p"]
+    assert estimate.free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
 
 
 # Sentences ------------------------------------------------------------------------------------------------------------
@@ -119,22 +95,31 @@ def test_sentences_name_what_is_simulated_and_left_out(settings: Settings, tmp_p
     )
 
 
-def test_missing_number_is_named_once(settings: Settings, tmp_path: Path) -> None:
-    text = estimate_text(settings, tmp_path, "noise=sony_a7s2")
-    assert "lens_shading, gain_by_colour, column_temporal (column_temporal_std_dn)." in text
-
-
-def test_sentences_say_none_if_nothing_visible_is_left_out(settings: Settings, tmp_path: Path) -> None:
-    text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=long_exposure")
-    assert "Left out though it would show: none." in text
-
-
-def test_assumed_numbers_that_are_off_are_named_if_they_would_show(settings: Settings, tmp_path: Path) -> None:
-    text = estimate_text(settings, tmp_path, "noise=nikon_d850", "scene=long_exposure", "effects.assumed=off")
-    visible = text.split("Left out though it would show: ")[1].split("\n")[0]
-    assert visible.startswith("prnu (")
-    assert "dark_current (" in visible
-    assert "prnu_std is assumed, no source gives it: on only where switched on" in visible
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ("noise=none", "skipped   heteroscedastic: noise=none has no variance"),
+        ("noise=imx385_iso3200_rvdd", "no noise up to 15.33 DN above black"),
+        ("noise.a=0 noise.b=-5 noise.negative_variance=clip", "b_dn2 -5"),
+        (
+            "noise=sony_a7s2",
+            "as the profile gives no number: lens_shading, gain_by_colour, column_temporal (column_temporal_std_dn), "
+            "dsnu (dsnu_std_e).",
+        ),
+        ("noise=nikon_d850 scene=long_exposure", "dark_current (assumed 1 e⁻/s at 25 °C, measured at 25 °C, doubled "),
+        (
+            "noise=nikon_d850 scene=long_exposure effects.hot_pixels=on",
+            "hot_pixels (assumed 6.4 in a million, 20 e⁻/s at ",
+        ),
+        ("noise=nikon_d850 scene=long_exposure", "Left out though it would show: none."),
+        (
+            "noise=nikon_d850 scene=long_exposure effects.assumed=off",
+            "prnu_std is assumed, no source gives it: on only where switched on",
+        ),
+    ],
+)
+def test_effects_of_a_profile_are_explained(overrides: str, sentence: str, settings: Settings, tmp_path: Path) -> None:
+    assert sentence in estimate_text(settings, tmp_path, *overrides.split())
 
 
 def test_scene_names_what_the_profile_uses_and_ignores(settings: Settings, tmp_path: Path) -> None:
@@ -158,7 +143,8 @@ def test_dark_scene_with_a_profile_of_two_numbers_is_warned_about(settings: Sett
     for profile in ("imx385", "nikon_d850", "sony_a7s2"):
         assert profile in warning
     assert "physical profiles" not in estimate_text(settings, tmp_path / "b", "scene=night", "noise=sony_a7s2")
-    assert "warning" not in estimate_text(settings, tmp_path / "c")
+    bright = ("noise=nikon_d850", "scene=indoor", "sensor=generic_14bit")
+    assert "warning" not in estimate_text(settings, tmp_path / "c") + estimate_text(settings, tmp_path / "d", *bright)
 
 
 @pytest.mark.parametrize(("ratio", "limit_db"), [(100, 54.5), (200, 48.5), (300, 45.0)])
@@ -172,38 +158,14 @@ def test_posterised_clean_frames_are_warned_about(
     assert "output.clean_dtype=float32" in text
 
 
-def test_bright_scenes_have_no_warning_of_few_levels(settings: Settings, tmp_path: Path) -> None:
-    assert "warning" not in estimate_text(
-        settings, tmp_path, "noise=nikon_d850", "scene=indoor", "sensor=generic_14bit"
-    )
-
-
 def test_failed_source_has_no_bytes_and_a_reason(settings: Settings, tmp_path: Path) -> None:
-    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
-    estimate = estimate_run(settings(f"source.root={tmp_path / 'p'}"), 1, read_all=True)
-    assert (estimate.bytes, estimate.source_estimates[0].reason, estimate.source_estimates[0].levels) == (
-        0,
-        "empty",
-        (),
-    )
-
-
-def test_free_bytes_are_measured_at_the_nearest_existing_folder(settings: Settings, tmp_path: Path) -> None:
-    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", f"out={tmp_path}/not/yet/there")
-    assert estimate_run(config, 1, True).free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, rel=0.1)
-
-
-def test_estimate_without_readable_sources_has_a_text(settings: Settings, tmp_path: Path) -> None:
-    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"")
+    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"no picture")
     config = settings(f"source.root={tmp_path / 'p'}")
-    assert "fails     000.png: empty" in format_estimate(config, estimate_run(config, 1, True))
-
-
-def test_skipped_effects_are_listed_with_their_reason(settings: Settings, tmp_path: Path) -> None:
-    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=none")
-    assert "skipped   heteroscedastic: noise=none has no variance" in format_estimate(
-        config, estimate_run(config, 1, True)
-    )
+    estimate = estimate_run(config, 1, read_all=True)
+    [source] = estimate.source_estimates
+    assert (estimate.bytes, source.reason, source.levels) == (0, "unsupported", ())
+    assert source.detail
+    assert f"fails     000.png: unsupported\n          {source.detail}" in format_estimate(config, estimate)
 
 
 @pytest.mark.parametrize(("method", "stated"), [("off", True), ("dither", True), ("dither_all", False)])
@@ -214,12 +176,7 @@ def test_highlights_next_to_empty_bands_are_stated(
     cv2.imwrite(str(tmp_path / "p" / "bright.png"), np.full((20, 20, 3), 254, dtype=np.uint8))
     config = settings(f"source.root={tmp_path / 'p'}", f"source.dequantize={method}", "gains=paper_max")
     text = format_estimate(config, estimate_run(config, 1, True))
-    assert ("highlight 100.00% of the sites have highlights next to an empty band" in text) == stated
-
-
-def test_shadows_without_noise_are_reported(settings: Settings, tmp_path: Path) -> None:
-    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", "noise=imx385_iso3200_rvdd")
-    assert "no noise up to 15.33 DN above black" in format_estimate(config, estimate_run(config, 1, True))
+    assert ("highlight 100 % of the sites are highlights where 8-bit codes are coarse" in text) == stated
 
 
 def test_every_noise_level_is_listed(run_main: RunMain, tmp_path: Path) -> None:
@@ -240,12 +197,6 @@ def test_empty_folder_is_refused(settings: Settings, tmp_path: Path) -> None:
         estimate_run(settings(f"source.root={tmp_path}"), 1, read_all=False)
 
 
-def test_negative_b_without_slope_has_a_text(settings: Settings, tmp_path: Path) -> None:
-    overrides = ("noise.a=0", "noise.b=-5", "noise.negative_variance=clip")
-    config = settings(f"source.root={fill(tmp_path / 'p', 1)}", *overrides)
-    assert "b_dn2 -5" in format_estimate(config, estimate_run(config, 1, True))
-
-
 def test_every_effect_of_a_profile_has_line_and_reason(settings: Settings, tmp_path: Path) -> None:
     config = settings("noise=sony_a7s2", "scene=night", f"source.root={fill(tmp_path / 'p', 2)}")
     estimate = format_estimate(config, estimate_run(config, 1, True))
@@ -260,10 +211,7 @@ def test_unmatched_files_are_counted_by_suffix_with_advice(settings: Settings, t
     for name in ("a.heic", "b.heic", "c.txt"):
         (folder / name).touch()
     config = settings(f"source.root={folder}")
-    estimate = estimate_run(config, 1, True)
-
-    assert estimate.unmatched == {".heic": 2, ".txt": 1}
-    line = format_estimate(config, estimate).splitlines()[1]
+    line = format_estimate(config, estimate_run(config, 1, True)).splitlines()[1]
     assert "3 files are not matched by source.include (2 .heic, 1 .txt); convert " in line
 
 
@@ -274,7 +222,7 @@ def test_compiling_kernels_is_announced_unless_they_are_compiled(
     monkeypatch.setattr("unprocess_gen.simulation.self_test.are_compiled", lambda kernels: compiled)
     caplog.set_level("INFO", "unprocess_gen")
     estimate_run(settings("source.limit=1"), 1, True)
-    assert caplog.messages == ([] if compiled else ["compiling kernels, once per machine and version"])
+    assert caplog.messages == ([] if compiled else [COMPILING])
 
 
 def test_second_plan_announces_no_compiling(
@@ -290,23 +238,7 @@ def test_second_plan_announces_no_compiling(
     tiers = {"fast": read_option(conf_dir() / "accuracy/fast.yaml", AccuracyConfig)}
     for _ in range(2):
         estimate_run(config, 1, True, tiers)
-    assert caplog.messages == ["compiling kernels, once per machine and version"]
-
-
-def test_failed_source_is_listed_with_its_explanation(settings: Settings, tmp_path: Path) -> None:
-    (fill(tmp_path / "p", 1) / "000.png").write_bytes(b"no picture")
-    config = settings(f"source.root={tmp_path / 'p'}")
-    estimate = estimate_run(config, 1, True)
-
-    detail = estimate.source_estimates[0].detail
-    assert detail
-    assert f"fails     000.png: unsupported\n          {detail}" in format_estimate(config, estimate)
-
-
-def test_pairs_are_extrapolated_from_the_sample(settings: Settings, tmp_path: Path) -> None:
-    config = settings(f"source.root={fill(tmp_path / 'p', SAMPLE + 4)}", "noise.draws=2")
-    assert estimate_run(config, 1, False).pairs == 2 * (SAMPLE + 4)
-    assert estimate_run(config, 1, True).pairs == 2 * (SAMPLE + 4)
+    assert caplog.messages == [COMPILING]
 
 
 def test_plan_states_source_and_uncertainty_of_numbers_at_its_isos(run_main: RunMain) -> None:

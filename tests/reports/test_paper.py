@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from helpers.promise_report import Figure
 from PIL import Image
 
 from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+from unprocess_gen.config.schema import GainsConfig, NoiseConfig, replaced
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports import report_files
 from unprocess_gen.reports.paper import figures as paper_figures
@@ -49,6 +50,21 @@ def drawn(settings: Settings, options: PaperOptions) -> list[PaperFigure]:
     return paper_figures.draw_figures(settings("source.limit=2"), options)
 
 
+def named(drawn: list[PaperFigure], file: str) -> PaperFigure:
+    (figure,) = (figure for figure in drawn if figure.file == file)
+    return figure
+
+
+def table_lines(figure: PaperFigure) -> list[Sequence[str]]:
+    assert figure.table is not None
+    return list(figure.table.lines)
+
+
+def page_text(drawn: list[PaperFigure]) -> str:
+    """Return the page of figures in one line."""
+    return " ".join(paper_figures.figures_page(drawn, "command").split())
+
+
 def colours(png: bytes) -> int:
     """Return the number of colours in a picture."""
     rgb = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(np.uint32)
@@ -56,21 +72,21 @@ def colours(png: bytes) -> int:
 
 
 def test_every_figure_has_many_colours(drawn: list[PaperFigure]) -> None:
-    assert [one.file for one in drawn] == FILES[:-1]
+    assert [figure.file for figure in drawn] == FILES[:-1]
     least = {"fig4.png": 200, "fig6.png": 200, "fig7.png": 200}
-    found = {one.file: colours(one.png) for one in drawn}
-    assert {file: count for file, count in found.items() if count < least.get(file, 2000)} == {}
+    assert [figure.file for figure in drawn if colours(figure.png) < least.get(figure.file, 2000)] == []
 
 
 def test_every_caption_compares_with_the_article(drawn: list[PaperFigure]) -> None:
-    assert [one.file for one in drawn if "Against the article: " not in " ".join(one.caption)] == []
-    assert [one.file for one in drawn if re.search(r"nan|inf\b|\{", " ".join(one.caption))] == []
+    captions = page_text(drawn).split("<figcaption>")[1:]
+    assert len(captions) == len(drawn)
+    assert all("Against the article: " in caption for caption in captions)
+    assert not re.search(r">[^<]*(nan|inf\b|\{)", "".join(captions))
 
 
 def test_counts_of_figure_6_agree_with_the_reference(
     settings: Settings, options: PaperOptions, drawn: list[PaperFigure], figure: Figure
 ) -> None:
-    (figure6,) = (one for one in drawn if one.file == "fig6.png")
     srgb = synthetic.scene("dead_leaves-0")
     planes = srgb[0::2, 0::2, 0], srgb[0::2, 1::2, 1], srgb[1::2, 0::2, 1], srgb[1::2, 1::2, 2]
     before = sum(int((plane == 255).sum()) for plane in planes)
@@ -79,7 +95,10 @@ def test_counts_of_figure_6_agree_with_the_reference(
     )
     after = {name: reference_pair(srgb, subject.plans[name]).counts.saturated for name in paper_sources.GAINS}
 
-    listed = {line[0]: tuple(int(cell.split()[0].replace(",", "")) for cell in line[2:4]) for line in figure6.table[1:]}
+    listed = {
+        line[0]: tuple(int(cell.split()[0].replace(",", "")) for cell in line[2:4])
+        for line in table_lines(named(drawn, "fig6.png"))
+    }
     assert listed == {name: (before, count) for name, count in after.items()}
     assert len(set(after.values())) > 2
     figure(
@@ -89,9 +108,9 @@ def test_counts_of_figure_6_agree_with_the_reference(
 
 
 def test_only_gains_above_one_add_saturation(drawn: list[PaperFigure]) -> None:
-    (figure,) = (one for one in drawn if one.file == "fig6.png")
-    before = {float(line[4].rstrip("%")) for line in figure.table[1:]}
-    after = {line[0]: float(line[5].rstrip("%")) for line in figure.table[1:]}
+    lines = table_lines(named(drawn, "fig6.png"))
+    before = {float(line[4].rstrip("%")) for line in lines}
+    after = {line[0]: float(line[5].rstrip("%")) for line in lines}
     assert after["paper_max"] == after["fig6_top"] <= min(before)
     assert after["fig6_bottom"] > after["paper_min"] > after["paper_max"] > 0
 
@@ -144,7 +163,7 @@ def test_photographs_of_any_shape_are_drawn(
 ) -> None:
     Image.fromarray(pixels(3, *shape)).save(tmp_path / "one.png")
     config = settings()
-    config.source.root = str(tmp_path)
+    config = replaced(config, {"source.root": str(tmp_path)})
     assert len(paper_figures.draw_figures(config, options)) == len(FILES) - 1
 
 
@@ -209,8 +228,8 @@ def test_unreadable_photograph_is_named_and_the_next_one_shown(
     (tmp_path / "<a>.png").write_bytes(b"no picture")
     Image.fromarray(pixels(3, 1, 1)).save(tmp_path / "<b>.png")
     config = settings()
-    config.source.root = str(tmp_path)
-    page = paper_figures.figures_page(paper_figures.draw_figures(config, options), "command")
+    config = replaced(config, {"source.root": str(tmp_path)})
+    page = page_text(paper_figures.draw_figures(config, options))
     assert "Photographs that cannot be read: &lt;a&gt;.png (unsupported)." in page
     assert html.unescape(page).count("On <b>.png") == 5
     assert "<a>" not in page and "<b>" not in page

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.flats import SILENT, bounds_off, flat, noisy_dn, plan_with, signal_dn
+from helpers.flats import SILENT, bounds_off, dead, flat, noisy_dn, plan_with, signal_dn
 from helpers.promise_report import Figure
 
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.reference import noise as effects
-from unprocess_gen.simulation.reference.noise import EFFECTS
 
 COUNTED = {"dark_e": 3.0, "hot_pixel_share": 0.3, "hot_pixel_e": 20.0, "dn_per_e": 16.0}
 
@@ -23,7 +23,7 @@ def test_omitted_effect_in_electrons_changes_no_other_effect(effect: str, figure
     others = [one for one in ("shot", "dark_current", "hot_pixels") if one != effect]
 
     def frame(*on: str) -> np.ndarray:
-        plan = replace(plan_with(*on, **COUNTED), black_level_dn=0)
+        plan = plan_with(*on, **COUNTED).replace(black_level_dn=0)
         return make_pair(flat(8000, 256, 256), plan).noisy.astype(np.int64)
 
     alone = frame(effect) - frame()
@@ -42,9 +42,9 @@ ALL = {
 def test_omitted_effect_in_dn_removes_only_its_values(effect: str) -> None:
     clean_dn = np.full((64, 96), 20000.0)
     on = [one for one in EFFECTS[:-1] if one != "dead_pixels"]
-    with_it = effects.physical(clean_dn, plan_with(*on, **ALL))
-    without = effects.physical(clean_dn, plan_with(*(one for one in on if one != effect), **ALL))
-    alone = effects.physical(clean_dn, plan_with(effect, **ALL)) - clean_dn
+    with_it = order.noisy(clean_dn, plan_with(*on, **ALL))
+    without = order.noisy(clean_dn, plan_with(*(one for one in on if one != effect), **ALL))
+    alone = order.noisy(clean_dn, plan_with(effect, **ALL)) - clean_dn
     assert np.abs(alone).max() > 1
     np.testing.assert_allclose(with_it - without, alone, rtol=0, atol=1e-10)
 
@@ -53,9 +53,9 @@ def test_omitted_dead_pixels_change_no_other_pixel() -> None:
     with_it, without = (
         make_pair(flat(20000, 64, 96), plan_with(*on, **ALL)).noisy for on in (EFFECTS[:-1], EFFECTS[:-2])
     )
-    dead = effects.dead(replace(SILENT, dead_pixel_share=0.1), (64, 96))
-    assert (with_it[dead] == 0).all()
-    assert (with_it[~dead] == without[~dead]).all()
+    is_dead = dead(replace(SILENT, dead_pixel_share=0.1), (64, 96))
+    assert (with_it[is_dead] == 0).all()
+    assert (with_it[~is_dead] == without[~is_dead]).all()
 
 
 def test_omitted_prnu_changes_nothing_in_the_dark() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.configs import with_branch
 from helpers.datasets import Settings
 from helpers.flats import (
     BLACK,
@@ -16,12 +17,15 @@ from helpers.flats import (
     SPAN,
     assert_same,
     bounds_off,
+    dead,
     flat,
+    hot_pixel_means,
     noisy_dn,
     picture,
     plan_with,
     planned,
     poisson_reach,
+    response,
     signal_dn,
     with_physics,
 )
@@ -31,8 +35,8 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
+from unprocess_gen.simulation.effects import order
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.reference import noise as effects
 
 # Shot noise -----------------------------------------------------------------------------------------------------------
 
@@ -41,13 +45,13 @@ def assert_poisson(counts: np.ndarray, rate: float) -> None:
     """Check mean, variance, third moment and fraction of zeros; words resolve probabilities to 2**-32."""
     reach = poisson_reach(rate)
     deviation = counts - rate
-    for order, moment, variance in (
+    for power, moment, variance in (
         (1, 0.0, rate),
         (2, rate, rate + 2 * rate**2),
         (3, rate, rate + 24 * rate**2 + 15 * rate**3),
     ):
-        bound = bernstein(variance, reach**order + moment, counts.size) + 2.0**-31 * reach**order
-        assert abs(float((deviation**order).mean()) - moment) <= bound, order
+        bound = bernstein(variance, reach**power + moment, counts.size) + 2.0**-31 * reach**power
+        assert abs(float((deviation**power).mean()) - moment) <= bound, power
     zero = math.exp(-min(rate, 700.0))
     assert abs(float((counts == 0).mean()) - zero) <= bernstein(zero * (1 - zero), 1, counts.size) + 2.0**-31
 
@@ -73,9 +77,7 @@ def test_no_light_gives_no_shot_noise() -> None:
 def test_poisson_form_has_mean_variance_and_skewness(code: int) -> None:
     """Only counts have a third moment, a²·u. The fourth is that of a normal plus a⁴·rate; the sixth is a bound."""
     a, b = 12.5, 900.0
-    plan = replace(
-        plan_with(), physics=None, effects=("heteroscedastic", "quantise"), noise_law="poisson", a_dn=a, b_dn2=b
-    )
+    plan = plan_with().replace(physics=None, effects=("heteroscedastic", "quantise"), law="poisson", a_dn=a, b_dn2=b)
     deviation = noisy_dn(plan, code) - signal_dn(code)
     rate = signal_dn(code) / a
     variance = a * a * rate + b + 1 / 12
@@ -159,6 +161,21 @@ def test_column_offsets_are_fixed_per_sensor_unit() -> None:
     assert_normal_offsets((one - other)[0] / math.sqrt(2), 300.0)
 
 
+def test_dsnu_is_a_fixed_offset_of_each_pixel_of_a_body() -> None:
+    plan = plan_with("dsnu", dsnu_std_e=40.0)  # 8 DN per electron
+    one, later, other = (noisy_dn(one) for one in (plan, plan.replace(stream_key=2), with_physics(plan, body_key=9)))
+    assert (one == later).all()
+    assert_normal_offsets(one.ravel()[:OFFSETS], 320.0)
+    assert_normal_offsets((one - other).ravel()[:OFFSETS] / math.sqrt(2), 320.0)
+
+
+def test_clean_frames_can_contain_dsnu() -> None:
+    """The noisy frame contains the same offsets, so that the pair has no difference without other noise."""
+    pair = make_pair(flat(30000, 64, 96), plan_with("dsnu", dsnu_std_e=40.0, fixed_pattern_in_clean=True))
+    assert len(np.unique(pair.clean)) > 100
+    np.testing.assert_array_equal(pair.clean, pair.noisy)
+
+
 # Gain by colour and lens shading -------------------------------------------------------------------------------------
 
 
@@ -168,7 +185,7 @@ def test_each_colour_counts_electrons_by_its_gain() -> None:
     plan = plan_with("shot", "gain_by_colour", gain_by_colour=gains)
     deviation = noisy_dn(plan, code)
     for colour, relative in zip("RGB", gains, strict=True):
-        for site in (place for place in range(4) if plan.pattern[place] == colour):
+        for site in (place for place in range(4) if plan.sensor.pattern[place] == colour):
             counts = deviation[site // 2 :: 2, site % 2 :: 2] / (8 * relative)
             assert (counts == np.rint(counts)).all()
             assert_poisson(counts, signal_dn(code) / (8 * relative))
@@ -242,9 +259,9 @@ def test_dark_current_scales_with_temperature_and_exposure_time(settings: Settin
     def dark_e(celsius: float, seconds: float) -> float:
         overrides = ("noise=sony_a7s2", f"noise.dark_doubling_c={doubling}", "noise.dark_e_per_s=3")
         plan = planned(settings, picture(), *overrides, f"scene.temperature_c={celsius}", f"scene.exposure_s={seconds}")
-        assert plan.physics is not None
-        assert plan.physics.hot_pixel_e == pytest.approx(plan.physics.dark_e * 50 / 3, rel=1e-12)
-        return plan.physics.dark_e
+        assert plan.noise.physics is not None
+        assert plan.noise.physics.hot_pixel_e == pytest.approx(plan.noise.physics.dark_e * 50 / 3, rel=1e-12)
+        return plan.noise.physics.dark_e
 
     assert dark_e(25, 2) == 6
     for times in (-3, -1, 1, 2, 5):
@@ -260,7 +277,7 @@ SHARE = 0.01
 @pytest.fixture(scope="module")
 def hot() -> np.ndarray:
     """Return the mean excess of about 10,000 hot pixels of a sensor unit, 0 for other pixels."""
-    return effects.hot_pixel_means(replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0), (1024, 1024))
+    return hot_pixel_means(replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0), (1024, 1024))
 
 
 def test_hot_pixels_have_given_fraction(hot: np.ndarray) -> None:
@@ -307,15 +324,15 @@ def test_hot_and_dead_pixels_are_fixed_per_sensor_unit() -> None:
 def test_hot_and_dead_pixels_differ_between_sensor_units(hot: np.ndarray) -> None:
     physics = replace(SILENT, hot_pixel_share=SHARE, hot_pixel_e=200.0, dead_pixel_share=SHARE)
     other = replace(physics, body_key=9)
-    both = (hot > 0) & (effects.hot_pixel_means(other, (1024, 1024)) > 0)
+    both = (hot > 0) & (hot_pixel_means(other, (1024, 1024)) > 0)
     assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
-    both = effects.dead(physics, (1024, 1024)) & effects.dead(other, (1024, 1024))
+    both = dead(physics, (1024, 1024)) & dead(other, (1024, 1024))
     assert bounds_off(both, SHARE**2, SHARE**2, 1) <= 1
 
 
 def test_hot_and_dead_pixels_are_independent(hot: np.ndarray) -> None:
-    dead = effects.dead(replace(SILENT, dead_pixel_share=SHARE), (1024, 1024))
-    assert bounds_off(dead & (hot > 0), SHARE**2, SHARE**2, 1) <= 1
+    is_dead = dead(replace(SILENT, dead_pixel_share=SHARE), (1024, 1024))
+    assert bounds_off(is_dead & (hot > 0), SHARE**2, SHARE**2, 1) <= 1
 
 
 def test_dead_pixels_read_0_and_have_given_fraction() -> None:
@@ -328,7 +345,7 @@ def test_dead_pixels_read_0_and_have_given_fraction() -> None:
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_none_or_all_pixels_can_be_dead_or_hot(share: float) -> None:
     assert ((noisy_dn(plan_with("dead_pixels", dead_pixel_share=share), 500, 64, 64) == -BLACK) == (share == 1)).all()
-    means = effects.hot_pixel_means(replace(SILENT, hot_pixel_share=share, hot_pixel_e=9.0), (64, 64))
+    means = hot_pixel_means(replace(SILENT, hot_pixel_share=share, hot_pixel_e=9.0), (64, 64))
     assert ((means > 0) == (share == 1)).all()
     assert_same(flat(500, 64, 64), plan_with("hot_pixels", hot_pixel_share=share, hot_pixel_e=9.0))
 
@@ -337,20 +354,20 @@ def test_none_or_all_pixels_can_be_dead_or_hot(share: float) -> None:
 
 
 def test_prnu_has_mean_1_and_given_standard_deviation() -> None:
-    pattern = effects.response(replace(SILENT, prnu_std=0.01), (1024, 1024))
+    pattern = response(replace(SILENT, prnu_std=0.01), (1024, 1024))
     assert bounds_off(pattern, 1, 1e-4, REACH * 0.01) <= 1
     assert bounds_off((pattern - 1) ** 2, 1e-4, 2e-8, (REACH * 0.01) ** 2) <= 1
 
 
 def test_prnu_response_is_never_negative() -> None:
-    pattern = effects.response(replace(SILENT, prnu_std=0.5), (1024, 1024))
+    pattern = response(replace(SILENT, prnu_std=0.5), (1024, 1024))
     assert pattern.min() == 0
 
 
 @pytest.mark.parametrize("code", [0, 800, 20000, 50000])
 def test_prnu_scales_with_signal_and_is_fixed_between_frames(code: int) -> None:
     plan = plan_with("prnu", prnu_std=0.01)
-    pattern = effects.response(plan.physics, (1024, 1024))  # type: ignore[arg-type]
+    pattern = response(plan.noise.physics, (1024, 1024))  # type: ignore[arg-type]
     frame = noisy_dn(plan, code)
     np.testing.assert_array_equal(frame, np.rint(signal_dn(code) * pattern + BLACK) - BLACK)
     np.testing.assert_array_equal(frame, noisy_dn(replace(plan, stream_key=2), code))
@@ -358,7 +375,7 @@ def test_prnu_scales_with_signal_and_is_fixed_between_frames(code: int) -> None:
 
 def test_prnu_differs_between_sensor_units() -> None:
     physics = replace(SILENT, prnu_std=0.01)
-    one, other = (effects.response(replace(physics, body_key=key), (1024, 1024)) - 1 for key in (1, 2))
+    one, other = (response(replace(physics, body_key=key), (1024, 1024)) - 1 for key in (1, 2))
     assert bounds_off(one * other, 0, 1e-8, (REACH * 0.01) ** 2) <= 1
 
 
@@ -373,10 +390,10 @@ def test_black_error_depends_on_cfa_site_alone() -> None:
 )
 def test_black_error_table_divides_iso_range_evenly_in_logarithm(settings: Settings, iso: int, row: int) -> None:
     config = settings("noise=nikon_d850", f"noise.iso={iso}")
-    config.noise.branches[0].iso = [100, 400]
-    config.noise.branches[0].black_error_dn = ["by_log_iso", *([n, 10 * n, -n, 0.5] for n in range(4))]
+    config = with_branch(config, iso=[100, 400])
+    config = with_branch(config, black_error_dn=["by_log_iso", *([n, 10 * n, -n, 0.5] for n in range(4))])
     validate_config(config)
-    physics = plan_image(config, SHA256, facts=facts_of(picture())).physics
+    physics = plan_image(config, SHA256, facts=facts_of(picture())).noise.physics
     scale = (4095 - 240) / (16150 - 400)
     assert physics is not None
     assert physics.black_error_dn == pytest.approx([scale * one for one in (row, 10 * row, -row, 0.5)], rel=1e-12)
@@ -384,9 +401,9 @@ def test_black_error_table_divides_iso_range_evenly_in_logarithm(settings: Setti
 
 def test_black_error_table_accepts_a_single_iso(settings: Settings) -> None:
     config = settings("noise=nikon_d850", "noise.iso=100")
-    config.noise.branches[0].iso = [100, 100]
+    config = with_branch(config, iso=[100, 100])
     validate_config(config)
-    physics = plan_image(config, SHA256, facts=facts_of(picture())).physics
+    physics = plan_image(config, SHA256, facts=facts_of(picture())).noise.physics
     assert physics is not None
     assert physics.black_error_dn[0] < 0
 
@@ -449,13 +466,13 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
         column_std_dn=20.0, fixed_pattern_in_clean=True,
     )  # fmt: skip
     clean = make_pair(flat(5000, *size), plan).clean.astype(np.float64)
-    columns_dn = effects.offsets(plan, size, fixed_only=True)
+    columns_dn = order.offsets(order.part_of(plan, size), order.effects_of(plan), fixed_only=True)
     full = np.rint(8 * 2000 + BLACK + columns_dn)
     assert (clean <= full).all()
     assert 0.1 < (clean == full).mean() < 0.3
     noisy = np.array([make_pair(flat(5000, *size), replace(plan, stream_key=key)).noisy for key in range(frames)])
     assert (noisy.mean(axis=0) <= full).all()
-    overfull = effects.hot_pixel_means(plan.physics, size) > 3000  # type: ignore[arg-type]
+    overfull = hot_pixel_means(plan.noise.physics, size) > 3000  # type: ignore[arg-type]
     assert overfull.any()
     assert (noisy[:, overfull] == full[overfull]).all()
     assert (clean[overfull] == full[overfull]).all()
@@ -467,14 +484,14 @@ def test_mean_of_frames_does_not_exceed_full_well() -> None:
 def test_each_image_has_its_own_sensor_unit_by_default(settings: Settings) -> None:
     config = settings("noise=sony_a7s2")
     facts = facts_of(picture())
-    bodies = {plan_image(config, f"{n:064x}", facts=facts).physics.body_key for n in range(40)}  # type: ignore[union-attr]
+    bodies = {plan_image(config, f"{n:064x}", facts=facts).noise.physics.body_key for n in range(40)}  # type: ignore[union-attr]
     assert len(bodies) == 40
 
 
 def test_images_share_given_number_of_sensor_units(settings: Settings) -> None:
     config = settings("noise=sony_a7s2", "sensor.units=3")
     facts = facts_of(picture())
-    physics = [plan_image(config, f"{n:064x}", facts=facts).physics for n in range(40)]
+    physics = [plan_image(config, f"{n:064x}", facts=facts).noise.physics for n in range(40)]
     bodies = {(one.sensor_unit, one.body_key) for one in physics if one is not None}
     assert {unit for unit, _ in bodies} == {"0", "1", "2"}
     assert len(bodies) == 3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from unprocess_gen.simulation.pair import make_pair
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0, 100.0])
 def test_exposure_ratio_darkens_scene_before_sensor(ratio: float) -> None:
-    plan = replace(plan_with("shot", "read", read_std_dn=50.0), exposure_ratio=ratio)
+    plan = plan_with("shot", "read", read_std_dn=50.0).replace(exposure_ratio=ratio)
     pair = make_pair(flat(24000), plan)
     signal = signal_dn(24000) / ratio
     assert (pair.clean == round(signal + BLACK)).all()
@@ -34,7 +33,7 @@ def test_darkened_scene_equals_darker_photograph(settings: Settings) -> None:
     codes = np.random.Generator(np.random.Philox(key=4)).integers(0, 65536, (40, 50, 3)).astype(np.uint16)
     plan = planned(settings, codes, *linear, "scene.exposure_ratio=5", "noise=imx385_iso3200")
     five = make_pair(codes // 5 * 5, plan)
-    one = make_pair(codes // 5, replace(plan, exposure_ratio=1.0))
+    one = make_pair(codes // 5, plan.replace(exposure_ratio=1.0))
     assert np.abs(five.clean.astype(int) - one.clean).max() <= 1  # 1/5 is not exact: halves may round either way
     assert (five.clean == one.clean).mean() > 0.999
     assert (five.noisy == one.noisy).mean() > 0.999
@@ -45,7 +44,7 @@ def test_two_parameter_noise_follows_darkened_scene(settings: Settings) -> None:
     plan = planned(settings, flat(9, 1, 1), *linear, "scene.exposure_ratio=16", "noise=imx385_iso3200")
     pair = make_pair(flat(52000), plan)
     signal = 52000 / 65535 / 16 * (4095 - 240)
-    variance = plan.a_dn * signal + plan.b_dn2 + 1 / 12
+    variance = plan.noise.a_dn * signal + plan.noise.b_dn2 + 1 / 12
     assert (pair.clean == round(240 + signal)).all()
     deviation = pair.noisy - 240.0 - signal
     reach = REACH * math.sqrt(variance) + 1
@@ -57,9 +56,9 @@ def test_two_parameter_noise_follows_darkened_scene(settings: Settings) -> None:
 # Saturation -----------------------------------------------------------------------------------------------------------
 
 WHITES = {
-    "gaussian": replace(plan_with(), physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0),
-    "poisson": replace(
-        plan_with(), physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0, noise_law="poisson"
+    "gaussian": plan_with().replace(physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0),
+    "poisson": plan_with().replace(
+        physics=None, effects=("heteroscedastic", "quantise"), a_dn=8.0, b_dn2=900.0, law="poisson"
     ),
     "physical": plan_with("shot", "read", "row", read_std_dn=30.0, row_std_dn=5.0),
 }
@@ -91,7 +90,7 @@ def test_pinning_changes_saturated_sites_only(distribution: str) -> None:
     srgb = np.where(np.random.Generator(np.random.Philox(key=5)).random((200, 300, 1)) < 0.3, 65535, 65000)
     srgb = np.broadcast_to(srgb, (200, 300, 3)).astype(np.uint16)
     free, pinned = (
-        make_pair(srgb, replace(WHITES[distribution], saturated=saturated)) for saturated in ("noisy", "pinned")
+        make_pair(srgb, WHITES[distribution].replace(saturated=saturated)) for saturated in ("noisy", "pinned")
     )
     white = free.clean == WHITE
     assert 0 < white.mean() < 1

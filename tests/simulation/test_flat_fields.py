@@ -9,7 +9,6 @@ the number of pixels. Wrong distributions that others have used are compared wit
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import itertools
@@ -62,30 +61,30 @@ def flats() -> np.ndarray:
 
 def with_noise(plan: Plan, a: float, b: float) -> Plan:
     """Return the plan with noise of variance a·(x - black) + b."""
-    return dataclasses.replace(plan, a_dn=a, b_dn2=b, effects=("heteroscedastic", "quantise"))
+    return plan.replace(a_dn=a, b_dn2=b, effects=("heteroscedastic", "quantise"))
 
 
 def clean_value(plan: Plan, code: int) -> float:
-    return plan.black_level_dn + code / 65535 * (plan.white_level_dn - plan.black_level_dn)
+    return plan.sensor.black_level_dn + code / 65535 * (plan.sensor.white_level_dn - plan.sensor.black_level_dn)
 
 
 @functools.lru_cache(maxsize=1)
 def histograms(plan: Plan, frames: int) -> np.ndarray:
     """Count each DN at each level, ``[levels, 2**bits]``; frames are stacked, so no random word occurs twice."""
-    found = np.zeros((len(CODES), 2**plan.bits), dtype=np.int64)
+    found = np.zeros((len(CODES), 2**plan.sensor.bits), dtype=np.int64)
     for frame in range(frames):
         noisy = make_pair(flats(), plan, origin=(frame * len(CODES) * ROWS, 0)).noisy
         for level, pixels in enumerate(noisy.reshape(len(CODES), SITES)):
-            found[level] += np.bincount(pixels, minlength=2**plan.bits)
+            found[level] += np.bincount(pixels, minlength=2**plan.sensor.bits)
     return found
 
 
 def promised(plan: Plan, x: float) -> tuple[float, float]:
-    return x, math.sqrt(max(0.0, plan.a_dn * (x - plan.black_level_dn) + plan.b_dn2))
+    return x, math.sqrt(max(0.0, plan.noise.a_dn * (x - plan.sensor.black_level_dn) + plan.noise.b_dn2))
 
 
 def exact_moments(plan: Plan, x: float, law: Law) -> Moments:
-    low, high = noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+    low, high = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
     centre, std = law(plan, x)
     return moments(centre, std, int(low), int(high))
 
@@ -97,7 +96,7 @@ def misfits(plan: Plan, found: np.ndarray, law: Law = promised) -> list[str]:
     deviation, the mean by 1.5e-7 of std + 1, and the mean square by twice the distance times that.
     """
     complaints = []
-    dn = np.arange(2**plan.bits)
+    dn = np.arange(2**plan.sensor.bits)
     for code, histogram in zip(CODES, found, strict=True):
         count = int(histogram.sum())
         x = clean_value(plan, code)
@@ -198,14 +197,20 @@ def scaled(by: float) -> Law:
 
 
 WRONG: dict[str, Law] = {
-    "black level in the signal": lambda plan, x: (x, math.sqrt(plan.a_dn * x + plan.b_dn2)),
+    "black level in the signal": lambda plan, x: (x, math.sqrt(plan.noise.a_dn * x + plan.noise.b_dn2)),
     "truncated": lambda plan, x: (x - 0.5, promised(plan, x)[1]),
     "noise on the rounded clean frame": lambda plan, x: (round(x), promised(plan, x)[1]),
     "variance of the rounded clean frame": lambda plan, x: (x, promised(plan, round(x))[1]),
     "deviation 2 % too great": scaled(1.02),
     "deviation 2 % too small": scaled(1 / 1.02),
-    "b a deviation": lambda plan, x: (x, math.sqrt(plan.a_dn * (x - plan.black_level_dn) + plan.b_dn2**2)),
-    "a and b deviations": lambda plan, x: (x, plan.a_dn * math.sqrt(x - plan.black_level_dn) + math.sqrt(plan.b_dn2)),
+    "b a deviation": lambda plan, x: (
+        x,
+        math.sqrt(plan.noise.a_dn * (x - plan.sensor.black_level_dn) + plan.noise.b_dn2**2),
+    ),
+    "a and b deviations": lambda plan, x: (
+        x,
+        plan.noise.a_dn * math.sqrt(x - plan.sensor.black_level_dn) + math.sqrt(plan.noise.b_dn2),
+    ),
 }
 
 
@@ -218,12 +223,15 @@ def test_wrong_noise_parameters_are_detected(settings: Settings, wrong: str) -> 
 @pytest.mark.parametrize(("simulated", "assumed"), [("sensor", "black"), ("black", "sensor")])
 def test_wrong_clip_is_detected(settings: Settings, simulated: str, assumed: str) -> None:
     plan = plan_of(settings, "imx385_iso3200", f"sensor.clip={simulated}")
-    assert misfits(dataclasses.replace(plan, sensor_clip=assumed), histograms(plan, 1)) != []
+    assert misfits(plan.replace(sensor_clip=assumed), histograms(plan, 1)) != []
 
 
 def test_mirrored_negative_variance_is_detected(settings: Settings) -> None:
     plan = plan_of(settings, "imx385_iso3200_rvdd")
-    mirrored: Law = lambda plan, x: (x, math.sqrt(abs(plan.a_dn * (x - plan.black_level_dn) + plan.b_dn2)))  # noqa: E731
+
+    def mirrored(plan: Plan, x: float) -> tuple[float, float]:
+        return x, math.sqrt(abs(plan.noise.a_dn * (x - plan.sensor.black_level_dn) + plan.noise.b_dn2))
+
     assert misfits(plan, histograms(plan, 1), mirrored) != []
 
 
@@ -238,7 +246,7 @@ def deep(settings: Settings) -> tuple[Plan, np.ndarray]:
     """Return a plan, and how many of 2**22 pixels in the middle of the range have each DN."""
     plan = plan_of(settings, "imx385_iso3200")
     noisy = make_pair(np.full((2048, 2048, 3), DEEP_CODE, dtype=np.uint16), plan).noisy
-    return plan, np.bincount(noisy.ravel(), minlength=2**plan.bits)
+    return plan, np.bincount(noisy.ravel(), minlength=2**plan.sensor.bits)
 
 
 def test_third_and_fourth_moments_follow_the_distribution(deep: tuple[Plan, np.ndarray]) -> None:
@@ -321,7 +329,7 @@ def transfer(settings: Settings, a: float, b: float, rounding: float) -> list[fl
     below that of a Gaussian of equal variance, and the variance of its square is below 2·variance². The roundings are
     uniform and independent up to e^(-2pi²s²)·(2/pi² + 4s²), with s the smallest standard deviation, and 1/12/257².
     """
-    plan = dataclasses.replace(plan_of(settings, "none"), black_level_dn=256, white_level_dn=256 + SPAN)
+    plan = plan_of(settings, "none").replace(black_level_dn=256, white_level_dn=256 + SPAN)
     plan = with_noise(plan, a, b)
     codes = np.arange(65535, dtype=np.uint16)
     rows = 64

@@ -17,12 +17,14 @@ import pytest
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.kernels import counts, exact_values, exact_values_by_vectors, fill_words, normalised_values
+from helpers.noise_fits import dataset_fits, fit_pair
 from helpers.promise_report import Figure
 from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
 from unprocess_gen.config.accuracy import Budget, choose_methods
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.lookup_tables import tukey_table
@@ -31,7 +33,6 @@ from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.effect_selection import facts_for
 from unprocess_gen.planning.plan import plan_image, plan_pairs
-from unprocess_gen.reports import photon_transfer as transfer
 from unprocess_gen.reports.estimate import estimate_run
 from unprocess_gen.simulation import self_test as selftest
 from unprocess_gen.simulation.kernels.normal import build_quantiles
@@ -48,10 +49,10 @@ ORIGIN = 1, 57
 GOLDEN = selftest.GOLDEN_PLANS
 PLANS = {
     **{name: GOLDEN[name] for name in ("per_channel", "gray_mean", "plain", "physical")},
-    "pinned": replace(GOLDEN["physical"], saturated="pinned"),
-    "averaged": replace(GOLDEN["physical"], physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True)),
-    "poisson": replace(GOLDEN["per_channel"], noise_law="poisson"),
-    "silent": replace(GOLDEN["per_channel"], effects=()),
+    "pinned": GOLDEN["physical"].replace(saturated="pinned"),
+    "averaged": GOLDEN["physical"].replace(physics=replace(selftest.GOLDEN_PHYSICS, fixed_pattern_in_clean=True)),
+    "poisson": GOLDEN["per_channel"].replace(law="poisson"),
+    "silent": GOLDEN["per_channel"].replace(effects=()),
 }
 """One plan for each set of kernels."""
 DISPATCHED = [
@@ -61,11 +62,11 @@ DISPATCHED = [
 
 
 def normalised(plan: Plan, clip: str = "none", layout: str = "mosaic") -> Plan:
-    return replace(plan, dtype="float32", sensor_clip=clip, layout=layout)
+    return plan.replace(dtype="float32", sensor_clip=clip, layout=layout)
 
 
 def dn(frame: Frame, plan: Plan) -> np.ndarray:
-    return in_dn(frame, (plan.black_level_dn, plan.white_level_dn))
+    return in_dn(frame, (plan.sensor.black_level_dn, plan.sensor.white_level_dn))
 
 
 # Draws ----------------------------------------------------------------------------------------------------------------
@@ -137,7 +138,7 @@ def test_normalised_values_are_rounded_quotients_near_midpoints(black_dn: float,
 @pytest.mark.parametrize("name", PLANS)
 def test_kernels_equal_the_reference_byte_for_byte(name: str, clip: str, figure: Figure) -> None:
     plan, picture = normalised(PLANS[name], clip), selftest.golden_image()
-    compiled, expected = (make_pair(picture, one, ORIGIN) for one in (plan, replace(plan, methods=(REFERENCE_METHOD,))))
+    compiled, expected = (make_pair(picture, one, ORIGIN) for one in (plan, plan.replace(methods=(REFERENCE_METHOD,))))
     assert compiled.clean.tobytes() == expected.clean.tobytes()
     assert compiled.noisy.tobytes() == expected.noisy.tobytes()
     assert compiled.counts == expected.counts
@@ -188,7 +189,7 @@ def test_unclipped_noise_has_mean_zero_in_black() -> None:
     """Tolerance: five standard errors. Clipped at black, the mean would be that of half a normal, σ/√(2π)."""
     black = np.zeros((512, 512, 3), dtype=np.uint8)
     plan = PLANS["per_channel"]
-    std = np.sqrt(plan.b_dn2) / 959
+    std = np.sqrt(plan.noise.b_dn2) / 959
     free, clipped = (make_pair(black, normalised(plan, clip)).noisy for clip in ("none", "black"))
     assert abs(free.mean(dtype=np.float64)) < 5 * std / 512
     assert abs(free.var(dtype=np.float64) / std**2 - 1) < 5 * np.sqrt(2) / 512
@@ -260,17 +261,17 @@ def test_an_odd_side_cannot_be_packed(shape: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="even"):
         bayer.pack(np.zeros(shape, dtype=np.uint16), "RGGB")
     with pytest.raises(ValueError, match="even"):
-        make_pair(np.zeros((*shape, 3), dtype=np.uint8), replace(PLANS["silent"], layout="packed"))
+        make_pair(np.zeros((*shape, 3), dtype=np.uint8), PLANS["silent"].replace(layout="packed"))
 
 
 @pytest.mark.parametrize("name", PLANS)
 def test_packed_frames_contain_the_values_of_mosaics(name: str) -> None:
     picture = selftest.golden_image()[:18, :82]
     for plan in (PLANS[name], normalised(PLANS[name])):
-        mosaics, planes = make_pair(picture, plan, ORIGIN), make_pair(picture, replace(plan, layout="packed"), ORIGIN)
+        mosaics, planes = make_pair(picture, plan, ORIGIN), make_pair(picture, plan.replace(layout="packed"), ORIGIN)
         assert planes.noisy.shape == (4, 9, 41)
-        assert np.array_equal(bayer.unpack(planes.noisy, plan.pattern, ORIGIN), mosaics.noisy)
-        assert np.array_equal(bayer.unpack(planes.clean, plan.pattern, ORIGIN), mosaics.clean)
+        assert np.array_equal(bayer.unpack(planes.noisy, plan.sensor.pattern, ORIGIN), mosaics.noisy)
+        assert np.array_equal(bayer.unpack(planes.clean, plan.sensor.pattern, ORIGIN), mosaics.clean)
 
 
 # Plans ----------------------------------------------------------------------------------------------------------------
@@ -290,8 +291,8 @@ def test_float_frames_skip_quantisation(noise: str, settings: Settings) -> None:
         config = settings(f"noise={noise}", *overrides)
         validate_config(config)
         plan = plan_image(config, "0" * 64, facts=facts_for(config, picture))
-        assert ("quantise" in plan.effects) == rounded
-        assert ("quantise: float output is not rounded" in plan.skipped) != rounded
+        assert ("quantise" in plan.noise.effects) == rounded
+        assert ("quantise: float output is not rounded" in plan.noise.skipped) != rounded
 
 
 def test_rounding_noise_masks_nothing_in_float_frames(settings: Settings) -> None:
@@ -300,9 +301,9 @@ def test_rounding_noise_masks_nothing_in_float_frames(settings: Settings) -> Non
     effects_of = {}
     for dtype in ("uint16", "float32"):
         config = settings(*noise, f"output.dtype={dtype}")
-        for branch in config.noise.branches:
-            branch.column_std_dn = 1e-4
-        effects_of[dtype] = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image())).effects
+        branches = [replace(branch, column_std_dn=1e-4) for branch in config.noise.branches]
+        config = replaced(config, {"noise.branches": branches})
+        effects_of[dtype] = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image())).noise.effects
     assert "column" not in effects_of["uint16"]
     assert "column" in effects_of["float32"]
 
@@ -313,7 +314,7 @@ def test_an_effect_without_masking_noise_is_decided(settings: Settings) -> None:
         "effects.dark_current=off", "output.dtype=float32",
     )  # fmt: skip
     plan = plan_image(config, "0" * 64, facts=facts_for(config, selftest.golden_image()))
-    assert "full_well" in plan.effects
+    assert "full_well" in plan.noise.effects
 
 
 # Datasets -------------------------------------------------------------------------------------------------------------
@@ -344,9 +345,9 @@ def test_an_odd_side_loses_its_last_row_or_column(packed: Path) -> None:
     assert sizes["strip.bmp"] == (2, 40)  # 3 x 40
 
 
-def test_an_image_without_a_complete_tile_is_unsupported(packed: Path) -> None:
+def test_an_image_without_a_complete_tile_is_too_small(packed: Path) -> None:
     rows = (packed / "manifest.csv").read_text(encoding="utf-8").splitlines()
-    assert [line for line in rows if ",unsupported," in line] == [line for line in rows if ",one.png," in line] != []
+    assert [line for line in rows if ",too_small," in line] == [line for line in rows if ",one.png," in line] != []
 
 
 def test_cropped_planes_equal_the_cropped_mosaic(packed: Path, photos: Path, make: Make) -> None:
@@ -386,7 +387,7 @@ def test_the_estimated_bytes_are_exact(
 ) -> None:
     """Unpatched images of 13 photographs; some have odd sides and one fails."""
     config = settings(*overrides, "noise.draws=2")
-    config.source.root = str(photos)
+    config = replaced(config, {"source.root": str(photos)})
     summary = make(photos, tmp_path / "ds", *overrides, "noise.draws=2")
     told = estimate_run(config, 1, read_all=True)
     assert told.bytes == summary.bytes == sum(path.stat().st_size for path in (tmp_path / "ds/shards").iterdir())
@@ -396,7 +397,7 @@ def test_plan_reports_the_loss_of_odd_sides(photos: Path, run_main: RunMain) -> 
     done = run_main("plan", "--all", f"source.root={photos}", "output.layout=packed", "source.max_failed=1")
     assert done.code == 0
     assert "packed    8 of 12 images have an odd side, whose last row or column is omitted: " in done.out
-    assert "one.png: unsupported\n          1 x 1 pixels contain no 2 x 2 tile" in done.out
+    assert "one.png: too_small\n          1 x 1 pixels contain no 2 x 2 tile" in done.out
 
 
 @pytest.mark.parametrize("accuracy", ["fast", pytest.param("reference", marks=pytest.mark.slow)])
@@ -455,12 +456,12 @@ def test_bytes_are_little_endian_and_match_the_digests(packed: Path) -> None:
 )
 def test_the_noise_of_the_arrays_fits_the_rows(overrides: tuple[str, ...], make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=1", *overrides)
-    found = list(transfer.iterate_fits(tmp_path / "ds"))
+    found = dataset_fits(tmp_path / "ds")
     assert len(found) == 1
     assert found[0].deviation < 5
     clean, noisy, row = RawPairs(tmp_path / "ds")[0]
     gain = "dn_per_e" if row["dn_per_e"] else "a_dn"  # the law of a physical profile follows from dn_per_e
-    lying = transfer.fit_pair(clean, noisy, row | {gain: row[gain] * 1.1})
+    lying = fit_pair(clean, noisy, row | {gain: row[gain] * 1.1})
     assert lying is not None
     assert lying.deviation > 6
 

@@ -31,20 +31,23 @@ from unprocess_gen.core.types import (
     PACKED,
     REFERENCE_METHOD,
     UINT16,
+    DarkFramePlan,
     DarkPixels,
     Pair,
-    Physics,
     Plan,
     Srgb,
 )
-from unprocess_gen.planning.effect_selection import LATER_EFFECTS
+from unprocess_gen.simulation.effects import BY_NAME, REPLACED, Physics
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
 from unprocess_gen.simulation.pair import make_pair, make_pairs, reference_pair
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
-from unprocess_gen.simulation.reference.noise import EFFECTS, REPLACED
 from unprocess_gen.simulation.reference.poisson import poisson
 from unprocess_gen.simulation.self_test import GOLDEN_PLAN
 from unprocess_gen.sources.scenes import synthetic
+
+LATER = tuple(name for name, effect in BY_NAME.items() if effect.since)
+"""Effects that version 0.1 did not have."""
 
 T = TypeVar("T")
 
@@ -118,8 +121,7 @@ def case(kind: str, number: int, dtype: str = UINT16) -> Case:
     dice = Dice(f"{kind} {dtype} {number}")
     bits, black, white = dice.pick(SENSORS)
     layout = PACKED if dice.chance(0.2) else MOSAIC
-    plan = replace(
-        GOLDEN_PLAN,
+    plan = GOLDEN_PLAN.replace(
         **drawn_curve(dice),
         **drawn_colour(dice),
         stream_key=dice.pick((0, 2**64 - 1, *(int(dice.random() * 2**53) << 11 for _ in range(6)))),
@@ -152,34 +154,36 @@ def with_dark_frame(one: Case, dice: Dice) -> Case:
     """Replace the noise of the read-out with a dark frame that is smaller or larger than the image."""
     shape = 2 * int(dice.power(0, 5)), 2 * int(dice.power(0, 7))
     drawn = words(int(dice.random() * 2**53), "parameters", shape) >> np.uint32(dice.pick((16, 20, 24, 28)))
-    plan = replace(
-        one.plan,
-        effects=tuple("dark_frame" if on == "read" else on for on in one.plan.effects if on not in REPLACED),
-        dark_frame="d" * 64,
-        dark_shift=(2 * int(dice.random() * shape[0] / 2), 2 * int(dice.random() * shape[1] / 2)),
-        dark_black_dn=dice.pick((0.0, 7.0, 512.0, 100.5)),
-        dark_scale=dice.pick((1.0, 1.0, 0.25, 3855 / 15871, 4.0)),
-        dark_shading=dice.pick(("", "", "e" * 64)),
+    plan = one.plan.replace(
+        effects=tuple("dark_frame" if on == "read" else on for on in one.plan.noise.effects if on not in REPLACED),
+        dark=DarkFramePlan(
+            "d" * 64,
+            (2 * int(dice.random() * shape[0] / 2), 2 * int(dice.random() * shape[1] / 2)),
+            dice.pick((0.0, 7.0, 512.0, 100.5)),
+            dice.pick((1.0, 1.0, 0.25, 3855 / 15871, 4.0)),
+            dice.pick(("", "", "e" * 64)),
+        ),
     )
-    plan = plan if "dark_frame" in plan.effects else replace(plan, effects=("dark_frame", *plan.effects))
+    plan = plan if "dark_frame" in plan.noise.effects else plan.replace(effects=("dark_frame", *plan.noise.effects))
     frames = {"d" * 64: drawn.astype(np.uint16), "f" * 64: np.full(shape, 600, dtype=np.uint16)}
     return replace(one, plan=plan, dark_pixels=DarkPixelsInMemory(frames))
 
 
 def with_later_effects(plan: Plan, origin: tuple[int, int], shape: tuple[int, int], dice: Dice) -> Plan:
     """Add lens shading, gains by colour, temporal column noise and correlated rows to a plan of a physical profile."""
-    assert plan.physics is not None
+    assert plan.noise.physics is not None
     few_rows = origin[0] < 2**14  # correlated offsets are computed from row 0
     physics = replace(
-        plan.physics,
+        plan.noise.physics,
         row_correlation=dice.pick((0.0, 0.7, -0.4, 0.999)) if few_rows else 0.0,
         column_temporal_std_dn=dice.at_most(9),
         gain_by_colour=dice.pick(((1.0, 1.0, 1.0), (0.97, 1.0, 1.04), (0.1, 3.0, 10.0))),
         lens_shading=dice.pick(((-0.3, 0.05, -0.1), (-0.9, 0.0, 0.0), (-0.001, -0.002, 0.0))),
+        dsnu_std_e=dice.at_most(40),
         frame_size=tuple(start + side + int(dice.power(0, 8)) for start, side in zip(origin, shape, strict=True)),
     )
-    on = {*plan.effects, *(one for one in LATER_EFFECTS if not dice.chance(0.3))}
-    return replace(plan, physics=physics, effects=tuple(one for one in EFFECTS if one in on))
+    on = {*plan.noise.effects, *(one for one in LATER if not dice.chance(0.3))}
+    return plan.replace(physics=physics, effects=tuple(one for one in EFFECTS if one in on))
 
 
 def drawn_curve(dice: Dice) -> dict[str, object]:
@@ -203,17 +207,17 @@ def drawn_colour(dice: Dice) -> dict[str, object]:
 
 def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
     """Draw the noise of a plan; its other fields stay as they are."""
-    span_dn = plan.white_level_dn - plan.black_level_dn
+    span_dn = plan.sensor.white_level_dn - plan.sensor.black_level_dn
     if kind == "gaussian":
         a_dn = dice.at_most(10)
         b_dn2 = dice.pick((dice.at_most(20), dice.power(-6, 12), -a_dn * span_dn * dice.random(), 1e15))
-        return replace(plan, a_dn=a_dn, b_dn2=b_dn2, effects=dice.pick(((), *[TWO] * 9)))
+        return plan.replace(a_dn=a_dn, b_dn2=b_dn2, effects=dice.pick(((), *[TWO] * 9)))
     light = ((-7, 3), (2, 7), (6, 14), (6, 14), (13, 26))
     brightest_e = dice.power(*dice.pick(light))
-    dn_per_e = span_dn * min(1.0, plan.exposure) / brightest_e
+    dn_per_e = span_dn * min(1.0, plan.scene.exposure) / brightest_e
     if kind == "poisson":
         a_dn, b_dn2 = dice.pick((dn_per_e, dn_per_e, dn_per_e, 0.0)), dice.at_most(12)
-        return replace(plan, noise_law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=TWO)
+        return plan.replace(law="poisson", a_dn=a_dn, b_dn2=b_dn2, effects=TWO)
     physics = drawn_physics(dice, dn_per_e, brightest_e)
     on = ("shot", "read", "row", "black_error", "quantise")
     if kind == "shot and read":
@@ -221,9 +225,9 @@ def with_noise(plan: Plan, kind: str, dice: Dice) -> Plan:
         on = tuple(one for one in on if one != omitted)
     else:
         share = dice.pick((0.0, 0.2, 0.5))
-        on = tuple(one for one in EFFECTS if one not in LATER_EFFECTS and not dice.chance(share))
+        on = tuple(one for one in EFFECTS if one not in LATER and not dice.chance(share))
     physics = replace(physics, fixed_pattern_in_clean=kind.endswith("averaged"))
-    return replace(plan, a_dn=dn_per_e, b_dn2=physics.read_std_dn * physics.read_std_dn, effects=on, physics=physics)
+    return plan.replace(a_dn=dn_per_e, b_dn2=physics.read_std_dn * physics.read_std_dn, effects=on, physics=physics)
 
 
 def drawn_physics(dice: Dice, dn_per_e: float, brightest_e: float) -> Physics:
@@ -285,9 +289,9 @@ def simulate(one: Case) -> Pair:
 
 def simulate_reference(one: Case) -> Pair:
     """Simulate the reference: with its formulas for integer frames, with the exact curve for frames in float32."""
-    if not one.plan.clean_normalised:
+    if not one.plan.output.clean_normalised:
         return reference_pair(one.srgb, one.plan, one.origin, one.dark_pixels)
-    return make_pair(one.srgb, replace(one.plan, methods=(REFERENCE_METHOD,)), one.origin, one.dark_pixels)
+    return make_pair(one.srgb, one.plan.replace(methods=(REFERENCE_METHOD,)), one.origin, one.dark_pixels)
 
 
 def differences(found: Pair, expected: Pair) -> str:
@@ -334,18 +338,18 @@ def test_float_clean_frames_change_no_noisy_frame(kind: str) -> None:
     for number in range(QUICK // 5):
         one = case(kind, number, FLOAT_CLEAN)
         pair = simulate(one)
-        rounded = simulate(replace(one, plan=replace(one.plan, clean_dtype="")))
-        floats = simulate(replace(one, plan=replace(one.plan, clean_dtype="", dtype=FLOAT32)))
+        rounded = simulate(replace(one, plan=one.plan.replace(clean_dtype="")))
+        floats = simulate(replace(one, plan=one.plan.replace(clean_dtype="", dtype=FLOAT32)))
         assert pair.noisy.tobytes() == rounded.noisy.tobytes(), number
-        assert one.plan.averaged or pair.clean.tobytes() == floats.clean.tobytes(), number
+        assert one.plan.noise.averaged or pair.clean.tobytes() == floats.clean.tobytes(), number
 
 
 # Crops and levels -----------------------------------------------------------------------------------------------------
 
 
 def mosaics(pair: Pair, one: Case) -> tuple[np.ndarray, np.ndarray]:
-    if one.plan.layout == PACKED:
-        clean, noisy = (unpack(frame, one.plan.pattern, one.origin) for frame in (pair.clean, pair.noisy))
+    if one.plan.output.layout == PACKED:
+        clean, noisy = (unpack(frame, one.plan.sensor.pattern, one.origin) for frame in (pair.clean, pair.noisy))
         return clean, noisy
     return pair.clean, pair.noisy
 
@@ -362,7 +366,7 @@ def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, cou
         bottom, right = (at + 1 + int(dice.random() * (side - at)) for at, side in ((top, height), (left, width)))
         rows, columns = slice(top, bottom), slice(left, right)
         origin = one.origin[0] + top, one.origin[1] + left
-        crop = make_pair(one.srgb[rows, columns], replace(one.plan, layout=MOSAIC), origin, one.dark_pixels)
+        crop = make_pair(one.srgb[rows, columns], one.plan.replace(layout=MOSAIC), origin, one.dark_pixels)
         for found, expected in zip((crop.clean, crop.noisy), mosaics(simulate(one), one), strict=True):
             if found.tobytes() != expected[rows, columns].tobytes():
                 failed.append(f"case({kind!r}, {number}, {dtype!r}): rows {top} to {bottom}, columns {left} to {right}")
@@ -371,11 +375,10 @@ def test_crops_of_random_plans_are_crops_of_the_frame(kind: str, dtype: str, cou
 
 def with_other_noise(plan: Plan, kinds: Sequence[str], dice: Dice) -> Plan:
     """Draw another noise, level, draw and clipping; the parameters of the clean frame stay as they are."""
-    plan = replace(plan, noise_law="gaussian", physics=None)
+    plan = plan.replace(law="gaussian", physics=None)
     plan = with_noise(plan, dice.pick(kinds), dice)
-    return replace(
-        plan,
-        effects=tuple(one for one in plan.effects if one != "full_well"),
+    return plan.replace(
+        effects=tuple(one for one in plan.noise.effects if one != "full_well"),
         level=int(dice.random() * 100),
         draw=int(dice.random() * 100),
         sensor_clip=dice.pick(("sensor", "black")),
@@ -405,7 +408,7 @@ def sweep(low_e: float, high_e: float, read_std_dn: float, height: int) -> Case:
     codes = np.linspace(low_e / high_e * 65535, 65535, 8192).astype(np.uint16)
     srgb = np.ascontiguousarray(np.broadcast_to(codes[None, :, None], (height, codes.size, 3)))
     plan = plan_with("shot", "read", dn_per_e=1.0, read_std_dn=read_std_dn)
-    return Case(srgb, replace(plan, black_level_dn=0, white_level_dn=65535, exposure_ratio=65535 / high_e), (0, 0))
+    return Case(srgb, plan.replace(black_level_dn=0, white_level_dn=65535, exposure_ratio=65535 / high_e), (0, 0))
 
 
 RATES_E = [(0, 0.3), (0, 6), (5.9, 9), (9, 66), (60, 65535)]
@@ -416,8 +419,8 @@ RATES_E = [(0, 0.3), (0, 6), (5.9, 9), (9, 66), (60, 65535)]
 @pytest.mark.parametrize(("low_e", "high_e"), RATES_E)
 def test_counts_equal_the_reference_at_every_rate(low_e: float, high_e: float, read_std_dn: float) -> None:
     ramp = sweep(low_e, high_e, read_std_dn, 16)
-    two_numbers = replace(ramp.plan, physics=None, noise_law="poisson", effects=TWO)
-    for plan in (ramp.plan, replace(ramp.plan, dtype=FLOAT32), two_numbers):
+    two_numbers = ramp.plan.replace(physics=None, law="poisson", effects=TWO)
+    for plan in (ramp.plan, ramp.plan.replace(dtype=FLOAT32), two_numbers):
         one = replace(ramp, plan=plan)
         assert differences(simulate(one), simulate_reference(one)) == ""
 
@@ -435,7 +438,7 @@ def test_counts_in_the_tails_equal_the_reference(low_e: float, high_e: float, re
     ramp = sweep(low_e, high_e, read_std_dn, height)
     drawn = words_of_counts(ramp.plan.stream_key, *ramp.srgb.shape[:2])
     is_tail = (drawn & np.uint32(2**31 - 1)) < np.uint32(0.0124 * 2**31)
-    rates_e = (ramp.srgb[..., 0][is_tail] / 65535 * ramp.plan.exposure) * 65535
+    rates_e = (ramp.srgb[..., 0][is_tail] / 65535 * ramp.plan.scene.exposure) * 65535
     counts = poisson(drawn[is_tail], rates_e)
     assert counts.size > 20_000
     np.testing.assert_array_equal(simulate(ramp).noisy[is_tail], np.minimum(counts, 65535))
@@ -472,9 +475,9 @@ def test_pairs_at_rare_words_equal_the_reference(stream: str, word: int, at: tup
     frame, y, x = at
     failed = {}
     for kind, number in itertools.product(kinds, range(12)):
-        plan = replace(case(kind, number, dtype).plan, layout=MOSAIC, stream_key=KEY, frame=frame, level=0, draw=0)
-        if plan.physics is not None:
-            plan = replace(plan, physics=replace(plan.physics, body_key=KEY))
+        plan = case(kind, number, dtype).plan.replace(layout=MOSAIC, stream_key=KEY, frame=frame, level=0, draw=0)
+        if plan.noise.physics is not None:
+            plan = plan.replace(physics=replace(plan.noise.physics, body_key=KEY))
         code = np.full((1, 1, 3), (0, 1, 9, 40, 90, 128, 180, 220, 243, 252, 254, 255)[number], dtype=np.uint8)
         one = Case(code, plan, (y, x))
         if text := differences(simulate(one), simulate_reference(one)):
@@ -486,14 +489,14 @@ def test_pairs_at_rare_words_equal_the_reference(stream: str, word: int, at: tup
 def test_pixels_at_the_limit_of_a_share_equal_the_reference(effect: str) -> None:
     """A share of w / 2**32 excludes the pixel with word w, a share of (w + 1) / 2**32 includes it."""
     one = case("physical", 0)
-    plan = replace(one.plan, effects=EFFECTS, layout=MOSAIC, bits=16, black_level_dn=4096, white_level_dn=65535)
+    plan = one.plan.replace(effects=EFFECTS, layout=MOSAIC, bits=16, black_level_dn=4096, white_level_dn=65535)
     srgb, numbers = np.full((3, 70, 3), 128, dtype=np.uint8), {"dark_e": 0.0, "dn_per_e": 8.0, "read_std_dn": 0.5}
     found = []
     for word in words(KEY, effect, (3, 70))[:, ::23].ravel().tolist():
         for share in (word / 2**32, (word + 1) / 2**32):
             shares = {"hot_pixel_share": 0.0, "dead_pixel_share": 0.0} | {f"{effect.removesuffix('s')}_share": share}
-            physics = replace(plan.physics, **numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
-            one = Case(srgb, replace(plan, physics=physics), (0, 0))
+            physics = replace(plan.noise.physics, **numbers, **shares, hot_pixel_e=2e4, full_well_e=1e6, body_key=KEY)
+            one = Case(srgb, plan.replace(physics=physics), (0, 0))
             found.append(simulate(one).noisy)
             assert differences(simulate(one), simulate_reference(one)) == ""
     assert all((without != with_one).sum() == 1 for without, with_one in zip(found[::2], found[1::2], strict=True))
@@ -521,10 +524,10 @@ def test_fast_pairs_of_random_plans_keep_their_digest(kind: str) -> None:
     for number in range(FAST_CASES):
         one = case(kind, number)
         if kind == "gaussian":
-            methods = () if is_steep(one.plan) else (FLOAT32_METHOD,)
+            methods = () if is_steep(one.plan.camera, one.plan.scene.exposure) else (FLOAT32_METHOD,)
         else:
             methods = ("shot:gaussian_where_near",)
-        pair = simulate(replace(one, plan=replace(one.plan, methods=methods, law_distance=5e-3)))
+        pair = simulate(replace(one, plan=one.plan.replace(methods=methods, law_distance=5e-3)))
         for frame in (pair.clean, pair.noisy):
             digest.update(frame.astype("<u2").tobytes())
         digest.update(repr(astuple(pair.counts)).encode())

@@ -8,6 +8,7 @@ from decimal import Decimal, localcontext
 import mpmath
 import numpy as np
 import pytest
+from helpers.configs import with_branch
 from helpers.datasets import Settings
 from helpers.flats import ISOS, bounds_off, noisy_dn, picture, plan_with, planned, signal_dn
 from helpers.moments import REACH
@@ -16,7 +17,14 @@ from helpers.published import CRVD
 from unprocess_gen.config.interpretation import branch_of
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.exact_distributions import tukey_std
-from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, draw_variance, tukey_table, unit_tukey_table
+from unprocess_gen.core.lookup_tables import (
+    OCTAVES,
+    SEGMENTS,
+    draw_variance,
+    quantile_table,
+    tukey_table,
+    unit_tukey_table,
+)
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.reference import noise as effects
@@ -124,7 +132,7 @@ def test_read_noise_has_given_standard_deviation_for_every_distribution(distribu
     std = 300.0
     plan = plan_with("read", read_law=distribution, read_shape=shape, read_std_dn=std)
     deviation = noisy_dn(plan, 32000) - signal_dn(32000)
-    table = effects.read_table(plan.physics)  # type: ignore[arg-type]
+    table = quantile_table(plan.physics.read_law, plan.physics.read_shape)
     with localcontext(prec=40):
         second = float(draw_variance(table))
     fourth, reach = table_moment(table, 4), float(np.abs(table[0]).sum()) * std + 1
@@ -143,10 +151,10 @@ def test_read_noise_check_rejects_another_standard_deviation() -> None:
 @pytest.mark.parametrize("iso", CRVD)
 def test_imx385_read_noise_has_variance_of_crvd(settings: Settings, iso: int) -> None:
     plan = planned(settings, picture(), "noise=imx385", f"noise.iso={iso}")
-    assert plan.physics is not None
-    assert plan.physics.dn_per_e == CRVD[iso][0]
-    assert plan.physics.read_std_dn**2 == pytest.approx(CRVD[iso][1], rel=1e-12)
-    assert plan.b_dn2 == plan.physics.read_std_dn**2
+    assert plan.noise.physics is not None
+    assert plan.noise.physics.dn_per_e == CRVD[iso][0]
+    assert plan.noise.physics.read_std_dn**2 == pytest.approx(CRVD[iso][1], rel=1e-12)
+    assert plan.noise.b_dn2 == plan.noise.physics.read_std_dn**2
 
 
 @pytest.mark.parametrize("iso", CRVD)
@@ -160,37 +168,36 @@ def test_pmn_scale_gives_almost_twice_the_standard_deviation(iso: int) -> None:
 @pytest.mark.parametrize("noise", ISOS)
 def test_plan_has_gain_and_read_variance_of_profile(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", f"noise.iso={ISOS[noise]}")
-    assert plan.physics is not None
+    assert plan.noise.physics is not None
     assert branch_of(settings(f"noise={noise}").noise, ISOS[noise]) is not None
-    assert (plan.a_dn, plan.b_dn2) == (plan.physics.dn_per_e, plan.physics.read_std_dn**2)
-    assert plan.physics.dn_per_e > 0
-    assert plan.physics.read_std_dn > 0
+    assert (plan.noise.a_dn, plan.noise.b_dn2) == (plan.noise.physics.dn_per_e, plan.noise.physics.read_std_dn**2)
+    assert plan.noise.physics.dn_per_e > 0
+    assert plan.noise.physics.read_std_dn > 0
 
 
 def test_tukey_scale_is_multiplied_by_standard_deviation_of_shape(settings: Settings) -> None:
     config = settings("noise=sony_a7s2", "noise.iso=800")
-    branch = config.noise.branches[0]
-    branch.read_shape, branch.read_std_dn = -0.0857, ["scale_line", 0.740, 0.862, 0]
-    branch.row_std_dn = ["line", 0.788, -0.342, 0]
+    lines = {"read_std_dn": ["scale_line", 0.740, 0.862, 0], "row_std_dn": ["line", 0.788, -0.342, 0]}
+    config = with_branch(config, read_shape=-0.0857, **lines)
     validate_config(config)
     plan = plan_image(config, f"{7:064x}", facts=facts_of(picture()))
-    assert plan.physics is not None
+    assert plan.noise.physics is not None
     gain, scale = 9.563e-4 * 800, (4095 - 240) / (16300 - 512)
-    assert plan.physics.dn_per_e == pytest.approx(gain * scale, rel=1e-15)
+    assert plan.noise.physics.dn_per_e == pytest.approx(gain * scale, rel=1e-15)
     deviation = math.exp(0.740 * math.log(gain) + 0.862) * float(tukey_deviation(-0.0857))
-    assert plan.physics.read_std_dn == pytest.approx(deviation * scale, rel=1e-9)
-    assert plan.physics.row_std_dn == pytest.approx(math.exp(0.788 * math.log(gain) - 0.342) * scale, rel=1e-12)
+    assert plan.noise.physics.read_std_dn == pytest.approx(deviation * scale, rel=1e-9)
+    assert plan.noise.physics.row_std_dn == pytest.approx(math.exp(0.788 * math.log(gain) - 0.342) * scale, rel=1e-12)
 
 
 def test_scatter_about_line_is_normal_in_logarithm(settings: Settings) -> None:
     config = settings("noise=oppo_reno10x", "noise.iso=800", "noise.scatter=image")
-    config.noise.branches[0].read_std_dn = ["line", 0.5, 1.25, 0.25]
+    config = with_branch(config, read_std_dn=["line", 0.5, 1.25, 0.25])
     validate_config(config)
     facts = facts_of(picture())
     plans = [plan_image(config, f"{n:064x}", facts=facts) for n in range(150)]
     scale = (4095 - 240) / (1023 - 64)
     centre = 0.5 * math.log(0.0005995267 * 800 + 0.00868861) + 1.25
-    normals = np.array([(math.log(math.sqrt(plan.b_dn2) / scale) - centre) / 0.25 for plan in plans])
+    normals = np.array([(math.log(math.sqrt(plan.noise.b_dn2) / scale) - centre) / 0.25 for plan in plans])
     assert bounds_off(normals, 0, 1, REACH) <= 1
     assert bounds_off(normals**2, 1, 2, REACH**2) <= 1
     assert 0.11 < float((normals > 0.5).mean()) < 0.5  # 0.309, five standard deviations

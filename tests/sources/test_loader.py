@@ -43,10 +43,10 @@ def test_black_and_white_stay_black_and_white_when_downscaled() -> None:
     assert (downscaled(np.full((64, 64, 3), 65535, dtype=np.uint16), 64) == 65535).all()
 
 
-def test_a_photograph_too_small_to_be_downscaled_is_unsupported(tmp_path: Path) -> None:
+def test_a_photograph_too_small_to_be_downscaled_is_too_small(tmp_path: Path) -> None:
     Image.fromarray(pixels(1, 3, 9)).save(tmp_path / "small.png")
     config = SourceConfig(root=str(tmp_path), include=["*"], downscale=4)
-    with pytest.raises(SourceError, match=r"^unsupported: 9 x 3 pixels are less than one square"):
+    with pytest.raises(SourceError, match=r"^too_small: 9 x 3 pixels are less than one square"):
         load_source(config, list_photographs(config).sources[0])
 
 

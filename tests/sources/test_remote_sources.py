@@ -12,15 +12,18 @@ from helpers import object_store as servers
 from helpers.configs import composed
 from helpers.datasets import Make, TreeHash
 
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import object_store
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.types import Source
 from unprocess_gen.pipeline.generate import generate
-from unprocess_gen.sources import listing, read_ahead
-from unprocess_gen.sources.listing import list_folder, number_twins, read_bytes
+from unprocess_gen.sources import listing, read_ahead, reading
+from unprocess_gen.sources.listing import list_folder
 from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.sources.reading import read_bytes
+from unprocess_gen.sources.twins import number_twins
 
 
 @pytest.fixture
@@ -33,7 +36,7 @@ def remote(photos: Path, bucket: ObjectPath) -> ObjectPath:
 def listed(root: object, **options: object) -> listing.Listing:
     """List photographs as a run does."""
     config = composed(*(f"source.{key}={value}" for key, value in options.items()))
-    config.source.root = str(root)
+    config = replaced(config, {"source.root": str(root)})
     return list_photographs(config.source)
 
 
@@ -122,8 +125,7 @@ def test_deleted_object_is_unreadable(remote: ObjectPath) -> None:
 def test_empty_and_too_large_objects_fail(bucket: ObjectPath, monkeypatch: pytest.MonkeyPatch) -> None:
     (bucket / "empty.png").write_bytes(b"")
     (bucket / "large.png").write_bytes(bytes(100))
-    monkeypatch.setattr(listing, "MAX_FILE_BYTES", 99)
-    monkeypatch.setattr(listing._opened.__wrapped__, "__defaults__", (99,))
+    monkeypatch.setattr(reading, "MAX_FILE_BYTES", 99)
     for source, reason in zip(listed(bucket).sources, ("empty", "too_large"), strict=True):
         with pytest.raises(SourceError, match=reason):
             read_bytes(str(bucket), source)
@@ -148,7 +150,7 @@ def test_path_of_an_edited_row_cannot_leave_the_prefix(remote: ObjectPath) -> No
 )
 def test_wrong_root_is_refused_in_one_line(root: str, text: str, remote: ObjectPath) -> None:
     config = composed()
-    config.source.root = root.format(remote)
+    config = replaced(config, {"source.root": root.format(remote)})
     with pytest.raises(ConfigError, match=text.format(remote)) as error:
         validate_config(config)
     assert "\n" not in str(error.value)
@@ -217,10 +219,10 @@ def test_bucket_gives_the_dataset_of_the_folder(
 ) -> None:
     shutil.copytree(photos, tmp_path / "photos")
     shutil.copy(tmp_path / "photos" / "deep.png", tmp_path / "photos" / "twin.png")
-    (remote / "twin.png").put_file(photos / "deep.png")
+    (remote / "twin.png").write_bytes((photos / "deep.png").read_bytes())
     make(tmp_path / "photos", tmp_path / "local", "output.pairs_per_shard=5")
     config = composed("output.pairs_per_shard=5", "n_jobs=1")
-    config.source.root, config.out = str(remote), str(tmp_path / "remote")
+    config = replaced(config, {"source.root": str(remote), "out": str(tmp_path / "remote")})
     validate_config(config)
     generate(config)
     assert tree_hash(tmp_path / "remote") == tree_hash(tmp_path / "local")

@@ -1,8 +1,7 @@
 """Describe the arguments of verbs as data, and parse a command line into a `Call`.
 
-Each verb has its own `argparse` parser, built from its `Argument` list. argparse parses only flags. This module
-assigns words, for two reasons that argparse cannot express: a dataset's folder may be called ``camera=sony_a7r``, and
-settings may be mixed with flags in any order.
+argparse parses the flags of a verb. Words are assigned here, because a dataset's folder may be called
+``camera=sony_a7r``, and settings and flags may be mixed in any order.
 """
 
 from __future__ import annotations
@@ -10,14 +9,17 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
+from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.object_store import AnyPath, any_path
 from unprocess_gen.core.suggestions import did_you_mean
+
+if TYPE_CHECKING:
+    from unprocess_gen.core.paths import AnyPath
 
 ANY_VALUE = ("…",)
 HYDRA_FLAGS: dict[tuple[str, ...], tuple[tuple[str, ...], str]] = {
@@ -36,29 +38,16 @@ HYDRA_FLAGS: dict[tuple[str, ...], tuple[tuple[str, ...], str]] = {
     ("-sc", "--shell-completion"): (ANY_VALUE, "Hydra's completion of settings; see gen-dataset completion"),
     ("--hydra-help",): ((), "print Hydra's help and stop"),
 }
-"""Flags that are passed on to Hydra, in each of their spellings: the values they take (none, any or these), help."""
+"""Flags of the verbs that take settings, in each spelling: the values they take (none, any or these), help."""
 
 
 @dataclass(frozen=True, slots=True)
 class Argument:
     """One argument of a verb.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Its spellings: ``--flag`` is followed by its value; ``key`` means ``key=value``.
-    help : str
-        One phrase for ``--help``.
-    metavar : str
-        Name of the value; empty for a switch.
-    read : callable
-        Converts the text of the value; raises ValueError.
-    expected : str
-        What ``read`` accepts, for error messages.
-    completes : str
-        ``folders`` or ``files`` if shells complete the value as such.
-    required : bool
-        Whether the verb needs it; shown by ``--help``, checked by the verb.
+    Its names are spellings: ``--flag`` is followed by its value, ``key`` means ``key=value``. A switch has no metavar.
+    ``read`` converts the text of the value and raises ValueError unless it is as ``expected`` says. Shells complete
+    the value as ``folders`` or ``files``. The verb itself checks that a required argument is given.
     """
 
     names: tuple[str, ...]
@@ -88,17 +77,7 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The file or folder that a verb works on.
-
-    Attributes
-    ----------
-    metavar : str
-        Its name in ``--help``.
-    expected : str
-        What it must be, for ``--help`` and error messages.
-    completes : str
-        ``folders`` or ``files``.
-    """
+    """The file or folder that a verb works on: its name in ``--help``, what it must be, what shells complete."""
 
     metavar: str
     expected: str
@@ -109,31 +88,14 @@ class Place:
 class Verb:
     """A verb of the command line.
 
-    Attributes
-    ----------
-    name : str
-        First word of the command line.
-    summary : str
-        One sentence for the list of verbs.
-    run : callable
-        Does the work; takes a `Call`, returns the exit code.
-    arguments : tuple of Argument
-        Flags and settings of this verb.
-    place : Place or None
-        The file or folder that it works on.
-    composes : bool
-        Whether it takes config overrides and Hydra's flags.
-    words : tuple of str
-        Words that are accepted instead of a place.
-    extra : Argument or None
-        A word that may follow the place.
-    resumes : bool
-        Whether a rerun continues interrupted work.
+    ``run`` names a module of this package and its function, which takes a `Call` and returns the exit code:
+    ``checks.verify``. ``composes`` verbs take config overrides and Hydra's flags. ``words`` are accepted instead of a
+    place, and an ``extra`` word may follow the place. ``resumes``: a rerun continues interrupted work.
     """
 
     name: str
     summary: str
-    run: Callable[[Call], int]
+    run: str
     arguments: tuple[Argument, ...] = ()
     place: Place | None = None
     composes: bool = False
@@ -144,24 +106,22 @@ class Verb:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A parsed command line.
+    """A parsed command line; arguments that were not given are absent.
 
-    Attributes
-    ----------
-    values : mapping
-        Values by `Argument.key`; arguments that were not given are absent.
-    path : Path, ObjectPath or None
-        The verb's place.
-    overrides : list of str
-        Config overrides and Hydra's flags, in the order given.
-    words : list of str
-        Other words.
+    ``values`` are by `Argument.key`, ``hydra`` by the long spelling of Hydra's flags, overrides as the user wrote them.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
     path: AnyPath | None = None
     overrides: list[str] = field(default_factory=list)
+    hydra: Mapping[str, Any] = field(default_factory=dict)
     words: list[str] = field(default_factory=list)
+
+    @property
+    def hydra_arguments(self) -> list[str]:
+        """Hydra's flags and their values, as on a command line."""
+        parts = ([flag] if value is True else [flag, value] for flag, value in self.hydra.items())
+        return [word for part in parts for word in part]
 
 
 STANDARD = (
@@ -187,86 +147,61 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(f"{verb}: {message.removeprefix('argument ')}; see {self.prog} --help")
 
 
-SWITCHES = frozenset(
-    (
-        *(flag for argument in STANDARD if not argument.metavar for flag in argument.flags),
-        *(flag for spellings, (values, _) in HYDRA_FLAGS.items() if not values for flag in spellings),
-    )
-)
-"""Flags without a value that verbs share."""
-
-
-def path_hint(word: str) -> str:
-    """Return what to write instead of the bare name of a file or folder, for an error message.
-
-    Parameters
-    ----------
-    word : str
-        A word of the command line.
-
-    Returns
-    -------
-    str
-        Begins with a semicolon; empty if there is no file or folder of that name.
-    """
-    path = Path(word)
-    if not word or not os.path.lexists(word):
-        return ""
-    if any((path / name).is_file() for name in ("dataset.json", "manifest.csv", "sweep.csv")):
-        return f"; {word} is a dataset: write gen-dataset verify {word}, or another verb"
-    return f"; {word} is a file or folder: write source.root={word}"
-
-
 def flag_parser(verb: Verb) -> argparse.ArgumentParser:
     """Return the parser of a verb's flags; it knows no words."""
-    parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False, argument_default=None)
+    parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False)
     for argument in (*verb.arguments, *STANDARD):
-        if argument.flags and argument.metavar:
-            parser.add_argument(*argument.flags, dest=argument.key, metavar=argument.metavar)
-        elif argument.flags:
-            parser.add_argument(*argument.flags, dest=argument.key, action="store_true", default=None)
+        if argument.flags:
+            _add(parser, argument.flags, argument.key, argument.metavar)
+    for spellings, (values, _) in HYDRA_FLAGS.items() if verb.composes else ():
+        _add(parser, spellings, spellings[-1], "VALUE" if values else "", None if values == ANY_VALUE else values)
     return parser
 
 
+def _add(
+    parser: argparse.ArgumentParser, flags: Sequence[str], dest: str, metavar: str, choices: Sequence[str] | None = None
+) -> None:
+    if metavar:
+        parser.add_argument(*flags, dest=dest, metavar=metavar, choices=choices)
+    else:
+        parser.add_argument(*flags, dest=dest, action="store_true", default=None)
+
+
 def parse(verb: Verb, arguments: Sequence[str]) -> Call:
-    """Parse the arguments of a verb.
+    """Parse what follows a verb; ConfigError for an argument that is unknown, given twice or cannot be read.
 
     Everything after ``--`` is a word, even with a leading hyphen.
-
-    Parameters
-    ----------
-    verb : Verb
-        The verb.
-    arguments : sequence of str
-        What follows it on the command line.
-
-    Returns
-    -------
-    Call
-        The parsed arguments.
-
-    Raises
-    ------
-    ConfigError
-        If an argument is unknown, is given twice in different spellings, or has a value that cannot be read.
     """
-    before = list(arguments)
-    after: list[str] = []
+    before, after = list(arguments), []
     if "--" in before:
         cut = before.index("--")
         before, after = before[:cut], before[cut + 1 :]
     parsed, rest = flag_parser(verb).parse_known_args(before)
-    given = {key: text for key, text in vars(parsed).items() if text is not None}
-    known = {argument.key: argument for argument in (*verb.arguments, *STANDARD)}
-    values = {key: _read(known[key], f"{verb.name}: {known[key].flags[-1]} ", text) for key, text in given.items()}
-    if verb.composes:
-        words = _take_settings(verb, [*rest, *after], values)
-        return Call(values, overrides=_overrides(verb, words, values))
     for word in rest:
-        is_number = verb.extra is not None and word[1:].isdecimal()
-        if word.startswith("-") and word != "-" and not is_number:
-            raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}")
-    return _assign_words(verb, [*rest, *after], values)
+        if word.startswith("-") and word != "-" and not (verb.extra and word[1:].isdecimal()):
+            raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}{_setting_hint(verb, word)}")
+    flags = {argument.key: argument for argument in (*verb.arguments, *STANDARD)}
+    given = {key: text for key, text in vars(parsed).items() if text is not None}
+    values = {
+        key: _read(flags[key], f"{verb.name}: {flags[key].flags[-1]} ", text)
+        for key, text in given.items()
+        if key in flags
+    }
+    words = [*rest, *after]
+    path = _take_place(verb, words)
+    if verb.extra is not None and words and "=" not in words[0]:
+        values[verb.extra.key] = _read(verb.extra, f"{verb.name}: ", words.pop(0))
+    others = _take_settings(verb, words, values)
+    hydra = {key: text for key, text in given.items() if key not in flags}
+    if empty := next((flag for flag, text in hydra.items() if text == ""), None):
+        raise ConfigError(f"{verb.name}: {empty}: a value is missing; see gen-dataset {verb.name} --help")
+    if verb.composes:
+        return Call(values, overrides=_with_source(others, values.get("source")), hydra=hydra)
+    if path is None:
+        return Call(values, words=others)
+    from unprocess_gen.core.paths import any_path  # imports NumPy, too slow for --help
+
+    return Call(values, any_path(path), words=others)
 
 
 def _read(argument: Argument, spelling: str, text: Any) -> Any:
@@ -280,85 +215,80 @@ def _read(argument: Argument, spelling: str, text: Any) -> Any:
         raise ConfigError(f"{spelling}{text}: expected {argument.expected}") from None
 
 
-def _take_settings(verb: Verb, words: list[str], values: dict[str, Any]) -> list[str]:
-    """Move the settings of the verb itself, which no config has, from words to values; return the other words."""
-    own = {name: argument for argument in verb.arguments for name in argument.settings}
+def _take_place(verb: Verb, words: list[str]) -> str | None:
+    """Remove the verb's place from words: the first that exists, without one the first that is no setting."""
+    if verb.place is None:
+        return None
+    known = {name for argument in verb.arguments for name in argument.settings}
+    existing = None if verb.extra else next((word for word in words if os.path.lexists(word)), None)
+    path = existing or next((word for word in words if word and word.partition("=")[0] not in known), None)
+    if path is None:
+        raise ConfigError(f"{verb.name}: expected {verb.place.expected}")
+    words.remove(path)
+    return path
+
+
+def _take_settings(verb: Verb, words: Iterable[str], values: dict[str, Any]) -> list[str]:
+    """Read the settings of the verb itself into values; return the other words that it accepts."""
+    known = {name: argument for argument in verb.arguments for name in argument.settings}
     others: list[str] = []
     for word in words:
         key, equals, text = word.partition("=")
-        if not equals or key not in own:
+        if equals and key in known:
+            if known[key].key in values:
+                raise ConfigError(
+                    f"{verb.name}: {word}: given twice, also as {known[key].names[0]}; expected one of them"
+                )
+            values[known[key].key] = _read(known[key], f"{verb.name}: {key}=", text)
+        elif verb.words or (verb.composes and (equals or word.startswith("~"))):
             others.append(word)
-        elif own[key].key in values:
-            raise ConfigError(f"{verb.name}: {word}: given twice; expected one value")
+        elif verb.composes:
+            raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{path_hint(word)}")
         else:
-            values[own[key].key] = _read(own[key], f"{verb.name}: {key}=", text)
+            hint = _expected(verb, key)
+            if not equals and any("--to" in argument.names for argument in verb.arguments) and "to" not in values:
+                hint += f"; to write to {word}, add --to {word}"
+            raise ConfigError(f"{verb.name}: {word}: unknown argument; {hint}")
     return others
 
 
-def _overrides(verb: Verb, words: list[str], values: dict[str, Any]) -> list[str]:
-    """Return what is passed on to Hydra; ``--source ROOT`` becomes ``source.root=ROOT``."""
-    flags, others = _flags_and_words(words)
-    for word in others:
-        if "=" not in word and (hint := path_hint(word)):
-            raise ConfigError(f"{verb.name}: {word}: expected a setting key=value{hint}")
-    for flag in flags:
-        if not any(flag.partition("=")[0] in spellings for spellings in HYDRA_FLAGS):
-            raise ConfigError(f"{flag}: no such flag; {_expected(verb, flag)}")
-    root = values.get("source")
+def _with_source(overrides: list[str], root: str | None) -> list[str]:
+    """Return overrides in which ``--source ROOT`` is ``source.root=ROOT``."""
     if root is None:
-        return words
-    if other := next((word for word in words if word.startswith("source.root=")), None):
+        return overrides
+    if other := next((word for word in overrides if word.startswith("source.root=")), None):
         raise ConfigError(f"--source {root}: the source is also given by {other}; expected one of them")
-    return [*words, f"source.root={root}"]
+    return [*overrides, f"source.root={root}"]
 
 
-def _flags_and_words(words: list[str]) -> tuple[list[str], list[str]]:
-    """Return the words that are flags, and those that are neither flags nor values of Hydra's flags."""
-    flags, others = [], []
-    waiting = iter(words)
-    for word in waiting:
-        if not word.startswith("-"):
-            others.append(word)
-            continue
-        flags.append(word)
-        if any(word in spellings and values for spellings, (values, _) in HYDRA_FLAGS.items()):
-            next(waiting, None)
-    return flags, others
+# ------------------------------------------------------------------------------------------------------------- hints
 
 
-def _assign_words(verb: Verb, words: list[str], values: dict[str, Any]) -> Call:
-    """Assign words to the verb's place and to its settings.
+def path_hint(word: str) -> str:
+    """Return what to write instead of the bare name of a file or folder; empty if there is none of that name."""
+    path = Path(word)
+    if not word or not os.path.lexists(word):
+        return ""
+    if any((path / name).is_file() for name in ("dataset.json", "manifest.csv", "sweep.csv")):
+        return f"; {word} is a dataset: write gen-dataset verify {word}, or another verb"
+    return f"; {word} is a file or folder: write source.root={word}"
 
-    The place is the first word that exists as a file or folder; without one, the first that is no setting of the verb.
-    """
-    known = {name: argument for argument in verb.arguments for name in argument.settings}
-    path = None
-    if verb.place is not None:
-        existing = None if verb.extra else next((word for word in words if os.path.lexists(word)), None)
-        path = existing or next((word for word in words if word and word.partition("=")[0] not in known), None)
-        if path is None:
-            raise ConfigError(f"{verb.name}: expected {verb.place.expected}")
-        words = words.copy()
-        words.remove(path)
-    if verb.extra is not None and words and "=" not in words[0]:
-        values[verb.extra.key] = _read(verb.extra, f"{verb.name}: ", words[0])
-        words = words[1:]
-    others = []
-    for word in words:
-        key, equals, text = word.partition("=")
-        if verb.words:
-            others.append(word)
-        elif not equals or key not in known:
-            raise ConfigError(f"{verb.name}: {word}: unknown argument; {_expected(verb, key)}")
-        elif known[key].key in values:
-            raise ConfigError(f"{verb.name}: {word}: given twice, also as {known[key].names[0]}; expected one of them")
-        else:
-            values[known[key].key] = _read(known[key], f"{verb.name}: {key}=", text)
-    return Call(values, None if path is None else any_path(path), words=others)
+
+def _setting_hint(verb: Verb, flag: str) -> str:
+    """Return what to write instead of a setting with hyphens, such as ``--out``."""
+    from unprocess_gen.config.schema import GROUPS, Config  # imports NumPy, too slow for --help
+
+    name, _, value = flag.lstrip("-").partition("=")
+    group, _, key = name.partition(".")
+    own = {setting for argument in verb.arguments for setting in argument.settings}
+    keys = settings_of(GROUPS.get(group, Config))
+    if name in own or (verb.composes and (name in GROUPS or (key or name) in keys)):
+        return f"; {name} is a setting: write {name}={value or '…'}"
+    return ""
 
 
 def _expected(verb: Verb, word: str) -> str:
-    """Return what a verb accepts, for an error message, and what ``word`` may have meant."""
+    """Return what a verb accepts, and what ``word`` may have meant."""
     hydra = [spellings[-1] for spellings in HYDRA_FLAGS] if verb.composes else []
     options = [name for argument in (*verb.arguments, *STANDARD) for name in argument.names]
     spelled_out = [name for name in (*options, *hydra) if not re.match("-[^-]", name)]

@@ -16,17 +16,7 @@ BROKEN_PIPE = 141
 
 @dataclass(frozen=True, slots=True)
 class ExitCode:
-    """Describe one exit code, or several with the same meaning.
-
-    Attributes
-    ----------
-    codes : tuple of int
-        The codes.
-    summary : str
-        A few words for ``--help``.
-    meaning : str
-        One sentence for the documentation.
-    """
+    """One exit code, or several with the same meaning: a few words for ``--help``, sentences for the documentation."""
 
     codes: tuple[int, ...]
     summary: str
@@ -50,8 +40,7 @@ EXIT_CODES = (
     ExitCode(
         (DamageError.exit_code,),
         "damage found",
-        "A dataset is damaged, differs from its manifest, or does not exist; or the results of `replay` or `again` "
-        "differ.",
+        "A dataset is damaged, or differs from its manifest; or the results of `replay` or `again` differ.",
     ),
     ExitCode(
         (MachineError.exit_code,),

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
-from unprocess_gen.config.schema import GROUPS, Config
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.values import value_text
 
@@ -44,28 +44,30 @@ Tab completion: eval "$(gen-dataset completion bash)", or zsh.
 
 """
 
+KEYS = "keys.json"
+"""File of ``conf/`` with `described_keys`, written by ``docs/update_reference.py``.
+
+``config.schema`` imports NumPy, which is too slow for --help.
+"""
+
+
+def described_keys() -> dict[str, Any]:
+    """Keys of each group, and keys at the top level with their defaults and descriptions."""
+    from unprocess_gen.config.schema import GROUPS, Config
+
+    top = {
+        f"{name}={default_text(getattr(Config, name))}": _description(setting)
+        for name, setting in settings_of(Config).items()
+    }
+    return {"groups": {group: list(settings_of(kind)) for group, kind in GROUPS.items()}, "top": top}
+
 
 def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
-    """Return the help of ``gen-dataset``.
-
-    Parameters
-    ----------
-    verbs : mapping of str to Verb
-        The verbs by name.
-    conf : Path
-        Folder of the options; they are listed from it.
-
-    Returns
-    -------
-    str
-        At most 100 columns wide.
-    """
+    """Return the help of ``gen-dataset``."""
     lines = [f"  gen-dataset {verb.name:<11} {verb.summary}" for verb in verbs.values()]
-    groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(conf)]
-    keys = [
-        _hanging(f"  {f'{name}={default_text(getattr(Config, name))}':<{INDENT + 6}}", _description(setting))
-        for name, setting in settings_of(Config).items()
-    ]
+    described = json.loads((conf / KEYS).read_text(encoding="utf-8"))
+    groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(described["groups"], conf)]
+    keys = [_hanging(f"  {key:<{INDENT + 6}}", text) for key, text in described["top"].items()]
     blocks = [INTRODUCTION + "\n".join(lines), SETTINGS + "\n".join(groups), "\nKeys at the top level:", *keys]
     flags = [(hydra_flag(spellings), HYDRA_FLAGS[spellings][1]) for spellings in SHOWN_HYDRA_FLAGS]
     flags += [(spelled(argument), argument.help) for argument in STANDARD]
@@ -78,12 +80,12 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     return "\n".join(blocks) + "\n" + ENDING + exit_code_lines()
 
 
-def group_lines(conf: Path) -> list[tuple[str, str]]:
+def group_lines(keys: Mapping[str, Sequence[str]], conf: Path) -> list[tuple[str, str]]:
     """Return each group with its options and, in parentheses, its keys, in the order of the config."""
     lines = []
-    for group, kind in GROUPS.items():
+    for group, names in keys.items():
         options = [name for name in group_options(group, conf) if name != "default"]
-        lines.append((group, " ".join([*options, f"({', '.join(settings_of(kind))})"])))
+        lines.append((group, " ".join([*options, f"({', '.join(names)})"])))
     for group, added in ADDED_GROUPS.items():
         options = group_options(group, conf)
         if options:
@@ -93,31 +95,14 @@ def group_lines(conf: Path) -> list[tuple[str, str]]:
 
 def exit_code_lines() -> str:
     """Return the exit codes with a few words for each."""
-    words = [f"{', '.join(map(str, code.codes))} {code.summary}" for code in EXIT_CODES]
-    lines = ["Exit codes:"]
-    for word in words:
-        if len(lines[-1]) + len(word) + 3 > WIDTH:
-            lines.append(" " * len(lines[0].split(":")[0]) + " ")
-        separator = " " if lines[-1].strip() in ("", "Exit codes:") else " · "
-        lines[-1] += f"{separator}{word}"
-    return "\n".join(lines) + "\n"
+    words = " · ".join(f"{', '.join(map(str, code.codes))} {code.summary}" for code in EXIT_CODES)
+    return "Exit codes:\n" + textwrap.fill(words, WIDTH, initial_indent="  ", subsequent_indent="  ") + "\n"
 
 
 def group_help(group: str, conf: Path) -> str:
-    """Return the help of one group of settings: its options and its keys.
+    """Return the help of one group of settings: its options and its keys."""
+    from unprocess_gen.config.schema import GROUPS
 
-    Parameters
-    ----------
-    group : str
-        A key of `schema.GROUPS` or `option_files.ADDED_GROUPS`.
-    conf : Path
-        Folder of the options.
-
-    Returns
-    -------
-    str
-        At most 100 columns wide.
-    """
     parts = []
     options = [option for option in group_options(group, conf) if option != "default"]
     if options:
@@ -146,18 +131,7 @@ def _description(setting: Setting) -> str:
 
 
 def default_text(value: Any) -> str:
-    """Return a value as users write it.
-
-    Parameters
-    ----------
-    value : Any
-        A value of a config.
-
-    Returns
-    -------
-    str
-        Its YAML text on one line.
-    """
+    """Return a value as users write it."""
     return str(value).lower() if isinstance(value, bool) else value_text(value)
 
 
@@ -168,18 +142,7 @@ def _hanging(start: str, text: str) -> str:
 
 
 def verb_help(verb: Verb) -> str:
-    """Return the help of one verb.
-
-    Parameters
-    ----------
-    verb : Verb
-        The verb.
-
-    Returns
-    -------
-    str
-        Usage, arguments and flags.
-    """
+    """Return the help of one verb."""
     sections = {
         "Arguments": [
             *([(verb.place.metavar, verb.place.expected)] if verb.place else []),
@@ -204,18 +167,7 @@ def verb_help(verb: Verb) -> str:
 
 
 def synopsis(verb: Verb) -> str:
-    """Return the command line of a verb with its required arguments.
-
-    Parameters
-    ----------
-    verb : Verb
-        The verb.
-
-    Returns
-    -------
-    str
-        One line, such as ``gen-dataset verify DIR [flags]``.
-    """
+    """Return the command line of a verb with its required arguments."""
     words = [verb.place.metavar] if verb.place else []
     words += [f"[{verb.extra.metavar}]"] if verb.extra else []
     words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
@@ -242,7 +194,6 @@ def _sentence(verb: Verb) -> str:
 
 
 def _two_columns(left: str, right: str) -> str:
-    text = textwrap.wrap(right, WIDTH - COLUMN, break_on_hyphens=False) or [""]
     if len(left) + 4 > COLUMN:
-        return "\n".join([f"  {left}", *(" " * COLUMN + line for line in text)])
-    return "\n".join([f"  {left}".ljust(COLUMN) + text[0], *(" " * COLUMN + line for line in text[1:])])
+        return f"  {left}\n{_hanging(' ' * COLUMN, right)}"
+    return _hanging(f"  {left}".ljust(COLUMN), right)

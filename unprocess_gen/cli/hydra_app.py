@@ -8,83 +8,106 @@ Design: ``docs/design/composition_and_sweeps.md``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unprocess_gen.cli.hydra_request import Request, Task, parse_arguments, run_hydra
-from unprocess_gen.cli.messages import print_result, print_results, report_error
-from unprocess_gen.cli.signals import SIGNALS
-from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, sweep_out, worst, write_table
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.jobs import JobResult, Task, run_hydra, run_job
+from unprocess_gen.cli.messages import print_result, print_results
+from unprocess_gen.cli.sweep import worst, write_table
 from unprocess_gen.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from unprocess_gen.config.composition import OptionFolders
-    from unprocess_gen.config.sweep_expansion import Expansion, SweepJob
+    from unprocess_gen.config.sweep_expansion import SweepJob
+
+PRINTING = {"--hydra-help", "--shell-completion", "--info"}
+"""Flags with which Hydra prints something that is independent of the config."""
+
+HYDRA_SETTINGS = (
+    "hydra.searchpath",
+    "hydra.mode",
+    "hydra.sweeper",
+    "hydra.launcher",
+    "hydra/sweeper",
+    "hydra/launcher",
+)
+"""Settings of Hydra that an override may set."""
 
 
 def compose(
-    arguments: list[str],
-    task: Task,
-    sweep_csv: bool = False,
-    totals: Callable[[Sequence[Any]], str] | None = None,
+    call: Call, task: Task, sweep_csv: bool = False, totals: Callable[[Sequence[Any]], str] | None = None
 ) -> int:
-    """Compose the config of a command line and run a task on it; for a sweep, on every combination.
+    """Run a task on the config of a command line, or on each config of a sweep; return the worst exit code.
 
-    A job of a sweep that fails does not stop the others.
-
-    Parameters
-    ----------
-    arguments : list of str
-        Overrides and Hydra's flags.
-    task : callable
-        Takes a config and a label; returns an exit code, a result and the texts to print (`Task`).
-    sweep_csv : bool
-        Whether a sweep writes ``sweep.csv`` in ``out``.
-    totals : callable, optional
-        Takes the results of a sweep's jobs; returns the text to print after them.
-
-    Returns
-    -------
-    int
-        The exit code; of a sweep, the worst of its jobs.
-
-    Raises
-    ------
-    ConfigError
-        If the command line or the config of a single run is refused.
+    A job of a sweep that fails does not stop the others. With ``sweep_csv``, a sweep writes ``sweep.csv`` in ``out``.
+    ``totals`` returns the text to print after a sweep, from the results of its jobs.
     """
-    request = parse_arguments(arguments)
-    if request.prints_without_config:
-        return _print_with_hydra(request.flags, request.overrides)
-    if "--resolve" in request.flags and not request.prints_config:
+    _check_overrides(call.overrides)
+    if PRINTING & call.hydra.keys():
+        return _print_with_hydra(call, call.overrides)
+    prints_config = "--cfg" in call.hydra
+    if "--resolve" in call.hydra and not prints_config:
         raise ConfigError("--resolve: --cfg is missing; expected both; add --cfg job")
     from unprocess_gen.config.composition import validated_config
     from unprocess_gen.config.sweep_expansion import expand
 
-    use_plugins = sweep_csv and not request.prints_config
-    expansion = expand(request.overrides, request.folders(), request.multirun, use_plugins)
+    folders = _option_folders(call.hydra)
+    expansion = expand(call.overrides, folders, "--multirun" in call.hydra, sweep_csv and not prints_config)
+    if prints_config:
+        jobs = [call.overrides] if expansion.node is not None else [job.overrides for job in expansion.jobs]
+        return worst(_print_with_hydra(call, overrides) for overrides in jobs)
     if expansion.node is not None:
-        if request.prints_config:
-            return _print_with_hydra(request.flags, request.overrides)
-        code, _, texts = task(validated_config(expansion.node, request.overrides), "")
+        code, _, texts = task(validated_config(expansion.node, call.overrides), "")
         print_results(texts)
         return code
-    if request.prints_config:
-        return worst([_print_with_hydra(request.flags, list(job.overrides)) for job in expansion.jobs])
     if expansion.plugins:
         from unprocess_gen.cli.sweep_plugins import run_with_plugins
 
-        return run_with_plugins(request, expansion, task)
-    return _run_sweep(request, expansion, task, sweep_csv, totals)
+        return run_with_plugins(call, expansion, task)
+    return _run_sweep(folders, expansion.jobs, task, sweep_csv, totals)
+
+
+def _check_overrides(overrides: Sequence[str]) -> None:
+    """Refuse what is not an override, and overrides of Hydra's settings that have no effect."""
+    from unprocess_gen.config.option_files import check_override
+
+    for override in overrides:
+        check_override(override)
+        key = override.lstrip("+").partition("=")[0]
+        if key.startswith("hydra") and not any(key == known or key.startswith(f"{known}.") for known in HYDRA_SETTINGS):
+            raise ConfigError(
+                f"{override}: Hydra's own settings are fixed; expected one of {', '.join(HYDRA_SETTINGS)}"
+            )
+
+
+def _option_folders(hydra: Mapping[str, Any]) -> OptionFolders:
+    """Return the folders and the primary config that flags choose; a config that Hydra would not use is refused."""
+    from unprocess_gen.config.composition import OptionFolders
+    from unprocess_gen.config.option_files import conf_dir
+
+    own, main = (Path(hydra[flag]) if flag in hydra else None for flag in ("--config-dir", "--config-path"))
+    name = hydra.get("--config-name", "config").removesuffix(".yaml")
+    if (
+        own
+        and "--config-name" in hydra
+        and all((path / f"{name}.yaml").is_file() for path in (own, main or conf_dir()))
+    ):
+        raise ConfigError(
+            f"--config-name {name}: {own / name}.yaml has the name of a built-in config, which would be used instead; "
+            "rename the file"
+        )
+    return OptionFolders(main, name, own)
 
 
 # ------------------------------------------------------------------------------------------------------------ sweeps
 
 
 def _run_sweep(
-    request: Request,
-    expansion: Expansion,
+    folders: OptionFolders,
+    jobs: Sequence[SweepJob],
     task: Task,
     sweep_csv: bool,
     totals: Callable[[Sequence[Any]], str] | None,
@@ -93,55 +116,23 @@ def _run_sweep(
 
     A job's row is written before its results are printed, so that an error of stdout ends the sweep without losing it.
     """
-    rows: list[JobRow] = []
-    results: list[Any] = []
-    sweep_folder: Path | None = None
-    for place, job in enumerate(expansion.jobs, start=1):
-        row, out, result, texts = _run_job(request.folders(), job, task, f"{place}/{len(expansion.jobs)}")
-        rows.append(row)
-        results += [] if result is None else [result]
-        sweep_folder = out or sweep_folder  # a refused job has no out; its row goes where the others are
+    from unprocess_gen.config.sweep_expansion import composed_job
+
+    done: list[JobResult] = []
+    for number, job in enumerate(jobs, start=1):
+        done.append(run_job(job, task, f"{number}/{len(jobs)}", partial(composed_job, job, folders)))
+        # a refused job has no out; its row goes where the others are
+        sweep_folder = next((result.out for result in reversed(done) if result.out is not None), None)
         if sweep_csv and sweep_folder is not None:
-            write_table(sweep_folder, rows)
-        print_results(texts)
+            write_table(sweep_folder, [result.row for result in done])
+        print_results(done[-1].texts)
+    results = [job.result for job in done if job.result is not None]
     if totals is not None and results:
         print_result(totals(results))
-    return worst(row.exit for row in rows)
+    return worst(job.row.exit for job in done)
 
 
-def _run_job(
-    folders: OptionFolders, job: SweepJob, task: Task, place: str
-) -> tuple[JobRow, Path | None, Any, list[str]]:
-    """Run one job in its own folder below ``out``; any error becomes its exit code, unless a signal arrived.
-
-    Returns its row of ``sweep.csv``, the sweep's ``out`` (None if the config is refused), the task's result, and the
-    texts to print.
-    """
-    from unprocess_gen.config.composition import compose_node, validated_config
-    from unprocess_gen.config.sweep_expansion import check_job
-
-    text = overrides_text(job.named)
-    folder = folder_name(text)
-    out, result = None, None
-    texts: list[str] = []
-    try:
-        node = compose_node(job.overrides, folders)
-        check_job(node, job)
-        config = validated_config(node, job.overrides)
-        out = sweep_out(config.out)
-        config.out = str(out / folder)
-        code, result, texts = task(config, f"{place} {folder}")
-    except Exception as error:
-        if SIGNALS.received is not None:  # libraries may fail in their own way when they are interrupted
-            raise
-        code = report_error(error, f"{folder}: ")
-    return JobRow.of(folder, text, job.swept, code, result), out, result, texts
-
-
-# ---------------------------------------------------------------------------------------------------- printing by Hydra
-
-
-def _print_with_hydra(flags: Sequence[str], overrides: Sequence[str]) -> int:
+def _print_with_hydra(call: Call, overrides: Sequence[str]) -> int:
     """Let Hydra print what its flags ask for, and return 0."""
-    run_hydra(flags, overrides, lambda node: None)
+    run_hydra(call, overrides, lambda node: None)
     return 0

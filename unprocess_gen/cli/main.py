@@ -15,16 +15,16 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 
 from unprocess_gen import __version__
-from unprocess_gen.cli.arguments import SWITCHES, Verb, parse, path_hint
+from unprocess_gen.cli.arguments import Call, Verb, flag_parser, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
 from unprocess_gen.cli.help import global_help, group_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
 from unprocess_gen.cli.signals import SIGNALS, TerminationSignal
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.option_files import ADDED_GROUPS, conf_dir
-from unprocess_gen.config.schema import GROUPS
 from unprocess_gen.core.errors import RESUME, ConfigError, UnprocessGenError
 from unprocess_gen.core.limits import prepare_libraries
 from unprocess_gen.core.suggestions import did_you_mean
@@ -34,13 +34,7 @@ OPENCV_LIMITS = ("PIXELS", "WIDTH", "HEIGHT")
 
 
 def main() -> int:
-    """Run ``gen-dataset`` with the arguments of this process.
-
-    Returns
-    -------
-    int
-        The exit code; see ``gen-dataset --help``.
-    """
+    """Run ``gen-dataset`` with the arguments of this process; return the exit code."""
     for limit in OPENCV_LIMITS:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
@@ -50,23 +44,7 @@ def main() -> int:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Dispatch to the verb.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        The command line without the program's name.
-
-    Returns
-    -------
-    int
-        Exit code of the verb.
-
-    Raises
-    ------
-    UnprocessGenError
-        If the arguments are wrong, or the verb fails.
-    """
+    """Run the verb of a command line without the program's name; return the verb's exit code."""
     verb, rest = find_verb(arguments)
     flags = rest[: rest.index("--")] if "--" in rest else rest
     if {"-h", "--help"} & set(flags):
@@ -76,13 +54,22 @@ def run(arguments: Sequence[str]) -> int:
         print(f"unprocess_gen {__version__}")
         return 0
     prepare_libraries()
+    if len(rest) == len(arguments):
+        _refuse_late_verb(arguments)
     call = parse(verb, rest)
     values = call.values
     with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):
         LOGGER.debug("unprocess_gen %s, Python %s: %s", __version__, sys.version.split()[0], list(arguments))
-        code = _exit_code(lambda: verb.run(call), arguments)
+        code = _exit_code(lambda: _run(verb, call), arguments)
         RESULTS.info("exit code %d", code)
         return code
+
+
+def _run(verb: Verb, call: Call) -> int:
+    """Import the function of a verb, which for some takes a second, and run it."""
+    module, name = verb.run.split(".")
+    function: Callable[[Call], int] = getattr(import_module(f"unprocess_gen.cli.{module}"), name)
+    return function(call)
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
@@ -90,39 +77,29 @@ def _help(verb: str, flags: Sequence[str]) -> str:
 
     The group may be that of a setting, such as ``noise.iso``.
     """
-    if verb:
-        return verb
-    word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "")
+    word = next((word for flag, word in itertools.pairwise(flags) if flag in ("-h", "--help")), "-")
+    if verb or word.startswith("-"):
+        return verb or global_help(VERBS, conf_dir())
+    prepare_libraries()
+    from unprocess_gen.config.schema import GROUPS  # imports NumPy, too slow for the other kinds of help
+
     name = re.split("[.=]", word)[0]
     parts = [verb_help(VERBS[name])] if name in VERBS else []
     parts += [group_help(name, conf_dir())] if name in GROUPS or name in ADDED_GROUPS else []
-    return "\n".join(parts) or global_help(VERBS, conf_dir())
+    if not parts:
+        names = list(dict.fromkeys([*VERBS, *GROUPS, *ADDED_GROUPS]))
+        raise ConfigError(
+            f"--help {word}: no such verb or group; expected one of {', '.join(names)}{did_you_mean(name, names)}"
+        )
+    return "\n".join(parts)
 
 
 def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
-    """Return the verb of a command line and the arguments behind it.
+    """Return the verb of a command line, ``generate`` if the first word is none, and the arguments behind it.
 
     A first word of small letters is always a verb, even if a folder has that name.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        The command line without the program's name.
-
-    Returns
-    -------
-    verb : Verb
-        ``generate`` if the first word is no verb.
-    rest : list of str
-        The arguments of the verb.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such verb.
     """
     if not arguments or not re.fullmatch("[a-z]+", arguments[0]):
-        _refuse_late_verb(arguments)
         return VERBS["generate"], list(arguments)
     name, *rest = arguments
     if name not in VERBS:
@@ -134,11 +111,14 @@ def find_verb(arguments: Sequence[str]) -> tuple[Verb, list[str]]:
 
 
 def _refuse_late_verb(arguments: Sequence[str]) -> None:
-    """Refuse a verb behind switches such as ``-q``, with the order that is expected."""
-    at = next((at for at, word in enumerate(arguments) if word not in SWITCHES), len(arguments))
-    if 0 < at < len(arguments) and arguments[at] in VERBS:
-        verb, rest = arguments[at], [*arguments[:at], *arguments[at + 1 :]]
-        raise ConfigError(f"{verb}: the verb must be the first word: {shlex.join(['gen-dataset', verb, *rest])}")
+    """Refuse a verb behind settings or flags, with the order that is expected."""
+    before = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    _, words = flag_parser(VERBS["generate"]).parse_known_args(before)
+    verb = next((word for word in words if word in VERBS), None)
+    if verb is not None:
+        others = list(arguments)
+        others.remove(verb)
+        raise ConfigError(f"{verb}: the verb must be the first word: {shlex.join(['gen-dataset', verb, *others])}")
 
 
 def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:

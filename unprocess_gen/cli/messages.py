@@ -39,20 +39,7 @@ def print_results(texts: Iterable[object]) -> None:
 
 
 def report_error(error: BaseException, job: str = "") -> int:
-    """Report an error on stderr, in one line unless it is a bug.
-
-    Parameters
-    ----------
-    error : BaseException
-        What ended the verb or the job.
-    job : str
-        The job of a sweep, with a colon and a space behind it; empty for a single run.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
+    """Report an error on stderr, in one line unless it is a bug; return the exit code. ``job`` is a prefix."""
     if isinstance(error, PermissionError) and error.filename is not None:
         error = _no_permission(error)
     if isinstance(error, UnprocessGenError):
@@ -80,27 +67,7 @@ def report(message: str, level: int = logging.WARNING) -> None:
 
 @contextmanager
 def logging_to(quiet: bool = False, verbose: bool = False, log_file: str | None = None) -> Iterator[None]:
-    """Show the messages of the logger ``unprocess_gen`` on stderr, and append them to a log file.
-
-    Parameters
-    ----------
-    quiet : bool
-        Only warnings and errors.
-    verbose : bool
-        Details too (level DEBUG).
-    log_file : str or None
-        The log file.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    ConfigError
-        If the log file cannot be written, is inside a dataset or is no text, or ``quiet`` and ``verbose`` are both
-        given.
-    """
+    """Show the messages of the logger ``unprocess_gen`` on stderr, and append them to a log file."""
     if quiet and verbose:
         raise ConfigError("--quiet and --verbose exclude each other; expected one of them")
     handlers: list[logging.Handler] = [_StderrHandler()]
@@ -201,10 +168,6 @@ def checked_streams() -> Iterator[None]:
 
     Streams that the caller closed become `os.devnull`: otherwise the next file to be opened would get the number of
     stdout, and receive what C libraries print.
-
-    Yields
-    ------
-    None
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

@@ -27,12 +27,7 @@ class Signals:
     """Turn signals into exceptions while it is entered: SIGINT, SIGTERM and SIGHUP, unless the caller ignores them.
 
     Python drops exceptions that are raised while LLVM calls back into Python. Without `_repeat`, 3 of 47 SIGTERM at
-    random times of a first run with ``n_jobs=1`` were lost, or ended with a traceback and exit code 1.
-
-    Attributes
-    ----------
-    received : int or None
-        The last signal; None if there was none.
+    random times of a first run with ``n_jobs=1`` were lost, or ended with a traceback. ``received`` is the last signal.
     """
 
     REPEAT_S = 0.05

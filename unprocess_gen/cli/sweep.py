@@ -6,16 +6,16 @@ import csv
 import hashlib
 import os
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
+from unprocess_gen.core.errors import RESUME, DamageError
 from unprocess_gen.core.locks import LockFile
-from unprocess_gen.core.object_store import is_url
 from unprocess_gen.core.output_paths import enclosing_dataset
+from unprocess_gen.core.paths import local_path
 
 if TYPE_CHECKING:
     from unprocess_gen.pipeline.generate import Summary
@@ -40,28 +40,18 @@ LAST_COLUMNS = ("rows", "failed", *(f"{name}_share" for name in SHARES), "second
 
 def sweep_out(out: str) -> Path:
     """Return the folder of a sweep; raise ConfigError for the URL of an object store."""
-    if is_url(out):
-        raise ConfigError(
-            f"out={out}: a sweep cannot write to an object store; expected a local folder; run its jobs one by one, or "
-            "copy its datasets afterwards"
-        )
-    return Path(out)
+    return local_path(
+        out,
+        f"out={out}: a sweep cannot write to an object store; expected a local folder; run its jobs one by one, or "
+        "copy its datasets afterwards",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class JobRow:
-    """Hold the row of one job in ``sweep.csv``.
+    """The row of one job in ``sweep.csv``: the dataset's folder, the exit code, and the text of each column.
 
-    Attributes
-    ----------
-    folder : str
-        Name of the dataset's folder in the sweep's folder.
-    exit : int
-        Exit code of the job.
-    cells : mapping of str to str
-        Text of the other columns; a missing column is empty.
-    generated : bool
-        Whether the job generated pairs, or found its dataset complete.
+    ``generated`` is False for a job that found its dataset complete.
     """
 
     folder: str
@@ -70,7 +60,9 @@ class JobRow:
     generated: bool = True
 
     @classmethod
-    def of(cls, folder: str, overrides: str, swept: Mapping[str, str], code: int, summary: Summary | Any) -> JobRow:
+    def from_summary(
+        cls, folder: str, overrides: str, swept: Mapping[str, str], code: int, summary: Summary | Any
+    ) -> JobRow:
         """Return the row of a job; ``summary`` is None if it has no dataset."""
         cells = {"folder": folder, "overrides": overrides, **swept, "exit": str(code)}
         sites = getattr(summary, "sites", None)
@@ -87,60 +79,39 @@ class JobRow:
         return cls(folder, code, cells, generated=bool(summary.made))
 
 
-def overrides_text(overrides: Iterable[str]) -> str:
-    """Return the overrides that name a job's folder on one line, sorted, as Hydra's ``override_dirname`` does.
-
-    Parameters
-    ----------
-    overrides : iterable of str
-        The job's overrides.
-
-    Returns
-    -------
-    str
-        ``key=value`` pairs separated by commas, without the keys in `NOT_IN_NAMES`.
-    """
+def named_overrides(overrides: Iterable[str]) -> list[str]:
+    """Return the overrides that name a job's folder, sorted as in Hydra's ``override_dirname``."""
 
     def decides_data(override: str) -> bool:
-        key = override.lstrip("+").partition("=")[0]
+        key = _key(override)
         return not any(key == name or key.startswith(f"{name}.") for name in NOT_IN_NAMES)
 
-    return ",".join(sorted(filter(decides_data, overrides)))
+    return sorted(filter(decides_data, overrides))
 
 
-def folder_name(text: str) -> str:
-    """Return the name of a job's folder.
+def _key(override: str) -> str:
+    return override.lstrip("+").partition("=")[0]
 
-    Parameters
-    ----------
-    text : str
-        Result of `overrides_text`.
 
-    Returns
-    -------
-    str
-        The text with slashes encoded. A name longer than `LONGEST_NAME` is cut and ends with a digest.
+def folder_name(overrides: Sequence[str], swept: Container[str] = ()) -> str:
+    """Return the name of a job's folder: its overrides, with slashes encoded.
+
+    A name longer than `LONGEST_NAME` begins with the overrides of swept keys, is cut, and ends with a digest.
     """
-    name = text.replace("%", "%25").replace("/", "%2F") or "default"
+    name = _encoded(overrides) or "default"
     if len(os.fsencode(name)) <= LONGEST_NAME:
         return name
     digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
-    return os.fsencode(name)[: LONGEST_NAME - 20].decode(errors="ignore") + "-" + digest
+    swept_first = sorted(overrides, key=lambda override: _key(override) not in swept)
+    return os.fsencode(_encoded(swept_first))[: LONGEST_NAME - 20].decode(errors="ignore") + "-" + digest
+
+
+def _encoded(overrides: Sequence[str]) -> str:
+    return ",".join(overrides).replace("%", "%25").replace("/", "%2F")
 
 
 def worst(exit_codes: Iterable[int]) -> int:
-    """Return the exit code of a sweep.
-
-    Parameters
-    ----------
-    exit_codes : iterable of int
-        Exit codes of its jobs.
-
-    Returns
-    -------
-    int
-        The worst of them (`SEVERITY`); 0 if there is none.
-    """
+    """Return the exit code of a sweep: the worst of its jobs' (`SEVERITY`), 0 without any."""
     return max(exit_codes, key=SEVERITY.index, default=0)
 
 
@@ -148,20 +119,6 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
     """Write ``sweep.csv`` in the sweep's folder, if the folder exists and is not inside a dataset.
 
     Earlier rows keep their places, so that the indices of `RawPairs` do not change; new rows follow them.
-
-    Parameters
-    ----------
-    out : Path
-        The sweep's folder.
-    jobs : sequence of JobRow
-        The jobs that have finished, in order.
-
-    Raises
-    ------
-    DamageError
-        If the file exists and is no table.
-    MachineError
-        If it cannot be read or written.
     """
     if not out.is_dir() or enclosing_dataset(out) is not None:  # every job was refused
         return
@@ -207,23 +164,7 @@ def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:
 
 
 def read_table(path: Path) -> list[dict[str, str]]:
-    """Read ``sweep.csv``; a file of version 0.1 has fewer columns.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    list of dict
-        One mapping of column to text for each job; empty if the file does not exist.
-
-    Raises
-    ------
-    DamageError
-        If the file is not UTF-8 text, or no CSV.
-    """
+    """Read the rows of ``sweep.csv``, of which version 0.1 has fewer columns; none if the file does not exist."""
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             rows = list(csv.DictReader(stream, restval=""))
@@ -237,18 +178,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 
 def plan_totals(estimates: Sequence[RunEstimate]) -> str:
-    """Return the totals of a planned sweep, whose jobs run one after the other.
-
-    Parameters
-    ----------
-    estimates : sequence of RunEstimate
-        Estimates of the jobs whose configs are valid.
-
-    Returns
-    -------
-    str
-        One line: jobs, pairs, shards, bytes and time.
-    """
+    """Return the totals of a planned sweep, whose jobs run one after the other, in one line."""
     pairs = sum(job.pairs for job in estimates)
     about = "" if all(job.exact for job in estimates) else "about "
     seconds = sum(job.seconds for job in estimates)

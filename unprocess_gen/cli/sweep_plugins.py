@@ -10,20 +10,17 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from unprocess_gen.cli.hydra_request import Request, Task, run_hydra
-from unprocess_gen.cli.messages import checked_streams, print_results, report_error
-from unprocess_gen.cli.signals import SIGNALS
-from unprocess_gen.cli.sweep import JobRow, folder_name, overrides_text, sweep_out, worst, write_table
-from unprocess_gen.config.composition import validated_config
-from unprocess_gen.config.sweep_expansion import Expansion
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.jobs import Task, run_hydra, run_job
+from unprocess_gen.cli.messages import checked_streams, print_results
+from unprocess_gen.cli.sweep import JobRow, sweep_out, worst, write_table
+from unprocess_gen.config.sweep_expansion import Expansion, SweepJob
 from unprocess_gen.core.errors import MachineError
 
 HYDRA_FOLDER = ".hydra"
@@ -32,95 +29,46 @@ HYDRA_FOLDER = ".hydra"
 
 @dataclass(frozen=True, slots=True)
 class PluginJob:
-    """Run one job in the process where a launcher starts it; Hydra's task function.
-
-    Attributes
-    ----------
-    task : callable
-        What to run on the config.
-    described_by, fixed : tuple of str
-        See `Expansion`.
-    rows : str
-        Folder for the rows of this sweep's jobs.
-    """
+    """Hydra's task function: run one job in the process where a launcher starts it, and write its row to ``rows``."""
 
     task: Task
-    described_by: tuple[str, ...]
-    fixed: tuple[str, ...]
-    rows: str
+    expansion: Expansion
+    rows: Path
 
     def __call__(self, node: DictConfig) -> int:
         """Run the job, write its row, print its results and return its exit code."""
         settings = HydraConfig.get()
-        overrides = list(settings.overrides.task)
-        text = overrides_text([one for one in overrides if one not in self.described_by])
-        swept = [one.lstrip("+").partition("=") for one in overrides if one not in self.fixed]
-        folder, result = folder_name(text), None
-        texts: list[str] = []
-        try:
-            config = validated_config(node, overrides)
-            config.out = str(sweep_out(config.out) / folder)
-            code, result, texts = self.task(config, f"{settings.job.num + 1} {folder}")
-        except Exception as error:
-            if SIGNALS.received is not None:  # libraries may fail in their own way when they are interrupted
-                raise
-            code = report_error(error, f"{folder}: ")
-        row = JobRow.of(folder, text, {key: value for key, _, value in swept}, code, result)
-        path = Path(self.rows, f"{settings.job.num:06d}.json")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.with_suffix(".part").write_text(json.dumps(asdict(row)), encoding="utf-8")
+        overrides, number = tuple(settings.overrides.task), settings.job.num
+        named = tuple(override for override in overrides if override not in self.expansion.described_by)
+        swept = [override.lstrip("+").partition("=") for override in overrides if override not in self.expansion.fixed]
+        job = SweepJob(overrides, named, {key: value for key, _, value in swept})
+        done = run_job(job, self.task, str(number + 1), lambda: node)
+        self.rows.mkdir(parents=True, exist_ok=True)
+        path = self.rows / f"{number:06d}.json"
+        path.with_suffix(".part").write_text(json.dumps(asdict(done.row)), encoding="utf-8")
         path.with_suffix(".part").replace(path)
         with checked_streams():  # a launcher's process has its own stdout
-            print_results(texts)
-        return code
+            print_results(done.texts)
+        return done.row.exit
 
 
-def run_with_plugins(request: Request, expansion: Expansion, task: Task) -> int:
-    """Let Hydra run a sweep with the user's plugins, then write ``sweep.csv``.
+def run_with_plugins(call: Call, expansion: Expansion, task: Task) -> int:
+    """Let Hydra run a sweep with the user's plugins, write ``sweep.csv``, and return the worst exit code.
 
-    Parameters
-    ----------
-    request : Request
-        The command line.
-    expansion : Expansion
-        What it describes; its jobs are not used.
-    task : callable
-        What to run on each config.
-
-    Returns
-    -------
-    int
-        The worst exit code of the jobs.
-
-    Raises
-    ------
-    ConfigError
-        If Hydra or a plugin refuses the config of any job; then none is started.
-    MachineError
-        If no job returned a result.
+    No job is started if Hydra or a plugin refuses the config of any job.
     """
     out = Path(os.path.abspath(sweep_out(expansion.out)))
-    hydra_folder = out / HYDRA_FOLDER
-    rows_folder = hydra_folder / f"rows-{uuid.uuid4().hex}"
-    job = PluginJob(task, expansion.described_by, expansion.fixed, str(rows_folder))
-    places = [f"hydra.sweep.dir='{_escaped(hydra_folder)}'", "hydra.sweep.subdir=${hydra.job.num}"]
+    rows_folder = out / HYDRA_FOLDER / f"rows-{uuid.uuid4().hex}"
+    place = str(out / HYDRA_FOLDER).replace("'", "\\'").replace("${", "\\${")
+    places = [f"hydra.sweep.dir='{place}'", "hydra.sweep.subdir=${hydra.job.num}"]
+    job = PluginJob(task, expansion, rows_folder)
     try:
-        run_hydra([*request.flags, "--multirun"], [*request.overrides, *places], job)
+        run_hydra(call, [*call.overrides, *places], job, multirun=True)
     finally:
-        rows = list(_read_rows(rows_folder))
+        files = sorted(rows_folder.glob("*.json"))
+        rows = [JobRow(**json.loads(file.read_text(encoding="utf-8"))) for file in files]
         write_table(out, rows)
         shutil.rmtree(rows_folder, ignore_errors=True)
     if not rows:
         raise MachineError(f"out={out}: {', '.join(expansion.plugins)} ended without the result of a job; see its log")
     return worst(row.exit for row in rows)
-
-
-def _escaped(path: Path) -> str:
-    """Escape a path for a quoted value of an override."""
-    return str(path).replace("'", "\\'").replace("${", "\\${")
-
-
-def _read_rows(folder: Path) -> Iterator[JobRow]:
-    for path in sorted(folder.glob("*.json")):
-        loaded: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        yield JobRow(**loaded)

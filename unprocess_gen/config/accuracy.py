@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Plan
+from unprocess_gen.core.types import CameraPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +39,9 @@ class Budget:
         Largest error of a normal deviate, in standard deviations.
     law_distance : float
         Largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead, by
-        the first Edgeworth term (`simulation.reference.poisson.gaussian_distance`).
+        the first Edgeworth term (`simulation.reference.near_normal.gaussian_distance`).
+    normal_shot : bool
+        Whether normals are drawn instead within ``law_distance``, as in versions 0.1 and 0.2.
     """
 
     name: str
@@ -47,6 +50,12 @@ class Budget:
     clean_changed_share: float
     normal_error: float
     law_distance: float
+    normal_shot: bool = False
+
+    @property
+    def draws_normals(self) -> bool:
+        """True if normals replace counts."""
+        return self.normal_shot and self.law_distance > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +102,7 @@ class Method:
             and self.clean_dn <= budget.clean_dn
             and self.clean_changed_share <= budget.clean_changed_share
             and self.normal_error <= budget.normal_error
-            and (budget.law_distance > 0 or not self.approximates_law)
+            and (budget.draws_normals or not self.approximates_law)
         )
 
 
@@ -107,54 +116,28 @@ QUADRATIC_NORMAL, POLYNOMIAL_NORMAL = 1.5e-7, 5.8e-4
 """Errors of normal deviates by 1024 quadratics and by a polynomial, in standard deviations."""
 
 
-def _clean32(stage: str, name: str, meaning: str) -> Method:
-    return Method(stage, name, "float32", meaning, FLOAT32_CLEAN_DN, FLOAT32_CHANGED_SHARE)
-
+_CLEAN32: dict[str, Any] = {"clean_dn": FLOAT32_CLEAN_DN, "clean_changed_share": FLOAT32_CHANGED_SHARE}
 
 METHODS = (
-    _clean32("curve", "float32_table", "the exact table and the matrix, rounded to float32"),
+    Method("curve", "float32_table", "float32", "the exact table and the matrix, rounded to float32", **_CLEAN32),
     Method("curve", "exact_table", "float64", "tone and gamma of every code, correctly rounded to float64"),
     Method("curve", "numpy_table", "numpy", "tone and gamma of every code, with NumPy"),
-    _clean32("colour", "fused_float32", "matrix and gains of the channel recorded at each site, float32"),
-    Method(
-        "colour",
-        "fused_float64",
-        "float64",
-        "matrix and gains of the channel recorded at each site, in the reference's order",
-    ),
+    Method("colour", "fused_float32", "float32", "matrix and gains of the channel of each site, float32", **_CLEAN32),
+    Method("colour", "fused_float64", "float64", "matrix and gains of the channel of each site, as the reference"),
     Method("colour", "numpy_float64", "numpy", "matrix and gains of all three channels, NumPy"),
-    Method("mosaic", "at_site_float32", "float32", "only the channel recorded at each site is computed, float32"),
-    Method("mosaic", "at_site", "float64", "only the channel recorded at each site is computed"),
+    Method("mosaic", "at_site_float32", "float32", "only the channel of each site is computed, float32", **_CLEAN32),
+    Method("mosaic", "at_site", "float64", "only the channel of each site is computed"),
     Method("mosaic", "after_colour", "numpy", "all three channels are computed, one is selected"),
-    Method(
-        "normal",
-        "polynomial_float32",
-        "float32",
-        "inverse CDF by a polynomial in √(-log p)",
-        normal_error=POLYNOMIAL_NORMAL,
-    ),
-    Method(
-        "normal",
-        "quadratic_float64",
-        "float64",
-        "inverse CDF by 1024 quadratics, or a method that gives the same DN",
-        normal_error=QUADRATIC_NORMAL,
-    ),
-    Method(
-        "normal", "numpy_float64", "numpy", "inverse CDF by 1024 quadratics, with NumPy", normal_error=QUADRATIC_NORMAL
-    ),
-    Method(
-        "shot",
-        "gaussian_where_near",
-        "float64",
-        "normal distribution if its CDF is near, otherwise counts",
-        approximates_law=True,
-    ),
+    Method("normal", "polynomial_float32", "float32", "polynomial in √(-log p)", normal_error=POLYNOMIAL_NORMAL),
+    Method("normal", "quadratic_float64", "float64", "1024 quadratics, or the same DN", normal_error=QUADRATIC_NORMAL),
+    Method("normal", "numpy_float64", "numpy", "1024 quadratics, with NumPy", normal_error=QUADRATIC_NORMAL),
+    # simulated by NumPy, but rows of 0.1 and 0.2 name it with the methods of float64
+    Method("shot", "gaussian_where_near", "float64", "normals where near (0.1 and 0.2)", approximates_law=True),
     Method("shot", "inversion", "float64", "Poisson counts by inversion of the CDF, correct to 2^-32"),
     Method("shot", "numpy_inversion", "numpy", "Poisson counts by inversion of the CDF, with NumPy"),
     Method("effects", "fused_float64", "float64", "effects in order, row by row"),
     Method("effects", "numpy_float64", "numpy", "effects in order, NumPy"),
-    _clean32("quantise", "fused_float32", "rounded half to even, clipped, float32"),
+    Method("quantise", "fused_float32", "float32", "rounded half to even, clipped, float32", **_CLEAN32),
     Method("quantise", "fused_float64", "float64", "rounded half to even, clipped"),
     Method("quantise", "numpy_float64", "numpy", "rounded half to even, clipped, with NumPy"),
 )
@@ -173,27 +156,17 @@ MAX_ERROR_GAIN, MAX_HIGHLIGHT_ERROR_GAIN = 8.0, 64.0
 hold. The cameras and gains of ``conf/`` reach 3, and 20 in highlights at the default threshold."""
 
 
-def is_steep(plan: Plan) -> bool:
-    """Return whether a plan amplifies rounding errors too much for float32.
+def is_steep(camera: CameraPlan, exposure: float) -> bool:
+    """Return whether colours and gains at an exposure amplify rounding errors too much for float32.
 
     The light of a channel is i · (gain + headroom · m²) with m = (i - threshold) / (1 - threshold). Here i is the sum
-    of table entries times one row of the matrix.
-
-    Parameters
-    ----------
-    plan : Plan
-        Matrix, gains, exposure and highlights of the pair.
-
-    Returns
-    -------
-    bool
-        True if the factor exceeds `MAX_ERROR_GAIN`, or `MAX_HIGHLIGHT_ERROR_GAIN` in highlights.
+    of table entries times one row of the matrix. The limits are `MAX_ERROR_GAIN` and `MAX_HIGHLIGHT_ERROR_GAIN`.
     """
-    rows = [sum(abs(entry) for entry in plan.rgb2cam[at : at + 3]) * plan.exposure for at in (0, 3, 6)]
-    highlights = 0.0 if plan.highlight == "none" else 1 + 2 / (1 - plan.highlight_threshold)
+    rows = [sum(abs(entry) for entry in camera.rgb2cam[at : at + 3]) * exposure for at in (0, 3, 6)]
+    highlights = 0.0 if camera.highlight == "none" else 1 + 2 / (1 - camera.highlight_threshold)
     return any(
         row * gain > MAX_ERROR_GAIN or row * (gain + max(1 - gain, 0.0) * highlights) > MAX_HIGHLIGHT_ERROR_GAIN
-        for row, gain in zip(rows, plan.inverse_gains, strict=True)
+        for row, gain in zip(rows, camera.inverse_gains, strict=True)
     )
 
 
@@ -238,40 +211,21 @@ def choose_methods(
 
 
 def methods_of_stage(stage: str) -> tuple[Method, ...]:
-    """Return the methods of a stage.
-
-    Parameters
-    ----------
-    stage : str
-        One of `STAGES`.
-
-    Returns
-    -------
-    tuple of Method
-        Cheapest first.
-    """
+    """Return the methods of a stage, cheapest first."""
     return tuple(method for method in METHODS if method.stage == stage)
-
-
-def method(stage: str, name: str) -> Method:
-    """Return the method with a stage and a name; raise KeyError if there is none."""
-    for candidate in methods_of_stage(stage):
-        if candidate.name == name:
-            return candidate
-    raise KeyError(f"{stage} has no method {name}")
 
 
 def _first(stage: str, implementation: str, budget: Budget) -> Method | None:
     """Return the cheapest method of a stage and implementation within a budget."""
-    candidates = (each for each in methods_of_stage(stage) if each.implementation == implementation)
-    return next((each for each in candidates if each.fits(budget)), None)
+    candidates = (method for method in methods_of_stage(stage) if method.implementation == implementation)
+    return next((method for method in candidates if method.fits(budget)), None)
 
 
 def _smallest_error(stages: Sequence[str], budget: Budget) -> str:
     """Return a message about the first limit that no method keeps, with the smallest error possible."""
     for key in ("clean_dn", "clean_changed_share", "normal_error"):
         for stage in stages:
-            best = min(methods_of_stage(stage), key=lambda each: float(getattr(each, key)))
+            best = min(methods_of_stage(stage), key=lambda method: float(getattr(method, key)))
             if getattr(best, key) > getattr(budget, key):
                 return (
                     f"accuracy.{key}={getattr(budget, key):g}: no method is that accurate; expected at least "

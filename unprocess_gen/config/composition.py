@@ -36,6 +36,7 @@ from yaml import YAMLError
 from unprocess_gen.config.composition_errors import explain, unknown_key
 from unprocess_gen.config.option_files import check_override, conf_dir, group_options
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.config.yaml_files import read_yaml_mapping
 from unprocess_gen.core.errors import ConfigError
@@ -43,7 +44,7 @@ from unprocess_gen.core.errors import ConfigError
 SCHEMA_NAME = "gen_dataset_schema"
 """Name of the schema in Hydra's ConfigStore; first entry of the defaults list in ``conf/config.yaml``."""
 
-ConfigStore.instance().store(name=SCHEMA_NAME, node=Config)
+ConfigStore.instance().store(name=SCHEMA_NAME, node=writable_node(Config))
 
 VERSION_BASE = "1.3"
 """Version of Hydra whose behaviour is requested."""
@@ -57,17 +58,7 @@ PATH_KEYS = ("source.root", "out")
 
 @dataclass(frozen=True, slots=True)
 class OptionFolders:
-    """Name the folders and the primary config that a config is composed from.
-
-    Attributes
-    ----------
-    main : Path
-        Folder with the primary config; None for `conf_dir`.
-    name : str
-        Primary config, without ``.yaml``.
-    own : Path or None
-        The user's folder of option files, searched after ``main``.
-    """
+    """The folder with the primary config (None: `conf_dir`), its name, and the user's folder, searched after it."""
 
     main: Path | None = None
     name: str = "config"
@@ -117,24 +108,9 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | os.PathLike[str
 
 
 def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None) -> DictConfig:
-    """Compose overrides without validating values.
+    """Compose overrides, whose paths need no quotes, without validating values; ConfigError if Hydra refuses them.
 
-    Parameters
-    ----------
-    overrides : sequence of str
-        Overrides as the user wrote them; paths need no quotes (`quoted_path`).
-    folders : OptionFolders, optional
-        What to compose from; the built-in options if omitted.
-
-    Returns
-    -------
-    DictConfig
-        The unresolved config, with Hydra's own settings in its key ``hydra``.
-
-    Raises
-    ------
-    ConfigError
-        If Hydra or OmegaConf refuses the overrides or an option file.
+    The node is unresolved, and has Hydra's own settings in its key ``hydra``.
     """
     folders = folders or OptionFolders()
     if folders.own is not None and not folders.own.is_dir():
@@ -149,24 +125,9 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
 
 
 def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
-    """Resolve and validate a composed config.
+    """Resolve and validate a composed config; messages quote the ``overrides`` that it was composed from.
 
-    Parameters
-    ----------
-    node : DictConfig
-        Result of `compose_node`; its key ``hydra`` is removed.
-    overrides : sequence of str
-        The overrides it was composed from, to quote in messages.
-
-    Returns
-    -------
-    Config
-        The resolved config.
-
-    Raises
-    ------
-    ConfigError
-        If a key is not in the schema, an interpolation fails or a value is out of range.
+    ConfigError if a key is not in the schema, an interpolation fails or a value is out of range.
     """
     with open_dict(node):
         node.pop("hydra", None)
@@ -182,44 +143,13 @@ def validated_config(node: DictConfig, overrides: Sequence[str]) -> Config:
 
 
 def is_multirun(node: DictConfig) -> bool:
-    """Return whether option files request a sweep.
-
-    Parameters
-    ----------
-    node : DictConfig
-        Result of `compose_node`.
-
-    Returns
-    -------
-    bool
-        Whether ``hydra.mode`` is ``MULTIRUN``.
-    """
+    """Return whether option files request a sweep."""
     mode = resolved_value(node, "hydra.mode")
     return str(getattr(mode, "name", mode)) == "MULTIRUN"
 
 
 def resolved_value(node: DictConfig, key: str, overrides: Sequence[str] = ()) -> Any:
-    """Return one value of a composed config, with its interpolations resolved.
-
-    Parameters
-    ----------
-    node : DictConfig
-        Result of `compose_node`.
-    key : str
-        Name of the value: ``hydra.mode``.
-    overrides : sequence of str
-        The overrides it was composed from, to quote in messages.
-
-    Returns
-    -------
-    any
-        The value; None if the key does not exist.
-
-    Raises
-    ------
-    ConfigError
-        If an interpolation fails.
-    """
+    """Return one value of a composed config, with its interpolations resolved; None if the key does not exist."""
     try:
         return OmegaConf.select(node, key)
     except OmegaConfBaseException as error:
@@ -231,16 +161,6 @@ def quoted_path(override: str) -> str:
 
     An unquoted path with an umlaut, an apostrophe or a bracket is not a word of that grammar. Interpolations stay
     active; ``\${`` is a literal ``${``.
-
-    Parameters
-    ----------
-    override : str
-        Any override.
-
-    Returns
-    -------
-    str
-        The override with its value quoted if its key is in `PATH_KEYS`, else unchanged.
     """
     key, _, path = override.partition("=")
     if key not in PATH_KEYS or path in ("", "null") or path[0] in "'\"":

@@ -10,7 +10,7 @@ from typing import Any
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from unprocess_gen.config.option_files import ADDED_GROUPS, group_options
+from unprocess_gen.config.option_files import ADDED_GROUPS, file_hint, group_options
 from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.values import error_in_one_line
@@ -94,7 +94,8 @@ def unknown_key(key: str, overrides: Sequence[str]) -> str:
 
 def unknown_option(group: str, name: str, options: Sequence[str]) -> str:
     """Return the sentence about an option that a group lacks."""
-    return f"{group}={name}: no such option; expected one of {', '.join(options)}{did_you_mean(name, options)}"
+    hint = file_hint(group, name) or did_you_mean(name, options)
+    return f"{group}={name}: no such option; expected one of {', '.join(options)}{hint}"
 
 
 def assignment(key: str, overrides: Sequence[str]) -> str:

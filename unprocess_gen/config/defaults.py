@@ -11,31 +11,14 @@ from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
 def default_options() -> dict[str, str]:
-    """Return the default option of each group that has option files.
-
-    Returns
-    -------
-    dict of str to str
-        The defaults list of ``conf/config.yaml``.
-    """
+    """Return the default option of each group that has option files."""
     entries = read_yaml_mapping(conf_dir() / "config.yaml")["defaults"]
     chosen = {group: option for entry in entries if isinstance(entry, dict) for group, option in entry.items()}
     return {group: option for group, option in chosen.items() if group in GROUPS}
 
 
 def default_values(group: str) -> dict[str, Any]:
-    """Return the value of each setting of a group in a config without overrides.
-
-    Parameters
-    ----------
-    group : str
-        A key of `schema.GROUPS`, or ``""`` for the top level.
-
-    Returns
-    -------
-    dict of str to Any
-        Values by key, as YAML has them; an interpolation is text.
-    """
+    """Return the default values of a group, or of the top level (``""``), as YAML has them; interpolations are text."""
     schema = GROUPS[group]() if group else Config()
     values = {name: getattr(schema, name) for name in settings_of(schema)}
     written = read_yaml_mapping(conf_dir() / "config.yaml")

@@ -23,21 +23,9 @@ from unprocess_gen.core.types import Distribution
 
 
 def draw_parameter(distribution: Distribution, uniform: float, a: float = 0.0) -> float:
-    """Return the value of a distribution at a uniform.
+    """Return the value of a distribution at a uniform in (0, 1), correctly rounded; ``uniform`` within three roundings.
 
-    Parameters
-    ----------
-    distribution : Distribution
-        As `parse_distribution` returns it.
-    uniform : float
-        Number in the open interval (0, 1).
-    a : float
-        Slope of the noise variance, for ``log_linear_in_a``.
-
-    Returns
-    -------
-    float
-        The correctly rounded value; within three roundings for ``uniform``.
+    ``a`` is the slope of the noise variance, for ``log_linear_in_a``.
     """
     kind, numbers = distribution.kind, distribution.numbers
     if kind in FIXED_POINT:
@@ -146,15 +134,11 @@ def _nearest_inverse(u: float, a: float, mean: float, std: float, low: float, hi
     return None if drawn is None else fixed_point.nearest_inverse(*drawn)
 
 
-def _nearest_log_linear(u: float, a: float, slope: float, intercept: float, std: float) -> float | None:
-    return fixed_point.nearest_log_linear(u, a, slope, intercept, std)
-
-
 FIXED_POINT: dict[str, Callable[..., float | None]] = {
     "log_uniform": _nearest_log_uniform,
     "truncated_normal": _nearest_truncated_normal,
     "inverse_truncated_normal": _nearest_inverse,
-    "log_linear_in_a": _nearest_log_linear,
+    "log_linear_in_a": fixed_point.nearest_log_linear,
 }
 """The functions of `DISTRIBUTIONS` that need an exponential, logarithm or quantile; None where they are undecided."""
 
@@ -194,31 +178,11 @@ _PROBLEMS: dict[str, Callable[..., str | None]] = {
 
 
 def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distribution:
-    """Parse a number or a distribution, ``[kind, number, …]``.
-
-    Parameters
-    ----------
-    key : str
-        Key of the value, for messages.
-    value : Any
-        The configuration value.
-    allowed : tuple of str
-        Allowed kinds; a finite number is always allowed.
-
-    Returns
-    -------
-    Distribution
-        Kind ``constant`` for a number.
-
-    Raises
-    ------
-    ConfigError
-        If the value is neither, its kind is not allowed, or its numbers do not fit the kind.
-    """
+    """Parse a number (kind ``constant``) or a distribution ``[kind, number, …]`` of an allowed kind."""
     forms = "; ".join(spelled(kind, DISTRIBUTION_FORMS[kind]) for kind in allowed)
     if is_number(value):
         return Distribution("constant", (float(value),))
-    if not isinstance(value, list) or not value or value[0] not in allowed:
+    if not isinstance(value, list | tuple) or not value or value[0] not in allowed:
         raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a distribution: {forms}")
     kind, numbers = str(value[0]), value[1:]
     form = DISTRIBUTION_FORMS[kind]
@@ -233,25 +197,7 @@ def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distri
 def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
     """Parse a number or a distribution, and check the range of its draws.
 
-    Parameters
-    ----------
-    key : str
-        Key of the value, for messages.
-    value : Any
-        The configuration value.
-    limit : Drawn
-        Allowed kinds and range.
-
-    Returns
-    -------
-    Distribution
-        Kind ``constant`` for a number.
-
-    Raises
-    ------
-    ConfigError
-        If the value is neither, its kind is not allowed, its numbers do not fit the kind, or a draw could be out of
-        range. The range of ``log_linear_in_a`` depends on a and is not checked.
+    The range of ``log_linear_in_a`` depends on a and is not checked.
     """
     distribution = parse_distribution(key, value, limit.kinds)
     if distribution.kind != "log_linear_in_a" and not (
@@ -262,42 +208,24 @@ def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
 
 
 def lowest(distribution: Distribution) -> float:
-    """Return a lower limit of all draws from a distribution.
-
-    Parameters
-    ----------
-    distribution : Distribution
-        Validated distribution.
-
-    Returns
-    -------
-    float
-        In the unit of the parameter; -inf if there is no limit.
-    """
-    if distribution.kind in ("constant", "choice"):
-        return min(distribution.numbers)
-    if distribution.kind == "truncated_normal":
-        return distribution.numbers[2]
-    if distribution.kind == "inverse_truncated_normal":
-        return 1 / distribution.numbers[3] if distribution.numbers[2] > 0 else -math.inf
-    return distribution.numbers[0] if distribution.kind in ("uniform", "log_uniform") else 0.0
+    """Return a lower limit of all draws from a validated distribution; -inf if there is none."""
+    return _limits(distribution)[0]
 
 
 def highest(distribution: Distribution) -> float:
-    """Return an upper limit of all draws from a distribution.
+    """Return an upper limit of all draws from a validated distribution; inf if there is none."""
+    return _limits(distribution)[1]
 
-    Parameters
-    ----------
-    distribution : Distribution
-        Validated distribution.
 
-    Returns
-    -------
-    float
-        In the unit of the parameter; inf if there is no limit.
-    """
-    if distribution.kind == "choice":
-        return max(distribution.numbers)
-    if distribution.kind == "inverse_truncated_normal":
-        return 1 / distribution.numbers[2] if distribution.numbers[2] > 0 else math.inf
-    return math.inf if distribution.kind == "log_linear_in_a" else distribution.numbers[-1]
+def _limits(distribution: Distribution) -> tuple[float, float]:
+    numbers = distribution.numbers
+    match distribution.kind:
+        case "constant" | "choice":
+            return min(numbers), max(numbers)
+        case "truncated_normal":
+            return numbers[2], numbers[3]
+        case "inverse_truncated_normal":
+            return (1 / numbers[3], 1 / numbers[2]) if numbers[2] > 0 else (-math.inf, math.inf)
+        case "log_linear_in_a":
+            return 0.0, math.inf
+    return numbers[0], numbers[-1]

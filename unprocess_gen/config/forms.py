@@ -8,17 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """Describe a list ``[name, number, …]``.
-
-    Attributes
-    ----------
-    numbers : tuple of str
-        What the numbers are, in order.
-    meaning : str
-        One phrase for the documentation.
-    optional : int
-        How many numbers at the end may be left out.
-    """
+    """A list ``[name, number, …]``: names of its numbers, its meaning, and how many at the end are ``optional``."""
 
     numbers: tuple[str, ...]
     meaning: str
@@ -81,18 +71,5 @@ ISO_FORMS: Mapping[str, Form] = {
 
 
 def spelled(name: str, form: Form) -> str:
-    """Return a form as users write it, such as ``[uniform, lowest, highest]``.
-
-    Parameters
-    ----------
-    name : str
-        Key of the form in its table.
-    form : Form
-        The form.
-
-    Returns
-    -------
-    str
-        The list, with the names of its numbers.
-    """
+    """Return a form as users write it, such as ``[uniform, lowest, highest]``."""
     return f"[{', '.join((name, *form.numbers))}]"

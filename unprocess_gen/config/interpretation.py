@@ -26,6 +26,7 @@ from unprocess_gen.config.limits import (
     VARIANCE_SLOPE,
 )
 from unprocess_gen.config.schema import (
+    BRANCH_FIELDS,
     AccuracyConfig,
     BranchConfig,
     Config,
@@ -38,6 +39,8 @@ from unprocess_gen.config.schema import (
 from unprocess_gen.config.values import is_integer, is_number, value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
+from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.simulation.effects.dark_current import HEAT
 
 SHADING_WORDS = ("keep", "remove")
 """Values of ``noise.dark_shading`` that are no path of a map."""
@@ -46,23 +49,7 @@ SHADING_WORDS = ("keep", "remove")
 
 
 def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, Distribution]:
-    """Parse the distributions of the gains.
-
-    Parameters
-    ----------
-    gains : GainsConfig
-        The gains of the configuration.
-
-    Returns
-    -------
-    tuple of Distribution
-        Of the red, blue and inverse brightening gain; all draws are within `limits.GAIN`.
-
-    Raises
-    ------
-    ConfigError
-        If a value is no number or distribution, or a draw could be out of range.
-    """
+    """Parse the distributions of the gains."""
     return (
         parse_drawn("gains.red", gains.red, GAIN),
         parse_drawn("gains.blue", gains.blue, GAIN),
@@ -71,23 +58,7 @@ def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, 
 
 
 def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]:
-    """Parse the distributions of the two numbers of a noise profile.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        A profile with two numbers.
-
-    Returns
-    -------
-    tuple of Distribution
-        Of the slope a and the offset b of the variance, in the units of the profile.
-
-    Raises
-    ------
-    ConfigError
-        If a value is no number or distribution, or a draw could be out of range.
-    """
+    """Parse the distributions of the two numbers of a noise profile."""
     a = parse_drawn("noise.a", noise.a, VARIANCE_SLOPE)
     b = parse_drawn("noise.b", noise.b, VARIANCE_OFFSET)
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
@@ -99,27 +70,11 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
 
 
 def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
-    """Split a noise profile into its noise levels.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        The profile, with ``levels`` as the user wrote it.
-
-    Returns
-    -------
-    tuple of NoiseConfig
-        One profile for each level. A number of levels gives equal profiles, whose parameters are drawn separately.
-
-    Raises
-    ------
-    ConfigError
-        If ``levels`` is neither a number of levels nor a list of levels that fit the profile.
-    """
+    """Split a noise profile into its noise levels."""
     levels = 1 if noise.levels is None else noise.levels
     if is_integer(levels) and 1 <= levels <= MAX_LEVELS:
         return (noise,) * levels
-    if not isinstance(levels, list) or not 1 <= len(levels) <= MAX_LEVELS:
+    if not isinstance(levels, list | tuple) or not 1 <= len(levels) <= MAX_LEVELS:
         raise ConfigError(f"noise.levels={value_text(levels)}: expected {LEVELS}")
     return tuple(_level(noise, level) for level in levels)
 
@@ -139,78 +94,19 @@ def _level(noise: NoiseConfig, level: Any) -> NoiseConfig:
 
 # --------------------------------------------------------------------------------------------------- noise profiles
 
-EFFECT_NUMBERS = {
-    "prnu": ("prnu_std",),
-    "dark_current": ("dark_e_per_s",),
-    "hot_pixels": ("hot_pixel_share", "hot_pixel_e_per_s"),
-    "full_well": ("full_well_e",),
-    "dead_pixels": ("dead_pixel_share",),
-    "gain_by_colour": ("gain_by_colour",),
-    "lens_shading": ("lens_shading",),
-}
-"""Keys of a profile that must have a number for an effect to be simulated."""
-
-BRANCH_NUMBERS = {
-    "shot": ("dn_per_e",),
-    "read": ("read_law", "read_shape", "read_std_dn"),
-    "row": ("row_std_dn",),
-    "column": ("column_std_dn",),
-    "column_temporal": ("column_temporal_std_dn",),
-    "black_error": ("black_error_dn",),
-}
-"""Keys of each branch of a profile that must have a value for an effect to be simulated."""
-
-HEAT = ("dark_reference_c", "dark_doubling_c")
-"""Keys that dark current and hot pixels depend on too."""
-
 
 def is_physical(noise: NoiseConfig) -> bool:
-    """Return whether a noise profile is physical: in electrons, with separate effects.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        The profile.
-
-    Returns
-    -------
-    bool
-        True for a physical profile, False for one with two numbers, a and b.
-    """
+    """Return whether a noise profile is physical: in electrons, with separate effects."""
     return bool(noise.branches)
 
 
 def uses_physics(noise: NoiseConfig) -> bool:
-    """Return whether pairs of a noise profile are simulated by the kernels of the physical effects.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        The profile.
-
-    Returns
-    -------
-    bool
-        True for physical profiles, and for two numbers with ``law=poisson``, which need Poisson counts.
-    """
+    """Return whether pairs of a noise profile are simulated by the kernels of the physical effects."""
     return is_physical(noise) or noise.law == "poisson"
 
 
 def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
-    """Find the numbers of a physical profile at an ISO.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        A physical profile.
-    iso : float
-        The ISO.
-
-    Returns
-    -------
-    BranchConfig or None
-        The first branch whose range contains the ISO; None if no branch does.
-    """
+    """Find the numbers of a physical profile at an ISO."""
     return next((branch for branch in noise.branches if branch.iso[0] <= iso <= branch.iso[1]), None)
 
 
@@ -238,127 +134,52 @@ def row_of_stop(iso: float) -> int:
 
 
 def table_words(value: Any) -> tuple[list[str], list[Any]]:
-    """Split a number of a branch into its leading words and the rest.
-
-    Parameters
-    ----------
-    value : Any
-        Such as ``["by_colour", "by_stop", [1, 2, 3, 4], …]``.
-
-    Returns
-    -------
-    words : list of str
-        The words before the first value that is none; empty if the value is not a list.
-    rest : list
-        The values after them.
-    """
-    if not isinstance(value, list):
+    """Split a number of a branch into its leading words and the rest."""
+    if not isinstance(value, list | tuple):
         return [], [value]
     count = next((place for place, one in enumerate(value) if not isinstance(one, str)), len(value))
-    return value[:count], value[count:]
+    return list(value[:count]), list(value[count:])
 
 
 def provenance_at(noise: NoiseConfig, isos: Sequence[float]) -> list[ProvenanceConfig]:
-    """Return the statements about the source of a physical profile's numbers at some ISOs.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        A physical profile.
-    isos : sequence of float
-        ISOs for which it is used.
-
-    Returns
-    -------
-    list of ProvenanceConfig
-        In the order of the profile: statements without a range of ISO, and those whose range contains one of them.
-    """
+    """Return the statements about the source of a physical profile's numbers at some ISOs."""
     return [one for one in noise.provenance if not one.iso or any(one.iso[0] <= iso <= one.iso[1] for iso in isos)]
 
 
+@functools.cache
+def needed_numbers(effect: str) -> tuple[str, ...]:
+    """Return the keys of a profile that must have a number for an effect to be simulated."""
+    declared = BY_NAME[effect].declared
+    return tuple(number.key or name for name, number in declared.items() if not number.optional)
+
+
 def missing_number(noise: NoiseConfig, effect: str) -> str | None:
-    """Find a number that a physical profile lacks to simulate an effect.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        A physical profile.
-    effect : str
-        One of `noise.EFFECTS`.
-
-    Returns
-    -------
-    str or None
-        Key of the first missing number; None if the profile has all of them.
-    """
-    for key in BRANCH_NUMBERS.get(effect, ()):
-        if any(getattr(branch, key) is None for branch in noise.branches):
+    """Return the first key that a physical profile lacks to simulate an effect; None if it has all."""
+    for key in needed_numbers(effect):
+        groups = noise.branches if key in BRANCH_FIELDS else (noise,)
+        if any(getattr(group, key) is None for group in groups):
             return key
-    return next((key for key in EFFECT_NUMBERS.get(effect, ()) if getattr(noise, key) is None), None)
+    return None
 
 
 def uses_dark_frames(noise: NoiseConfig) -> bool:
-    """Return whether the noise of the read-out is sampled from dark frames.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        The profile.
-
-    Returns
-    -------
-    bool
-        True if a folder of dark frames is given, or the digest of a recorded set.
-    """
+    """Return whether the noise of the read-out is sampled from dark frames."""
     return noise.dark_frames is not None or noise.dark_frames_sha256 is not None
 
 
 def shading_place(noise: NoiseConfig) -> str | None:
-    """Return the place of the dark-shading map.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        The profile.
-
-    Returns
-    -------
-    str or None
-        A file or folder; None if ``noise.dark_shading`` is one of `SHADING_WORDS`.
-    """
+    """Return the place of the dark-shading map."""
     return None if noise.dark_shading in SHADING_WORDS else noise.dark_shading
 
 
 def run_iso(config: Config) -> float:
-    """Return the ISO of a run with dark frames, which has only one.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration, with ``noise.dark_frames``.
-
-    Returns
-    -------
-    float
-        ``noise.iso``, or that of the scene.
-    """
+    """Return the ISO of a run with dark frames, which has only one."""
     iso = config.scene.iso if config.noise.iso is None else config.noise.iso
     return parse_drawn("iso", iso, ISO).numbers[0]
 
 
 def without_dark_frames(config: Config) -> Config:
-    """Return a copy of a configuration with the noise of the profile in place of dark frames.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    Config
-        For measurements that need no real dark frames, such as times.
-    """
+    """Return a copy of a configuration with the noise of the profile in place of dark frames."""
     noise = dataclasses.replace(
         config.noise,
         dark_frames=None,
@@ -371,38 +192,13 @@ def without_dark_frames(config: Config) -> Config:
 
 
 def uses_assumed(config: Config) -> bool:
-    """Return whether effects with assumed numbers are simulated like others.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    bool
-        True with ``effects.assumed=use`` and a physical profile that marks numbers as assumed.
-    """
+    """Return whether effects with assumed numbers are simulated like others."""
     return config.effects.assumed == "use" and is_physical(config.noise) and bool(config.noise.assumed)
 
 
 def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:
-    """Return the assumed numbers of a physical profile that an effect depends on.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        A physical profile.
-    effect : str
-        One of `noise.EFFECTS`.
-
-    Returns
-    -------
-    tuple of str
-        Keys of ``noise``, in the order of the tables of effects.
-    """
-    heat = HEAT if effect in ("dark_current", "hot_pixels") else ()
-    keys = (*EFFECT_NUMBERS.get(effect, ()), *BRANCH_NUMBERS.get(effect, ()), *heat)
+    """Return the keys of a physical profile that an effect depends on and that the profile marks as assumed."""
+    keys = (*needed_numbers(effect), *(HEAT if BY_NAME[effect].heat else ()))
     return tuple(key for key in keys if key in noise.assumed)
 
 
@@ -410,23 +206,7 @@ def assumed_numbers(noise: NoiseConfig, effect: str) -> tuple[str, ...]:
 
 
 def patch_rule(source: SourceConfig) -> PatchRule | None:
-    """Interpret ``source.patch``.
-
-    Parameters
-    ----------
-    source : SourceConfig
-        ``patch`` is None, a side, ``[grid, side]``, ``[grid, side, stride]`` or ``[random, side, count]``.
-
-    Returns
-    -------
-    PatchRule or None
-        How to cut images into patches; None if images are not cut.
-
-    Raises
-    ------
-    ConfigError
-        If the value has another form, or a number is odd or out of range.
-    """
+    """Interpret ``source.patch``."""
     match ["grid", source.patch] if is_integer(source.patch) else source.patch:
         case None:
             return None
@@ -464,16 +244,6 @@ def saturated_as(config: Config) -> str:
 
     Without a full well, and without clipping of the noisy frame, nothing stops noise above white. Otherwise half of it
     is cut off, and the mean of the noisy frame at white is below white.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    str
-        ``noisy`` or ``pinned``: ``sensor.saturated``, with ``auto`` decided.
     """
     if config.sensor.saturated != "auto":
         return config.sensor.saturated
@@ -482,82 +252,25 @@ def saturated_as(config: Config) -> str:
 
 
 def effect_switch(effects: EffectsConfig, effect: str) -> str:
-    """Return the switch of an effect.
-
-    Parameters
-    ----------
-    effects : EffectsConfig
-        The switches of the configuration.
-    effect : str
-        One of `noise.EFFECTS`.
-
-    Returns
-    -------
-    str
-        ``auto``, ``on`` or ``off``: the effect's own switch if it is set, otherwise that of ``all``.
-    """
+    """Return the switch of an effect."""
     return str(SWITCH.word(getattr(effects, effect) or effects.all))
 
 
 def dequantize_method(source: SourceConfig) -> str:
-    """Return how 8-bit codes are dequantized.
-
-    Parameters
-    ----------
-    source : SourceConfig
-        The source of the configuration.
-
-    Returns
-    -------
-    str
-        ``off``, or ``dither`` and ``dither_all``: codes get a random offset of up to half a code.
-    """
+    """Return how 8-bit codes are dequantized."""
     return str(DEQUANTIZE.word(source.dequantize))
 
 
 def has_float_clean(config: Config) -> bool:
-    """Return whether clean frames are normalised and noisy frames are integer DN.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    bool
-        True with ``output.clean_dtype=float32`` and ``output.dtype=uint16``.
-    """
+    """Return whether clean frames are normalised and noisy frames are integer DN."""
     return config.output.clean_dtype == FLOAT32 and not is_normalised(config)
 
 
 def is_normalised(config: Config) -> bool:
-    """Return whether noisy frames are normalised.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    bool
-        True for float32 frames, 0 at black and 1 at white, not rounded; False for integer DN.
-    """
+    """Return whether noisy frames are normalised."""
     return config.output.dtype == FLOAT32
 
 
 def accuracy_budget(accuracy: AccuracyConfig) -> Budget:
-    """Convert the configured limits on errors.
-
-    Parameters
-    ----------
-    accuracy : AccuracyConfig
-        The limits of the configuration.
-
-    Returns
-    -------
-    Budget
-        The same limits, for `accuracy.choose_methods`.
-    """
+    """Convert the configured limits on errors."""
     return Budget(**dataclasses.asdict(accuracy))

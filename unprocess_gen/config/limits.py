@@ -8,76 +8,60 @@ from __future__ import annotations
 
 import math
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from unprocess_gen.config.values import in_range, is_integer, is_number, value_text
 from unprocess_gen.core.object_store import is_url
 
-
-class Limit(ABC):
-    """Allowed values of one setting."""
-
-    @abstractmethod
-    def __str__(self) -> str:
-        """Return the allowed values in words."""
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is allowed; True if that depends on other settings."""
-        return True
-
-    def shown(self, value: Any) -> str:
-        """Return the value as messages show it."""
-        return value_text(value)
+Test = Callable[[Any], bool]
 
 
-@dataclass(frozen=True)
-class Described(Limit):
-    """Values that are checked together with other settings, or by the function that parses them."""
+class Limit:
+    """Allowed values of one setting.
 
-    text: str
+    ``text`` names them, ``allows`` tests a value by itself, ``shown`` is the value in messages. ``is_float`` limits
+    are for numbers that are written as floats.
+    """
+
+    def __init__(self, text: str, allows: Test = lambda value: True, shown: Callable[[Any], str] = value_text) -> None:
+        self.text, self.allows, self.shown, self.is_float = text, allows, shown, False
 
     def __str__(self) -> str:
         return self.text
 
 
-@dataclass(frozen=True)
+class Described(Limit):
+    """Values that are checked together with other settings, or by the function that parses them."""
+
+
 class Boolean(Limit):
     """True or false; OmegaConf converts and checks it."""
 
-    def __str__(self) -> str:
-        return "true or false"
+    def __init__(self) -> None:
+        super().__init__("true or false")
 
 
-@dataclass(frozen=True)
 class Choice(Limit):
     """One of a few words."""
 
-    words: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"one of {', '.join(self.words)}"
+    def __init__(self, words: tuple[str, ...]) -> None:
+        self.words = words
+        super().__init__(
+            f"one of {', '.join(words)}",
+            lambda value: self.word(value) in words,
+            lambda value: value_text(self.word(value)),
+        )
 
     def word(self, value: Any) -> Any:
         """Return the value as one of the words is spelled."""
         return value
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is one of the words."""
-        return self.word(value) in self.words
-
-    def shown(self, value: Any) -> str:
-        """Return the word that the user wrote."""
-        return value_text(self.word(value))
 
 
 YAML_SWITCHES = {"True": "on", "False": "off"}
 """Text of the booleans that YAML reads from on and off without quotes."""
 
 
-@dataclass(frozen=True)
 class Switch(Choice):
     """One of a few words, of which YAML may have read on or off as a boolean."""
 
@@ -86,174 +70,105 @@ class Switch(Choice):
         return YAML_SWITCHES.get(value, value)
 
 
-@dataclass(frozen=True)
 class Integers(Limit):
     """An integer from ``low`` to ``high``, or the one in ``other``, whose meaning is ``remark``."""
 
-    low: int
-    high: int
-    other: int | None = None
-    remark: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.low} to {self.high}{self.remark}"
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is an integer in the range."""
-        return is_integer(value) and (self.low <= value <= self.high or value == self.other)
-
-
-@dataclass(frozen=True)
-class Numbers(Limit):
-    """A finite number from ``low`` to ``high``; ``open_low`` and ``open_high`` exclude the ends."""
-
-    low: float
-    high: float = math.inf
-    open_low: bool = False
-    open_high: bool = False
-
-    def __str__(self) -> str:
-        if self.open_high:
-            return f"{self.low:g} up to, but not including, {self.high:g}"
-        if self.open_low:
-            return f"more than {self.low:g}, up to {self.high:g}"
-        if self.high == math.inf:
-            return f"a number of {self.low:g} or more"
-        return f"{self.low:g} to {self.high:g}"
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is a finite number in the range."""
-        return is_number(value) and (
-            (self.low < value if self.open_low else self.low <= value)
-            and (value < self.high if self.open_high else value <= self.high)
+    def __init__(self, low: int, high: int, other: int | None = None, remark: str = "") -> None:
+        super().__init__(
+            f"{low} to {high}{remark}",
+            lambda value: is_integer(value) and (low <= value <= high or value == other),
         )
 
 
-@dataclass(frozen=True)
+class Numbers(Limit):
+    """A finite number from ``low`` to ``high``; ``open_low`` and ``open_high`` exclude the ends."""
+
+    def __init__(self, low: float, high: float = math.inf, open_low: bool = False, open_high: bool = False) -> None:
+        if open_high:
+            text = f"{low:g} up to, but not including, {high:g}"
+        elif open_low:
+            text = f"more than {low:g}, up to {high:g}"
+        else:
+            text = f"a number of {low:g} or more" if high == math.inf else f"{low:g} to {high:g}"
+        first, last = math.nextafter(low, math.inf) if open_low else low, math.nextafter(high, 0) if open_high else high
+        super().__init__(text, lambda value: is_number(value) and first <= value <= last)
+        self.is_float = True
+
+
 class NumberList(Limit):
     """A list of ``count`` numbers, each within ``numbers``."""
 
-    count: int
-    numbers: Numbers
-
-    def __str__(self) -> str:
-        return f"a list of {self.count} numbers, each {self.numbers}"
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is a list of so many allowed numbers."""
-        return len(value) == self.count and all(map(self.numbers.allows, value))
+    def __init__(self, count: int, numbers: Numbers) -> None:
+        super().__init__(
+            f"a list of {count} numbers, each {numbers}",
+            lambda value: len(value) == count and all(map(numbers.allows, value)),
+        )
 
 
-@dataclass(frozen=True)
 class NumberOrWord(Limit):
     """A number, or one word; ``text`` contains ``{word}`` and ``{numbers}``."""
 
-    word: str
-    numbers: Numbers | Integers
-    text: str
-
-    def __str__(self) -> str:
-        return self.text.format(word=self.word, numbers=self.numbers)
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value is the word or in the range."""
-        return bool(value == self.word) or self.numbers.allows(value)
+    def __init__(self, word: str, numbers: Numbers | Integers, text: str) -> None:
+        super().__init__(
+            text.format(word=word, numbers=numbers), lambda value: bool(value == word) or numbers.allows(value)
+        )
+        self.is_float = numbers.is_float
 
 
-@dataclass(frozen=True)
 class Name(Limit):
     """A name that rows of a manifest contain."""
 
-    def __str__(self) -> str:
-        return "up to 100 letters, digits, and . _ + -"
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the value has 1 to 100 allowed characters."""
-        return re.fullmatch(r"[\w.+-]{1,100}", value, re.ASCII) is not None
-
-    def shown(self, value: Any) -> str:
-        """Return the beginning of the text in quotes."""
-        return repr(value[:40])
+    def __init__(self) -> None:
+        super().__init__(
+            "up to 100 letters, digits, and . _ + -",
+            lambda value: re.fullmatch(r"[\w.+-]{1,100}", value, re.ASCII) is not None,
+            lambda value: repr(value[:40]),
+        )
 
 
-@dataclass(frozen=True)
 class Text(Limit):
     """Text that is not empty; ``what`` names it."""
 
-    what: str
-
-    def __str__(self) -> str:
-        return self.what
-
-    def allows(self, value: Any) -> bool:
-        """Return whether the text is not empty."""
-        return bool(value)
-
-    def shown(self, value: Any) -> str:
-        """Return the text in quotes."""
-        return repr(value)
+    def __init__(self, what: str) -> None:
+        super().__init__(what, bool, repr)
 
 
-@dataclass(frozen=True)
-class OutputPlace(Text):
+class OutputPlace(Limit):
     """A local path, or the URL of an object store; another URL would become a folder named after its scheme."""
 
-    def allows(self, value: Any) -> bool:
-        """Return whether the text is not empty, and no URL of another kind."""
-        return bool(value) and ("://" not in value or is_url(value))
+    def __init__(self, what: str) -> None:
+        super().__init__(
+            what,
+            lambda value: bool(value) and ("://" not in value or is_url(value)),
+            lambda value: value or repr(value),
+        )
 
-    def shown(self, value: Any) -> str:
-        """Return the text, in quotes if it is empty."""
-        return value or repr(value)
 
-
-@dataclass(frozen=True)
 class LevelRange(Limit):
     """An integer whose range follows from other keys of its group; ``ends`` computes it."""
 
-    text: str
-    ends: Callable[[Any], tuple[int, int]]
-    remark: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.text}{self.remark}"
+    def __init__(self, text: str, ends: Callable[[Any], tuple[int, int]], remark: str = "") -> None:
+        super().__init__(f"{text}{remark}")
+        self._ends, self._remark = ends, remark
 
     def check_in(self, key: str, value: int, group: Any) -> None:
-        """Raise ConfigError unless the value is in the range that the group's other keys give.
-
-        Parameters
-        ----------
-        key : str
-            Full name of the setting.
-        value : int
-            Its value.
-        group : SensorConfig or NoiseConfig
-            The group, with valid ``bits``.
-        """
-        in_range(key, value, *self.ends(group), self.remark)
+        """Raise ConfigError unless the value is in the range that the group, whose ``bits`` are valid, gives."""
+        in_range(key, value, *self._ends(group), self._remark)
 
 
-@dataclass(frozen=True)
 class Drawn(Limit):
     """A number, or a distribution of one of ``kinds``, all of whose draws are from ``low`` to ``high``.
 
     ``range_text`` replaces the range in words. `distributions.parse_drawn` checks values.
     """
 
-    kinds: tuple[str, ...]
-    low: float = -math.inf
-    high: float = math.inf
-    range_text: str = ""
-
-    @property
-    def range(self) -> str:
-        """Return the allowed draws in words."""
-        if self.range_text or self.low == -math.inf:
-            return self.range_text or "a finite number"
-        return f"{self.low:g} to {self.high:g}"
-
-    def __str__(self) -> str:
-        return f"{self.range}; constant, or drawn: {', '.join(self.kinds)}"
+    def __init__(
+        self, kinds: tuple[str, ...], low: float = -math.inf, high: float = math.inf, range_text: str = ""
+    ) -> None:
+        self.kinds, self.low, self.high = kinds, low, high
+        self.range = range_text or ("a finite number" if low == -math.inf else f"{low:g} to {high:g}")
+        super().__init__(f"{self.range}; constant, or drawn: {', '.join(kinds)}")
+        self.is_float = True
 
 
 # ------------------------------------------------------------------------------------- limits that several modules use
@@ -304,23 +219,13 @@ EXPOSURE_RATIO = Drawn(SCENE_KINDS, 1e-3, 1e6)
 """Ranges of the values of a scene. Chosen: far beyond cameras."""
 
 
-@dataclass(frozen=True)
-class DrawnOrByIso(Drawn):
-    """A number, a distribution, or a table by ISO: one of ``forms``, which `noise_validation` checks."""
-
-    forms: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return f"{super().__str__()}; or by ISO: {', '.join(self.forms)}"
-
-
-READ_SHAPE = DrawnOrByIso(
+READ_SHAPE = Drawn(
     ("choice",),
     math.nextafter(-0.5, 0),
     math.nextafter(10.0, 0),
     "more than -0.5, where the Tukey-lambda distribution has a variance, and less than 10",
-    ("by_stop", "by_iso"),
 )
+READ_SHAPE.text += "; or by ISO: by_stop, by_iso"
 
 PATCH = Described(
     "null, a side, [grid, side], [grid, side, stride] or [random, side, count]; side and stride are even, "
@@ -328,8 +233,6 @@ PATCH = Described(
 )
 LEVELS = Described(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
 ISO_RANGE = Described("the lowest and the highest ISO, [100, 6400]")
-GAIN_BY_COLOUR = NumberList(3, Numbers(0.1, 10))
-LENS_SHADING = NumberList(3, Numbers(-10, 10))
 BLACK_ERROR = Described(
     "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "
     "[four], …], whose fours are in the order R, G1, B, G2 if by_colour precedes it"
@@ -343,11 +246,9 @@ WHITE_LEVEL = LevelRange(
 )
 
 
-@dataclass(frozen=True)
 class IsoForm(Limit):
     """A number, or one of some forms of `forms.ISO_FORMS`; `noise_validation` checks it."""
 
-    forms: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: {', '.join(self.forms)}"
+    def __init__(self, forms: tuple[str, ...]) -> None:
+        self.forms = forms
+        super().__init__(f"a number of 0 or more, up to {MAX_BRANCH_NUMBER:g}, or a form: {', '.join(forms)}")

@@ -44,7 +44,7 @@ from unprocess_gen.config.schema import (
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.config.values import is_number, one_of, value_text
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.simulation.reference.noise import illumination_at
+from unprocess_gen.simulation.effects.lens_shading import illumination_at
 
 MAX_ELECTRONS = 1e9
 """Largest mean of an exact Poisson count (`simulation.reference.poisson`); no pixel holds as many electrons."""
@@ -176,7 +176,7 @@ def _check_branch(key: str, noise: NoiseConfig, branch: BranchConfig) -> None:
 
 def _check_tails(key: str, branch: BranchConfig) -> None:
     """Raise ConfigError for shapes of ``tukey_lambda`` whose variance is mostly in values that are never drawn."""
-    shapes = branch.read_shape if isinstance(branch.read_shape, list) else [branch.read_shape]
+    shapes = branch.read_shape if isinstance(branch.read_shape, list | tuple) else [branch.read_shape]
     if branch.read_law == "tukey_lambda" and min(filter(is_number, shapes)) < HEAVIEST_TAILS:
         raise ConfigError(
             f"{key}.read_shape={value_text(branch.read_shape)}: draws of 32 bits lack more than 12 % of the variance; "
@@ -185,27 +185,15 @@ def _check_tails(key: str, branch: BranchConfig) -> None:
 
 
 def well_ends_first(noise: NoiseConfig, scene: SceneConfig) -> bool:
-    """Return whether a full well can end below white, so that the clean frame depends on the ISO.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        A profile that `check_noise` accepts, with the ISO of one noise level.
-    scene : SceneConfig
-        The scene, whose ISO is used if the profile has none.
-
-    Returns
-    -------
-    bool
-        False for profiles with two numbers, and without a full well.
-    """
+    """Return whether a full well can end below white, so that the clean frame depends on the ISO."""
     if not is_physical(noise) or noise.full_well_e is None:
         return False
     assert noise.white_level_dn is not None and noise.black_level_dn is not None
     drawn = parse_drawn("iso", scene.iso if noise.iso is None else noise.iso, ISO)
     low, high = lowest(drawn), highest(drawn)
     gains = [_gain_at(branch, max(low, branch.iso[0])) for branch in noise.branches if _overlaps(branch, low, high)]
-    return noise.full_well_e * min(gains) < noise.white_level_dn - noise.black_level_dn
+    full_dn: float = noise.full_well_e * min(gains)
+    return full_dn < noise.white_level_dn - noise.black_level_dn
 
 
 def _overlaps(branch: BranchConfig, low: float, high: float) -> bool:
@@ -219,7 +207,7 @@ def _gains_at_ends(branch: BranchConfig) -> tuple[float, float]:
 
 def _gain_at(branch: BranchConfig, iso: float) -> float:
     gain = branch.dn_per_e
-    if not isinstance(gain, list):
+    if not isinstance(gain, list | tuple):
         return float(gain)
     return float(gain[1] * iso + (gain[2] if len(gain) > 2 else 0.0))
 
@@ -238,7 +226,7 @@ def _check_form(key: str, value: Any, limit: IsoForm, gains: tuple[float, ...]) 
     """Raise ConfigError unless a value is a number or an allowed form; ``gains`` are those at which lines are used."""
     if is_number(value) and 0 <= value <= MAX_BRANCH_NUMBER:
         return
-    form, numbers = (value[0], value[1:]) if isinstance(value, list) and value else (None, [])
+    form, numbers = (value[0], value[1:]) if isinstance(value, list | tuple) and value else (None, [])
     if form not in limit.forms:
         raise ConfigError(f"{key}={value_text(value)}: expected {limit}")
     if form == "by_iso":
@@ -269,7 +257,7 @@ def _check_form(key: str, value: Any, limit: IsoForm, gains: tuple[float, ...]) 
 
 
 def _is_table(value: Any, form: str) -> bool:
-    return isinstance(value, list) and bool(value) and value[0] == form
+    return isinstance(value, list | tuple) and bool(value) and value[0] == form
 
 
 def _check_isos(key: str, value: list[Any], branch: BranchConfig) -> None:
@@ -346,13 +334,13 @@ def _check_black_error(key: str, branch: BranchConfig) -> None:
     rows = rest if has_rows else [rest]
     if (
         words not in BLACK_ERROR_WORDS
-        or not isinstance(value, list)
+        or not isinstance(value, list | tuple)
         or not rows
-        or not all(isinstance(row, list) and len(row) == 4 and all(map(_is_black_error, row)) for row in rows)
+        or not all(isinstance(row, list | tuple) and len(row) == 4 and all(map(_is_black_error, row)) for row in rows)
     ):
         raise ConfigError(f"{key}={value_text(value)[:60]}: expected {BLACK_ERROR}")
     if words[-1:] == ["by_stop"]:
-        _check_stops(key, value, len(rows), branch)
+        _check_stops(key, list(value), len(rows), branch)
 
 
 def _is_black_error(value: Any) -> bool:

@@ -36,16 +36,6 @@ def conf_dir() -> Path:
     """Return the folder of the built-in option files.
 
     An installed package contains it as ``unprocess_gen/conf``; in a source tree it is next to the package.
-
-    Returns
-    -------
-    Path
-        Absolute path of the folder that contains ``config.yaml``.
-
-    Raises
-    ------
-    ConfigError
-        If the installation lacks the folder.
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "conf", package.parent / "conf"):
@@ -55,38 +45,12 @@ def conf_dir() -> Path:
 
 
 def group_options(group: str, *folders: Path) -> list[str]:
-    """Return the names of the options of a config group.
-
-    Parameters
-    ----------
-    group : str
-        A folder of option files, such as ``camera``.
-    *folders : Path
-        Roots to search; `conf_dir` if none is given.
-
-    Returns
-    -------
-    list of str
-        File names without ``.yaml``, sorted; empty if no root has the group.
-    """
+    """Return the names of the options of a config group below some folders, `conf_dir` if none is given."""
     return sorted({path.stem for folder in folders or (conf_dir(),) for path in (folder / group).glob("*.yaml")})
 
 
 def option_summary(group: str, option: str, folder: Path | None = None) -> str:
-    """Return the description of an option: the first line of the comment at the head of its file.
-
-    Parameters
-    ----------
-    group, option : str
-        Name of the option: ``camera``, ``sony_a7r``.
-    folder : Path, optional
-        Folder that contains the group; `conf_dir` if omitted.
-
-    Returns
-    -------
-    str
-        One line; empty if the file does not begin with a comment.
-    """
+    """Return the first line of the comment at the head of an option's file; empty without one."""
     path = (folder or conf_dir()) / group / f"{option}.yaml"
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     head = [line for line in lines if not line.startswith(PACKAGE_DIRECTIVE)][:1]
@@ -94,18 +58,7 @@ def option_summary(group: str, option: str, folder: Path | None = None) -> str:
 
 
 def check_override(override: str) -> None:
-    """Refuse an override that Hydra would take for something else, or answer with several lines.
-
-    Parameters
-    ----------
-    override : str
-        Override as the user wrote it.
-
-    Raises
-    ------
-    ConfigError
-        If it is not ``key=value``, removes a key, or gives a group something that is not the name of an option.
-    """
+    """Refuse an override that Hydra would take for something else, or answer with several lines."""
     key, equals, value = override.lstrip("+").partition("=")
     if max(override.count(bracket) for bracket in "[{(") > MAX_BRACKETS:
         raise ConfigError(f"{override[:60]}…: nested too deeply; expected at most {MAX_BRACKETS} brackets")
@@ -121,5 +74,12 @@ def check_override(override: str) -> None:
         raise ConfigError(f"{override}: {ADDED_GROUPS[key].noun} is added to the settings; write +{override}")
     options = group_options(key) if key.isalpha() else []
     word = re.match(r"[A-Za-z_]", value) and value not in ("null", "true", "false")
-    if options and not word:
-        raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}")
+    if options and (not word or ("/" in value and value.endswith((".yaml", ".yml")))):
+        raise ConfigError(f"{override}: expected the name of an option: {', '.join(options)}{file_hint(key, value)}")
+
+
+def file_hint(group: str, name: str) -> str:
+    """Return how to use a file of the user's own as an option; empty if the name is no path of a YAML file."""
+    if "/" not in name and not name.endswith((".yaml", ".yml")):
+        return ""
+    return f"; for a file of your own, put it in FOLDER/{group} and write --config-dir FOLDER {group}={Path(name).stem}"

@@ -1,8 +1,8 @@
 """Define the configuration as typed dataclasses: one for each folder of ``conf/``, and `Config` for all of them.
 
 Each key is declared once, with its meaning, unit and allowed values (`settings.key`). OmegaConf checks keys and types
-against these dataclasses; `validation` checks values by the same declarations. The dataclasses are not frozen, because
-Hydra cannot override frozen ones. No code changes a configuration once it has been validated.
+against these dataclasses; `validation` checks values by the same declarations. A config is immutable and hashable:
+lists become tuples. `replaced` returns a copy with other values.
 
 A parameter that is drawn for every image is a number or a distribution, written as a list: ``[uniform, 1.9, 2.4]``. An
 override replaces a list completely. A mapping would be merged with the default's mapping, into a mixture of both.
@@ -11,9 +11,9 @@ override replaces a list completely. A mapping would be merged with the default'
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
-from typing import Any, Optional
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Optional, TypeVar
 
 from unprocess_gen.config import limits
 from unprocess_gen.config.limits import (
@@ -22,18 +22,47 @@ from unprocess_gen.config.limits import (
     Described,
     Integers,
     IsoForm,
+    Limit,
     Name,
+    NumberList,
     NumberOrWord,
     Numbers,
     OutputPlace,
     Text,
 )
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
+from unprocess_gen.simulation.effects import EFFECTS, profile_keys
+from unprocess_gen.simulation.effects.effect import Effect
+from unprocess_gen.simulation.effects.numbers import SHAPE, SITES, Number
+
+
+class FrozenMapping(dict[str, Any]):
+    """A mapping inside a config, such as ``{a: 1, b: 2}`` of ``noise.levels``."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self.items()))
+
+
+def frozen(value: Any) -> Any:
+    """Return a value of a config in a hashable form."""
+    if isinstance(value, list | tuple):
+        return tuple(map(frozen, value))
+    return FrozenMapping({name: frozen(item) for name, item in value.items()}) if isinstance(value, dict) else value
+
+
+class Group:
+    """Base of the dataclasses of a config, whose lists become tuples."""
+
+    def __post_init__(self) -> None:
+        """Freeze the values of the fields."""
+        for name, value in vars(self).items():
+            if isinstance(value, list | tuple | dict):
+                object.__setattr__(self, name, frozen(value))
 
 
 @documented
-@dataclass
-class SourceConfig:
+@dataclass(frozen=True)
+class SourceConfig(Group):
     """Select and prepare the source images."""
 
     root: Optional[str] = key(
@@ -43,8 +72,8 @@ class SourceConfig:
         null="the built-in synthetic scenes",
         decides_data=False,
     )
-    include: list[str] = key(
-        [],
+    include: tuple[str, ...] = key(
+        (),
         "glob patterns of images; one with a slash matches the path below root, others the file name, in any case",
         Described("a list of at least one pattern such as '*.jpg'"),
     )
@@ -73,8 +102,8 @@ class SourceConfig:
         "and fixed patterns",
         Boolean(),
     )
-    video: list[str] = key(
-        [], "glob patterns of video files, used if clips is true (extra video)", Described("a list of patterns")
+    video: tuple[str, ...] = key(
+        (), "glob patterns of video files, used if clips is true (extra video)", Described("a list of patterns")
     )
     downscale: int = key(
         1,
@@ -94,8 +123,8 @@ class SourceConfig:
 
 
 @documented
-@dataclass
-class CameraConfig:
+@dataclass(frozen=True)
+class CameraConfig(Group):
     """Choose the colour matrix of the camera."""
 
     name: str = key("convex", "name of the camera, recorded in each row", Name())
@@ -105,7 +134,7 @@ class CameraConfig:
         "four, identity linear sRGB, custom xyz2cam",
         limits.CAMERA_LAWS,
     )
-    xyz2cam: Optional[list[float]] = key(
+    xyz2cam: Optional[tuple[float, ...]] = key(
         None,
         "matrix from XYZ (D65) to the camera, row by row, for law=custom",
         Described("nine numbers of an invertible matrix"),
@@ -114,8 +143,8 @@ class CameraConfig:
 
 
 @documented
-@dataclass
-class GainsConfig:
+@dataclass(frozen=True)
+class GainsConfig(Group):
     """Define white balance, brightening and the treatment of highlights."""
 
     red: Any = key(None, "forward white-balance gain of red", limits.GAIN)
@@ -130,8 +159,8 @@ class GainsConfig:
 
 
 @documented
-@dataclass
-class IspConfig:
+@dataclass(frozen=True)
+class IspConfig(Group):
     """Define the curves that the camera applied after the colour matrix."""
 
     tone: str = key("smoothstep", "tone curve that is inverted", Choice(("smoothstep", "none")))
@@ -143,8 +172,8 @@ class IspConfig:
 
 
 @documented
-@dataclass
-class SensorConfig:
+@dataclass(frozen=True)
+class SensorConfig(Group):
     """Define the digital output of the sensor."""
 
     bits: int = key(12, "bits per sample", Integers(1, 16))
@@ -179,84 +208,116 @@ class SensorConfig:
     )
 
 
+CHOSEN, PROFILE = "Chosen for a run", "Every profile"
+TWO_PARAMETERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
+"""Sections of the keys of `NoiseConfig`."""
+
+AS_ALL = "the value of all"
+
+Body = TypeVar("Body")
+
+Fields = Mapping[str, tuple[Any, Any]]
+"""Type and default of each field."""
+
+
+def with_fields(added: Fields, before: str = "") -> Callable[[type[Body]], type[Body]]:
+    """Add fields to the body of a dataclass, at its end or before one of its fields."""
+
+    def add(group: type[Body]) -> type[Body]:
+        types: dict[str, Any] = {}
+        following: dict[str, Any] = {}
+        for name, kind in group.__annotations__.items():
+            (following if following or name == before else types)[name] = kind
+        group.__annotations__ = {**types, **{name: kind for name, (kind, _) in added.items()}, **following}
+        for name, (_, default) in added.items():
+            setattr(group, name, default)
+        return group
+
+    return add
+
+
+def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
+    """Return type and default of the key of a number."""
+    kind: Any
+    null, kind, limit = "", float, _limit(number)
+    if number.may_be_unknown:
+        null = number.optional or f"not known, so the effect {effect.name} cannot be simulated"
+        kind = Optional[float] if number.count == 1 else Optional[tuple[float, ...]]
+    if number.in_branch:
+        kind = str if number.words else Any
+    declared = key(
+        number.key_default,
+        number.key_meaning or number.meaning,
+        limit,
+        unit=number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit),
+        null=null,
+        section="" if number.in_branch else PHYSICAL,
+        since=number.since,
+    )
+    return kind, declared
+
+
+def _limit(number: Number) -> Limit:
+    """Return the values that the key of a number allows."""
+    if number.kind in (SHAPE, SITES):
+        return limits.READ_SHAPE if number.kind == SHAPE else limits.BLACK_ERROR
+    if number.in_branch:
+        return Choice(number.words) if number.words else IsoForm(number.forms)
+    numbers = Numbers(number.low, number.high)
+    return numbers if number.count == 1 else NumberList(number.count, numbers)
+
+
+BRANCH_FIELDS: Fields = {
+    name: _number_field(effect, number) for name, (effect, number) in profile_keys().items() if number.in_branch
+}
+PROFILE_FIELDS: Fields = {
+    name: _number_field(effect, number) for name, (effect, number) in profile_keys().items() if not number.in_branch
+}
+SWITCH_FIELDS: Fields = {
+    effect.name: (Optional[str], key(None, effect.meaning, limits.SWITCH, null=AS_ALL, since=effect.since))
+    for effect in EFFECTS
+    if effect.has_switch
+}
+
+
 @documented
-@dataclass
-class BranchConfig:
+@dataclass(frozen=True)
+@with_fields(BRANCH_FIELDS)
+class BranchConfig(Group):
     """Hold the numbers of a physical noise profile that depend on ISO, for one range of ISO.
 
     A number may be written as a form of `forms.ISO_FORMS`.
     """
 
-    iso: list[float] = key([], "lowest and highest ISO of the branch", limits.ISO_RANGE)
-    dn_per_e: Any = key(None, "system gain K", IsoForm(("per_iso",)), unit="DN per electron")
-    read_law: str = key(
-        "gaussian",
-        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45; tukey "
-        "is that of version 0.1, whose variance is low for shapes below -0.3",
-        Choice(("gaussian", "tukey", "tukey_lambda")),
-    )
-    read_shape: Any = key(0.0, "shape of Tukey's lambda distribution", limits.READ_SHAPE)
-    read_std_dn: Any = key(
-        None,
-        "standard deviation of the read noise",
-        IsoForm(("root", "line", "scale_line", "by_iso")),
-        unit="DN of the profile",
-    )
-    row_std_dn: Any = key(
-        None,
-        "standard deviation of row offsets",
-        IsoForm(("root", "line", "by_iso")),
-        unit="DN of the profile",
-        null="not known, so the effect row cannot be simulated",
-    )
-    column_std_dn: Any = key(
-        None,
-        "standard deviation of column offsets",
-        IsoForm(("root", "line", "by_iso")),
-        unit="DN of the profile",
-        null="not known, so the effect column cannot be simulated",
-    )
-    column_temporal_std_dn: Any = key(
-        None,
-        "standard deviation of the part of column offsets that is new in every frame",
-        IsoForm(("root", "line")),
-        unit="DN of the profile",
-        null="not known, so the effect column_temporal cannot be simulated",
-        since="0.2",
-    )
-    black_error_dn: Any = key(
-        None,
-        "error of the black level",
-        limits.BLACK_ERROR,
-        unit="DN of the profile",
-        null="not known, so the effect black_error cannot be simulated",
-    )
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    iso: tuple[float, ...] = key((), "lowest and highest ISO of the branch", limits.ISO_RANGE)
 
 
 @documented
-@dataclass
-class ProvenanceConfig:
+@dataclass(frozen=True)
+class ProvenanceConfig(Group):
     """State the source and the uncertainty of numbers of a physical noise profile."""
 
-    numbers: list[str] = key(
-        [], "keys of a branch or of the profile", Described("a list of keys whose values are numbers")
+    numbers: tuple[str, ...] = key(
+        (), "keys of a branch or of the profile", Described("a list of keys whose values are numbers")
     )
-    iso: list[float] = key([], "lowest and highest ISO the statement holds for; empty: all", limits.ISO_RANGE)
+    iso: tuple[float, ...] = key((), "lowest and highest ISO the statement holds for; empty: all", limits.ISO_RANGE)
     source: str = key("", "where the numbers come from", Text("a text"))
     uncertainty: str = key("", "how far the numbers may be off, or how far sources differ", Text("a text"))
 
 
-CHOSEN, PROFILE = "Chosen for a run", "Every profile"
-TWO_PARAMETERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
-"""Sections of the keys of `NoiseConfig`."""
-
-UNKNOWN = "not known"
-
-
 @documented
-@dataclass
-class NoiseConfig:
+@dataclass(frozen=True)
+@with_fields(PROFILE_FIELDS, before="assumed")
+class NoiseConfig(Group):
     """Define the noise: two numbers (variance a·x + b), or a physical profile with ``branches`` by ISO."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
     name: str = key("none", "name of the profile, recorded in each row", Name(), section=PROFILE)
     units: Optional[str] = key(
@@ -384,91 +445,20 @@ class NoiseConfig:
         section=CHOSEN,
         since="0.2",
     )
-    branches: list[BranchConfig] = key(
-        [],
+    branches: tuple[BranchConfig, ...] = key(
+        (),
         "numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters",
         Described("a list of mappings with the keys of a branch"),
         section=PHYSICAL,
     )
-    prnu_std: Optional[float] = key(
-        None,
-        "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1",
-        Numbers(0, 0.5),
-        null=UNKNOWN,
-        section=PHYSICAL,
-    )
-    dark_e_per_s: Optional[float] = key(
-        None,
-        "mean dark current at dark_reference_c",
-        Numbers(0, 1e6),
-        unit="electrons per second",
-        null=UNKNOWN,
-        section=PHYSICAL,
-    )
-    dark_reference_c: float = key(
-        25.0,
-        "temperature at which the dark currents were measured",
-        Numbers(-273, 200),
-        unit="degrees Celsius",
-        section=PHYSICAL,
-    )
-    dark_doubling_c: float = key(
-        7.0,
-        "rise of the temperature that doubles the dark currents",
-        Numbers(0.1, 100),
-        unit="degrees Celsius",
-        section=PHYSICAL,
-    )
-    hot_pixel_share: Optional[float] = key(
-        None, "fraction of hot pixels", Numbers(0, 1), null=UNKNOWN, section=PHYSICAL
-    )
-    hot_pixel_e_per_s: Optional[float] = key(
-        None,
-        "mean of the exponentially distributed current of hot pixels at dark_reference_c",
-        Numbers(0, 1e6),
-        unit="electrons per second",
-        null=UNKNOWN,
-        section=PHYSICAL,
-    )
-    dead_pixel_share: Optional[float] = key(
-        None, "fraction of dead pixels, which read 0", Numbers(0, 1), null=UNKNOWN, section=PHYSICAL
-    )
-    full_well_e: Optional[float] = key(
-        None, "saturation capacity", Numbers(1, 1e9), unit="electrons", null=UNKNOWN, section=PHYSICAL
-    )
-    row_correlation: Optional[float] = key(
-        None,
-        "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the effect row",
-        Numbers(-0.999, 0.999),
-        null="independent rows",
-        section=PHYSICAL,
-        since="0.2",
-    )
-    gain_by_colour: Optional[list[float]] = key(
-        None,
-        "system gain of red, green and blue, relative to dn_per_e",
-        limits.GAIN_BY_COLOUR,
-        null="equal gains, so the effect gain_by_colour cannot be simulated",
-        section=PHYSICAL,
-        since="0.2",
-    )
-    lens_shading: Optional[list[float]] = key(
-        None,
-        "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
-        "full frame, 1 in the corners",
-        limits.LENS_SHADING,
-        null="not known, so the effect lens_shading cannot be simulated",
-        section=PHYSICAL,
-        since="0.2",
-    )
-    assumed: list[str] = key(
-        [],
+    assumed: tuple[str, ...] = key(
+        (),
         "keys whose numbers no source gives for this camera; effects.assumed controls their effects",
         Described("a list of keys of this section or of a branch"),
         section=PHYSICAL,
     )
-    provenance: list[ProvenanceConfig] = key(
-        [],
+    provenance: tuple[ProvenanceConfig, ...] = key(
+        (),
         "source and uncertainty of the numbers, which plan prints",
         Described("a list of mappings with the keys numbers, iso, source and uncertainty"),
         decides_data=False,
@@ -478,19 +468,20 @@ class NoiseConfig:
 
 
 PHYSICAL_NUMBERS = tuple(
-    name
-    for name, setting in settings_of(NoiseConfig).items()
-    if setting.section == PHYSICAL and isinstance(setting.limit, Numbers)
+    name for name, (_, number) in profile_keys().items() if number.count == 1 and not number.in_branch
 )
 """Keys of the numbers of a physical profile that do not depend on ISO."""
 
-ASSUMABLE = (*PHYSICAL_NUMBERS, "row_std_dn", "column_std_dn", "black_error_dn")
+ASSUMABLE = (
+    *PHYSICAL_NUMBERS,
+    *(name for name, (_, number) in profile_keys().items() if number.in_branch and number.may_be_unknown),
+)
 """Keys that ``noise.assumed`` may name: numbers of a physical profile, and those of a branch that may be unknown."""
 
 
 @documented
-@dataclass
-class SceneConfig:
+@dataclass(frozen=True)
+class SceneConfig(Group):
     """Describe the exposure of a scene; each value is a number or a distribution."""
 
     name: str = key("daylight", "name of the scene, recorded in each row", Name())
@@ -505,13 +496,15 @@ class SceneConfig:
     )
 
 
-AS_ALL = "the value of all"
-
-
 @documented
-@dataclass
-class EffectsConfig:
+@dataclass(frozen=True)
+@with_fields(SWITCH_FIELDS)
+class EffectsConfig(Group):
     """Choose the sensor effects to simulate."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
     all: str = key(
         "auto",
@@ -531,46 +524,11 @@ class EffectsConfig:
         Choice(("use", "off")),
         since="0.2",
     )
-    heteroscedastic: Optional[str] = key(
-        None, "noise of a two-parameter profile, its only effect", limits.SWITCH, null=AS_ALL
-    )
-    lens_shading: Optional[str] = key(
-        None,
-        "less light towards the corners, in the clean and the noisy frame",
-        limits.SWITCH,
-        null=AS_ALL,
-        since="0.2",
-    )
-    prnu: Optional[str] = key(None, "unequal response of pixels; fixed pattern", limits.SWITCH, null=AS_ALL)
-    shot: Optional[str] = key(None, "Poisson counts of electrons", limits.SWITCH, null=AS_ALL)
-    dark_current: Optional[str] = key(None, "Poisson counts of thermal electrons", limits.SWITCH, null=AS_ALL)
-    hot_pixels: Optional[str] = key(
-        None, "few pixels with a far larger dark current; fixed pattern", limits.SWITCH, null=AS_ALL
-    )
-    full_well: Optional[str] = key(
-        None, "saturation capacity, at which the clean and the noisy frame are clipped", limits.SWITCH, null=AS_ALL
-    )
-    gain_by_colour: Optional[str] = key(
-        None, "a system gain of its own for each colour", limits.SWITCH, null=AS_ALL, since="0.2"
-    )
-    read: Optional[str] = key(None, "noise of the amplifier and the converter", limits.SWITCH, null=AS_ALL)
-    row: Optional[str] = key(None, "an offset of each row, new in every frame", limits.SWITCH, null=AS_ALL)
-    column: Optional[str] = key(None, "an offset of each column; fixed pattern", limits.SWITCH, null=AS_ALL)
-    column_temporal: Optional[str] = key(
-        None, "an offset of each column, new in every frame", limits.SWITCH, null=AS_ALL, since="0.2"
-    )
-    black_error: Optional[str] = key(
-        None, "difference between black and the black level, by CFA site; fixed pattern", limits.SWITCH, null=AS_ALL
-    )
-    dead_pixels: Optional[str] = key(None, "few pixels that read 0; fixed pattern", limits.SWITCH, null=AS_ALL)
-    quantise: Optional[str] = key(
-        None, "rounding and clipping; on for uint16, off for float32", limits.SWITCH, null=AS_ALL
-    )
 
 
 @documented
-@dataclass
-class CleanConfig:
+@dataclass(frozen=True)
+class CleanConfig(Group):
     """Choose what clean frames contain."""
 
     includes_fixed_pattern: bool = key(
@@ -582,8 +540,8 @@ class CleanConfig:
 
 
 @documented
-@dataclass
-class AccuracyConfig:
+@dataclass(frozen=True)
+class AccuracyConfig(Group):
     """Limit the errors accepted for speed.
 
     The keys are those of `accuracy.Budget`.
@@ -601,6 +559,13 @@ class AccuracyConfig:
         "largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead",
         Numbers(0),
     )
+    normal_shot: bool = key(
+        True,
+        "normal distribution in place of Poisson counts within law_distance, as in 0.1 and 0.2; simulated with NumPy, "
+        "which is slow",
+        Boolean(),
+        since="0.3",
+    )
 
 
 AUTO = "auto"
@@ -608,8 +573,8 @@ AUTO = "auto"
 
 
 @documented
-@dataclass
-class OutputConfig:
+@dataclass(frozen=True)
+class OutputConfig(Group):
     """Define the format of the dataset."""
 
     dtype: str = key(
@@ -646,14 +611,15 @@ class OutputConfig:
 
     def __post_init__(self) -> None:
         """Convert the text of an integer, such as the value of an environment variable."""
+        super().__post_init__()
         if isinstance(self.pairs_per_shard, str):
             with contextlib.suppress(ValueError):
-                self.pairs_per_shard = int(self.pairs_per_shard)
+                object.__setattr__(self, "pairs_per_shard", int(self.pairs_per_shard))
 
 
 @documented
-@dataclass
-class ExecutorConfig:
+@dataclass(frozen=True)
+class ExecutorConfig(Group):
     """Choose what runs the workers; no byte of a dataset depends on it."""
 
     kind: str = key(
@@ -696,8 +662,8 @@ class ExecutorConfig:
 
 
 @documented
-@dataclass
-class Config:
+@dataclass(frozen=True)
+class Config(Group):
     """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level."""
 
     source: SourceConfig = field(default_factory=SourceConfig)
@@ -750,15 +716,18 @@ GROUPS: dict[str, type[Any]] = {
 
 
 def all_settings() -> Iterator[tuple[str, str, Setting]]:
-    """Yield every setting of a config with its group, ``""`` for the top level; branches are left out.
-
-    Yields
-    ------
-    group, name : str
-        Where the setting is.
-    setting : Setting
-        Its description.
-    """
+    """Yield every setting of a config with its group, ``""`` for the top level; branches are left out."""
     for group, kind in [*GROUPS.items(), ("", Config)]:
         for name, setting in settings_of(kind).items():
             yield group, name, setting
+
+
+def replaced(config: Config, changes: Mapping[str, Any]) -> Config:
+    """Return a copy of a config with other values: ``{"source.root": "photos", "seed": 3}``."""
+    for setting, value in changes.items():
+        group, _, name = setting.rpartition(".")
+        if group:
+            config = replace(config, **{group: replace(getattr(config, group), **{name: value})})
+        else:
+            config = replace(config, **{name: value})
+    return config

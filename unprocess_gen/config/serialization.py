@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -19,15 +19,18 @@ from unprocess_gen.config.interpretation import (
     saturated_as,
     shading_place,
     uses_assumed,
+    uses_physics,
 )
-from unprocess_gen.config.limits import Drawn, NumberOrWord, Numbers
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line, is_number, one_of, value_text
 from unprocess_gen.config.yaml_files import parse_yaml_mapping, read_yaml_text
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.object_store import AnyPath
+from unprocess_gen.core.paths import AnyPath
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 Option = TypeVar("Option")
 
@@ -51,12 +54,7 @@ NOT_RECORDED = tuple(
 )
 """Groups of which no key decides data; ``config.yaml`` omits them."""
 
-NUMBER_KEYS = _keys(
-    lambda setting: (
-        isinstance(setting.limit, Drawn)
-        or (isinstance(setting.limit, NumberOrWord) and isinstance(setting.limit.numbers, Numbers))
-    )
-)
+NUMBER_KEYS = _keys(lambda setting: setting.limit.is_float and setting.decides_data)
 """Keys whose numbers are written as floats, because users may write 1 or 1.0."""
 
 
@@ -64,34 +62,12 @@ SOURCE_KINDS = ("folder", "synthetic")
 
 
 def source_kind(config: Config) -> str:
-    """Return the kind of source that ``config.yaml`` records.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    str
-        ``folder``, or ``synthetic`` if ``source.root`` is None.
-    """
+    """Return the kind of source that ``config.yaml`` records, ``folder`` or ``synthetic``."""
     return "synthetic" if config.source.root is None else "folder"
 
 
 def dataset_yaml(config: Config) -> str:
-    """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling.
-
-    Parameters
-    ----------
-    config : Config
-        A configuration that `validate_config` accepts.
-
-    Returns
-    -------
-    str
-        YAML. Equal data have equal texts.
-    """
+    """Return the text of ``config.yaml``: all keys that decide the bytes of a dataset, in one spelling."""
     settings = _recorded(config)
     settings["source"] = {"kind": source_kind(config)} | settings["source"]
     settings["sensor"]["saturated"] = saturated_as(config)
@@ -100,6 +76,8 @@ def dataset_yaml(config: Config) -> str:
         settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
+    if not (config.accuracy.law_distance and uses_physics(config.noise)):
+        settings["accuracy"].pop("normal_shot", None)  # decides nothing
     if not has_float_clean(config):
         settings["output"].pop("clean_dtype", None)
     for group, keys in NUMBER_KEYS.items():
@@ -109,10 +87,12 @@ def dataset_yaml(config: Config) -> str:
 
 def _recorded(group: Any) -> Any:
     """Return a dataclass of the schema as mappings, without keys that ``config.yaml`` omits."""
-    if isinstance(group, list):
+    if isinstance(group, list | tuple):
         return [_recorded(item) for item in group]
+    if isinstance(group, dict):
+        return dict(group)
     if not dataclasses.is_dataclass(group) or isinstance(group, type):
-        return copy.deepcopy(group)
+        return group
     settings = settings_of(group)
     recorded: dict[str, Any] = {}
     for one in dataclasses.fields(group):
@@ -120,43 +100,22 @@ def _recorded(group: Any) -> Any:
         if setting is None:
             omitted = one.name in NOT_RECORDED
         else:
-            omitted = not setting.decides_data or bool(setting.since and value == _default(one))
+            omitted = not setting.decides_data or bool(setting.since and value == one.default)
         if not omitted:
             recorded[one.name] = _recorded(value)
     return recorded
 
 
-def _default(field: dataclasses.Field[Any]) -> Any:
-    """Return the value of a key that a recorded config does not have."""
-    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-
-
 def _canonical(value: Any) -> Any:
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]
     return float(value) if is_number(value) else value
 
 
 def read_dataset_yaml(path: AnyPath) -> tuple[Config, str]:
-    """Read the ``config.yaml`` of a dataset.
+    """Read the ``config.yaml`` of a dataset: the config, and the kind of its source.
 
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        The file, as `dataset_yaml` writes it.
-
-    Returns
-    -------
-    config : Config
-        The configuration, with values that `check_values` accepts. Keys of `NOT_DATA` have their defaults.
-    kind : str
-        ``folder`` or ``synthetic``.
-
-    Raises
-    ------
-    ConfigError
-        If the file does not exist, is not YAML, lacks a key, has an unknown key, or has a value of the wrong type or
-        out of range: one line that names the file, the key and the value.
+    Keys of `NOT_DATA` have their defaults. ConfigError, with the file, unless `check_values` accepts the config.
     """
     try:
         config, kind = parse_dataset_yaml(read_yaml_text(path))
@@ -172,26 +131,6 @@ def parse_dataset_yaml(text: str) -> tuple[Config, str]:
     """Parse the text of a ``config.yaml``; check keys and types, not ranges.
 
     Strings are taken literally: ``${…}`` is no interpolation here.
-
-    Parameters
-    ----------
-    text : str
-        All keys of `Config` except those of `NOT_DATA`, and ``source.kind``. Keys that later versions added may be
-        missing; they have their defaults (`Setting.since`).
-
-    Returns
-    -------
-    config : Config
-        The configuration. Keys of `NOT_DATA` have their defaults.
-    kind : str
-        ``folder`` or ``synthetic``.
-
-    Raises
-    ------
-    ValueError
-        If the text breaks a rule of `parse_yaml_mapping`.
-    ConfigError
-        If a key is missing or unknown, or a value has the wrong type.
     """
     loaded = parse_yaml_mapping(text)
     if not isinstance(loaded.get("source"), dict) or "kind" not in loaded["source"]:
@@ -226,66 +165,63 @@ def _convert(kind: Any, value: Any, key: str) -> Any:
         return None if value is None else _convert(get_args(kind)[0], value, key)
     if dataclasses.is_dataclass(kind):
         return _build(cast(type[Any], kind), value, f"{key}.")
-    if get_origin(kind) is list:
+    if get_origin(kind) is tuple:
         if isinstance(value, list):
-            (item,) = get_args(kind)
-            return [_convert(item, one, f"{key}[{index}]") for index, one in enumerate(value)]
+            return tuple(_convert(get_args(kind)[0], item, f"{key}[{index}]") for index, item in enumerate(value))
     elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     elif kind is str and isinstance(value, str | bool | int | float):
         return str(value)  # on and off without quotes are booleans in YAML; a name may be a number
     elif type(value) is kind:
         return value
-    name = "list" if get_origin(kind) is list else kind.__name__
+    name = "list" if get_origin(kind) is tuple else kind.__name__
     raise ConfigError(f"{key}={value_text(value)[:60]}: expected a value of type {name}")
 
 
-def read_option(path: Path, group: type[Option]) -> Option:
-    """Read one option file of ``conf/``.
-
-    Parameters
-    ----------
-    path : Path
-        A file that belongs to the package.
-    group : type
-        Dataclass of the config group.
-
-    Returns
-    -------
-    object
-        Instance of ``group``; keys that the file lacks have their defaults.
-    """
+def writable_node(group: type[Any]) -> DictConfig:
+    """Return OmegaConf's node of a dataclass, which accepts overrides although the dataclass is frozen."""
     from omegaconf import OmegaConf
 
-    option = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(group), OmegaConf.load(path)))
+    def unlock(node: Any) -> None:
+        OmegaConf.set_readonly(node, None)
+        for key in node:
+            if OmegaConf.is_dict(child := node[key]):
+                unlock(child)
+
+    node: DictConfig = OmegaConf.structured(group)
+    unlock(node)
+    return node
+
+
+def read_option(path: Path, group: type[Option]) -> Option:
+    """Read an option file of ``conf/`` into its dataclass; keys that the file lacks have their defaults."""
+    from omegaconf import OmegaConf
+
+    option = OmegaConf.to_object(OmegaConf.merge(writable_node(group), OmegaConf.load(path)))
     assert isinstance(option, group)
     return option
 
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:
-    """List the differences between two ``config.yaml`` texts.
-
-    Parameters
-    ----------
-    config_yaml, other_yaml : str
-        The texts; either may have been edited by hand.
-
-    Returns
-    -------
-    list of str
-        ``key=value (there: value)``, sorted by key.
-
-    Raises
-    ------
-    ValueError
-        If a text breaks a rule of `parse_yaml_mapping`.
-    """
+    """List the differences between two ``config.yaml`` texts, ``key=value (there: value)``, sorted by key."""
     here, there = _flat(parse_yaml_mapping(config_yaml)), _flat(parse_yaml_mapping(other_yaml))
     return [
-        f"{key}={value_text(here.get(key))} (there: {value_text(there.get(key))})"
+        "{}={} (there: {})".format(key, *_shortened(value_text(here.get(key)), value_text(there.get(key))))
         for key in sorted(here.keys() | there.keys())
         if here.get(key) != there.get(key)
     ]
+
+
+SHOWN = 60
+"""Characters of a value in a difference; longer values are cut around the first character that differs."""
+
+
+def _shortened(*values: str) -> Iterator[str]:
+    common = sum(1 for _ in itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*values, strict=False)))
+    start = max(0, common - SHOWN // 3) if max(map(len, values)) > SHOWN else 0
+    for value in values:
+        part = value[start : start + SHOWN]
+        yield "…" * (start > 0) + part + "…" * (len(value) > start + len(part))
 
 
 def _flat(settings: Any, prefix: str = "") -> dict[str, Any]:

@@ -25,23 +25,10 @@ Group = TypeVar("Group", bound=type)
 class Setting:
     """Describe one key of a config group.
 
-    Attributes
-    ----------
-    meaning : str
-        One sentence for users, without a period at its end.
-    limit : Limit
-        The allowed values.
-    unit : str
-        Unit of a number; empty for words and pure numbers.
-    null : str
-        What null means; empty if null is not allowed.
-    decides_data : bool
-        Whether the bytes of a dataset depend on the value. ``config.yaml`` omits other keys.
-    section : str
-        Title of the part of the group that the key belongs to; empty in groups without parts.
-    since : str
-        First version that records the key; empty for keys of all versions. A ``config.yaml`` without a later key has
-        its default in the dataclass, which is what versions before did; ``config.yaml`` omits the key at that value.
+    ``meaning`` is one sentence without a period. ``null`` says what null means, and is empty if null is not allowed.
+    ``config.yaml`` omits keys that do not decide data. ``section`` is the part of the group that the key belongs to.
+    ``since`` is the first version that records the key: a ``config.yaml`` without it has its default in the dataclass,
+    which is what versions before did; ``config.yaml`` omits the key at that value.
     """
 
     meaning: str
@@ -59,78 +46,18 @@ class Setting:
         return f"{text} or null" if self.null and "null" not in text else text
 
     def check(self, key: str, value: Any) -> None:
-        """Check a value by itself; limits that depend on other settings are checked by `validation`.
-
-        Parameters
-        ----------
-        key : str
-            Full name of the setting.
-        value : Any
-            Its value.
-
-        Raises
-        ------
-        ConfigError
-            If the value is not allowed.
-        """
+        """Check a value by itself; limits that depend on other settings are checked by `validation`."""
         if not (value is None and self.null) and not self.limit.allows(value):
             raise ConfigError(f"{key}={self.limit.shown(value)}: expected {self.allowed}")
 
 
-def key(
-    default: Any,
-    meaning: str,
-    limit: Limit,
-    *,
-    unit: str = "",
-    null: str = "",
-    decides_data: bool = True,
-    section: str = "",
-    since: str = "",
-) -> Any:
-    """Return a field of the schema with its description; the parameters are those of `Setting`.
-
-    Parameters
-    ----------
-    default : Any
-        Default value; a list is copied for each instance.
-    meaning : str
-        One sentence for users.
-    limit : Limit
-        The allowed values.
-    unit, null : str
-        Unit of a number, and what null means.
-    decides_data : bool
-        Whether the bytes of a dataset depend on the value.
-    section : str
-        Title of the part of the group that the key belongs to.
-    since : str
-        First version that records the key; empty for keys of all versions.
-
-    Returns
-    -------
-    dataclasses.Field
-        For the body of a dataclass.
-    """
-    metadata = {METADATA: Setting(meaning, limit, unit, null, decides_data, section, since)}
-    if isinstance(default, list):
-        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+def key(default: Any, meaning: str, limit: Limit, **details: Any) -> Any:
+    """Return a field of the schema with its description; ``details`` are other fields of `Setting`."""
+    return dataclasses.field(default=default, metadata={METADATA: Setting(meaning, limit, **details)})
 
 
 def settings_of(group: Any) -> Mapping[str, Setting]:
-    """Return the settings of a group by key.
-
-    Parameters
-    ----------
-    group : dataclass
-        A class of `schema`, or an instance.
-
-    Returns
-    -------
-    dict of str to Setting
-        In the order of the fields; groups inside the group are left out.
-    """
+    """Return the settings of a group by key."""
     return {field.name: field.metadata[METADATA] for field in dataclasses.fields(group) if METADATA in field.metadata}
 
 

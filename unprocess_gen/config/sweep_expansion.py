@@ -25,6 +25,8 @@ from unprocess_gen.core.errors import ConfigError
 MAX_JOBS = 100_000
 """Most jobs of one sweep: each takes 0.2 s to compose, so a larger number is a mistake."""
 
+TOO_MANY_JOBS = f"a sweep of more than {MAX_JOBS} jobs; expected fewer values"
+
 PLUGIN_KEYS = ("sweeper", "launcher")
 BUILT_IN = "hydra._internal.core_plugins.basic_"
 """Start of the ``_target_`` of Hydra's own sweeper and launcher, which the sweep of this package replaces."""
@@ -45,14 +47,8 @@ FIXED_KEYS: dict[str, tuple[Any, ...]] = {
 class SweepJob:
     """One combination of a sweep.
 
-    Attributes
-    ----------
-    overrides : tuple of str
-        All overrides of the job.
-    named : tuple of str
-        The overrides that name its folder: without settings of Hydra, and without the option that described the sweep.
-    swept : mapping of str to str
-        Value of each swept key.
+    ``named`` are the overrides that name its folder: without settings of Hydra, and without the option that described
+    the sweep. ``swept`` has the value of each swept key.
     """
 
     overrides: tuple[str, ...]
@@ -62,22 +58,11 @@ class SweepJob:
 
 @dataclass(frozen=True, slots=True)
 class Expansion:
-    """Hold what a list of overrides describes: one config, or a sweep.
+    """The composed ``node`` of one config, or the jobs of a sweep.
 
-    Attributes
-    ----------
-    node : DictConfig or None
-        The composed config of a single run; None for a sweep.
-    jobs : tuple of SweepJob
-        Jobs of a sweep, in order; the value written last changes fastest.
-    plugins : tuple of str
-        Classes of the user's Hydra launcher and sweeper that run the sweep, if any; then ``jobs`` is empty.
-    described_by : tuple of str
-        The overrides whose option files contain the swept values; they are not in the names of folders.
-    fixed : tuple of str
-        The overrides that are equal in all jobs.
-    out : str
-        The sweep's folder, if ``plugins`` run the sweep; else empty.
+    The ``jobs`` of a sweep are in order; the value written last changes fastest. If the user's launcher and sweeper
+    ``plugins`` run it, into the folder ``out``, its jobs are not known. Then ``described_by`` has the overrides whose
+    option files contain swept values, and ``fixed`` those that are equal in all jobs.
     """
 
     node: DictConfig | None
@@ -102,7 +87,7 @@ class _Choice:
         return self.key.lstrip("+")
 
     @property
-    def of_hydra(self) -> bool:
+    def sets_hydra(self) -> bool:
         return self.name.startswith(("hydra.", "hydra/"))
 
     @property
@@ -114,93 +99,78 @@ class _Choice:
         return [f"{self.key}={value}" for value in self.values]
 
 
+@dataclass(frozen=True, slots=True)
+class _Base:
+    """Swept values of option files, and the overrides that chose these files."""
+
+    params: list[_Choice]
+    origin: tuple[str, ...]
+
+
 def expand(
     overrides: Sequence[str], folders: OptionFolders, multirun: bool = False, use_plugins: bool = False
 ) -> Expansion:
     """Decide whether overrides describe one run or a sweep, and list the jobs of a sweep.
 
     A sweep is requested by ``multirun`` or by ``hydra.mode: MULTIRUN`` in an option file. Its values come from the
-    overrides and from ``hydra.sweeper.params``; an override of a key wins over a parameter of the same key.
-
-    Parameters
-    ----------
-    overrides : sequence of str
-        Overrides as the user wrote them.
-    folders : OptionFolders
-        What to compose from.
-    multirun : bool
-        Whether the user asked for a sweep (``-m``).
-    use_plugins : bool
-        Whether to leave the expansion to the user's Hydra launcher or sweeper plugin, if the config has one.
-
-    Returns
-    -------
-    Expansion
-        The composed config, or the jobs.
-
-    Raises
-    ------
-    ConfigError
-        If an override or option file of a single run is refused, or a sweep cannot be honoured.
+    overrides and from ``hydra.sweeper.params``; an override of a key wins over a parameter of the same key. With
+    ``use_plugins``, the user's Hydra launcher or sweeper plugin expands the sweep, if the config has one.
     """
     choices = _parse(overrides, folders)
-    swept_groups = [choice for choice in choices if choice.swept and choice.adds_group]
-    jobs: list[SweepJob] = []
+    fixed = [choice.text for choice in choices if not choice.swept]
+    added = [choice.overrides() for choice in choices if choice.swept and choice.adds_group]
+    bases: dict[tuple[str, ...], _Base] = {}
     plugins: tuple[str, ...] = ()
-    described: tuple[str, ...] = ()
-    plugins_out = ""
-    bases: dict[tuple[str, ...], tuple[list[_Choice], tuple[str, ...]]] = {}
-    for combination in itertools.product(*(choice.overrides() for choice in swept_groups)):
-        fixed = [choice.text for choice in choices if not choice.swept]
+    out = ""
+    for combination in itertools.product(*added):
         try:
             node = compose_node([*fixed, *combination], folders)
         except ConfigError:
             if not multirun:
                 raise
-            bases[combination] = [], ()  # each job reports the error itself
+            bases[combination] = _Base([], ())  # each job reports the error itself
             continue
         _check_hydra_settings(node)
         if not multirun and not is_multirun(node):
             _refuse_values_without_sweep(choices, node)
             return Expansion(node)
         if use_plugins and not plugins and (plugins := _plugins(node)):
-            plugins_out = str(resolved_value(node, "out", overrides))
-        params = _params(node, choices, folders)
+            out = str(resolved_value(node, "out", overrides))
         origin = _described_by(_raw_params(node), choices, [*fixed, *combination], folders)
-        described += origin
-        bases[combination] = params, origin
-    fixed_overrides = tuple(one for choice in choices if not choice.swept for one in choice.overrides())
-    described = tuple(dict.fromkeys(described))
+        bases[combination] = _Base(_params(node, choices, folders), origin)
     if plugins:
-        return Expansion(None, (), plugins, described, fixed_overrides, plugins_out)
-    for choice in [*choices, *(one for params, _ in bases.values() for one in params)]:
+        described = tuple(dict.fromkeys(override for base in bases.values() for override in base.origin))
+        equal = tuple(override for choice in choices if not choice.swept for override in choice.overrides())
+        return Expansion(None, plugins=plugins, described_by=described, fixed=equal, out=out)
+    jobs = tuple(itertools.islice(_jobs(choices, bases), MAX_JOBS + 1))
+    if len(jobs) > MAX_JOBS:
+        raise ConfigError(TOO_MANY_JOBS)
+    return Expansion(None, jobs)
+
+
+def _jobs(choices: list[_Choice], bases: Mapping[tuple[str, ...], _Base]) -> Iterator[SweepJob]:
+    """Yield each combination of the overrides with each combination of its option files' values."""
+    for choice in [*choices, *(param for base in bases.values() for param in base.params)]:
         if choice.swept and not choice.values:
             raise ConfigError(f"{choice.text}: an interval has no list of values; expected choice or range")
+    added = [choice.key for choice in choices if choice.swept and choice.adds_group]
     for own in _combinations(choices):
-        combination = tuple(own[choice.key] for choice in swept_groups)
-        params, origin = bases[combination]
-        for added in _combinations(params):
-            jobs.append(_job(own, added, [*choices, *params], origin))
-            if len(jobs) > MAX_JOBS:
-                raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
-    return Expansion(None, tuple(jobs), (), described, fixed_overrides)
+        base = bases[tuple(own[key] for key in added)]
+        for params in _combinations(base.params):
+            yield _job(own | params, [*choices, *base.params], base.origin)
 
 
-def check_job(node: DictConfig, job: SweepJob) -> None:
-    """Refuse a job whose option files contain swept values that the expansion has not seen.
+def _job(overrides: dict[str, str], choices: list[_Choice], origin: tuple[str, ...]) -> SweepJob:
+    named = [
+        overrides[choice.key] for choice in choices if not choice.sets_hydra and overrides[choice.key] not in origin
+    ]
+    swept = {choice.name: overrides[choice.key].partition("=")[2] for choice in choices if choice.swept}
+    return SweepJob(tuple(overrides.values()), tuple(named), swept)
 
-    Parameters
-    ----------
-    node : DictConfig
-        The composed job, with Hydra's settings.
-    job : SweepJob
-        The job as it was expanded.
 
-    Raises
-    ------
-    ConfigError
-        If a parameter of ``hydra.sweeper.params`` is not fixed by the job.
-    """
+def composed_job(job: SweepJob, folders: OptionFolders) -> DictConfig:
+    """Compose a job; ConfigError if its option files contain swept values that the expansion has not seen."""
+    node = compose_node(job.overrides, folders)
     given = {override.partition("=")[0].lstrip("+") for override in job.overrides}
     for key in _raw_params(node):
         if key.lstrip("+") not in given:
@@ -209,6 +179,7 @@ def check_job(node: DictConfig, job: SweepJob) -> None:
                 "primary config or in an option added with +group=option"
             )
     _check_hydra_settings(node)
+    return node
 
 
 def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
@@ -217,21 +188,19 @@ def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
     choices: dict[str, _Choice] = {}
     try:
         parsed = parser.parse_overrides([quoted_path(one) for one in overrides])
-        for text, one in zip(overrides, parsed, strict=True):
-            key = one.get_key_element()
-            if not one.is_sweep_override():
-                choice = _Choice(key, (one.get_value_element_as_str(),), False, text)
-            elif not one.is_discrete_sweep():
-                choice = _Choice(key, (), True, text)  # an interval: for sweeper plugins only
-            else:
-                values = tuple(itertools.islice(one.sweep_string_iterator(), MAX_JOBS + 1))
-                choice = _Choice(key, values, True, text)
+        for text, override in zip(overrides, parsed, strict=True):
+            key, values = override.get_key_element(), tuple[str, ...]()
+            if not override.is_sweep_override():
+                values = (override.get_value_element_as_str(),)
+            elif override.is_discrete_sweep():  # else an interval, for sweeper plugins only
+                values = tuple(itertools.islice(override.sweep_string_iterator(), MAX_JOBS + 1))
+            choice = _Choice(key, values, override.is_sweep_override(), text)
             _refuse_repetition(choice, choices.values())
             choices[key] = choice
     except (HydraException, ValueError, RecursionError) as error:
         raise ConfigError(explain(error, overrides)) from error
     if math.prod(max(len(choice.values), 1) for choice in choices.values()) > MAX_JOBS:
-        raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
+        raise ConfigError(TOO_MANY_JOBS)
     return list(choices.values())
 
 
@@ -250,13 +219,6 @@ def _combinations(choices: Iterable[_Choice]) -> Iterator[dict[str, str]]:
     choices = list(choices)
     for values in itertools.product(*(choice.overrides() for choice in choices)):
         yield dict(zip((choice.key for choice in choices), values, strict=True))
-
-
-def _job(own: dict[str, str], added: dict[str, str], choices: list[_Choice], origin: tuple[str, ...]) -> SweepJob:
-    overrides = own | added
-    named = [overrides[choice.key] for choice in choices if not choice.of_hydra and overrides[choice.key] not in origin]
-    swept = {choice.name: overrides[choice.key].partition("=")[2] for choice in choices if choice.swept}
-    return SweepJob(tuple(overrides.values()), tuple(named), swept)
 
 
 def _raw_params(node: DictConfig) -> dict[str, Any]:
@@ -293,10 +255,7 @@ def _spelling(value: Any) -> str:
 
 
 def _described_by(
-    params: Mapping[str, Any],
-    choices: Sequence[_Choice],
-    overrides: Sequence[str],
-    folders: OptionFolders,
+    params: Mapping[str, Any], choices: Sequence[_Choice], overrides: Sequence[str], folders: OptionFolders
 ) -> tuple[str, ...]:
     """Return the added options that contain the sweep's values: without one of them, its values are missing."""
     if not params:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import functools
 import re
+from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 
 from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn
@@ -41,13 +41,13 @@ from unprocess_gen.config.schema import (
     all_settings,
 )
 from unprocess_gen.config.settings import settings_of
-from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.config.values import one_of, value_text
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.object_store import StoreAccessError, any_path, is_url
+from unprocess_gen.core.object_store import StoreAccessError
+from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.core.types import UINT16
+from unprocess_gen.simulation.effects import REPLACED
 from unprocess_gen.simulation.reference import colour
-from unprocess_gen.simulation.reference.noise import REPLACED
 
 CHECKED_WHERE_USED = ("scene.iso", "noise.iso", "noise.a", "noise.b", "noise.bits")
 """Settings that `noise_validation` checks if the noise profile uses them, as version 0.1 did.
@@ -60,7 +60,7 @@ SWITCHES = tuple(
 )
 """Effects that have a switch of their own."""
 
-SEED = settings_of(Config)["seed"].limit
+SEED = settings_of(Config)["seed"]
 
 _DIGEST = re.compile("[0-9a-f]{64}")
 
@@ -68,53 +68,22 @@ _DIGEST = re.compile("[0-9a-f]{64}")
 
 
 def validate_config(config: Config) -> None:
-    """Check a configuration before a run.
-
-    Parameters
-    ----------
-    config : Config
-        The composed configuration.
-
-    Raises
-    ------
-    ConfigError
-        If a value is not allowed, or does not fit this machine: no such ``source.root``, Pillow not installed. One
-        line with the key, the value and what is allowed.
-    """
-    content = snapshot(config)
-    if content is None or not SEED.allows(config.seed) or not _has_allowed_values(content):
-        check_values(config)
+    """Check a configuration before a run: its values, and whether they fit this machine."""
+    check_values(config)
     _check_environment(config)
     check_parquet(config.output)
     _check_dark_folder(config.noise)
 
 
-@functools.lru_cache(maxsize=64)
-def _has_allowed_values(content: bytes) -> bool:
-    """Return whether `check_values` accepts the config of a snapshot, with an allowed seed.
-
-    Without the cache, every call of `unprocess_gen.make_pair` checks its config for 0.2 to 0.4 ms.
-    """
-    try:
-        check_values(restored(content))
-    except ConfigError:
-        return False
-    return True
-
-
 def check_values(config: Config) -> None:
-    """Check the values of a configuration, independent of files and installed packages.
+    """Check the values of a configuration, composed or recorded, independent of files and installed packages."""
+    SEED.check("seed", config.seed)
+    _check_values(replace(config, seed=0))
 
-    Parameters
-    ----------
-    config : Config
-        The configuration, composed or read from the ``config.yaml`` of a dataset.
 
-    Raises
-    ------
-    ConfigError
-        If a value is not allowed: one line with the key, the value and what is allowed.
-    """
+@functools.lru_cache(maxsize=64)
+def _check_values(config: Config) -> None:
+    """Check all values but the seed, once for each config: `unprocess_gen.make_pair` checks it in every call."""
     _check_settings(config)
     _check_source(config.source)
     _check_camera(config.camera)
@@ -131,18 +100,7 @@ def check_values(config: Config) -> None:
 
 
 def check_parquet(output: OutputConfig) -> None:
-    """Check that pyarrow is installed if ``manifest.parquet`` is wanted.
-
-    Parameters
-    ----------
-    output : OutputConfig
-        The format of the dataset.
-
-    Raises
-    ------
-    ConfigError
-        If it is not.
-    """
+    """Check that pyarrow is installed if ``manifest.parquet`` is wanted."""
     if output.parquet and find_spec("pyarrow") is None:
         raise ConfigError(
             "output.parquet=true: needs pyarrow; in the source folder, run: pip install '.[parquet]', or set "
@@ -210,7 +168,7 @@ def _check_camera(camera: CameraConfig) -> None:
     if camera.law != "custom":
         if camera.xyz2cam is not None:
             raise ConfigError(
-                f"camera.xyz2cam={camera.xyz2cam}: a matrix needs camera.law=custom, not {camera.law}; "
+                f"camera.xyz2cam={value_text(camera.xyz2cam)}: a matrix needs camera.law=custom, not {camera.law}; "
                 "set camera=custom"
             )
         return
@@ -221,7 +179,7 @@ def _check_camera(camera: CameraConfig) -> None:
     try:
         colour.rgb2cam(colour.matrix(camera.xyz2cam))
     except ValueError as error:
-        raise ConfigError(f"camera.xyz2cam={camera.xyz2cam}: {error}") from error
+        raise ConfigError(f"camera.xyz2cam={value_text(camera.xyz2cam)}: {error}") from error
     if camera.name in (*colour.CAMERAS, *CAMERA_LAWS.words) and camera.name != "custom":
         raise ConfigError(f"camera.name={camera.name}: is the name of an existing camera; expected a new name")
 
@@ -295,21 +253,18 @@ def _check_dark_folder(noise: NoiseConfig) -> None:
     """Raise ConfigError if dark frames or the map of a recorded config are not given, or do not exist."""
     if noise.dark_frames is None and noise.dark_frames_sha256 is not None:
         raise ConfigError("noise.dark_frames is missing; expected the folder of the recorded dark frames")
-    if is_url(noise.dark_frames):
-        raise ConfigError(
-            f"noise.dark_frames={noise.dark_frames}: dark frames are read from a local folder only; copy them to one"
-        )
-    if noise.dark_frames is not None and not Path(noise.dark_frames).is_dir():
-        raise ConfigError(f"noise.dark_frames={noise.dark_frames}: no such folder; expected a folder of dark frames")
+    if noise.dark_frames is not None:
+        start = f"noise.dark_frames={noise.dark_frames}"
+        refusal = f"{start}: dark frames are read from a local folder only; copy them to one"
+        if not local_path(noise.dark_frames, refusal).is_dir():
+            raise ConfigError(f"{start}: no such folder; expected a folder of dark frames")
     place = shading_place(noise)
     if place is None and noise.dark_shading_sha256 is not None:
         raise ConfigError("noise.dark_shading is missing; expected the place of the recorded dark-shading map")
-    if is_url(place):
-        raise ConfigError(f"noise.dark_shading={place}: maps are read from a local folder only; copy them to one")
-    if place is not None and not Path(place).exists():
-        raise ConfigError(
-            f"noise.dark_shading={place}: no such file or folder; expected keep, remove, or a dark-shading map"
-        )
+    if place is not None:
+        start = f"noise.dark_shading={place}"
+        if not local_path(place, f"{start}: maps are read from a local folder only; copy them to one").exists():
+            raise ConfigError(f"{start}: no such file or folder; expected keep, remove, or a dark-shading map")
 
 
 # ------------------------------------------------------------------------------------------------ effects and output

@@ -10,22 +10,7 @@ from unprocess_gen.core.errors import ConfigError
 
 
 def one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
-    """Check that a value is one of a few words.
-
-    Parameters
-    ----------
-    key : str
-        Full name of the setting, for the message.
-    value : Any
-        Its value.
-    allowed : tuple of str
-        The words.
-
-    Raises
-    ------
-    ConfigError
-        If it is none of them.
-    """
+    """Check that a value is one of a few words."""
     if value not in allowed:
         raise ConfigError(f"{key}={value_text(value)}: expected one of {', '.join(allowed)}")
 
@@ -52,19 +37,8 @@ def is_number(value: Any) -> bool:
 
 
 def value_text(value: Any) -> str:
-    """Format a value for a message.
-
-    Parameters
-    ----------
-    value : Any
-        A configuration value.
-
-    Returns
-    -------
-    str
-        The value as YAML writes it: None as ``null``, lists in brackets.
-    """
-    if isinstance(value, list):
+    """Format a value for a message as YAML writes it: None as ``null``, lists in brackets."""
+    if isinstance(value, list | tuple):
         return "[" + ", ".join(value_text(item) for item in value) + "]"
     if is_integer(value) and value.bit_length() > MAX_PRINTED_BITS:
         return f"an integer of {value.bit_length()} bits"  # Python refuses to convert the longest to text
@@ -75,35 +49,11 @@ MAX_PRINTED_BITS = 1024
 
 
 def error_in_one_line(error: BaseException) -> str:
-    """Return the message of an exception with each run of white space replaced by one space.
-
-    Parameters
-    ----------
-    error : BaseException
-        Any exception.
-
-    Returns
-    -------
-    str
-        The message, or the name of the exception's class if the message is empty.
-    """
+    """Return the message of an exception with each run of white space replaced by one space."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def value_range(values: Sequence[float], digits: int = 6) -> str:
-    """Return the smallest and largest of some numbers as text.
-
-    Parameters
-    ----------
-    values : sequence of float
-        At least one number.
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-        Both numbers, or the number itself if they are equal.
-    """
+    """Return the smallest and largest of some numbers as text."""
     low, high = f"{min(values):.{digits}g}", f"{max(values):.{digits}g}"
     return low if low == high else f"{low} to {high}"

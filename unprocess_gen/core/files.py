@@ -9,83 +9,44 @@ import shutil
 import sys
 from contextlib import suppress
 from pathlib import Path
-
-import numpy as np
-import xxhash
+from typing import TYPE_CHECKING
 
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.object_store import AnyPath
-from unprocess_gen.core.types import DESCRIPTIONS, Frame
+from unprocess_gen.core.object_store import ObjectPath
+
+if TYPE_CHECKING:
+    from unprocess_gen.core.types import Frame
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors for which the free space of the disk is worth reporting."""
 
 
 def array_xxh3(array: Frame) -> str:
-    """Return the XXH3-128 of an array's little-endian bytes.
+    """XXH3-128 of an array's little-endian bytes, 32 hex digits."""
+    import xxhash
 
-    Parameters
-    ----------
-    array : ndarray
-        Any shape; of a dtype that a dataset can hold.
-
-    Returns
-    -------
-    str
-        32 hex digits.
-    """
     return xxhash.xxh3_128_hexdigest(little_endian(array).data)
 
 
 def little_endian(array: Frame) -> Frame:
-    """Return an array as contiguous little-endian numbers.
+    """Return an array as contiguous little-endian numbers, without a copy if it is that already."""
+    import numpy as np  # takes longer than the start of a command may
 
-    Parameters
-    ----------
-    array : ndarray
-        Any shape; of a dtype that a dataset can hold.
+    from unprocess_gen.core.types import DESCRIPTIONS
 
-    Returns
-    -------
-    ndarray
-        The array itself if it is contiguous and little-endian, a copy otherwise.
-    """
     return np.ascontiguousarray(array, dtype=DESCRIPTIONS[array.dtype.name])
 
 
-def file_sha256(path: AnyPath) -> str:
-    """Return the SHA-256 of a file.
-
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        The file.
-
-    Returns
-    -------
-    str
-        64 hex digits.
-    """
+def file_sha256(path: Path | ObjectPath) -> str:
+    """SHA-256 of a file, 64 hex digits."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def machine_error(error: OSError, path: AnyPath, advice: str = "") -> MachineError:
-    """Turn a failed file operation into one sentence: which path, why, and how much space is free if it matters.
+def machine_error(error: OSError, path: Path | ObjectPath, advice: str = "") -> MachineError:
+    """Return a failed file operation as one sentence: path, reason, free space if it matters, and ``advice``.
 
-    Parameters
-    ----------
-    error : OSError
-        What the operating system reported.
-    path : Path or ObjectPath
-        The file or folder in use, for errors that name none.
-    advice : str
-        What to do, appended to the sentence.
-
-    Returns
-    -------
-    MachineError
-        For the caller to raise.
+    ``path`` is the file or folder in use, for errors that name none.
     """
     reason = error.strerror or str(error)
     if error.errno in NO_SPACE and isinstance(path, Path):
@@ -97,18 +58,7 @@ def machine_error(error: OSError, path: AnyPath, advice: str = "") -> MachineErr
 
 
 def free_bytes(path: Path) -> int:
-    """Return the bytes that are free on the disk of a path.
-
-    Parameters
-    ----------
-    path : Path
-        A file or folder; if it does not exist, its nearest parent that does is used.
-
-    Returns
-    -------
-    int
-        Free bytes for an unprivileged user.
-    """
+    """Bytes that are free for an unprivileged user on the disk of a path, or of its nearest parent that exists."""
     path = Path(os.path.abspath(path))
     while not path.exists() and path != path.parent:
         path = path.parent
@@ -116,32 +66,22 @@ def free_bytes(path: Path) -> int:
 
 
 def commit_file(temporary: Path, path: Path) -> None:
-    """Rename a finished file to its final name, durably; a file of that name is replaced.
-
-    Parameters
-    ----------
-    temporary : Path
-        The finished file, on the same file system.
-    path : Path
-        Its final name.
-    """
+    """Rename a finished file to its final name on the same file system, durably; replace a file of that name."""
     sync(temporary)
     os.replace(temporary, path)
-    if sys.platform != "win32":  # Windows opens no folders
-        sync(path.parent)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the renames in a folder survive a loss of power; Windows, which opens no folders, does so by itself."""
+    if sys.platform != "win32":
+        sync(folder)
 
 
 def sync(path: Path) -> None:
-    """Make a file's contents, or a folder's renames, survive a loss of power.
-
-    Parameters
-    ----------
-    path : Path
-        A file or folder.
-    """
-    handle = os.open(
-        path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
-    )  # Windows syncs only what it may write
+    """Make a file's contents, or a folder's renames, survive a loss of power."""
+    # Windows syncs only what it may write
+    handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -149,17 +89,9 @@ def sync(path: Path) -> None:
 
 
 def leads_outside(path: str) -> bool:
-    """Return whether a relative path leads out of the folder that it is relative to.
+    """Return whether a relative path with ``/`` between its segments is absolute or contains ``..``.
 
-    Parameters
-    ----------
-    path : str
-        A path with ``/`` between its segments. On Windows, backslashes separate segments too.
-
-    Returns
-    -------
-    bool
-        True for an absolute path, a path with a drive, and a path with a ``..`` segment.
+    On Windows, backslashes separate segments too, and a drive leads outside.
     """
     path = path.replace(os.sep, "/")
     return path.startswith("/") or ".." in path.split("/") or os.path.splitdrive(path)[0] != ""

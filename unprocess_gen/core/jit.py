@@ -71,15 +71,15 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 _INNER_OPTIONS: Any = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
-def by_class(implementations: Mapping[Any, Callable[..., Any]]) -> Callable[..., Any]:
-    """Return a function that calls one of several kernels, chosen by the class of its first argument or arguments.
+def by_class(implementations: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function that calls one of several kernels, chosen by the class of its first argument.
 
-    Compiled kernels contain only the chosen one, because Numba knows the classes when it compiles them.
+    Compiled kernels contain only the chosen one, because Numba knows the class when it compiles them.
 
     Parameters
     ----------
-    implementations : mapping of class, or of a tuple of classes, to callable
-        Return values of `inner` by class of named tuple; all take the same number of arguments.
+    implementations : mapping of class to callable
+        Return values of `inner`, or plain functions, by class of named tuple; all take the same number of arguments.
 
     Returns
     -------
@@ -87,25 +87,21 @@ def by_class(implementations: Mapping[Any, Callable[..., Any]]) -> Callable[...,
         Function for use in kernels.
     """
 
-    first = next(iter(implementations))
-    count = len(first) if isinstance(first, tuple) else 1
+    def call(first: Any, *others: Any) -> Any:
+        return _implementation(implementations, type(first))(first, *others)
 
-    def call(*arguments: Any) -> Any:
-        return _implementation(implementations, [type(each) for each in arguments[:count]])(*arguments)
-
-    def choose(*types: Any) -> Any:
-        chosen = _implementation(implementations, [each.instance_class for each in types[:count]])
+    def choose(first: Any, *others: Any) -> Any:
+        chosen = _implementation(implementations, first.instance_class)
         return getattr(chosen, "py_func", chosen)
 
     overload(call, jit_options=_INNER_OPTIONS, strict=False)(choose)
     return call
 
 
-def _implementation(implementations: Mapping[Any, Callable[..., Any]], classes: list[type]) -> Any:
-    key = classes[0] if len(classes) == 1 else tuple(classes)
-    if key not in implementations:
-        raise TypeError(f"{', '.join(each.__name__ for each in classes)}: no kernel takes it")
-    return implementations[key]
+def _implementation(implementations: Mapping[type, Any], kind: type) -> Any:
+    if kind not in implementations:
+        raise TypeError(f"{kind.__name__}: no kernel takes it")
+    return implementations[kind]
 
 
 def has_run(kernels: str) -> bool:

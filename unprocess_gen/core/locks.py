@@ -39,59 +39,35 @@ _HELD: set[str] = set()
 
 
 class LockFile:
-    """Hold a lock from `acquire` until `release` or the end of the process.
-
-    Parameters
-    ----------
-    path : Path
-        The file, in a folder that exists.
-    """
+    """Hold a lock from `acquire` until `release` or the end of the process; ``path`` is in a folder that exists."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         self._text = ""
         self._released = threading.Event()
         self._handle: int | None = None
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self._path
-
     def acquire(self, wait: bool) -> None:
         """Create the file; replace one whose owner has ended.
 
-        Parameters
-        ----------
-        wait : bool
-            Whether to wait while another process holds the lock.
-
-        Raises
-        ------
-        BlockingIOError
-            If another process holds the lock and ``wait`` is False.
-        OSError
-            If the file cannot be created.
+        Raises BlockingIOError if another process holds the lock and ``wait`` is False, OSError if the file cannot be
+        created.
         """
         mark = uuid.uuid4().hex
         owner = {"host": host(), "pid": os.getpid(), "start": process_start(os.getpid()), "mark": mark}
-        self._text = json.dumps(owner)
+        text = json.dumps(owner)
         _HELD.add(mark)  # before the file exists: another thread would take it for one that could not be deleted
         try:
-            while not self._create():
-                found = self._holder()
-                if found is None:
+            while not self._create(text):
+                if self._delete_ended():
                     continue
-                if not self._is_held():
-                    self._remove(found)
-                elif not wait:
+                if not wait:
                     raise BlockingIOError("is locked by another process")
-                else:
-                    time.sleep(POLL_S)
+                time.sleep(POLL_S)
         except BaseException:
             _HELD.discard(mark)
-            self._text = ""
             raise
+        self._text = text
         self._released.clear()
         threading.Thread(target=self._renew, args=(self._released,), daemon=True).start()
 
@@ -105,21 +81,21 @@ class LockFile:
             os.close(self._handle)
             self._handle = None
         with suppress(OSError):  # the folder may have been deleted
-            if self._path.read_text(encoding="utf-8") == self._text:
-                self._path.unlink()
+            if self.path.read_text(encoding="utf-8") == self._text:
+                self.path.unlink()
         self._text = ""
 
-    def _create(self) -> bool:
+    def _create(self, text: str) -> bool:
         """Create the file with its text; return False if it exists."""
         try:
-            handle = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
             return False
         try:
-            os.write(handle, self._text.encode())
+            os.write(handle, text.encode())
         except OSError:  # the disk is full
             os.close(handle)
-            self._path.unlink()
+            self.path.unlink()
             raise
         if sys.platform == "win32":
             self._handle = handle
@@ -127,61 +103,41 @@ class LockFile:
             os.close(handle)
         return True
 
-    def _holder(self) -> str | None:
-        """Return the text of the file, None if it was deleted meanwhile."""
-        try:
-            return self._path.read_text(encoding="utf-8", errors="replace")
-        except FileNotFoundError:
-            return None
+    def _delete_ended(self) -> bool:
+        """Delete the file if its owner has ended; return False if the owner still runs.
 
-    def _is_held(self) -> bool:
-        if sys.platform != "win32":
-            return is_held(self._path)
-        else:  # noqa: RET505 - mypy understands the platform of a branch only
-            try:
-                self._path.unlink()
-            except PermissionError:
-                return True
-            return False
-
-    def _remove(self, found: str) -> None:
-        """Remove the file of an owner that has ended, unless another process has replaced it meanwhile.
-
-        One process at a time may compare and remove, which a second file decides; otherwise a slow process could remove
+        One process at a time may judge and delete, which a second file decides; otherwise a slow process could delete
         the file of a quicker one.
         """
-        guard = self._path.with_name(f"{self._path.name}.takeover")
-        try:
-            os.close(os.open(guard, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-        except FileExistsError:
-            if _age_s(guard) > STALE_S:  # its process was killed between the next lines
-                guard.unlink(missing_ok=True)
+        if sys.platform == "win32":
+            with suppress(PermissionError):
+                self.path.unlink(missing_ok=True)
+            return not self.path.exists()
+        guard = LockFile(self.path.with_name(f"{self.path.name}.takeover"))
+        if self.path.exists() and is_held(self.path):
+            return False
+        if guard._create(""):
+            try:
+                if self.path.exists() and not is_held(self.path):
+                    self.path.unlink(missing_ok=True)
+            finally:
+                guard.path.unlink(missing_ok=True)
+        elif _age_s(guard.path) > STALE_S:  # its process was killed between the lines above
+            guard.path.unlink(missing_ok=True)
+        else:
             time.sleep(POLL_S)
-            return
-        try:
-            if self._holder() == found:
-                self._path.unlink(missing_ok=True)
-        finally:
-            guard.unlink(missing_ok=True)
+        return True
 
     def _renew(self, released: threading.Event) -> None:
         while not released.wait(HEARTBEAT_S):
             with suppress(OSError):
-                os.utime(self._path)
+                os.utime(self.path)
 
 
 def is_held(path: Path) -> bool:
     """Return whether the owner of a lock file still runs, as far as other processes can see.
 
-    Parameters
-    ----------
-    path : Path
-        The file; one that does not exist is held for as long as its folder is younger than `STALE_S`.
-
-    Returns
-    -------
-    bool
-        False if the owner has ended, or renewed its lock more than `STALE_S` seconds ago.
+    A file that does not exist is held for as long as its folder is younger than `STALE_S`.
     """
     ended = has_ended(path)
     return not ended if ended is not None else _age_s(path) < STALE_S
@@ -190,32 +146,22 @@ def is_held(path: Path) -> bool:
 def has_ended(path: Path) -> bool | None:
     """Return whether the owner of a lock file has ended, if this host's process table shows it.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    bool or None
-        None if the owner ran on another host or is not named, or if this system reports no processes.
+    None if the owner ran on another host or is not named, or if this system reports no processes.
     """
     try:
         owner = json.loads(path.read_text(encoding="utf-8"))
-        if owner["host"] == host() and owner["pid"] == os.getpid() and owner["mark"] in _HELD:
-            return False
-        if owner["host"] == host() and owner["pid"] == os.getpid():
-            return True
-        start = process_start(int(owner["pid"])) if owner["host"] == host() else None
-        if start is not None and owner["start"] is not None:
-            return bool(start != owner["start"])
+        if owner["host"] != host():
+            return None
+        if owner["pid"] == os.getpid():
+            return owner["mark"] not in _HELD
+        start = process_start(int(owner["pid"]))
+        return None if start is None or owner["start"] is None else bool(start != owner["start"])
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # its owner has created the file and not yet written it, or has deleted it
-    return None
+        return None  # its owner has created the file and not yet written it, or has deleted it
 
 
 def _age_s(path: Path) -> float:
-    """Return the time since a file was renewed by the clock of its file system, which may be another machine's."""
+    """Time since a file was renewed by the clock of its file system, which may be another machine's."""
     try:
         renewed = path.stat().st_mtime
     except FileNotFoundError:
@@ -230,14 +176,7 @@ def _age_s(path: Path) -> float:
 
 @cache
 def host() -> str:
-    """Return what identifies this host and its process numbers.
-
-    Returns
-    -------
-    str
-        Name of the host; on Linux also its boot and its namespace of process numbers, because containers can share a
-        name.
-    """
+    """Name of this host; on Linux also its boot and its namespace of processes, because containers can share a name."""
     parts = [platform.node()]
     with suppress(OSError):
         parts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
@@ -246,36 +185,17 @@ def host() -> str:
 
 
 def process_start(pid: int) -> str | None:
-    """Return when a process started, which distinguishes it from later processes of its number.
+    """Time at which a process of this host started, which distinguishes it from later processes of its number.
 
-    Parameters
-    ----------
-    pid : int
-        Number of a process of this host.
-
-    Returns
-    -------
-    str or None
-        Empty if no such process runs; None if this system does not report it, or hides the process from this user.
+    Empty if no such process runs, or if the system hides it from this user; None if this system does not report it.
     """
     if platform.system() == "Linux":
         try:
             state, *fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            return None if _exists(pid) else ""
+        except FileNotFoundError:
+            return ""
         return "" if state in "ZX" else fields[18]  # proc(5): field 22 is the start in clock ticks since boot
     if platform.system() == "Darwin":
         listed = subprocess.run(["ps", "-o", "lstart=", "-p", str(pid)], capture_output=True, text=True, check=False)
         return listed.stdout.strip()
     return None
-
-
-def _exists(pid: int) -> bool:
-    """Return whether a process exists, also one of another user in a ``/proc`` mounted with ``hidepid``."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True

@@ -16,8 +16,10 @@ import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.exact_distributions import DIGITS, tukey_quantile, tukey_std
@@ -228,3 +230,42 @@ def _interpolate(z: Sequence[float]) -> tuple[float, float, float]:
     c2 = (slope12 - slope01) / (t[2] - t[0])
     c1 = slope01 - c2 * (t[0] + t[1])
     return z[0] - t[0] * (c1 + t[0] * c2), c1, c2
+
+
+LINES_PER_OCTAVE = 128
+LINE_SHIFT, FIRST_LINE = 16, 126 * LINES_PER_OCTAVE
+"""A word's line is number (bits of f) >> `LINE_SHIFT` - `FIRST_LINE`, for the float32 f = (its lower 31 bits) + ½."""
+
+FLOAT32_LINE_ERROR = 2.0**-21
+"""Error that float32 adds to a line, relative to the farthest quantile and to the line's rise over its octave."""
+
+
+class QuantileLines(NamedTuple):
+    """Approximate a symmetric distribution in float32 by lines start + slope·f; the last one is the median."""
+
+    start: NDArray[np.float32]
+    slope: NDArray[np.float32]
+    error: float  # largest difference from the quadratics
+
+
+def quantile_lines(table: Float) -> QuantileLines:
+    """Return lines for a table of quadratics ``[1024, 3]``: 128 for each octave, which halve the errors of chords."""
+    per_segment = LINES_PER_OCTAVE // SEGMENTS
+    rows = np.repeat(table, per_segment, axis=0)
+    t = np.arange(per_segment + 1) / LINES_PER_OCTAVE
+    part = np.tile(np.arange(per_segment), len(table))
+    low, high = t[part], t[part + 1]
+    z_low, z_high, z_middle = (rows[:, 0] + x * (rows[:, 1] + x * rows[:, 2]) for x in (low, high, (low + high) / 2))
+    octave = np.repeat(2.0 ** (np.arange(OCTAVES) - 1), LINES_PER_OCTAVE)
+    f_low = octave * (1 + np.tile(np.arange(LINES_PER_OCTAVE) / LINES_PER_OCTAVE, OCTAVES))
+    f_high = f_low + octave / LINES_PER_OCTAVE
+    slope = (z_high - z_low) / (f_high - f_low)
+    start = z_low - slope * f_low + (z_middle - (z_low + z_high) / 2) / 2
+    lines = [np.append(values, 0.0).astype(np.float32) for values in (start, slope)]
+    start64, slope64 = (values[:-1].astype(np.float64) for values in lines)
+    error = max(
+        float(np.abs(z - (start64 + slope64 * f)).max())
+        for z, f in ((z_low, f_low), (z_middle, (f_low + f_high) / 2), (z_high, f_high))
+    )
+    error += FLOAT32_LINE_ERROR * (float(np.abs(table[:, 0]).max()) + float(np.abs(slope * f_high).max()))
+    return QuantileLines(lines[0], lines[1], error)

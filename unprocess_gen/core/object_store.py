@@ -11,19 +11,22 @@ get a 5xx or 429 answer, with a growing delay, until `RETRY_TIMEOUT_S`. Measurem
 
 from __future__ import annotations
 
+import enum
 import io
 import itertools
 import os
 import re
+import shutil
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
 
 from unprocess_gen.core.errors import ConfigError, MachineError
 
@@ -52,11 +55,14 @@ MIN_PIECE, MAX_PIECE = 2**16, 2**23
 UPLOADS = 4
 """Pieces of `MAX_PIECE` bytes of one file that are uploaded at a time and are in memory."""
 
+PREFIX = "unprocess_gen-"
+"""Beginning of the names of temporary folders, by which a later run on this host finds those that a kill left."""
+
 DELETED_AT_ONCE = 1000
 """Objects that one request deletes, the most that S3 allows."""
 
 THREADS = 32
-"""Requests at a time of `in_threads`."""
+"""Requests at a time of `ObjectPath.each`."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -73,33 +79,43 @@ class StoreAccessError(MachineError):
     """Report that a store refuses access, or that a bucket does not exist."""
 
 
-class ObjectFacts(NamedTuple):
-    """Hold an entry of a listing: key below the listed prefix, size in bytes, ETag (None if the store has none)."""
+class EntryKind(enum.Enum):
+    """Kind of an entry of a folder."""
 
-    key: str
-    size: int
-    etag: str | None
+    FILE = "regular file or object"
+    FOLDER = "folder or prefix"
+    LOOP = "link to a folder that contains the link"
+    OTHER = "pipe or device"
+    BROKEN_LINK = "link to nothing"
+    UNREADABLE = "entry whose status cannot be read"
 
 
-class ObjectStat(NamedTuple):
-    """Hold the size of an object in bytes, under the name that `os.stat_result` gives it."""
+class Entry(NamedTuple):
+    """Entry of a folder.
 
-    st_size: int
+    Attributes
+    ----------
+    path : str
+        Path below the listed folder or prefix.
+    size : int or None
+        Size of a file in bytes.
+    kind : EntryKind
+        What the entry is.
+    etag : str or None
+        ETag of an object, if the store has ETags.
+    problem : str
+        Why the status of the entry cannot be read.
+    """
+
+    path: str
+    size: int | None
+    kind: EntryKind = EntryKind.FILE
+    etag: str | None = None
+    problem: str = ""
 
 
 def is_url(text: object) -> bool:
-    """Return whether a text is the URL of an object store, rather than a path.
-
-    Parameters
-    ----------
-    text : object
-        Value of ``source.root`` or ``out``, or a path.
-
-    Returns
-    -------
-    bool
-        True for ``s3://…``, ``gs://…`` and ``az://…``.
-    """
+    """Return whether a text is the URL of an object store: ``s3://…``, ``gs://…`` or ``az://…``."""
     return isinstance(text, str) and _URL.match(text) is not None
 
 
@@ -156,133 +172,129 @@ class ObjectPath:
         """Return the URL without its last part."""
         return ObjectPath(f"{self.scheme}://{self.bucket}/{self.key.rpartition('/')[0]}")
 
+    @property
+    def parents(self) -> tuple[ObjectPath, ...]:
+        """URLs of the prefixes above this one, the nearest first."""
+        return (self.parent, *self.parent.parents) if self.key else ()
+
+    def resolve(self) -> ObjectPath:
+        """Return the URL itself; object stores have no links."""
+        return self
+
     # -------------------------------------------------------------------------------------------------- as a folder
 
-    def objects(self, recursive: bool = True) -> Iterator[ObjectFacts]:
-        """List the objects below this prefix, without holding the listing in memory.
+    def walk_entries(self, recursive: bool = True) -> Iterator[Entry]:
+        """Yield the objects below this prefix in the order of the store, without holding the listing in memory.
 
-        Parameters
-        ----------
-        recursive : bool
-            Whether to list objects whose key has further slashes.
-
-        Yields
-        ------
-        ObjectFacts
-            In the order of the store. Empty objects ``FOLDER/``, by which consoles show folders, are omitted if they
-            are followed by objects below them; obstore lists them without the slash.
+        Empty objects ``FOLDER/``, by which consoles show folders, are omitted if they are followed by objects below
+        them; obstore lists them without the slash.
         """
-        held: ObjectFacts | None = None
-        for found in self._listed(recursive):
-            if held is not None and not found.key.startswith(f"{held.key}/"):
+        held: Entry | None = None
+        for entry in self._listed(recursive):
+            if held is not None and not entry.path.startswith(f"{held.path}/"):
                 yield held
             held = None
-            if found.size:
-                yield found
+            if entry.size:
+                yield entry
             else:
-                held = found
+                held = entry
         if held is not None:
             yield held
 
-    def _listed(self, recursive: bool) -> Iterator[ObjectFacts]:
+    def _listed(self, recursive: bool) -> Iterator[Entry]:
         prefix = f"{self.key}/" if self.key else ""
         with _request(self) as (obstore, store):
             if recursive:
                 chunks = obstore.list(store, self.key or None, chunk_size=1000)
             else:
                 chunks = iter([obstore.list_with_delimiter(store, self.key or None)["objects"]])
-            for chunk in chunks:
-                for found in chunk:
-                    if found["path"] != self.key:
-                        yield ObjectFacts(found["path"].removeprefix(prefix), found["size"], found["e_tag"])
+            for facts in itertools.chain.from_iterable(chunks):
+                if facts["path"] != self.key:
+                    yield Entry(facts["path"].removeprefix(prefix), facts["size"], etag=facts["e_tag"])
+
+    def entries(self) -> dict[str, int]:
+        """Names one level below this prefix: sizes in bytes of objects, -1 for prefixes."""
+        with _request(self) as (obstore, store):
+            listed = obstore.list_with_delimiter(store, self.key or None)
+        sizes = {facts["path"]: facts["size"] for facts in listed["objects"] if facts["path"] != self.key}
+        sizes |= dict.fromkeys(listed["common_prefixes"], -1)
+        return {name.rstrip("/").rpartition("/")[2]: size for name, size in sizes.items()}
 
     def iterdir(self) -> Iterator[ObjectPath]:
         """Yield the objects and prefixes one level below this one."""
         return (self / name for name in self.entries())
 
-    def entries(self) -> dict[str, int]:
-        """Return what is one level below this prefix: names and sizes of objects, and -1 for the names of prefixes."""
-        with _request(self) as (obstore, store):
-            found = obstore.list_with_delimiter(store, self.key or None)
-        sizes = {facts["path"]: facts["size"] for facts in found["objects"] if facts["path"] != self.key}
-        sizes |= dict.fromkeys(found["common_prefixes"], -1)
-        return {name.rstrip("/").rpartition("/")[2]: size for name, size in sizes.items()}
+    def mkdir(self, mode: int = 0, parents: bool = False, exist_ok: bool = True) -> None:
+        """Check that the bucket exists; a prefix needs no creation."""
+        self.is_dir()
 
     def is_dir(self) -> bool:
         """Return whether any object is below this prefix."""
-        return next(self.objects(), None) is not None
+        return next(self.walk_entries(), None) is not None
 
     def is_file(self) -> bool:
         """Return whether an object has this key."""
-        return self.facts() is not None
+        return self._head() is not None
 
     def exists(self) -> bool:
         """Return whether an object has this key or is below it."""
         return self.is_file() or self.is_dir()
 
-    # ------------------------------------------------------------------------------------------------------ reading
+    def is_listed(self) -> bool:
+        """Return whether an object has this key or is below it."""
+        return self.exists()
 
-    def facts(self) -> ObjectFacts | None:
-        """Return name, size and ETag of the object; None if there is none."""
+    def entry(self) -> Entry:
+        """Describe this prefix or object; raise FileNotFoundError if there is none."""
+        if self.is_dir():
+            return Entry(self.name, None, EntryKind.FOLDER)
+        entry = self._head()
+        if entry is None:
+            raise FileNotFoundError(2, "no such object", str(self))
+        return entry
+
+    def size(self) -> int | None:
+        """Size of the object in bytes, None if there is no such object."""
+        entry = self._head()
+        return None if entry is None else entry.size
+
+    def stat(self) -> SimpleNamespace:
+        """Return the size of the object as ``st_size``; FileNotFoundError if there is none."""
+        size = self.size()
+        if size is None:
+            raise FileNotFoundError(2, "no such object", str(self))
+        return SimpleNamespace(st_size=size)
+
+    def _head(self) -> Entry | None:
         if not self.key:
             return None
         try:
             with _request(self) as (obstore, store):
-                found = obstore.head(store, self.key)
+                facts = obstore.head(store, self.key)
         except FileNotFoundError:
             return None
-        return ObjectFacts(self.name, found["size"], found["e_tag"])
+        return Entry(self.name, facts["size"], etag=facts["e_tag"])
 
-    def stat(self) -> ObjectStat:
-        """Return the size of the object; FileNotFoundError if there is none."""
-        facts = self.facts()
-        if facts is None:
-            raise FileNotFoundError(2, "no such object", str(self))
-        return ObjectStat(facts.size)
+    # ------------------------------------------------------------------------------------------------------ reading
 
     def open(self, mode: str = "rb", etag: str | None = None, first_piece: int = MIN_PIECE) -> io.BufferedReader:
-        """Open the object as a seekable binary file.
+        """Open the object as a seekable binary file for reading; the first read is the first request.
 
-        Parameters
-        ----------
-        mode : {"rb"}
-            Objects are opened for reading only.
-        etag : str, optional
-            The ETag that the object must have.
-        first_piece : int
-            Bytes of the first request; later ones grow to `MAX_PIECE` while reading is sequential.
-
-        Returns
-        -------
-        binary file
-            Its methods raise as `read_bytes`. The first read is the first request.
+        Reading raises ObjectChangedError if the object has another ETag than ``etag``. Requests begin with
+        ``first_piece`` bytes and grow to `MAX_PIECE` while reading is sequential.
         """
         if mode != "rb":
             raise ValueError(f"mode={mode}: objects are opened for reading only")
         return io.BufferedReader(_RangeReader(self, etag, min(first_piece, MAX_PIECE)))
 
+    @contextmanager
+    def open_listed(self, size: int, etag: str | None = None) -> Iterator[tuple[BinaryIO, int]]:
+        """Open an object of a listing; yield the open file and the listed size, which the ETag proves."""
+        with self.open("rb", etag, max(size, 1)) as stream:
+            yield stream, size
+
     def read_bytes(self, etag: str | None = None) -> bytes:
-        """Return the content of the object.
-
-        Parameters
-        ----------
-        etag : str, optional
-            The ETag that the object must have.
-
-        Returns
-        -------
-        bytes
-            The content.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such object.
-        ObjectChangedError
-            If the object has another ETag.
-        MachineError
-            If the store does not answer.
-        """
+        """Return the content of the object; raise FileNotFoundError, ObjectChangedError or MachineError."""
         with self.open("rb", etag, MAX_PIECE) as stream:
             return stream.read()
 
@@ -290,14 +302,29 @@ class ObjectPath:
         """Return the content of the object as text."""
         return self.read_bytes().decode(encoding)
 
-    def read_range(self, start: int, size: int, etag: str | None = None) -> bytes:
-        """Return ``size`` bytes from byte ``start`` on, or fewer at the end of the object; raise as `read_bytes`."""
-        reader = _RangeReader(self, etag, first_piece=min(size, MAX_PIECE))
-        reader.seek(start)
-        pieces = bytearray()
-        while len(pieces) < size and (piece := reader.read(size - len(pieces))):
-            pieces += piece
-        return bytes(pieces)
+    def mapped(self, offset: int, size: int) -> tuple[bytearray, int]:
+        """Read a part of the object with one request, as bytes that can be written to; see `LocalPath.mapped`."""
+        with self.open("rb", first_piece=size) as stream:
+            stream.seek(offset)
+            content = bytearray(stream.read(size))
+        if len(content) < size:
+            raise ValueError("the object ends before")
+        return content, 0
+
+    @contextmanager
+    def local_copy(self) -> Iterator[Path]:
+        """Provide a temporary copy of the object on the local disk."""
+        with tempfile.TemporaryDirectory(prefix=PREFIX) as folder:
+            file = Path(folder) / self.name
+            with self.open(first_piece=MAX_PIECE) as source, file.open("wb") as copy:
+                shutil.copyfileobj(source, copy, MAX_PIECE)
+            yield file
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Apply a function that waits for the store to items, `THREADS` at a time; yield the results in order."""
+        with ThreadPoolExecutor(THREADS, "requests") as pool:
+            for future in started_ahead(pool, function, items, THREADS):
+                yield future.result()
 
     # ------------------------------------------------------------------------------------------------------ writing
 
@@ -305,7 +332,11 @@ class ObjectPath:
         """Write the object; readers see the former object or the new one, never a part."""
         self._put(content, "overwrite")
 
-    def create(self, content: bytes) -> bool:
+    def write(self, content: bytes, unfinished: str = "") -> None:
+        """Write the object as `write_bytes`; an object store needs no folder of unfinished files."""
+        self.write_bytes(content)
+
+    def create(self, content: bytes, unfinished: str = "") -> bool:
         """Write the object unless it exists; return whether it was written.
 
         A repeated request can find the object that its first attempt wrote. The result is then False although this
@@ -317,9 +348,10 @@ class ObjectPath:
             return False
         return True
 
-    def put_file(self, file: Path) -> None:
-        """Write a local file as the object; an interrupted upload leaves no object."""
+    def commit(self, file: Path) -> None:
+        """Put a finished file as the object and delete it; an interrupted upload leaves no object."""
         self._put(file, "overwrite")
+        file.unlink()
 
     def _put(self, content: bytes | Path, mode: Any) -> None:
         with _request(self) as (obstore, store):
@@ -331,132 +363,42 @@ class ObjectPath:
             obstore.delete(store, self.key)
 
     def delete_all(self) -> None:
-        """Delete all objects below this prefix."""
+        """Delete the object, and all objects below this prefix."""
         prefix = f"{self.key}/" if self.key else ""
-        found = self.objects()
-        while keys := [prefix + facts.key for facts in itertools.islice(found, DELETED_AT_ONCE)]:
+        entries = self.walk_entries()
+        while keys := [prefix + entry.path for entry in itertools.islice(entries, DELETED_AT_ONCE)]:
             with suppress(FileNotFoundError), _request(self) as (obstore, store):
                 obstore.delete(store, keys)
+        self.delete()
+
+    def scratch_place(self, unfinished: str) -> tuple[Path, str]:
+        """Local folder for unfinished files, ``TMPDIR``, and the first letters of the names of its folders."""
+        return Path(tempfile.gettempdir()), PREFIX
 
 
-AnyPath = Path | ObjectPath
-"""A local path, or the URL of an object or prefix."""
+def started_ahead(
+    pool: ThreadPoolExecutor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    most: int,
+    size: Callable[[Item], int] = lambda item: 0,
+    most_bytes: int = 0,
+) -> Generator[Future[Result], None, None]:
+    """Yield the calls of a function in the order of the items.
 
-
-def any_path(text: str | os.PathLike[str] | ObjectPath) -> AnyPath:
-    """Return the path that a text names.
-
-    Parameters
-    ----------
-    text : str, path-like or ObjectPath
-        A local path, or a URL of an object store.
-
-    Returns
-    -------
-    Path or ObjectPath
-        `ObjectPath` only for a text that `is_url` accepts; a local path stays a local path.
+    Up to ``most`` calls have begun, of items whose sizes sum to at most ``most_bytes``; one call is always allowed.
     """
-    if isinstance(text, ObjectPath):
-        return text
-    return ObjectPath(text) if isinstance(text, str) and is_url(text) else Path(text)
-
-
-def open_text(path: AnyPath) -> io.TextIOWrapper:
-    """Open a UTF-8 text file for reading, with its line ends.
-
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        The file.
-
-    Returns
-    -------
-    text file
-        The caller closes it.
-    """
-    return io.TextIOWrapper(path.open("rb"), encoding="utf-8", newline="")
-
-
-def folder_name(path: AnyPath) -> str:
-    """Return the name of a folder, for ``.`` and ``..`` too.
-
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        The folder.
-
-    Returns
-    -------
-    str
-        Its last part.
-    """
-    return path.name if isinstance(path, ObjectPath) else path.name or path.resolve().name
-
-
-def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Apply a function that waits for a store to many items.
-
-    Parameters
-    ----------
-    function : callable
-        Takes an item; `THREADS` calls run at a time.
-    items : iterable
-        Any number; they are taken as results are used.
-
-    Yields
-    ------
-    object
-        Results in the order of the items.
-    """
-    waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(THREADS, "requests") as pool:
-        try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) >= THREADS:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for future in waiting:
-                future.cancel()
-
-
-@contextmanager
-def local_copy(path: AnyPath, etag: str | None = None) -> Iterator[Path]:
-    """Provide a file on the local disk.
-
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        A local file is used in place.
-    etag : str, optional
-        The ETag that an object must have.
-
-    Yields
-    ------
-    Path
-        The file itself, or a temporary copy of the object that is deleted afterwards.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such object.
-    OSError
-        If the local disk is full or fails.
-    MachineError
-        If the store does not answer.
-    """
-    if isinstance(path, Path):
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="unprocess_gen-") as folder:
-        file = Path(folder) / path.name
-        reader = _RangeReader(path, etag, first_piece=MAX_PIECE)
-        with file.open("wb") as stream:
-            while piece := reader.read(MAX_PIECE):
-                stream.write(piece)
-        yield file
+    started: deque[tuple[Future[Result], int]] = deque()
+    try:
+        for item in items:
+            while started and (len(started) == most or sum(begun for _, begun in started) + size(item) > most_bytes):
+                yield started.popleft()[0]
+            started.append((pool.submit(function, item), size(item)))
+        while started:
+            yield started.popleft()[0]
+    finally:
+        for future, _ in started:
+            future.cancel()
 
 
 class _RangeReader(io.RawIOBase):
@@ -479,7 +421,7 @@ class _RangeReader(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         if whence == io.SEEK_END:
-            offset += self._known_size()
+            offset += self._path.stat().st_size
         elif whence == io.SEEK_CUR:
             offset += self._position
         if offset < 0:
@@ -496,13 +438,6 @@ class _RangeReader(io.RawIOBase):
         self._position += len(piece)
         return len(piece)
 
-    def readall(self) -> bytes:
-        pieces = []
-        while piece := self._at_position(MIN_PIECE):
-            pieces.append(piece)
-            self._position += len(piece)
-        return b"".join(pieces)
-
     def _at_position(self, wanted: int) -> memoryview:
         """Return bytes from the position on, fetched if necessary; none only at the end of the object."""
         end = self._start + len(self._piece)
@@ -513,22 +448,17 @@ class _RangeReader(io.RawIOBase):
             self._piece, self._start = self._fetch(self._position, size), self._position
         return self._piece[self._position - self._start :]
 
-    def _known_size(self) -> int:
-        if self._size < 0:
-            self._size = self._path.stat().st_size
-        return self._size
-
     def _fetch(self, start: int, size: int) -> memoryview:
         if 0 <= self._size <= start:
             return memoryview(b"")
         options = {"range": (start, start + size), **({"if_match": self._etag} if self._etag else {})}
         try:
             with _request(self._path) as (obstore, store):
-                found = obstore.get(store, self._path.key, options=options)
-                content = memoryview(found.bytes())
+                answer = obstore.get(store, self._path.key, options=options)
+                content = memoryview(answer.bytes())
         except _EndOfObjectError:
             return memoryview(b"")
-        self._size, self._etag = found.meta["size"], self._etag or found.meta["e_tag"]
+        self._size, self._etag = answer.meta["size"], self._etag or answer.meta["e_tag"]
         return content
 
 
@@ -536,7 +466,7 @@ class _RangeReader(io.RawIOBase):
 
 
 class _EndOfObjectError(Exception):
-    """A range begins behind the last byte."""
+    """Report that a range begins behind the last byte."""
 
 
 @lru_cache(maxsize=64)
@@ -574,43 +504,33 @@ def _request(path: ObjectPath) -> Iterator[tuple[Any, Any]]:
     _check_process(path)
     try:
         yield obstore, _store(path.scheme, path.bucket)
-    except FileNotFoundError as error:
-        reason = _reason(error)
-        if _is_missing_bucket(reason):
-            raise _no_bucket(path, reason) from None
-        raise FileNotFoundError(2, "no such object", str(path)) from None
     except exceptions.AlreadyExistsError:
         raise FileExistsError(17, "the object exists", str(path)) from None
     except exceptions.PreconditionError:
         raise ObjectChangedError(f"{path}: has another ETag than when it was listed") from None
     except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
-        raise _no_access(path, _reason(error)) from None
+        raise _error(path, error, is_refused=True) from None
     except (exceptions.BaseError, OSError, ValueError) as error:
-        reason = _reason(error)
-        if reason.startswith("416"):
-            raise _EndOfObjectError from None
-        if _is_missing_bucket(reason):
-            raise _no_bucket(path, reason) from None
-        if reason.startswith(("401", "403")):  # from a service of credentials
-            raise _no_access(path, reason) from None
-        raise MachineError(f"{path}: the object store failed ({reason}); rerun when it answers") from None
+        raise _error(path, error) from None
 
 
-def _no_access(path: ObjectPath, reason: str) -> StoreAccessError:
-    return StoreAccessError(
-        f"{path}: access was refused ({reason}); expected credentials in the environment, such as "
-        f"{SCHEMES[path.scheme]}"
-    )
-
-
-def _is_missing_bucket(reason: str) -> bool:
-    return any(code in reason for code in MISSING_BUCKET)
-
-
-def _no_bucket(path: ObjectPath, reason: str) -> StoreAccessError:
-    return StoreAccessError(
-        f"{path}: the bucket {path.bucket} does not exist ({reason}); create it, or correct its name"
-    )
+def _error(path: ObjectPath, error: Exception, is_refused: bool = False) -> Exception:
+    """Return an error of obstore as one of this module's errors."""
+    reason = _reason(error)
+    if any(code in reason for code in MISSING_BUCKET):
+        return StoreAccessError(
+            f"{path}: the bucket {path.bucket} does not exist ({reason}); create it, or correct its name"
+        )
+    if isinstance(error, FileNotFoundError):
+        return FileNotFoundError(2, "no such object", str(path))
+    if is_refused or reason.startswith(("401", "403")):  # the latter from a service of credentials
+        return StoreAccessError(
+            f"{path}: access was refused ({reason}); expected credentials in the environment, such as "
+            f"{SCHEMES[path.scheme]}"
+        )
+    if reason.startswith("416"):
+        return _EndOfObjectError()
+    return MachineError(f"{path}: the object store failed ({reason}); rerun when it answers")
 
 
 def _reason(error: Exception) -> str:

@@ -4,35 +4,29 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from unprocess_gen.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from unprocess_gen.core.paths import AnyPath
 
 DATASET_ENTRIES = ("dataset.json", "config.yaml", "manifest.csv", "shards", ".work")
 """Names that mark a folder as a dataset, finished or not. Other files in such a folder count as damage."""
 
 
 def enclosing_dataset(path: Path) -> Path | None:
-    """Return the dataset that a path is in, finished or begun.
-
-    Parameters
-    ----------
-    path : Path
-        A file or folder; it need not exist.
-
-    Returns
-    -------
-    Path or None
-        The path itself or its nearest parent that is the folder of a dataset; None if there is none.
-    """
+    """Return the nearest dataset, finished or begun, that is a path itself or a parent of it; None without one."""
     resolved = Path(os.path.realpath(path))
-    return next((folder for folder in (resolved, *resolved.parents) if _is_dataset(folder)), None)
+    return next((folder for folder in (resolved, *resolved.parents) if is_dataset(folder)), None)
 
 
-def _is_dataset(folder: Path) -> bool:
+def is_dataset(folder: AnyPath) -> bool:
+    """Return whether a folder or prefix is a dataset, finished or begun."""
     try:
         return (
             (folder / "dataset.json").is_file()
-            or any((folder / ".work" / name).exists() for name in ("listing.json", "sources.json"))
+            or any((folder / ".work" / name).is_file() for name in ("listing.json", "sources.json"))
             or ((folder / "manifest.csv").is_file() and (folder / "shards").is_dir())
         )
     except OSError:  # a folder that may not be searched, above one that may
@@ -40,19 +34,9 @@ def _is_dataset(folder: Path) -> bool:
 
 
 def check_output_folder(folder: Path, option: str) -> None:
-    """Check that files can be written to a folder outside of every dataset.
+    """Raise ConfigError if a folder is inside a dataset, is a file, or cannot be written; it need not exist.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder; it need not exist.
-    option : str
-        What the user wrote, for messages: ``--to sheets``.
-
-    Raises
-    ------
-    ConfigError
-        If the folder is inside a dataset, is a file, or cannot be written.
+    ``option`` is the text of the user for messages, such as ``--to sheets``.
     """
     _refuse_dataset(folder, option, "folder")
     if folder.exists() and not folder.is_dir():
@@ -65,24 +49,10 @@ def check_output_folder(folder: Path, option: str) -> None:
 
 
 def check_output_file(file: Path, option: str, expected: str, *marks: bytes) -> None:
-    """Check that a file can be written outside of every dataset, and replaces at most an earlier output.
+    """Raise ConfigError if a file is inside a dataset, cannot be written, or replaces another file than an output.
 
-    Parameters
-    ----------
-    file : Path
-        The file; its folder must exist.
-    option : str
-        What the user wrote, for messages: ``--to page.html``.
-    expected : str
-        Description of an earlier output, which may be replaced: ``an HTML page``.
-    *marks : bytes
-        Lower-case text; the first 1,024 bytes of an earlier output contain one of them.
-
-    Raises
-    ------
-    ConfigError
-        If the file is inside a dataset, its folder does not exist or cannot be written, or another file of that name
-        exists.
+    ``expected`` describes an earlier output (``an HTML page``), which may be replaced. Its first 1,024 bytes contain
+    one of the ``marks``, in lower case. The folder of the file must exist.
     """
     _refuse_dataset(file, option, "file")
     if file.is_dir() or not file.parent.is_dir():
@@ -95,20 +65,7 @@ def check_output_file(file: Path, option: str, expected: str, *marks: bytes) -> 
 
 
 def check_log_file(file: Path, option: str) -> None:
-    """Check that text can be appended to a file outside of every dataset.
-
-    Parameters
-    ----------
-    file : Path
-        The file; it need not exist.
-    option : str
-        What the user wrote, for messages.
-
-    Raises
-    ------
-    ConfigError
-        If the file is inside a dataset, or exists and is not text.
-    """
+    """Raise ConfigError if a file is inside a dataset, or exists and is not text."""
     _refuse_dataset(file, option, "file")
     if file.is_file() and b"\0" in _first_bytes(file, option):
         raise ConfigError(f"{option}: exists and is not a text file; expected a log file; choose another name")

@@ -43,6 +43,7 @@ STREAMS = {
     "column_temporal": 13,
     "dark_frame": 14,
     "dark_dither": 15,
+    "dsnu": 16,
 }
 """Stream numbers by purpose. Every existing dataset depends on them: add new ones, never renumber."""
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from unprocess_gen.simulation.effects import Physics
 
 Srgb = NDArray[np.uint8] | NDArray[np.uint16]
 Raw = NDArray[np.uint16]
@@ -219,84 +222,11 @@ class Facts:
     frames: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Physics:
-    """Numbers of a physical noise profile for one scene and sensor; 0 if the profile does not have the number.
-
-    Attributes
-    ----------
-    iso, exposure_s, temperature_c : float
-        The scene: ISO, exposure time (s) and sensor temperature (°C).
-    dn_per_e : float
-        System gain K, DN per electron.
-    prnu_std : float
-        Standard deviation of the pixels' relative gain.
-    dark_e : float
-        Mean dark signal of the exposure, electrons.
-    dark_offset : str
-        ``"removed"`` if the camera subtracts the mean dark signal, else ``"kept"``.
-    hot_pixel_share, hot_pixel_e : float
-        Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure.
-    full_well_e : float
-        Saturation capacity, electrons.
-    read_law : str
-        Distribution of the read noise: ``"gaussian"``, or Tukey's lambda with shape ``read_shape``, as
-        ``"tukey_lambda"``, or as ``"tukey"`` (version 0.1; `lookup_tables.quantile_table`).
-    read_std_dn : float
-        Standard deviation of the read noise, DN.
-    row_std_dn, column_std_dn : float
-        Standard deviations of a row's offset per frame and of a column's offset per body, DN.
-    black_error_dn : tuple of four floats
-        Black-level errors of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the 2x2 tile, DN.
-    dead_pixel_share : float
-        Fraction of pixels that read 0.
-    sensor_unit : str
-        Name of the camera body.
-    body_key : int
-        Key of the body's fixed patterns (`random_streams.body_key`).
-    fixed_pattern_in_clean : bool
-        Whether the clean frame contains the fixed patterns too.
-    row_correlation : float
-        Correlation of the offsets of neighbouring rows, between -1 and 1.
-    column_temporal_std_dn : float
-        Standard deviation of a column's offset that is new in every frame, DN.
-    gain_by_colour : tuple of three floats
-        System gain of red, green and blue, relative to ``dn_per_e``.
-    lens_shading : tuple of three floats
-        Coefficients of r², r⁴ and r⁶ in the relative illumination; r is 1 in the corners.
-    frame_size : (int, int)
-        Height and width of the full frame if its lens shading is known, else 0; pixels.
-    """
-
-    iso: float
-    exposure_s: float
-    temperature_c: float
-    dn_per_e: float
-    prnu_std: float
-    dark_e: float
-    dark_offset: str
-    hot_pixel_share: float
-    hot_pixel_e: float
-    full_well_e: float
-    read_law: str
-    read_shape: float
-    read_std_dn: float
-    row_std_dn: float
-    column_std_dn: float
-    black_error_dn: tuple[float, float, float, float]
-    dead_pixel_share: float
-    sensor_unit: str
-    body_key: int
-    fixed_pattern_in_clean: bool
-    row_correlation: float = 0.0
-    column_temporal_std_dn: float = 0.0
-    gain_by_colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    lens_shading: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    frame_size: tuple[int, int] = (0, 0)
-
-
 REFERENCE_METHOD, FLOAT32_METHOD = "colour:numpy_float64", "colour:fused_float32"
 """Methods that select the NumPy reference and the float32 kernels; plans without them use the float64 kernels."""
+
+NEAR_NORMAL = "shot:gaussian_where_near"
+"""Method of recorded settings of 0.1 and 0.2 that selects the NumPy reference too: normals in place of counts."""
 
 UINT16, FLOAT32 = "uint16", "float32"
 """Dtypes of frames."""
@@ -304,43 +234,42 @@ MOSAIC, PACKED = "mosaic", "packed"
 """Layouts of frames: ``[H, W]``, or ``[4, H / 2, W / 2]`` (`cfa.pack`)."""
 
 
-def inverse_gains(red_gain: float, blue_gain: float, inverse_rgb_gain: float) -> tuple[float, float, float]:
-    """Return the factors of the red, green and blue channels (Brooks et al. 2019, random_gains()).
-
-    Parameters
-    ----------
-    red_gain, blue_gain, inverse_rgb_gain : float
-        White-balance gains, and inverse of the brightness gain.
-
-    Returns
-    -------
-    tuple of float
-        Factors of the linear channels.
-    """
-    return inverse_rgb_gain / red_gain, inverse_rgb_gain, inverse_rgb_gain / blue_gain
-
-
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """All parameters of a pair; with the pixels it determines the pair completely.
-
-    A plan is drawn once (`unprocess_gen.plan_image`) or read from a manifest row.
+class SourcePlan:
+    """Preparation of the source's pixels.
 
     Attributes
     ----------
-    seed : int
-        Seed of the dataset.
-    stream_key : int
-        Key of the image's random streams (`random_streams.stream_key`).
     downscale : int
         Side of the squares of source pixels that were averaged.
     dequantize : str
         ``"off"``, or how 8-bit codes are dithered.
-    scene : str
-        Name of the scene.
-    exposure_ratio : float
-        Factor by which the scene is darkened.
-    camera : str
+    """
+
+    downscale: int
+    dequantize: str
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePlan:
+    """Light of the scene: its name, and the factor ``exposure_ratio`` by which the photograph is darkened."""
+
+    name: str
+    exposure_ratio: float
+
+    @property
+    def exposure(self) -> float:
+        """Factor applied to the light of the scene."""
+        return 1 / self.exposure_ratio
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPlan:
+    """Colours and gains of the camera.
+
+    Attributes
+    ----------
+    name : str
         Name of the camera option.
     weights : tuple of four floats
         Weights of the mixed cameras, in the order of `colour.CAMERAS`.
@@ -348,122 +277,118 @@ class Plan:
         Matrix from linear sRGB to camera RGB, row by row; each row sums to 1.
     red_gain, blue_gain, inverse_rgb_gain : float
         White-balance gains of red and blue, and inverse of the brightness gain.
-    tone, gamma : str, float or str
-        Tone curve and gamma that were inverted (`tone_curves.linear_table`).
     highlight, highlight_threshold : str, float
         Method for highlights (`unprocess.HIGHLIGHTS`), and the intensity from which it acts, in [0, 1).
-    pattern : str
-        CFA pattern, one of `cfa.PATTERNS`.
-    bits, black_level_dn, white_level_dn : int
-        Bit depth of the sensor, and its levels in DN.
-    sensor_clip : str
-        Clipping of the noisy frame (`sensor.noisy_limits`).
-    saturated : str
-        Noisy value at sites where the clean frame is saturated: ``"noisy"``, or ``"pinned"`` to white.
-    noise, noise_law : str
-        Name of the noise profile, and for two-parameter profiles its distribution: ``"gaussian"`` or ``"poisson"``.
-    a_dn, b_dn2 : float
-        Slope (DN) and intercept (DN²) of the noise variance above black.
-    effects, skipped : tuple of str
-        Simulated effects, and the omitted ones with their reasons.
-    accuracy, methods, law_distance : str, tuple of str, float
-        Name of the budget, method of each stage, and largest accepted CDF difference of shot plus read noise.
-    physics : Physics or None
-        Numbers of a physical profile. None for two-parameter profiles, whose one effect is ``heteroscedastic``.
-    level, draw, frame : int
-        Numbers of the noise level, of the draw at this level, and of the frame in its clip. Each selects other random
-        values.
-    dtype, layout : str
-        Dtype and layout of both frames.
-    clean_dtype : str
-        Dtype of the clean frame if it differs from ``dtype``; empty if it does not.
-    assumed : tuple of str
-        Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
-    dark_frame : str
-        SHA-256 of the dark frame whose noise replaces that of the read-out; empty without one.
-    dark_shift : (int, int)
-        Even row and column of the dark frame at row 0, column 0 of the full frame.
-    dark_black_dn, dark_scale : float
-        Value that is subtracted from the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
-    dark_shading : str
-        SHA-256 of the dark-shading map that is subtracted too: of its file, or of the set of dark frames whose mean it
-        is. Empty without a map.
     """
 
-    seed: int
-    stream_key: int
-    downscale: int
-    dequantize: str
-    scene: str
-    exposure_ratio: float
-    camera: str
+    name: str
     weights: tuple[float, float, float, float]
     rgb2cam: tuple[float, float, float, float, float, float, float, float, float]
     red_gain: float
     blue_gain: float
     inverse_rgb_gain: float
-    tone: str
-    gamma: float | str
     highlight: str
     highlight_threshold: float
+
+    @property
+    def inverse_gains(self) -> tuple[float, float, float]:
+        """Factors of the red, green and blue channels (Brooks et al. 2019, random_gains())."""
+        return self.inverse_rgb_gain / self.red_gain, self.inverse_rgb_gain, self.inverse_rgb_gain / self.blue_gain
+
+
+@dataclass(frozen=True, slots=True)
+class IspPlan:
+    """Tone curve and gamma that are inverted (`tone_curves.linear_table`)."""
+
+    tone: str
+    gamma: float | str
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPlan:
+    """CFA pattern (one of `cfa.PATTERNS`), bit depth, and levels in DN of the sensor."""
+
     pattern: str
     bits: int
     black_level_dn: int
     white_level_dn: int
-    sensor_clip: str
-    saturated: str
-    noise: str
-    noise_law: str
+
+    @property
+    def span_dn(self) -> int:
+        """White level minus black level, DN."""
+        return self.white_level_dn - self.black_level_dn
+
+
+@dataclass(frozen=True, slots=True)
+class DarkFramePlan:
+    """Dark frame whose noise replaces that of the read-out; without one, every field has its default.
+
+    Attributes
+    ----------
+    sha256 : str
+        SHA-256 of the frame; empty without one.
+    shift : (int, int)
+        Even row and column of the dark frame at row 0, column 0 of the full frame.
+    black_dn, scale : float
+        Value that is subtracted from the dark frame, DN of the dark frame, and DN of the sensor per DN of it.
+    shading : str
+        SHA-256 of the dark-shading map that is subtracted too: of its file, or of the set of dark frames whose mean it
+        is. Empty without a map.
+    """
+
+    sha256: str = ""
+    shift: tuple[int, int] = (0, 0)
+    black_dn: float = 0.0
+    scale: float = 1.0
+    shading: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NoisePlan:
+    """Noise and limits of the noisy frame.
+
+    Attributes
+    ----------
+    name, law : str
+        Name of the noise profile, and for two-parameter profiles its distribution: ``"gaussian"`` or ``"poisson"``.
+    a_dn, b_dn2 : float
+        Slope (DN) and intercept (DN²) of the noise variance above black.
+    effects, skipped : tuple of str
+        Simulated effects, and the omitted ones with their reasons.
+    sensor_clip : str
+        Clipping of the noisy frame (`sensor.noisy_limits`).
+    saturated : str
+        Noisy value at sites where the clean frame is saturated: ``"noisy"``, or ``"pinned"`` to white.
+    physics : Physics or None
+        Numbers of a physical profile. None for two-parameter profiles, whose one effect is ``heteroscedastic``.
+    level, draw, frame : int
+        Numbers of the noise level, of the draw at this level, and of the frame in its clip. Each selects other random
+        values.
+    assumed : tuple of str
+        Assumed numbers of the noise profile that the simulated effects use; empty with ``effects.assumed=off``.
+    dark : DarkFramePlan
+        Dark frame whose noise replaces that of the read-out.
+    """
+
+    name: str
+    law: str
     a_dn: float
     b_dn2: float
     effects: tuple[str, ...]
     skipped: tuple[str, ...]
-    accuracy: str
-    methods: tuple[str, ...]
-    law_distance: float = 0.0
+    sensor_clip: str
+    saturated: str
     physics: Physics | None = None
     level: int = 0
     draw: int = 0
     frame: int = 0
-    dtype: str = UINT16
-    layout: str = MOSAIC
     assumed: tuple[str, ...] = ()
-    clean_dtype: str = ""
-    dark_frame: str = ""
-    dark_shift: tuple[int, int] = (0, 0)
-    dark_black_dn: float = 0.0
-    dark_scale: float = 1.0
-    dark_shading: str = ""
-
-    @property
-    def normalised(self) -> bool:
-        """True if noisy frames are float32, 0 at black and 1 at white, without rounding to DN."""
-        return self.dtype == FLOAT32
-
-    @property
-    def clean_normalised(self) -> bool:
-        """True if the clean frame is float32, 0 at black and 1 at white, without rounding to DN."""
-        return (self.clean_dtype or self.dtype) == FLOAT32
-
-    @property
-    def uses_reference(self) -> bool:
-        """True if the NumPy reference is selected."""
-        return REFERENCE_METHOD in self.methods
-
-    @property
-    def uses_float32(self) -> bool:
-        """True if the float32 kernels are selected."""
-        return FLOAT32_METHOD in self.methods
-
-    @property
-    def exposure(self) -> float:
-        """Factor applied to the light of the scene."""
-        return 1 / self.exposure_ratio
+    dark: DarkFramePlan = DarkFramePlan()
 
     @property
     def counts_electrons(self) -> bool:
         """True if the noise contains Poisson counts, not only one normal deviate per site."""
-        return self.physics is not None or (self.noise_law == "poisson" and self.variance_line[0] > 0)
+        return self.physics is not None or (self.law == "poisson" and self.variance_line[0] > 0)
 
     @property
     def averaged(self) -> bool:
@@ -478,23 +403,178 @@ class Plan:
         has_read_noise = "read" in self.effects or "dark_frame" in self.effects
         return self.a_dn if "shot" in self.effects else 0.0, self.b_dn2 if has_read_noise else 0.0
 
+
+@dataclass(frozen=True, slots=True)
+class AccuracyPlan:
+    """Accuracy of the simulation.
+
+    Attributes
+    ----------
+    name : str
+        Name of the budget.
+    methods : tuple of str
+        Method of each stage.
+    law_distance : float
+        Largest accepted CDF difference of shot plus read noise.
+    """
+
+    name: str
+    methods: tuple[str, ...]
+    law_distance: float = 0.0
+
     @property
-    def brightest_dn(self) -> float:
-        """Value of `brightest` in DN, unrounded."""
-        return self.brightest * float(self.white_level_dn - self.black_level_dn) + float(self.black_level_dn)
+    def uses_reference(self) -> bool:
+        """True if the NumPy reference is selected."""
+        return REFERENCE_METHOD in self.methods or NEAR_NORMAL in self.methods
+
+    @property
+    def uses_float32(self) -> bool:
+        """True if the float32 kernels are selected."""
+        return FLOAT32_METHOD in self.methods
+
+
+@dataclass(frozen=True, slots=True)
+class OutputPlan:
+    """Format of the frames: dtype and layout of both, and dtype of the clean frame if it differs, else empty."""
+
+    dtype: str = UINT16
+    layout: str = MOSAIC
+    clean_dtype: str = ""
+
+    @property
+    def normalised(self) -> bool:
+        """True if noisy frames are float32, 0 at black and 1 at white, without rounding to DN."""
+        return self.dtype == FLOAT32
+
+    @property
+    def clean_normalised(self) -> bool:
+        """True if the clean frame is float32, 0 at black and 1 at white, without rounding to DN."""
+        return (self.clean_dtype or self.dtype) == FLOAT32
+
+
+class CleanPlan(NamedTuple):
+    """All that decides a clean frame; pairs with equal ones share it.
+
+    Attributes
+    ----------
+    stream_key, source, scene, camera, isp, sensor, accuracy, output
+        Parts of the plan.
+    brightest : float
+        Light at which the frame saturates.
+    lens : tuple or None
+        Coefficients and frame size of the lens shading.
+    patterns : tuple or None
+        Numbers, effects and clipping of the noise if the frame contains its fixed patterns.
+    """
+
+    stream_key: int
+    source: SourcePlan
+    scene: ScenePlan
+    camera: CameraPlan
+    isp: IspPlan
+    sensor: SensorPlan
+    accuracy: AccuracyPlan
+    output: OutputPlan
+    brightest: float
+    lens: tuple[tuple[float, float, float], tuple[int, int]] | None
+    patterns: tuple[Physics | None, tuple[str, ...], str] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All parameters of a pair; with the pixels it determines the pair completely.
+
+    A plan is drawn once (`unprocess_gen.plan_image`) or read from a manifest row.
+
+    Attributes
+    ----------
+    seed : int
+        Seed of the dataset.
+    stream_key : int
+        Key of the image's random streams (`random_streams.stream_key`).
+    source, scene, camera, isp, sensor : SourcePlan, ScenePlan, CameraPlan, IspPlan, SensorPlan
+        Preparation of the pixels, light, colours and gains, curves, and levels.
+    noise : NoisePlan
+        Noise and limits of the noisy frame.
+    accuracy, output : AccuracyPlan, OutputPlan
+        Methods of the simulation, and format of the frames.
+    """
+
+    seed: int
+    stream_key: int
+    source: SourcePlan
+    scene: ScenePlan
+    camera: CameraPlan
+    isp: IspPlan
+    sensor: SensorPlan
+    noise: NoisePlan
+    accuracy: AccuracyPlan
+    output: OutputPlan = OutputPlan()
+
+    @property
+    def physics(self) -> Physics:
+        """Numbers of the physical profile, which the plan must have."""
+        assert self.noise.physics is not None
+        return self.noise.physics
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """All records of the plan, except `Physics`."""
+        source, scene, camera, isp, sensor = self.source, self.scene, self.camera, self.isp, self.sensor
+        return source, scene, camera, isp, sensor, self.noise, self.noise.dark, self.accuracy, self.output
+
+    def __hash__(self) -> int:
+        """Hash a few numbers: those of all fields take ten times as long, and patches look up their plan's records."""
+        return hash((self.stream_key, self.noise.level, self.noise.draw, self.noise.frame))
+
+    def replace(self, **values: Any) -> Plan:
+        """Return a copy with other values in fields of the plan or of its parts.
+
+        Parameters
+        ----------
+        **values : Any
+            New values by the names of the fields. The field ``name``, which several parts have, cannot be given.
+        """
+        changes: dict[str, dict[str, Any]] = {}
+        for name, value in values.items():
+            changes.setdefault(_PART_OF[name], {})[name] = value
+        own = changes.pop("", {})
+        return replace(self, **own, **{part: replace(getattr(self, part), **new) for part, new in changes.items()})
+
+    @property
+    def clean(self) -> CleanPlan:
+        """All that decides the clean frame."""
+        noise, lens, patterns = self.noise, None, None
+        if noise.physics is not None and "lens_shading" in noise.effects:
+            lens = noise.physics.lens_shading, noise.physics.frame_size
+        if noise.averaged:
+            patterns = noise.physics, noise.effects, noise.sensor_clip
+        return CleanPlan(
+            self.stream_key, self.source, self.scene, self.camera, self.isp, self.sensor, self.accuracy, self.output,
+            self.brightest, lens, patterns,
+        )  # fmt: skip
 
     @property
     def brightest(self) -> float:
         """Light at which the clean frame saturates: 1 (white), or less if the full well is reached below white."""
-        if self.physics is None or "full_well" not in self.effects:
+        physics = self.noise.physics
+        if physics is None or "full_well" not in self.noise.effects:
             return 1.0
-        span_dn = self.white_level_dn - self.black_level_dn
-        return min(1.0, self.physics.full_well_e * self.physics.dn_per_e / span_dn)
+        return min(1.0, physics.full_well_e * physics.dn_per_e / self.sensor.span_dn)
 
     @property
-    def inverse_gains(self) -> tuple[float, float, float]:
-        """Factors of the red, green and blue channels (Brooks et al. 2019, random_gains())."""
-        return inverse_gains(self.red_gain, self.blue_gain, self.inverse_rgb_gain)
+    def brightest_dn(self) -> float:
+        """Value of `brightest` in DN, unrounded."""
+        return self.brightest * float(self.sensor.span_dn) + float(self.sensor.black_level_dn)
+
+
+_PARTS: dict[str, Any] = {
+    "source": SourcePlan, "scene": ScenePlan, "camera": CameraPlan, "isp": IspPlan, "sensor": SensorPlan,
+    "noise": NoisePlan, "accuracy": AccuracyPlan, "output": OutputPlan,
+}  # fmt: skip
+_PART_OF = {field.name: part for part, record in _PARTS.items() for field in fields(record) if field.name != "name"}
+_PART_OF |= {field.name: "" for field in fields(Plan)}
+"""Part of a plan in which each field is; empty for the plan's own fields."""
 
 
 @dataclass(frozen=True, slots=True)

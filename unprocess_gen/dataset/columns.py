@@ -1,6 +1,7 @@
 """Define the columns of a manifest: names, types, allowed values and the fields that they hold.
 
-`COLUMNS` is the only table. A column with ``of=Plan`` holds a field of `Plan` in the type and spelling given here.
+`COLUMNS` is the only table. A column with ``of=NoisePlan`` holds a field of `NoisePlan` in the type and spelling given
+here.
 `manifest.pair_row` writes rows by this table, and `manifest.plan_from_row` reads plans by it. A new parameter is a new
 field of its dataclass and one line below.
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,14 +22,23 @@ from unprocess_gen.core.types import (
     MOSAIC,
     PACKED,
     UINT16,
+    AccuracyPlan,
+    CameraPlan,
     Counts,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    OutputPlan,
     Patch,
-    Physics,
     Plan,
+    ScenePlan,
+    SensorPlan,
     Source,
+    SourcePlan,
     Value,
     gamma_text,
 )
+from unprocess_gen.simulation.effects import NUMBERS, RECORDED_NUMBERS, Physics
 
 FIRST = "0.1"
 """The version of the first manifests. Every manifest has the columns of this version."""
@@ -90,7 +100,8 @@ class RelativePath(NamedTuple):
 _PERCENT = re.compile("%([0-9A-F]{2})")
 
 Allowed = Range | Words | Text | RelativePath
-Record = type[Plan] | type[Physics] | type[Patch] | type[Counts] | type[Source]
+Record = type[Any]
+"""Dataclass of `core.types`: a plan or a part of it, `Physics`, `Patch`, `Counts` or `Source`."""
 
 
 class Spelling(NamedTuple):
@@ -145,7 +156,6 @@ COORDINATE = Range(0, 2**32 - 1)
 SIDE = Range(1, 2**32)
 MATRIX_ENTRY = Range(-1e10, 1e10)
 GAIN = Range(1e-4, 1e4)
-ELECTRONS = Range(0, 1e9)
 ANY_TEXT = Text(re.compile("[^\x00-\x1f\x7f\ud800-\udfff]*"), "text without control characters")
 KEY_TEXT = Text(re.compile(r"\d{8,12}(-p\d{4,12})?(-l\d\dd\d\d)?"), "eight digits, then -pNNNN and -lNNdNN if present")
 HEX_64 = Text(re.compile(r"([0-9a-f]{16})?|none"), "16 hexadecimal digits")
@@ -246,6 +256,25 @@ def _short(value: object) -> str:
     return repr(text[:40]) if isinstance(value, str) else text[:40]
 
 
+def _columns_of_numbers(*names: str) -> Iterator[Column]:
+    """Yield the columns of numbers of effects, by the fields of `Physics`."""
+    for field_name in names:
+        number = NUMBERS[field_name]
+        allowed = Words((*number.words, "none")) if number.words else Range(number.lowest, number.highest)
+        for name, meaning in (number.columns or {field_name: number.meaning}).items():
+            yield Column(
+                name,
+                str if number.words else float,
+                meaning,
+                allowed,
+                Physics,
+                field_name,
+                unit=number.unit,
+                since=number.since or FIRST,
+                empty_if=number.empty_if if number.since else FAILED,
+            )
+
+
 COLUMNS = (
     Column(
         "key", str, "source index as eight digits, then number of patch, level and draw if there are several", KEY_TEXT,
@@ -271,62 +300,70 @@ COLUMNS = (
     Column("shard", int, "number of the shard", Range(0, 10**9), empty_if=""),
     Column("seed", int, "seed of the run", COUNT, Plan, empty_if=""),
     Column("stream_key", str, "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
-    Column("camera", str, "convex, or the name of the camera", ANY_TEXT, Plan),
+    Column("camera", str, "convex, or the name of the camera", ANY_TEXT, CameraPlan, "name"),
     *(
         Column(
             f"w_{camera}", float, "weight of this camera in the mix; 0 if it is not part of it",
-            SHARE, Plan, "weights",
+            SHARE, CameraPlan, "weights",
         )
         for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
     ),
     *(
         Column(
             f"rgb2cam_{i}{j}", float, f"matrix from linear sRGB to the camera, row {i}, column {j}",
-            MATRIX_ENTRY, Plan, "rgb2cam",
+            MATRIX_ENTRY, CameraPlan, "rgb2cam",
         )
         for i in range(3)
         for j in range(3)
     ),
-    Column("red_gain", float, "forward white-balance gain of red", GAIN, Plan),
-    Column("blue_gain", float, "forward white-balance gain of blue", GAIN, Plan),
-    Column("inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it", GAIN, Plan),
-    Column("tone", str, "inverted tone curve: smoothstep or none", Words(("smoothstep", "none")), Plan),
+    Column("red_gain", float, "forward white-balance gain of red", GAIN, CameraPlan),
+    Column("blue_gain", float, "forward white-balance gain of blue", GAIN, CameraPlan),
     Column(
-        "gamma", number_or_text, "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",)), Plan,
+        "inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it", GAIN,
+        CameraPlan,
+    ),
+    Column("tone", str, "inverted tone curve: smoothstep or none", Words(("smoothstep", "none")), IspPlan),
+    Column(
+        "gamma", number_or_text, "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",)), IspPlan,
         spelling=GAMMA,
     ),
     Column(
         "highlight", str, "preservation of highlights: per_channel, gray_mean or none",
-        Words(("per_channel", "gray_mean", "none")), Plan,
+        Words(("per_channel", "gray_mean", "none")), CameraPlan,
     ),
     Column(
         "highlight_threshold", float, "linear signal above which highlights are preserved, 1 is white",
-        Range(0, math.nextafter(1, 0)), Plan,
+        Range(0, math.nextafter(1, 0)), CameraPlan,
     ),
-    Column("pattern", str, "CFA pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), Plan),
-    Column("bits", int, "bits per sample of the sensor", Range(1, 16), Plan),
-    Column("black_level_dn", int, "black level", Range(0, 65534), Plan, unit="DN"),
-    Column("white_level_dn", int, "white level (saturation)", Range(1, 65535), Plan, unit="DN"),
+    Column(
+        "pattern", str, "CFA pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), SensorPlan
+    ),
+    Column("bits", int, "bits per sample of the sensor", Range(1, 16), SensorPlan),
+    Column("black_level_dn", int, "black level", Range(0, 65534), SensorPlan, unit="DN"),
+    Column("white_level_dn", int, "white level (saturation)", Range(1, 65535), SensorPlan, unit="DN"),
     Column(
         "sensor_clip", str, "clipping of the noisy frame: sensor, black or none",
-        Words(("sensor", "black", "none")), Plan,
+        Words(("sensor", "black", "none")), NoisePlan,
     ),
-    Column("noise", str, "name of the noise profile", ANY_TEXT, Plan),
+    Column("noise", str, "name of the noise profile", ANY_TEXT, NoisePlan, "name"),
     Column(
-        "a_dn", float, "slope of the noise variance, which is a_dn (x - black) + b_dn2",
-        Range(-1e30, 1e30), Plan, unit="DN",
+        "a_dn", float, "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2",
+        Range(-1e30, 1e30), NoisePlan, unit="DN",
     ),
-    Column("b_dn2", float, "noise variance at black", FINITE, Plan, unit="DN²"),
     Column(
-        "effects", str, "simulated effects, in order, separated by ;", ANY_TEXT, Plan, spelling=LIST,
+        "b_dn2", float, "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2",
+        FINITE, NoisePlan, unit="DN²",
+    ),
+    Column(
+        "effects", str, "simulated effects, in order, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
         empty_if="no effect was simulated, or the source failed",
     ),
     Column(
-        "skipped", str, "skipped effects, each with its reason, separated by ;", ANY_TEXT, Plan, spelling=LIST,
+        "skipped", str, "skipped effects, each with its reason, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
         empty_if="no effect was skipped, or the source failed",
     ),
-    Column("accuracy", str, "name of the accuracy tier", ANY_TEXT, Plan),
-    Column("methods", str, "method of each stage, separated by ;", ANY_TEXT, Plan, spelling=LIST),
+    Column("accuracy", str, "name of the accuracy tier", ANY_TEXT, AccuracyPlan, "name"),
+    Column("methods", str, "method of each stage, separated by ;", ANY_TEXT, AccuracyPlan, spelling=LIST),
     Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes", HEX_128),
     Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
     Column("clean_clipped_low", int, "clean sites below black before clipping", COUNT, Counts, unit="sites"),
@@ -337,63 +374,41 @@ COLUMNS = (
     Column("zero_variance", int, "sites at which the noise has no variance", COUNT, Counts, unit="sites"),
     Column(
         "law_distance", float, "largest accepted CDF distance of shot plus read noise",
-        NOT_NEGATIVE, Plan,
+        NOT_NEGATIVE, AccuracyPlan,
     ),
-    Column("scene", str, "name of the scene", ANY_TEXT, Plan),
-    Column("exposure_ratio", float, "divisor of the light in the photograph", Range(1e-4, 1e7), Plan),
+    Column("scene", str, "name of the scene", ANY_TEXT, ScenePlan, "name"),
+    Column("exposure_ratio", float, "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
     Column(
         "saturated_as", str, "noisy sites whose clean site is saturated: noisy, or pinned to white",
-        Words(("noisy", "pinned")), Plan, "saturated",
+        Words(("noisy", "pinned")), NoisePlan, "saturated",
     ),
     Column(
         "noise_law", str, "distribution of a two-parameter profile: gaussian or poisson",
-        Words(("gaussian", "poisson")), Plan,
+        Words(("gaussian", "poisson")), NoisePlan, "law",
     ),
     Column("iso", float, "ISO of a physical profile", Range(0, 1e9), Physics),
     Column("exposure_s", float, "exposure time", Range(0, 1e7), Physics, unit="seconds"),
     Column("temperature_c", float, "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius"),
-    Column("dn_per_e", float, "system gain K", Range(0, 1e20), Physics, unit="DN per electron"),
-    Column("prnu_std", float, "relative standard deviation of pixel responses (PRNU)", SHARE, Physics),
-    Column("dark_e", float, "mean dark current of the exposure", ELECTRONS, Physics, unit="electrons"),
-    Column(
-        "dark_offset", str, "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics
-    ),
-    Column("hot_pixel_share", float, "fraction of hot pixels", SHARE, Physics),
-    Column("hot_pixel_e", float, "mean excess of a hot pixel in the exposure", ELECTRONS, Physics, unit="electrons"),
-    Column("full_well_e", float, "saturation capacity; 0 if it is not known", ELECTRONS, Physics, unit="electrons"),
-    Column(
-        "read_law", str, "distribution of the read noise: gaussian, tukey or tukey_lambda",
-        Words(("gaussian", "tukey", "tukey_lambda", "none")), Physics,
-    ),
-    Column("read_shape", float, "shape of Tukey's lambda distribution", Range(-0.5, 10), Physics),
-    Column("read_std_dn", float, "standard deviation of the read noise", NOT_NEGATIVE, Physics, unit="DN"),
-    Column("row_std_dn", float, "standard deviation of row offsets", NOT_NEGATIVE, Physics, unit="DN"),
-    Column("column_std_dn", float, "standard deviation of column offsets", NOT_NEGATIVE, Physics, unit="DN"),
-    *(
-        Column(
-            f"black_error_dn_{i}{j}", float, f"black-level error of the 2x2 CFA pattern, row {i}, column {j}",
-            FINITE, Physics, "black_error_dn", unit="DN",
-        )
-        for i in range(2)
-        for j in range(2)
-    ),
-    Column("dead_pixel_share", float, "fraction of dead pixels, which read 0", SHARE, Physics),
+    *_columns_of_numbers(*RECORDED_NUMBERS[0]),
+    Column("dark_offset", str, "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics),
+    *_columns_of_numbers(*RECORDED_NUMBERS[1]),
     Column("sensor_unit", str, "camera body", ANY_TEXT, Physics),
     Column("body_key", str, "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
     Column(
         "fixed_pattern_in_clean", int, "1 if the clean frame has the fixed patterns too", SHARE, Physics,
         spelling=SWITCH,
     ),
-    Column("level", int, "number of the noise level, from 0", Range(0, 99), Plan),
-    Column("draw", int, "number of the draw at this level, from 0", Range(0, 99), Plan),
-    Column("frame", int, "number of the frame in its clip, from 0", COORDINATE, Plan, empty_if=NO_VIDEO),
+    Column("level", int, "number of the noise level, from 0", Range(0, 99), NoisePlan),
+    Column("draw", int, "number of the draw at this level, from 0", Range(0, 99), NoisePlan),
+    Column("frame", int, "number of the frame in its clip, from 0", COORDINATE, NoisePlan, empty_if=NO_VIDEO),
     Column("clip", str, "name of the clip; none for single photographs", ANY_TEXT, Source, empty_if=NO_VIDEO),
     Column(
-        "downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), Plan, unit="pixels"
+        "downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), SourcePlan,
+        unit="pixels",
     ),
     Column(
         "dequantize", str, "dequantization of 8-bit codes: off, dither or dither_all",
-        Words(("off", "dither", "dither_all")), Plan,
+        Words(("off", "dither", "dither_all")), SourcePlan,
     ),
     Column("patch", int, "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
     Column(
@@ -404,43 +419,22 @@ COLUMNS = (
     ),
     Column(
         "dtype", str, "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)",
-        Words((UINT16, FLOAT32)), Plan,
+        Words((UINT16, FLOAT32)), OutputPlan,
     ),
-    Column("layout", str, "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), Plan),
+    Column("layout", str, "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), OutputPlan),
     Column(
         "detail", str, "explanation of the failure, one line", ANY_TEXT, since="0.2", in_json=False,
         empty_if="the source did not fail",
     ),
     Column(
-        "assumed", str, "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT, Plan,
-        spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off",
+        "assumed", str, "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT,
+        NoisePlan, spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off",
     ),
     Column(
-        "clean_dtype", str, "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), Plan,
+        "clean_dtype", str, "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), OutputPlan,
         since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed",
     ),
-    Column(
-        "row_correlation", float, "correlation of the offsets of neighbouring rows", Range(-0.999, 0.999), Physics,
-        since="0.2", empty_if="it is 0",
-    ),
-    Column(
-        "column_temporal_std_dn", float, "standard deviation of the part of column offsets that is new in every frame",
-        NOT_NEGATIVE, Physics, unit="DN", since="0.2", empty_if="it is 0",
-    ),
-    *(
-        Column(
-            f"gain_{colour[0]}", float, f"system gain of {colour}, relative to dn_per_e", Range(0.1, 10), Physics,
-            "gain_by_colour", since="0.2", empty_if="all are 1",
-        )
-        for colour in ("red", "green", "blue")
-    ),
-    *(
-        Column(
-            f"lens_shading_{power}", float, f"coefficient of r^{power} in the relative illumination", Range(-10, 10),
-            Physics, "lens_shading", since="0.2", empty_if="all are 0",
-        )
-        for power in (2, 4, 6)
-    ),
+    *_columns_of_numbers(*RECORDED_NUMBERS[2]),
     *(
         Column(
             f"frame_{side}", int, f"{side} of the full frame, to which the lens shading belongs", COORDINATE, Physics,
@@ -454,29 +448,38 @@ COLUMNS = (
         empty_if="the source failed, is a built-in scene or an array, or no tile of 32 x 32 pixels is free of clipping",
     ),
     Column(
-        "dark_frame", str, "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256, Plan,
-        since="0.2", empty_if=NO_DARK_FRAME,
+        "dark_frame", str, "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256,
+        DarkFramePlan, "sha256", since="0.2", empty_if=NO_DARK_FRAME,
     ),
     *(
         Column(
             f"dark_frame_{axis}", int, f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
-            Plan, "dark_shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0",
+            DarkFramePlan, "shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0",
         )
         for axis, side in (("y", "row"), ("x", "column"))
     ),
     Column(
         "dark_black_dn", float, "value that is subtracted from all sites of the dark frame: its black level, or 0 if "
-        "the map of dark_shading contains that", Range(0, 65535), Plan, unit="DN of the dark frame", since="0.2",
+        "the map of dark_shading contains that", Range(0, 65535), DarkFramePlan, "black_dn",
+        unit="DN of the dark frame", since="0.2",
         empty_if="there is no dark frame, or it is 0",
     ),
     Column(
-        "dark_scale", float, "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), Plan, since="0.2",
+        "dark_scale", float, "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan, "scale",
+        since="0.2",
         empty_if="there is no dark frame, or it is 1",
     ),
     Column(
         "dark_shading", str, "SHA-256 of the dark-shading map that is subtracted from the dark frame: of its file, or "
-        "of the set of dark frames whose mean it is", HEX_256, Plan, since="0.2", empty_if="no map is subtracted",
+        "of the set of dark frames whose mean it is", HEX_256, DarkFramePlan, "shading",
+        since="0.2", empty_if="no map is subtracted",
     ),
+    Column(
+        "dark_variance_dn2", float, "noise variance of a site at black, by all simulated effects except hot pixels, "
+        "dead pixels and rounding; ug.noise_std uses it", FINITE, unit="DN²", since="0.3", in_json=False,
+        empty_if="the source failed",
+    ),
+    *_columns_of_numbers(*(name for name, number in NUMBERS.items() if number.since not in ("", "0.2"))),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""
 
@@ -489,22 +492,10 @@ HEADERS = tuple(
 """The header that each version wrote, oldest version first; new columns are appended, so each begins with the last."""
 
 
-def columns_of(record: Record) -> dict[str, tuple[Column, ...]]:
-    """Return the columns that hold a dataclass, by field.
+COLUMNS_OF: dict[Record, dict[str, tuple[Column, ...]]] = {}
+"""Columns that hold a record, by field: one for a scalar field, several for a tuple."""
 
-    Parameters
-    ----------
-    record : type
-        `Plan`, `Physics`, `Patch`, `Counts` or `Source`.
-
-    Returns
-    -------
-    dict of str to tuple of Column
-        One column for a scalar field, several for a tuple.
-    """
-    fields: dict[str, tuple[Column, ...]] = {}
-    for column in COLUMNS:
-        if column.of is record:
-            name = column.field or column.name
-            fields[name] = (*fields.get(name, ()), column)
-    return fields
+for _column in COLUMNS:
+    if _column.of is not None:
+        _fields = COLUMNS_OF.setdefault(_column.of, {})
+        _fields[_column.field or _column.name] = (*_fields.get(_column.field or _column.name, ()), _column)

@@ -1,12 +1,12 @@
-"""Check the values of ``dataset.json``, so that an edited file is reported as damage by every verb."""
+"""Define the records of ``dataset.json``, so that an edited file is reported as damage by every verb."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
-from unprocess_gen.dataset.columns import NOT_NEGATIVE
+import msgspec
+
+from unprocess_gen.core.records import Amount, Count, Digest, check_record
 from unprocess_gen.dataset.shards import shard_name
 
 MAX_BYTES = 2**30
@@ -15,76 +15,76 @@ MAX_BYTES = 2**30
 PARQUET_SHA256 = "parquet_sha256"
 """Key of the digest of ``manifest.parquet``; missing if the dataset has no such file."""
 
-MAX_COUNT = 2**63 - 1
 
-_DIGEST = re.compile("[0-9a-f]{64}")
+class SourceFacts(msgspec.Struct, frozen=True):
+    """Hold kind and place of the sources."""
 
-
-def check_dataset_json(facts: Any) -> None:
-    """Check the types and ranges of the values of a ``dataset.json``.
-
-    Parameters
-    ----------
-    facts : object
-        The loaded file, of this or an older version; values that only describe the run are not checked.
-
-    Raises
-    ------
-    ValueError
-        If a value is missing, of another type or not allowed. The sentence names the key and the value.
-    """
-    if not isinstance(facts, dict):
-        raise ValueError("expected an object")
-    for key in ("fingerprint", "manifest_sha256", "config_sha256"):
-        _check(facts, key, _is_digest, "64 hexadecimal digits")
-    if PARQUET_SHA256 in facts:
-        _check(facts, PARQUET_SHA256, _is_digest, "64 hexadecimal digits")
-    _check(facts, "pairs", _is_count, "a number of 0 or more")
-    for key in ("failed", "sites"):
-        _check(facts, key, _is_counts, "an object of numbers")
-    _check(facts, "source", _is_source, "an object with kind and root")
-    _check(facts, "shards", lambda value: isinstance(value, list), "a list")
-    for number, entry in enumerate(facts["shards"]):
-        try:
-            _check_entry(number, entry)
-        except ValueError as error:
-            raise ValueError(f"shards[{number}]: {error}") from None
+    kind: Literal["folder", "synthetic"]
+    root: str | None
 
 
-def _check_entry(number: int, entry: Any) -> None:
-    if not isinstance(entry, dict):
-        raise ValueError("expected an object")
-    name = f"shards/{shard_name(number)}"
-    _check(entry, "file", lambda value: value in (None, name), f"null or {name}")
-    for key in ("pairs", "failed", "bytes"):
-        _check(entry, key, _is_count, "a number of 0 or more")
-    _check(entry, "sha256", lambda value: _is_digest(value) or entry["file"] is None, "64 hexadecimal digits")
-    if "source_noise_dn" in entry:
-        _check(entry, "source_noise_dn", _is_noise, "a list of null and numbers of 0 or more")
+class DarkFrameFacts(msgspec.Struct, frozen=True):
+    """Hold place and statistics of the dark frames of a run."""
+
+    root: str | None = None
+    count: Count = 0
+    sizes: list[str] = []
+    black_dn: float = 0.0
+    std_dn: Amount = 0.0
+    shading: str = ""
 
 
-def _check(facts: dict[str, Any], key: str, allows: Callable[[Any], bool], expected: str) -> None:
-    if key not in facts:
-        raise ValueError(f"{key} is missing")
-    if not allows(facts[key]):
-        raise ValueError(f"{key}={str(facts[key])[:40]!r}: expected {expected}")
+class ShardFacts(msgspec.Struct, frozen=True):
+    """Hold file, counts and digest of a shard; no file if all its sources failed."""
+
+    file: str | None
+    pairs: Count
+    failed: Count
+    bytes: Count
+    sha256: Digest | None
+    source_noise_dn: list[Amount | None] | None = None
 
 
-def _is_digest(value: Any) -> bool:
-    return isinstance(value, str) and _DIGEST.fullmatch(value) is not None
+class RunFacts(msgspec.Struct, frozen=True):
+    """Hold where and how a dataset was finished; a run in parts has no times."""
+
+    host: str
+    platform: str
+    python: str
+    n_jobs: int = 0
+    seconds: Amount = 0.0
+    shards_made: Count = 0
+    parts: Count = 0
 
 
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
+class DatasetFacts(msgspec.Struct, frozen=True):
+    """Hold the contents of a ``dataset.json`` that a verb reads; None is what a repair could not restore."""
+
+    fingerprint: Digest
+    manifest_sha256: Digest
+    config_sha256: Digest
+    pairs: Count
+    failed: dict[str, Count]
+    sites: dict[str, Count]
+    source: SourceFacts
+    shards: list[ShardFacts]
+    config: str
+    self_test: str
+    not_matched: Count | None = None
+    skipped_links: Count | None = None
+    run: RunFacts | None = None
+    versions: dict[str, str] | None = None
+    dark_frames: DarkFrameFacts | None = None
+    parquet_sha256: Digest | None = None
 
 
-def _is_counts(value: Any) -> bool:
-    return isinstance(value, dict) and all(map(_is_count, value.values()))
-
-
-def _is_noise(value: Any) -> bool:
-    return isinstance(value, list) and all(one is None or one in NOT_NEGATIVE for one in value)
-
-
-def _is_source(value: Any) -> bool:
-    return isinstance(value, dict) and isinstance(value.get("kind"), str) and isinstance(value.get("root"), str | None)
+def check_dataset_json(facts: Any) -> DatasetFacts:
+    """Check the types and ranges of a loaded ``dataset.json`` of this or an older version; ValueError names the key."""
+    checked = check_record(facts, DatasetFacts)
+    for number, entry in enumerate(checked.shards):
+        name = f"shards/{shard_name(number)}"
+        if entry.file not in (None, name):
+            raise ValueError(f"shards[{number}].file={entry.file[:40]!r}: expected null or {name}")
+        if entry.file is not None and entry.sha256 is None:
+            raise ValueError(f"shards[{number}].sha256=null: expected 64 hexadecimal digits")
+    return checked

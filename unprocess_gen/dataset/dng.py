@@ -9,10 +9,10 @@ The tags follow the DNG Specification 1.4 and, where it is silent, Adobe's DNG S
   that white is reached where the first channel saturates (dng_color_spec::SetWhiteXY; LibRaw too); the tag cancels this
   scale. LibRaw and dcraw leave the tag to their callers. LibRaw also takes the brightest DN for white if it exceeds
   three quarters of it; adjust_maximum_thr=0 switches this off.
-* NoiseProfile describes the simulated shot and read noise: variance = S·x + O, with x = 0 at black and 1 at white.
-  Therefore S = a_dn / span and O = b_dn2 / span². The tag cannot describe row, column and dark-current noise, PRNU and
-  rounding. Readers refuse S of 0 or less and O below 0 (dng_noise_function::IsValid). The clean frame and noisy frames
-  with such values have no NoiseProfile.
+* NoiseProfile describes the variance of the noise of a site: S·x + O, with x = 0 at black and 1 at white. Therefore
+  S = a_dn / span and O = dark_variance_dn2 / span². The tag cannot describe correlations, PRNU and rounding. Readers
+  refuse S of 0 or less and O below 0 (dng_noise_function::IsValid). The clean frame and noisy frames with such values
+  have no NoiseProfile.
 * BlackLevel is the camera's nominal value, equal at all four sites; a black-level error is unknown to the camera.
 
 No tag records how highlights were kept. Above the row's threshold readers show them brighter than the photograph,
@@ -40,12 +40,13 @@ import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
-from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import plan_from_row, without_empty
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
 from unprocess_gen.dataset.selection import select_pairs
+from unprocess_gen.simulation.effects import dark_variance_dn2
 from unprocess_gen.simulation.reference.cfa import CHANNELS
 from unprocess_gen.simulation.reference.colour import RGB2XYZ, Matrix, invert, matrix, multiply
 from unprocess_gen.simulation.reference.sensor import quantise
@@ -236,19 +237,19 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
     profile = noise_profile(plan) if name == "noisy" else None
     return [
         Tag(271, ASCII, 0, MAKE),  # Make
-        Tag(272, ASCII, 0, plan.camera),  # Model
+        Tag(272, ASCII, 0, plan.camera.name),  # Model
         Tag(274, SHORT, 1, 1),  # Orientation: frames are upright
         Tag(700, BYTE, len(packet), packet),  # XMP
         Tag(33421, SHORT, 2, (2, 2)),  # CFARepeatPatternDim
-        Tag(33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.pattern)),  # CFAPattern
+        Tag(33422, BYTE, 4, bytes(CHANNELS.index(letter) for letter in plan.sensor.pattern)),  # CFAPattern
         Tag(50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
         Tag(50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-        Tag(50708, ASCII, 0, f"{MAKE} {plan.camera}"),  # UniqueCameraModel
+        Tag(50708, ASCII, 0, f"{MAKE} {plan.camera.name}"),  # UniqueCameraModel
         Tag(50710, BYTE, 3, bytes((0, 1, 2))),  # CFAPlaneColor: red, green, blue
         Tag(50711, SHORT, 1, 1),  # CFALayout: rectangular
         Tag(50713, SHORT, 2, (2, 2)),  # BlackLevelRepeatDim
-        Tag(50714, LONG, 4, (plan.black_level_dn,) * 4),  # BlackLevel
-        Tag(50717, LONG, 1, plan.white_level_dn),  # WhiteLevel
+        Tag(50714, LONG, 4, (plan.sensor.black_level_dn,) * 4),  # BlackLevel
+        Tag(50717, LONG, 1, plan.sensor.white_level_dn),  # WhiteLevel
         Tag(50719, LONG, 2, (0, 0)),  # DefaultCropOrigin
         Tag(50720, LONG, 2, (width, height)),  # DefaultCropSize
         Tag(50721, SRATIONAL, 9, _rationals(color_matrix(plan))),  # ColorMatrix1
@@ -262,25 +263,24 @@ def tags(row: Row, name: str, shape: tuple[int, int]) -> list[Tag]:
 
 def color_matrix(plan: Plan) -> Matrix:
     """Return the row-major matrix from XYZ under D65 to native camera values, white-balance gains included."""
-    native = matrix([as_shot_neutral(plan)[i // 3] * entry for i, entry in enumerate(plan.rgb2cam)])
+    native = matrix([as_shot_neutral(plan)[i // 3] * entry for i, entry in enumerate(plan.camera.rgb2cam)])
     return multiply(native, invert(RGB2XYZ))
 
 
 def as_shot_neutral(plan: Plan) -> tuple[float, float, float]:
     """Return the native camera values of a neutral colour, relative to green."""
-    return 1 / plan.red_gain, 1.0, 1 / plan.blue_gain
+    return 1 / plan.camera.red_gain, 1.0, 1 / plan.camera.blue_gain
 
 
 def baseline_exposure_ev(plan: Plan) -> float:
     """Return the stops by which a reader brightens the frame to the brightness of the photograph."""
-    return -math.log2(plan.exposure * max(plan.inverse_gains))
+    return -math.log2(plan.scene.exposure * max(plan.camera.inverse_gains))
 
 
 def noise_profile(plan: Plan) -> tuple[float, float] | None:
     """Return S and O of variance = S·x + O, x = 0 at black and 1 at white; None if readers would refuse them."""
-    span_dn = plan.white_level_dn - plan.black_level_dn
-    slope_dn, intercept_dn2 = plan.variance_line
-    scale, offset = slope_dn / span_dn, intercept_dn2 / span_dn**2
+    span_dn = plan.sensor.white_level_dn - plan.sensor.black_level_dn
+    scale, offset = plan.noise.variance_line[0] / span_dn, dark_variance_dn2(plan) / span_dn**2
     return (scale, offset) if scale > 0 and offset >= 0 else None
 
 

@@ -61,7 +61,7 @@ def pair_key(sample: str, plan: Plan, several: bool) -> str:
     str
         The sample's key, with for example ``-l01d02`` for level 1, draw 2.
     """
-    return f"{sample}-l{plan.level:02d}d{plan.draw:02d}" if several else sample
+    return f"{sample}-l{plan.noise.level:02d}d{plan.noise.draw:02d}" if several else sample
 
 
 def image_key(row: Row) -> str:

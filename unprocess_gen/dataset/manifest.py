@@ -18,13 +18,32 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, BinaryIO, NamedTuple, TextIO
+from typing import Any, BinaryIO, NamedTuple, TextIO, TypeVar
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.object_store import AnyPath
-from unprocess_gen.core.types import Counts, Pair, Patch, Physics, Plan, Row, Source, Value
-from unprocess_gen.dataset.columns import COLUMNS, FIRST, HEADERS, NAMES, Column, Record, columns_of
+from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.types import (
+    AccuracyPlan,
+    CameraPlan,
+    DarkFramePlan,
+    IspPlan,
+    NoisePlan,
+    OutputPlan,
+    Pair,
+    Patch,
+    Plan,
+    Row,
+    ScenePlan,
+    SensorPlan,
+    Source,
+    SourcePlan,
+    Value,
+)
+from unprocess_gen.dataset.columns import COLUMNS, COLUMNS_OF, FIRST, HEADERS, NAMES, Column, Record
 from unprocess_gen.dataset.keys import key_text
+from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
+
+Part = TypeVar("Part")
 
 JSON_BYTES = 5632
 """Bytes of a row's JSON without the name of its source; the longest row takes less."""
@@ -84,11 +103,6 @@ def pair_row(
     Row
         Value by column, in the order of `columns.COLUMNS`.
     """
-    physics = (
-        {column.name: column.not_applicable for some in columns_of(Physics).values() for column in some}
-        if plan.physics is None
-        else _cells(plan.physics)
-    )
     values = {
         "key": key,
         "status": "ok",
@@ -97,8 +111,8 @@ def pair_row(
         "noisy_xxh3": digests[1],
         "clip": source.clip,
         "source_noise_dn": source_noise_dn,
-        **_cells(plan),
-        **physics,
+        "dark_variance_dn2": dark_variance_dn2(plan),
+        **_plan_cells(plan),
         **_cells(patch),
         **_cells(pair.counts),
     }
@@ -155,24 +169,33 @@ def detail_text(text: str) -> str:
 _UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
-_DEFAULTS = {
-    record: {field.name: field.default for field in dataclasses.fields(record)}
-    for record in (Plan, Physics, Patch, Counts)
-}
-"""Default of each field; `dataclasses.MISSING` for fields without one."""
+def _plan_cells(plan: Plan) -> dict[str, Value]:
+    """Return the values of all columns that hold a plan."""
+    physics = plan.noise.physics
+    cells: dict[str, Value] = {}
+    for part in (plan, *plan.parts):
+        cells |= _cells(part)
+    if physics is not None:
+        return cells | _cells(physics)
+    return cells | {column.name: column.not_applicable for column in COLUMNS if column.of is Physics}
 
 
-def _cells(record: Plan | Physics | Patch | Counts) -> dict[str, Value]:
+def _cells(record: Any) -> dict[str, Value]:
     """Return the values of all columns that hold a record; later columns are empty at the default of their field."""
     cells: dict[str, Value] = {}
-    for field, columns in columns_of(type(record)).items():
+    defaults = _DEFAULTS[type(record)]
+    for field, columns in COLUMNS_OF[type(record)].items():
         value = getattr(record, field)
-        if columns[0].since != FIRST and value == _DEFAULTS[type(record)][field]:
+        if columns[0].since != FIRST and value == defaults[field]:
             cells |= {column.name: column.empty for column in columns}
             continue
         values = value if len(columns) > 1 else (value,)
         cells |= {column.name: column.from_field(item) for column, item in zip(columns, values, strict=True)}
     return cells
+
+
+_DEFAULTS = {record: {field.name: field.default for field in dataclasses.fields(record)} for record in COLUMNS_OF}
+"""Default of each field; `dataclasses.MISSING` for fields without one."""
 
 
 def _row(source: Source, sha256: str | None, shard: int, seed: int, values: Mapping[str, Value]) -> Row:
@@ -199,7 +222,7 @@ def row_of_values(values: Sequence[Value]) -> Row:
     Returns
     -------
     Row
-        The row; columns that were added after that version are empty.
+        The row; columns that were added after that version are empty, or follow from the others.
 
     Raises
     ------
@@ -209,7 +232,14 @@ def row_of_values(values: Sequence[Value]) -> Row:
     if len(values) not in map(len, HEADERS):
         raise ValueError(f"a row of {len(values)} values; expected {' or '.join(map(str, map(len, HEADERS)))}")
     known = dict(zip(NAMES, values, strict=False))
-    return {column.name: known.get(column.name, column.empty) for column in COLUMNS}
+    return _completed({column.name: known.get(column.name, column.empty) for column in COLUMNS})
+
+
+def _completed(row: Row) -> Row:
+    """Add the column that follows from others to a row of a version, or of a file, that lacks it."""
+    if row["status"] != "ok" or row["dark_variance_dn2"] is not None:
+        return row
+    return {**row, "dark_variance_dn2": dark_variance_dn2(plan_from_row(row))}
 
 
 def plan_from_row(row: Row) -> Plan:
@@ -231,8 +261,19 @@ def plan_from_row(row: Row) -> Plan:
         If a value is missing, of another type or not allowed.
     """
     try:
-        physics = None if row.get("read_law") == "none" else Physics(**_fields(row, Physics))
-        plan = Plan(**_fields(row, Plan), physics=physics)
+        physics = None if row.get("read_law") == "none" else _part(row, Physics)
+        noise = NoisePlan(**_fields(row, NoisePlan), physics=physics, dark=_part(row, DarkFramePlan))
+        plan = Plan(
+            **_fields(row, Plan),
+            source=_part(row, SourcePlan),
+            scene=_part(row, ScenePlan),
+            camera=_part(row, CameraPlan),
+            isp=_part(row, IspPlan),
+            sensor=_part(row, SensorPlan),
+            noise=noise,
+            accuracy=_part(row, AccuracyPlan),
+            output=_part(row, OutputPlan),
+        )
         _check_plan(plan)
     except ValueError as error:
         raise DamageError(f"row {_key_of(row)}: not a plan ({error})") from error
@@ -258,9 +299,14 @@ def patch_from_row(row: Row) -> Patch:
         If a value is missing, of another type or not allowed.
     """
     try:
-        return Patch(**_fields(row, Patch))
+        return _part(row, Patch)
     except ValueError as error:
         raise DamageError(f"row {_key_of(row)}: not a patch ({error})") from error
+
+
+def _part(row: Row, record: type[Part]) -> Part:
+    """Return a record from the columns that hold it."""
+    return record(**_fields(row, record))
 
 
 def _fields(row: Row, record: Record) -> dict[str, Any]:
@@ -269,7 +315,7 @@ def _fields(row: Row, record: Record) -> dict[str, Any]:
     A field is omitted, and keeps its default, if its columns are newer than the row and thus empty.
     """
     fields: dict[str, Any] = {}
-    for field, columns in columns_of(record).items():
+    for field, columns in COLUMNS_OF[record].items():
         if all(column.since != FIRST and row.get(column.name, column.empty) == column.empty for column in columns):
             continue
         values = tuple(column.to_field(row) for column in columns)
@@ -279,13 +325,14 @@ def _fields(row: Row, record: Record) -> dict[str, Any]:
 
 def _check_plan(plan: Plan) -> None:
     """Raise ValueError for values that are allowed one by one and contradict each other."""
-    if not plan.black_level_dn < plan.white_level_dn < 2**plan.bits:
+    sensor, physics = plan.sensor, plan.noise.physics
+    if not sensor.black_level_dn < sensor.white_level_dn < 2**sensor.bits:
         raise ValueError(
-            f"white_level_dn={plan.white_level_dn}: expected more than black_level_dn={plan.black_level_dn} "
-            f"and less than 2^{plan.bits} (bits)"
+            f"white_level_dn={sensor.white_level_dn}: expected more than black_level_dn={sensor.black_level_dn} "
+            f"and less than 2^{sensor.bits} (bits)"
         )
-    if plan.physics is not None and not plan.physics.dn_per_e > 0:
-        raise ValueError(f"dn_per_e={plan.physics.dn_per_e}: expected more than 0")
+    if physics is not None and not physics.dn_per_e > 0:
+        raise ValueError(f"dn_per_e={physics.dn_per_e}: expected more than 0")
 
 
 def _key_of(row: Row) -> str:
@@ -410,7 +457,7 @@ def header_text(names: Sequence[str] = NAMES) -> str:
 
 
 def current_lines(lines: bytes, columns: int) -> bytes:
-    """Return lines of a manifest with an empty cell for each column that was added later.
+    """Return lines of a manifest with a cell for each column that was added later.
 
     Parameters
     ----------
@@ -433,10 +480,8 @@ def current_lines(lines: bytes, columns: int) -> bytes:
         return lines
     if columns not in map(len, HEADERS):
         raise ValueError(f"rows of {columns} columns; expected those of a known version")
-    stream = io.StringIO()
-    rows = csv.reader(io.StringIO(lines.decode(), newline=""))
-    csv.writer(stream, lineterminator="\n").writerows([*row, *[""] * (len(NAMES) - columns)] for row in rows)
-    return stream.getvalue().encode()
+    rows = (_completed(_typed(NAMES[:columns], line)) for line in lines.splitlines(keepends=True))
+    return rows_text(rows).encode()
 
 
 def _cell(value: Value) -> str:
@@ -730,4 +775,4 @@ def _row_of_json(content: Any) -> Row:
         check_row(row)
     except ValueError as error:
         raise ValueError(f"row {_key_of(content)}: {error}") from None
-    return row
+    return _completed(row)

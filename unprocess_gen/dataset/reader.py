@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import operator
 from collections.abc import Iterator
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, folder_name, open_text
+from unprocess_gen.core.object_store import ObjectPath
+from unprocess_gen.core.paths import AnyPath, any_path, folder_name, open_text
 from unprocess_gen.core.types import FLOAT32, PACKED, UINT16, Float, Frame, Row
 from unprocess_gen.dataset.keys import sample_key
 from unprocess_gen.dataset.manifest import read_columns, read_row, rows_with_offsets
@@ -107,6 +109,9 @@ class RawPairs:
     path : str or Path
         Folder of a finished dataset, or of a sweep; or its URL in an object store, such as ``s3://bucket/ds``. A
         sweep's datasets follow each other as in its ``sweep.csv``; jobs that left no dataset are omitted.
+    arrays_only : bool
+        Items are tuples ``(clean, noisy)`` without the row, which PyTorch's default ``collate_fn`` stacks if all frames
+        have one size. It cannot stack rows, because cells without a value are None.
 
     Attributes
     ----------
@@ -133,8 +138,9 @@ class RawPairs:
     (dtype('uint16'), '00000000')
     """
 
-    def __init__(self, path: str | Path | ObjectPath) -> None:
+    def __init__(self, path: str | Path | ObjectPath, *, arrays_only: bool = False) -> None:
         self.path = any_path(path)
+        self.arrays_only = arrays_only
         self._datasets = [_Dataset(folder) for folder in _dataset_folders(self.path)]
         offsets = [dataset.offsets() for dataset in self._datasets]
         self._offsets: NDArray[np.int64] = np.concatenate([np.empty(0, np.int64), *offsets])
@@ -162,15 +168,15 @@ class RawPairs:
     @overload
     def __getitem__(self, number: slice) -> RawPairs: ...
 
-    def __getitem__(self, number: SupportsIndex | slice) -> Sample | RawPairs:
+    def __getitem__(self, number: SupportsIndex | slice) -> Any:  # two arrays instead of a Sample with arrays_only
         if isinstance(number, slice):
-            part = RawPairs.__new__(RawPairs)
-            part.path, part._datasets = self.path, self._datasets
+            part = copy.copy(self)
             part._offsets, part._dataset_of = self._offsets[number], self._dataset_of[number]
             return part
         place = operator.index(number)
         dataset: _Dataset = self._datasets[int(self._dataset_of[place])]
-        return dataset.read(int(self._offsets[place]))
+        sample = dataset.read(int(self._offsets[place]))
+        return sample[:2] if self.arrays_only else sample
 
 
 class _Dataset:
@@ -230,43 +236,14 @@ def _dataset_folders(path: AnyPath) -> list[AnyPath]:
 
 
 def sweep_folders(table: AnyPath) -> list[str]:
-    """Return the folders of the finished datasets of a sweep.
-
-    Parameters
-    ----------
-    table : Path or ObjectPath
-        The ``sweep.csv``, of this or an older version.
-
-    Returns
-    -------
-    list of str
-        Names below the folder of ``table``, in its order.
-
-    Raises
-    ------
-    DamageError
-        As `read_sweep_table`.
-    """
+    """Return the names of the folders of the finished datasets of a sweep; raise as `read_sweep_table`."""
     return [folder for folder, exit_code in read_sweep_table(table) if exit_code in FINISHED]
 
 
 def read_sweep_table(table: AnyPath) -> list[tuple[str, str]]:
-    """Return folder and exit code of every job of a sweep.
+    """Return folder and exit code of every job of a ``sweep.csv``, of this or an older version.
 
-    Parameters
-    ----------
-    table : Path or ObjectPath
-        The ``sweep.csv``, of this or an older version.
-
-    Returns
-    -------
-    list of (str, str)
-        Names below the folder of ``table``, and exit codes, in its order.
-
-    Raises
-    ------
-    DamageError
-        If the file cannot be read, lacks the columns ``folder`` and ``exit``, or names a folder elsewhere.
+    Raises DamageError if the file cannot be read, lacks a column, or names a folder elsewhere.
     """
     try:
         with open_text(table) as stream:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.object_store import AnyPath
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset.columns import KEY_TEXT
 from unprocess_gen.dataset.keys import image_key, key_text, sample_key

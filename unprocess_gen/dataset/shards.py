@@ -15,7 +15,6 @@ import errno
 import hashlib
 import io
 import math
-import mmap
 import os
 import tarfile
 from collections import deque
@@ -30,7 +29,7 @@ import xxhash
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import little_endian
-from unprocess_gen.core.object_store import AnyPath, ObjectPath
+from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.types import DESCRIPTIONS, PACKED, UINT16, Frame, Row
 
 RECORD = 512
@@ -42,34 +41,12 @@ MAX_JSON_BYTES = 2**27
 
 
 def noisy_member(level: int, draw: int) -> str:
-    """Return the name of a noisy frame's member, without the key.
-
-    Parameters
-    ----------
-    level, draw : int
-        Noise level and draw, 0 to 99.
-
-    Returns
-    -------
-    str
-        ``noisy.npy`` for level 0 and draw 0; otherwise for example ``noisy.l01d02.npy``.
-    """
+    """Return the name of a noisy frame's member, without the key."""
     return f"noisy.l{level:02d}d{draw:02d}.npy" if level or draw else "noisy.npy"
 
 
 def shard_name(number: int) -> str:
-    """Return the file name of a shard.
-
-    Parameters
-    ----------
-    number : int
-        Number of the shard, from 0.
-
-    Returns
-    -------
-    str
-        For example ``shard-00000.tar``; more digits from shard 100000 on.
-    """
+    """Return the file name of a shard."""
     return f"shard-{number:05d}.tar"
 
 
@@ -103,39 +80,13 @@ class ArrayFormat(NamedTuple):
 
 
 def array_format(dtype: str, layout: str, height: int, width: int) -> ArrayFormat:
-    """Return the format of a frame.
-
-    Parameters
-    ----------
-    dtype : str
-        ``uint16`` or ``float32``.
-    layout : str
-        ``mosaic`` or ``packed``.
-    height, width : int
-        Sides of the mosaic, pixels.
-
-    Returns
-    -------
-    ArrayFormat
-        Shape [H, W], or [4, H / 2, W / 2] for packed planes.
-    """
+    """Return the format of a frame."""
     shape = (4, height // 2, width // 2) if layout == PACKED else (height, width)
     return ArrayFormat(dtype, shape)
 
 
 def frame_formats(row: Row) -> tuple[ArrayFormat, ArrayFormat]:
-    """Return the formats of the clean and of the noisy frame of a row.
-
-    Parameters
-    ----------
-    row : Row
-        Row of a pair.
-
-    Returns
-    -------
-    clean, noisy : ArrayFormat
-        They differ if ``clean_dtype`` is not empty.
-    """
+    """Return the formats of the clean and of the noisy frame of a row."""
     layout, height, width = str(row["layout"]), int(row["height"] or 0), int(row["width"] or 0)
     noisy = array_format(str(row["dtype"]), layout, height, width)
     return noisy._replace(dtype=str(row["clean_dtype"] or row["dtype"])), noisy
@@ -152,41 +103,13 @@ def _padding(size: int) -> int:
 
 
 def image_bytes(array: ArrayFormat, json_bytes: int, pairs: int = 1, clean: ArrayFormat | None = None) -> int:
-    """Return the bytes of one sample in a shard.
-
-    Parameters
-    ----------
-    array : ArrayFormat
-        Format of its noisy frames.
-    json_bytes : int
-        Size of its JSON (`manifest.json_size`).
-    pairs : int
-        Number of noisy frames.
-    clean : ArrayFormat, optional
-        Format of the clean frame, if it is another one.
-
-    Returns
-    -------
-    int
-        Bytes with tar headers and padding.
-    """
+    """Return the bytes of one sample in a shard."""
     sizes = [len(form.header) + form.size for form in (clean or array, *[array] * pairs)]
     return sum(RECORD + member + _padding(member) for member in (*sizes, json_bytes))
 
 
 def shard_bytes(pairs: list[int]) -> int:
-    """Return the size of a shard.
-
-    Parameters
-    ----------
-    pairs : list of int
-        Bytes of each sample (`image_bytes`).
-
-    Returns
-    -------
-    int
-        Bytes of the file; 0 without samples, because such a shard has no file.
-    """
+    """Return the size of a shard."""
     return sum(pairs) + len(END) if pairs else 0
 
 
@@ -202,23 +125,10 @@ SYNC_BYTES = 2**25
 class ShardWriter:
     """Write one shard, computing its size and SHA-256.
 
-    Parameters
-    ----------
-    path : Path
-        File to create; it must not exist. The caller deletes it after an error.
-    threaded : bool
-        Hash, write and sync in a second thread while the caller makes the next frames. Saves time if a core is idle. At
-        most `MAX_PENDING_BYTES` and one frame wait; the caller must not change frames that it has added.
-
-    Attributes
-    ----------
-    bytes : int
-        Size so far; the size of the file after the context was left.
-
-    Raises
-    ------
-    OSError
-        From the file system, at the failing call or a later one.
+    ``path`` must not exist; the caller deletes it after an error. ``bytes`` is the size so far. If ``threaded``, a
+    second thread hashes, writes and syncs while the caller makes the next frames, which saves time if a core is idle.
+    At most `MAX_PENDING_BYTES` and one frame wait; the caller must not change frames that it has added. Methods raise
+    OSError.
     """
 
     def __init__(self, path: Path, threaded: bool = False) -> None:
@@ -332,30 +242,13 @@ def map_array(path: AnyPath, member: Member, array: ArrayFormat) -> Frame:
     """
     header = array.header
     try:
-        content, skipped = _map_member(path, member) if isinstance(path, Path) else (_read_member(path, member), 0)
+        content, skipped = any_path(path).mapped(member.offset, member.size)
     except (OSError, ValueError) as error:
         raise DamageError(f"{path}: the member at byte {member.offset} cannot be read ({error})") from error
     size = len(header) + array.size
     if member.size != size or content[skipped : skipped + len(header)] != header:
         raise DamageError(f"{path}: the member at byte {member.offset} is not an array of {array}")
     return np.ndarray(array.shape, np.dtype(array.description), content, skipped + len(header))
-
-
-def _map_member(path: Path, member: Member) -> tuple[mmap.mmap, int]:
-    """Map a member into memory; return the mapping and the offset of the member in it."""
-    start = member.offset - member.offset % mmap.ALLOCATIONGRANULARITY
-    skipped = member.offset - start
-    with path.open("rb") as stream:
-        mapped = mmap.mmap(stream.fileno(), skipped + member.size, access=mmap.ACCESS_COPY, offset=start)
-    return mapped, skipped
-
-
-def _read_member(path: ObjectPath, member: Member) -> bytearray:
-    """Return a member as bytes that can be written to, as a mapping can."""
-    content = bytearray(path.read_range(member.offset, member.size))
-    if len(content) < member.size:
-        raise ValueError("the object ends before")
-    return content
 
 
 # ------------------------------------------------------------------------------------------------------- verifying
@@ -372,14 +265,7 @@ class ExpectedFrame(NamedTuple):
 class ExpectedSample(NamedTuple):
     """Hold what a shard must contain of one sample.
 
-    Attributes
-    ----------
-    key : str
-        Key of the sample.
-    frames : tuple of ExpectedFrame
-        The clean frame, then the noisy ones.
-    json : bytes
-        Content of ``KEY.json``.
+    ``frames`` are the clean frame, then the noisy ones; ``json`` is the content of ``KEY.json``.
     """
 
     key: str
@@ -394,22 +280,6 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
     """Compare every byte of a shard with what its samples must be.
 
     Tar headers, npy headers, JSON and padding are compared byte by byte, arrays by digest.
-
-    Parameters
-    ----------
-    path : Path
-        The shard.
-    samples : sequence of ExpectedSample
-        All samples, in order.
-
-    Yields
-    ------
-    str
-        Key of a damaged member; empty for the end of the archive.
-    str
-        The member.
-    str
-        The difference.
     """
     with path.open("rb") as stream:
         for sample in samples:
@@ -430,20 +300,7 @@ def check_members(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[tup
 
 
 def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dict[str, Frame]]:
-    """Read the frames of a damaged shard that are intact and at their place.
-
-    Parameters
-    ----------
-    path : Path
-        The shard; it may be missing, truncated or something else.
-    samples : sequence of ExpectedSample
-        All samples, in order.
-
-    Yields
-    ------
-    dict of str to ndarray
-        Intact frames of each sample, by member.
-    """
+    """Read the frames of a damaged shard that are intact and at their place."""
     with path.open("rb") if path.is_file() else io.BytesIO() as stream:
         at = 0
         for sample in samples:
@@ -461,20 +318,7 @@ def intact_frames(path: Path, samples: Sequence[ExpectedSample]) -> Iterator[dic
 def json_inside(path: Path) -> list[bytes]:
     """Return the JSON members of an intact shard.
 
-    Parameters
-    ----------
-    path : Path
-        The shard.
-
-    Returns
-    -------
-    list of bytes
-        Content of each ``KEY.json``, in the order of the shard; `manifest.rows_of_json` reads it.
-
-    Raises
-    ------
-    DamageError
-        If the file is not a complete tar archive, or a member has more than `MAX_JSON_BYTES`.
+    Raises DamageError.
     """
     members = [member for name, member in read_index(path).items() if name.endswith(f".{ROW}")]
     if any(member.size > MAX_JSON_BYTES for member in members):

@@ -8,7 +8,7 @@ index of the source in progress.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 from unprocess_gen.core.types import Source
@@ -21,15 +21,7 @@ LIMIT = 4
 
 
 class Deaths:
-    """Hold the deaths at a shard before this attempt.
-
-    Parameters
-    ----------
-    storage : Storage
-        Where the dataset is written.
-    shard : int
-        Number of the shard.
-    """
+    """Hold the deaths at a shard before this attempt."""
 
     def __init__(self, storage: Storage, shard: int) -> None:
         self._storage, self._prefix = storage, f"{shard:05d}-"
@@ -49,12 +41,17 @@ class Deaths:
         return sources[0]
 
     @contextmanager
-    def marked(self) -> Iterator[str]:
-        """Yield the name of this attempt's file, which exists until the attempt ends or its process dies."""
+    def marked(self) -> Iterator[Callable[[Source], None]]:
+        """Keep a file until this attempt ends or its process dies; yield a function that records the source."""
         name = f"{FOLDER}/{self._prefix}{uuid.uuid4().hex}"
         self._storage.write(name, "")
+
+        def mark(source: Source) -> None:
+            if self._names:
+                self._storage.write(name, str(source.index))
+
         try:
-            yield name
+            yield mark
         finally:
             self._storage.remove(name)
 
@@ -65,12 +62,6 @@ class Deaths:
 
 
 def forget_deaths(storage: Storage) -> None:
-    """Remove the files of all shards.
-
-    Parameters
-    ----------
-    storage : Storage
-        Where the dataset is written.
-    """
+    """Remove the files of all shards."""
     for name in storage.names(FOLDER):
         storage.remove(f"{FOLDER}/{name}")

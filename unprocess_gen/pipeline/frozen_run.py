@@ -15,29 +15,30 @@ import json
 import os
 import platform
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from importlib.metadata import version
-from typing import Any
 
 from unprocess_gen.config.interpretation import shading_place
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
+from unprocess_gen.core.paths import absolute_text
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import row_json
 from unprocess_gen.dataset.shards import ShardWriter
-from unprocess_gen.pipeline.listing_record import ListingRecord, RecordedListing, read_record, write_listing
+from unprocess_gen.pipeline.listing_record import INDEX, RecordedListing, write_listing
+from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.pipeline.run import Run
 from unprocess_gen.pipeline.shard_records import ShardRecords
 from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
-from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
-from unprocess_gen.pipeline.worker import ShardLog, make_and_commit, make_image
+from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardTask
+from unprocess_gen.pipeline.worker import make_and_commit, make_image
 from unprocess_gen.pipeline.workspace import Workspace
-from unprocess_gen.sources.dark_frames import DarkPlaces, set_dark_places
-from unprocess_gen.sources.listing import Listing, absolute_root
+from unprocess_gen.sources.dark_frames import DarkPlaces, with_dark_places
 
 PACKAGE = "unprocess_gen"
 PLAN = f"{WORK}/plan.json"
@@ -59,38 +60,22 @@ class FrozenPlan:
 
     Attributes
     ----------
-    version : str
-        Version of unprocess_gen.
-    config_sha256 : str
-        Digest of ``config.yaml``.
-    sources : int
-        Number of sources.
-    listing_sha256 : tuple of str
-        Digests of the listing's files.
-    pairs_per_shard : int
-        Sources in a shard.
-    root : str or None
-        Absolute place of the sources; None for built-in scenes.
-    max_failed, n_jobs : int
-        Settings of the run.
-    self_test : str
-        Setting of the run.
+    config_sha256, listing_sha256 : str
+        Digests of ``config.yaml`` and of the index of the recorded listing.
+    root, dark_frames, dark_shading : str or None
+        Absolute places of the sources, the dark frames and their map; None without them.
     not_matched, skipped_links : int
         What the listing left out.
     canary_source : int or None
-        Index of the source that every process makes first.
+        Index of the source that every process makes first; None without a usable one.
     canary_sha256 : str
         Digest of its rows.
-    dark_frames : str or None
-        Absolute place of the dark frames; None without them.
-    dark_shading : str or None
-        Absolute place of the dark-shading map, or of the folder of maps; None without a map.
     """
 
     version: str
     config_sha256: str
     sources: int
-    listing_sha256: tuple[str, ...]
+    listing_sha256: str
     pairs_per_shard: int
     root: str | None
     max_failed: int
@@ -102,6 +87,7 @@ class FrozenPlan:
     canary_sha256: str
     dark_frames: str | None = None
     dark_shading: str | None = None
+    parts: int | None = None
 
     @property
     def shards(self) -> int:
@@ -109,91 +95,65 @@ class FrozenPlan:
         return -(-self.sources // self.pairs_per_shard)
 
     @property
-    def record(self) -> ListingRecord:
-        """The recorded listing."""
-        return ListingRecord(self.sources, self.listing_sha256)
-
-    @property
     def text(self) -> str:
         """Content of ``plan.json``."""
         return json.dumps(dataclasses.asdict(self), indent=1) + "\n"
 
-    @property
-    def sha256(self) -> str:
-        """Digest of `text`."""
-        return hashlib.sha256(self.text.encode()).hexdigest()
-
 
 def freeze(
-    workspace: Workspace, config: Config, listing: Listing, on_compiling: OnCompiling | None = None
+    workspace: Workspace, run: Run, on_compiling: OnCompiling | None = None, parts: int | None = None
 ) -> FrozenPlan:
-    """Record the plan of a run that `Workspace.begin` has begun, or return the plan that is recorded.
+    """Record the plan of a run that `Workspace.begin` has begun, or continue the plan that is recorded.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        The begun dataset.
-    config : Config
-        Its validated config.
-    listing : Listing
-        Its sources, with which ``workspace`` began.
-    on_compiling : callable, optional
-        Called before kernels are compiled.
-
-    Returns
-    -------
-    FrozenPlan
-        With the settings of the process that froze the run first.
-
-    Raises
-    ------
-    ConfigError
-        If another version of unprocess_gen froze the run.
-    CanaryError
-        If this host makes another canary than the one recorded.
-    MachineError
-        If the self-test fails, or a file cannot be written.
+    Raises ConfigError if another version of unprocess_gen froze the run, CanaryError if this host makes another canary
+    than the one recorded, MachineError if the self-test fails or a file cannot be written.
     """
-    known = _read_plan(workspace.storage, workspace.out)
-    if known is None:
-        known = _new_plan(workspace, config, listing, on_compiling)
-        if workspace.storage.create(PLAN, known.text):
-            return known
-        known = _read_plan(workspace.storage, workspace.out) or known
-    check_version(known, workspace.out)
-    check_canary(known, config, listing.sources, on_compiling)
-    return known
+    storage, out = workspace.storage, workspace.out
+    plan = recorded_plan(storage, out)
+    if plan is None:
+        plan = _new_plan(workspace, run, on_compiling, parts)
+        if storage.create(PLAN, plan.text):
+            return plan
+        plan = recorded_plan(storage, out) or plan
+    check_canary(plan, run.settings, run.sources, on_compiling)
+    if parts is not None and plan.parts is None:  # a run on a cluster is continued in parts
+        plan = dataclasses.replace(plan, parts=parts)
+        storage.write(PLAN, plan.text)
+    return plan
 
 
-def _new_plan(workspace: Workspace, config: Config, listing: Listing, on_compiling: OnCompiling | None) -> FrozenPlan:
-    record = read_record(workspace.storage, workspace.out)
-    if record is None:  # version 0.1 began the dataset
-        record = write_listing(workspace.storage, workspace.out, listing.sources)
-    smallest_first = sorted(listing.sources[:TRIED], key=lambda source: source.size_bytes or 0)
-    canary = next(_canaries(config, smallest_first, on_compiling), (None, ""))
+def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, parts: int | None) -> FrozenPlan:
+    if workspace.storage.size(INDEX) is None:  # version 0.1 began the dataset
+        write_listing(workspace.storage, workspace.out, run.sources)
+    smallest_first = sorted(run.sources[:TRIED], key=lambda source: source.size_bytes or 0)
+    index, sha256 = _make_canary(run.settings, smallest_first, on_compiling)
+    config = run.config
     return FrozenPlan(
         version=version(PACKAGE),
-        config_sha256=hashlib.sha256(workspace.config_yaml.encode()).hexdigest(),
-        sources=record.sources,
-        listing_sha256=record.sha256,
+        config_sha256=text_sha256(workspace.config_yaml),
+        sources=len(run.sources),
+        listing_sha256=text_sha256(workspace.storage.read(INDEX)),
         pairs_per_shard=config.output.pairs_per_shard,
-        root=absolute_root(config.source.root),
+        root=absolute_text(config.source.root),
         max_failed=config.source.max_failed,
         n_jobs=config.n_jobs,
         self_test=config.self_test,
-        not_matched=listing.not_matched,
-        skipped_links=listing.skipped_links,
-        canary_source=canary[0],
-        canary_sha256=canary[1],
-        dark_frames=absolute_root(config.noise.dark_frames),
-        dark_shading=absolute_root(shading_place(config.noise)),
+        not_matched=run.listing.not_matched,
+        skipped_links=run.listing.skipped_links,
+        canary_source=index,
+        canary_sha256=sha256,
+        dark_frames=absolute_text(config.noise.dark_frames),
+        dark_shading=absolute_text(shading_place(config.noise)),
+        parts=parts,
     )
 
 
-def _canaries(config: Config, sources: Sequence[Source], on_compiling: OnCompiling | None) -> Iterator[tuple[int, str]]:
-    """Yield the index of each usable source, and the digest of its rows."""
-    storage = open_storage(config.out)
-    context = RunContext(config, str(storage.scratch), os.getpid(), on_compiling=on_compiling)
+def _make_canary(
+    settings: PairSettings, sources: Iterable[Source], on_compiling: OnCompiling | None
+) -> tuple[int | None, str]:
+    """Make the first usable source; return its index and the digest of its rows, None and "" without one."""
+    storage = open_storage(settings.config.out)
+    context = RunContext(settings, str(storage.scratch), os.getpid(), on_compiling=on_compiling)
     path = storage.scratch / "canary.tar"
     try:
         for source in sources:
@@ -201,93 +161,63 @@ def _canaries(config: Config, sources: Sequence[Source], on_compiling: OnCompili
                 rows = make_image(context, 0, source, writer, ShardLog())
             path.unlink()
             if rows[0]["status"] == "ok":
-                yield source.index, hashlib.sha256(row_json(rows)).hexdigest()
+                return source.index, hashlib.sha256(row_json(rows)).hexdigest()
+        return None, ""
     finally:
         storage.close()
 
 
-def read_plan(storage: Storage, out: str) -> FrozenPlan:
-    """Return the plan of a run that this version of unprocess_gen can continue.
-
-    Parameters
-    ----------
-    storage : Storage
-        Where the dataset is written.
-    out : str
-        Its place, for messages.
-
-    Returns
-    -------
-    FrozenPlan
-        The plan.
-
-    Raises
-    ------
-    ConfigError
-        If there is none, another version froze it, or ``config.yaml`` or the listing are not those of the plan.
-    DamageError
-        If the plan cannot be read.
-    """
-    plan = _read_plan(storage, out)
-    if plan is None:
-        raise ConfigError(f"out={out}: contains no plan of a run in parts; expected one; run gen-dataset prepare first")
-    check_version(plan, out)
-    if hashlib.sha256(storage.read("config.yaml").encode()).hexdigest() != plan.config_sha256:
-        raise ConfigError(f"out={out}: its config.yaml is not the one that was prepared; prepare another out")
-    if read_record(storage, out) != plan.record:
-        raise ConfigError(f"out={out}: its listing of sources is not the one that was prepared; prepare another out")
-    return plan
+def text_sha256(text: str) -> str:
+    """SHA-256 of a text, 64 hexadecimal digits."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _read_plan(storage: Storage, out: str) -> FrozenPlan | None:
+def recorded_plan(storage: Storage, out: str) -> FrozenPlan | None:
+    """Read the plan of a run, None if there is none; raise ConfigError if another version recorded it."""
     try:
-        values: dict[str, Any] = json.loads(storage.read(PLAN))
-        return FrozenPlan(**values | {"listing_sha256": tuple(values["listing_sha256"])})
+        plan = FrozenPlan(**json.loads(storage.read(PLAN)))
     except FileNotFoundError:
         return None
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError) as error:
         raise DamageError(
             f"{out}/{PLAN}: cannot be read ({error_in_one_line(error)}); remove the folder and start again"
         ) from error
-
-
-def check_version(plan: FrozenPlan, out: str) -> None:
-    """Raise ConfigError if another version of unprocess_gen froze the run."""
     if plan.version != version(PACKAGE):
         raise ConfigError(
             f"out={out}: was begun by {PACKAGE} {plan.version}, this is {version(PACKAGE)}; use that version, or "
             "prepare another out"
         )
+    return plan
+
+
+def read_plan(storage: Storage, out: str) -> FrozenPlan:
+    """Read the plan of a run; raise ConfigError without one, or if ``config.yaml`` or the listing are not its own."""
+    plan = recorded_plan(storage, out)
+    if plan is None:
+        raise ConfigError(f"out={out}: contains no plan of a run in parts; expected one; run gen-dataset prepare first")
+    for name, sha256 in (("config.yaml", plan.config_sha256), (INDEX, plan.listing_sha256)):
+        try:
+            is_prepared = text_sha256(storage.read(name)) == sha256
+        except (FileNotFoundError, ValueError):  # was deleted, is no regular file or not UTF-8
+            is_prepared = False
+        if not is_prepared:
+            what = "listing of sources" if name == INDEX else name
+            raise ConfigError(f"out={out}: its {what} is not the one that was prepared; prepare another out")
+    return plan
 
 
 def check_canary(
-    plan: FrozenPlan, config: Config, sources: Sequence[Source], on_compiling: OnCompiling | None = None
+    plan: FrozenPlan, settings: PairSettings, sources: Sequence[Source], on_compiling: OnCompiling | None = None
 ) -> None:
-    """Make the canary of a plan once per process, and compare it.
+    """Make the canary of a plan, which is among the sources, and compare it.
 
-    Parameters
-    ----------
-    plan : FrozenPlan
-        The plan.
-    config : Config
-        Its config.
-    sources : sequence of Source
-        Sources that include the canary.
-    on_compiling : callable, optional
-        Called before kernels are compiled.
-
-    Raises
-    ------
-    CanaryError
-        If its rows differ.
-    MachineError
-        If the self-test fails, or the source was changed or deleted.
+    Raises CanaryError if its rows differ, MachineError if the self-test fails, or the source was changed or deleted.
     """
     if plan.canary_source is None:
         return
     canary = [source for source in sources if source.index == plan.canary_source]
-    found = next(_canaries(config, canary, on_compiling), (None, ""))
-    if found != (plan.canary_source, plan.canary_sha256):
+    made = _make_canary(settings, canary, on_compiling)
+    if made != (plan.canary_source, plan.canary_sha256):
         raise CanaryError(
             f"{platform.node()} makes other bytes from source {canary[0].name} than the host that began the run; "
             "expected the same; install the same versions of its libraries"
@@ -295,7 +225,7 @@ def check_canary(
 
 
 class FrozenRun:
-    """Make shards of a frozen run; `open_run` returns one.
+    """Make shards of a frozen run in this process.
 
     Attributes
     ----------
@@ -315,9 +245,7 @@ class FrozenRun:
         self.records = ShardRecords(self.storage, out)
         self.plan = read_plan(self.storage, out)
         self.config = self._config(root)
-        self._listing = RecordedListing(self.storage, out, self.plan.record)
-        self._making = threading.Lock()
-        self._is_checked = False
+        self._listing = RecordedListing(self.storage, out)
 
     def _config(self, root: str | None) -> Config:
         plan = self.plan
@@ -326,93 +254,55 @@ class FrozenRun:
             check_values(config)
         except (ValueError, ConfigError) as error:
             raise DamageError(f"{self.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
-        config.out, config.source.root = self.out, root or plan.root
-        set_dark_places(config, DarkPlaces(plan.dark_frames, plan.dark_shading))
-        config.source.max_failed, config.n_jobs, config.self_test = plan.max_failed, plan.n_jobs, plan.self_test
-        return config
+        changes = {"out": self.out, "n_jobs": plan.n_jobs, "self_test": plan.self_test}
+        changes |= {"source.root": root or plan.root, "source.max_failed": plan.max_failed}
+        return with_dark_places(replaced(config, changes), DarkPlaces(plan.dark_frames, plan.dark_shading))
+
+    @cached_property
+    def settings(self) -> PairSettings:
+        """The config with its dark frames, which this process reads."""
+        return PairSettings.read(self.config)
 
     def check_host(self, on_compiling: OnCompiling | None = None) -> None:
-        """Run the self-test and make the canary, unless it was done before; arguments and errors of `check_canary`."""
-        index = self.plan.canary_source
-        if index is not None and not self._is_checked:
-            check_canary(self.plan, self.config, self._listing.sources(index, index + 1), on_compiling)
-        self._is_checked = True
+        """Run the self-test and make the canary; errors are those of `check_canary`."""
+        if (index := self.plan.canary_source) is not None:
+            check_canary(self.plan, self.settings, self._listing.sources(index, index + 1), on_compiling)
 
-    def tasks(self, shards: Iterable[int]) -> Iterator[ShardTask]:
-        """Yield the tasks of shards in ascending order; only the listing files of their sources are read."""
+    def task(self, shard: int) -> ShardTask:
+        """Read the sources of a shard."""
         size = self.plan.pairs_per_shard
-        for shard in shards:
-            last = min((shard + 1) * size, self.plan.sources)
-            yield ShardTask(shard, tuple(self._listing.sources(shard * size, last)))
+        return ShardTask(shard, tuple(self._listing.sources(shard * size, min((shard + 1) * size, self.plan.sources))))
 
-    def make(self, shards: Iterable[int]) -> Iterator[ShardReport]:
-        """Make and commit shards that are not committed; yield a report of each.
+    def make(self, shard: int) -> ShardReport | None:
+        """Make and commit a shard, or return None if it is committed; one at a time in a process.
 
-        One shard is made at a time in a process, whatever the number of threads that call this method.
-
-        Parameters
-        ----------
-        shards : iterable of int
-            Numbers of shards.
-
-        Yields
-        ------
-        ShardReport
-            For each shard that this call made.
-
-        Raises
-        ------
-        MachineError
-            If a file cannot be read or written, or a source was changed or deleted.
+        Raises MachineError if a file cannot be read or written, or a source was changed or deleted.
         """
-        for shard in shards:
-            with self._making:
-                if self.records.is_committed(shard):
-                    continue
-                (task,) = self.tasks([shard])
-                context = RunContext(self.config, str(self.storage.scratch), None, counts_deaths=True)
-                report = make_and_commit(context, task)
-            yield report
+        with _ONE_AT_A_TIME:
+            if self.records.is_committed(shard):
+                return None
+            context = RunContext(self.settings, str(self.storage.scratch), None, counts_deaths=True)
+            return make_and_commit(context, self.task(shard))
 
 
-def open_run(out: str, plan_sha256: str, root: str | None = None, on_compiling: OnCompiling | None = None) -> FrozenRun:
-    """Return a frozen run for this process, after the self-test and the canary.
+_ONE_AT_A_TIME = threading.Lock()
 
-    Parameters
-    ----------
-    out : str
-        Folder of the dataset.
-    plan_sha256 : str
-        Digest of the plan (`FrozenPlan.sha256`), so that a later run in the same folder is another one.
-    root : str, optional
-        Place of the sources, if they were moved since the run was frozen.
-    on_compiling : callable, optional
-        Called before kernels are compiled.
 
-    Returns
-    -------
-    FrozenRun
-        The same object for every call with the same arguments.
+def open_run(out: str, plan_sha256: str, root: str | None = None) -> FrozenRun:
+    """Open a frozen run once for this process, and check the host.
 
-    Raises
-    ------
-    ConfigError, DamageError
-        As `read_plan`.
-    CanaryError, MachineError
-        As `check_canary`.
+    ``plan_sha256`` identifies the run, because a later one can be in the same folder; ``root`` is the place of the
+    sources if they were moved. Raises ConfigError and DamageError as `read_plan`, CanaryError and MachineError as
+    `check_canary`.
     """
-    with _OPENING:
-        run = _open_run(out, plan_sha256, root)
-        run.check_host(on_compiling)
-        return run
-
-
-_OPENING = threading.Lock()
+    with _ONE_AT_A_TIME:
+        return _open_run(out, plan_sha256, root)
 
 
 @lru_cache(maxsize=2)
 def _open_run(out: str, plan_sha256: str, root: str | None) -> FrozenRun:
     run = FrozenRun(out, root)
-    if run.plan.sha256 != plan_sha256:
+    if text_sha256(run.plan.text) != plan_sha256:
         raise ConfigError(f"out={out}: its plan is not that of this run; prepare another out")
+    run.check_host()
     return run

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import fields
 from typing import NamedTuple
 
 from unprocess_gen.config.values import error_in_one_line
@@ -38,26 +39,18 @@ class RecordedFile(NamedTuple):
     etag: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ListingRecord:
-    """Hold the number of recorded sources, and the SHA-256 of each file of the record."""
-
-    sources: int
-    sha256: tuple[str, ...]
-
-
-def write_listing(storage: Storage, place: str, sources: Sequence[Source]) -> ListingRecord:
-    """Record the sources of a run; return what identifies the record.
+def write_listing(storage: Storage, place: str, sources: Sequence[Source]) -> None:
+    """Record the sources of a run.
 
     Raises ConfigError if another process has begun to record other sources: files of the record are never replaced.
     """
-    texts = (_text(sources[first : first + PER_FILE]) for first in range(0, len(sources), PER_FILE))
     digests: list[str] = []
-    for number, text in enumerate(texts):
+    for first in range(0, len(sources), PER_FILE):
+        rows = [[getattr(source, name) for name in _FIELDS] for source in sources[first : first + PER_FILE]]
+        text = json.dumps(rows, separators=(",", ":"))
+        _create(storage, place, f"{FOLDER}/{len(digests):05d}.json", text)
         digests.append(_sha256(text))
-        _create(storage, place, f"{FOLDER}/{number:05d}.json", text)
     _create(storage, place, INDEX, json.dumps({"sources": len(sources), "sha256": digests}))
-    return ListingRecord(len(sources), tuple(digests))
 
 
 def _sha256(text: str) -> str:
@@ -71,37 +64,20 @@ def _create(storage: Storage, place: str, name: str, text: str) -> None:
         )
 
 
-def _text(sources: Iterable[Source]) -> str:
-    return json.dumps([[getattr(source, name) for name in _FIELDS] for source in sources], separators=(",", ":"))
-
-
-def read_record(storage: Storage, place: str) -> ListingRecord | None:
-    """Return what identifies the recorded sources, None if there is no record; raise DamageError if it is damaged."""
-    try:
-        found = json.loads(storage.read(INDEX))
-        return ListingRecord(int(found["sources"]), tuple(map(str, found["sha256"])))
-    except FileNotFoundError:
-        return None
-    except (ValueError, KeyError, TypeError) as error:
-        raise _damage(place, INDEX, error) from error
-
-
 class RecordedListing:
     """Read the recorded sources of a run; the file that was read last is kept.
 
-    Parameters
-    ----------
-    storage : Storage
-        Where the dataset is written.
-    place : str
-        Its place, for messages.
-    record : ListingRecord
-        What identifies the record.
+    Raises FileNotFoundError if there is no record, DamageError if it cannot be read.
     """
 
-    def __init__(self, storage: Storage, place: str, record: ListingRecord) -> None:
-        self._storage, self._place, self._record = storage, place, record
+    def __init__(self, storage: Storage, place: str) -> None:
+        self._storage, self._place = storage, place
         self._last: tuple[int, list[Source]] = (-1, [])
+        try:
+            index = json.loads(storage.read(INDEX))
+            self.count, self._sha256 = int(index["sources"]), list(map(str, index["sha256"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise _damage(place, INDEX, error) from error
 
     def sources(self, first: int, last: int) -> list[Source]:
         """Return the sources from index ``first`` to before ``last``; raise DamageError if they are damaged."""
@@ -113,7 +89,7 @@ class RecordedListing:
             name = f"{FOLDER}/{number:05d}.json"
             try:
                 text = self._storage.read(name)
-                if _sha256(text) != self._record.sha256[number]:
+                if _sha256(text) != self._sha256[number]:
                     raise ValueError(f"its SHA-256 differs from that in {INDEX}")
                 self._last = number, [Source(*values) for values in json.loads(text)]
             except (OSError, ValueError, TypeError, IndexError) as error:
@@ -126,11 +102,10 @@ def recorded_files(storage: Storage, place: str) -> Iterator[tuple[str, Recorded
 
     Raises DamageError if the record is damaged.
     """
-    record = read_record(storage, place)
-    if record is not None:
-        listing = RecordedListing(storage, place, record)
-        for first in range(0, record.sources, PER_FILE):
-            for source in listing.sources(first, min(first + PER_FILE, record.sources)):
+    with suppress(FileNotFoundError):
+        listing = RecordedListing(storage, place)
+        for first in range(0, listing.count, PER_FILE):
+            for source in listing.sources(first, min(first + PER_FILE, listing.count)):
                 yield source.name, RecordedFile(source.size_bytes, source.sha256, source.etag)
         return
     try:

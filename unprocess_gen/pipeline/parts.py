@@ -10,40 +10,29 @@ Of S shards, part K of N contains those from K·S // N up to, but not including,
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.config.settings import settings_of
-from unprocess_gen.config.values import error_in_one_line
-from unprocess_gen.core.errors import RESUME, ConfigError, DamageError, MachineError
+from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
 from unprocess_gen.core.files import machine_error
-from unprocess_gen.core.object_store import any_path
+from unprocess_gen.core.paths import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
-from unprocess_gen.pipeline.frozen_run import FrozenRun, freeze, read_plan
-from unprocess_gen.pipeline.generate import (
-    Summary,
-    dataset_json_facts,
-    follow,
-    shard_tasks,
-    summary_of,
-    warnings_before,
-)
+from unprocess_gen.pipeline.frozen_run import FrozenPlan, FrozenRun, freeze, read_plan, recorded_plan
+from unprocess_gen.pipeline.generate import Summary, begin, dataset_json_facts, follow, images_in
+from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import COMPILING, LOGGER, Progress
+from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.sizes import check_free_space, with_pairs_per_shard
-from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
+from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
-from unprocess_gen.sources.dark_frames import open_dark_frames
-from unprocess_gen.sources.loader import list_photographs
-
-PARTS = f"{WORK}/parts.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,103 +104,45 @@ class PartsStatus:
 
 
 def shards_of_part(part: int, parts: int, shards: int) -> range:
-    """Return the shards of one part.
-
-    Parameters
-    ----------
-    part : int
-        Number of the part, from 0.
-    parts, shards : int
-        Number of all parts and of all shards.
-
-    Returns
-    -------
-    range
-        Numbers of shards; the sizes of two parts differ by at most one.
-    """
+    """Return the shards of one part."""
     return range(part * shards // parts, (part + 1) * shards // parts)
 
 
 def prepare(config: Config, parts: int) -> Prepared:
     """Freeze a run in parts; a second call with the same settings changes nothing.
 
-    Parameters
-    ----------
-    config : Config
-        Config that `config.validation.validate_config` has accepted.
-    parts : int
-        Number of parts, at least 1.
-
-    Returns
-    -------
-    Prepared
-        What was frozen.
-
-    Raises
-    ------
-    ConfigError
-        As `generate`; if there are fewer shards than parts; if the run was prepared with another number of parts, or
-        begun by another version.
-    LockedError, DamageError, MachineError
-        As `generate`.
+    Raises ConfigError as `generate`; if there are fewer shards than parts; if the run was prepared with another number
+    of parts, or begun by another version; LockedError, DamageError, MachineError as `generate`.
     """
-    listing = list_photographs(config.source)
-    config, _, _ = open_dark_frames(config)
-    config = with_pairs_per_shard(config, listing.sources, open_storage(config.out))
-    tasks = shard_tasks(listing.sources, config.output.pairs_per_shard)
-    if parts > len(tasks):
+    run = resolve(config)
+    shards, sources = len(run.tasks()), len(run.sources)
+    if parts > shards:
         raise ConfigError(
-            f"parts={parts}: this dataset has {len(tasks)} shard{'s' * (len(tasks) != 1)}; expected 1 to {len(tasks)}; "
+            f"parts={parts}: this dataset has {shards} shard{'s' * (shards != 1)}; expected 1 to {shards}; "
             "lower parts or output.pairs_per_shard"
         )
-    with Workspace(config.out, dataset_yaml(config)) as workspace:
+    with Workspace(config.out, dataset_yaml(run.config)) as workspace:
         workspace.open()
         if workspace.is_complete():
-            workspace.check_complete(listing.sources)
-            return Prepared(parts, len(tasks), len(listing.sources), complete=True)
-        workspace.check_begun(listing.sources, config.source.root)
-        known = _read_parts(workspace.storage, workspace.out)
-        if known not in (None, parts):
+            workspace.check_complete(run.sources)
+            return Prepared(parts, shards, sources, complete=True)
+        plan = recorded_plan(workspace.storage, workspace.out)
+        if plan is not None and plan.parts not in (None, parts):
             raise ConfigError(
-                f"parts={parts}: {config.out} was prepared with parts={known}; expected that number; choose another out"
+                f"parts={parts}: {config.out} was prepared with parts={plan.parts}; expected that number; choose "
+                "another out"
             )
-        done = workspace.records.committed(range(len(tasks)))
-        if config.check_disk:
-            check_free_space(config, [task for task in tasks if task.shard not in done], any_path(config.out))
-        workspace.begin(listing.sources, len(tasks))
-        freeze(workspace, config, listing, partial(LOGGER.info, COMPILING))
-        workspace.storage.create(PARTS, json.dumps({"parts": parts}) + "\n")
-    return Prepared(parts, len(tasks), len(listing.sources), warnings=warnings_before(config, listing))
+        begin(workspace, run)
+        freeze(workspace, run, partial(LOGGER.info, COMPILING), parts)
+    return Prepared(parts, shards, sources, warnings=run.warnings())
 
 
 def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None = None) -> PartMade | None:
     """Make and commit the shards of one part that are not committed yet.
 
-    Parameters
-    ----------
-    out : str
-        Folder of the dataset.
-    part : int
-        Number of the part, from 0.
-    n_jobs : int, optional
-        Number of worker processes, -1 for all cores; by default as prepared.
-    root : str, optional
-        Place of the sources on this host; by default as prepared.
-
-    Returns
-    -------
-    PartMade or None
-        What this call made; None if the dataset is finished.
-
-    Raises
-    ------
-    ConfigError
-        If ``out`` was not prepared, or by another version or with other settings; if there is no such part, or
-        ``n_jobs`` is not allowed.
-    CanaryError
-        If this host makes other bytes than the host that prepared the run.
-    MachineError
-        If the self-test fails, a file cannot be read or written, or a source was changed or deleted.
+    Raises ConfigError if ``out`` was not prepared, or by another version or with other settings; if there is no such
+    part, or ``n_jobs`` is not allowed; CanaryError if this host makes other bytes than the host that prepared the run;
+    MachineError if the self-test fails, a file cannot be read or written, or a source was changed or deleted.
     """
     started = time.monotonic()
     if n_jobs is not None:
@@ -219,20 +150,20 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
     if _is_complete(out):
         return None
     run = FrozenRun(out, root)
-    parts = _parts(run.storage, out)
+    parts = _parts(run.plan, out)
     if not 0 <= part < parts:
         raise ConfigError(f"part {part}: {out} has {parts} parts; expected 0 to {parts - 1}")
     wanted = shards_of_part(part, parts, run.plan.shards)
     try:
         done = run.records.committed(wanted)
-        todo = list(run.tasks(shard for shard in wanted if shard not in done))
+        todo = [run.task(shard) for shard in wanted if shard not in done]
         jobs = effective_jobs(run.plan.n_jobs if n_jobs is None else n_jobs, len(todo))
         scratch, spare = str(run.storage.scratch), jobs < own_cores()
-        context = RunContext(run.config, scratch, os.getpid(), core_to_spare=spare, counts_deaths=True)
-        with Progress(sum(len(task.sources) for task in todo), 0, f"part {part} of {parts}") as progress:
+        with Progress(images_in(todo), 0, f"part {part} of {parts}") as progress:
             run.check_host(progress.report_compiling)
-            progress.watch_compiling(context.compiling_path)
-            rows, _ = follow(run_tasks(context, todo, jobs), progress)
+            context = RunContext(run.settings, scratch, os.getpid(), core_to_spare=spare, counts_deaths=True)
+            progress.watch(context)
+            rows = follow(run_tasks(context, todo, jobs), progress).rows
     except OSError as error:
         raise machine_error(error, any_path(out), RESUME) from error
     finally:
@@ -241,30 +172,15 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
 
 
 def parts_status(out: str) -> PartsStatus:
-    """Return which parts of a prepared run are left.
+    """Find the parts of a prepared run that are left.
 
-    Parameters
-    ----------
-    out : str
-        Folder of the dataset.
-
-    Returns
-    -------
-    PartsStatus
-        A shard with provisional rows counts as done, because a merge accepts it.
-
-    Raises
-    ------
-    ConfigError
-        If ``out`` was not prepared.
-    DamageError
-        If a record of the run cannot be read.
+    Raises ConfigError if ``out`` was not prepared; DamageError if a record of the run cannot be read.
     """
     storage = open_storage(out)
     if _is_complete(out):
         return PartsStatus(0, 0, 0, (), complete=True)
     plan = read_plan(storage, out)
-    parts = _parts(storage, out)
+    parts = _parts(plan, out)
     recorded = ShardRecords(storage, out).recorded(range(plan.shards))
     left = (part for part in range(parts) if not recorded.issuperset(shards_of_part(part, parts, plan.shards)))
     return PartsStatus(parts, plan.shards, len(recorded), tuple(left))
@@ -273,33 +189,16 @@ def parts_status(out: str) -> PartsStatus:
 def merge(out: str) -> tuple[Summary, int]:
     """Write manifest and ``dataset.json`` of a run whose parts are done.
 
-    Parameters
-    ----------
-    out : str
-        Folder of the dataset.
-
-    Returns
-    -------
-    summary : Summary
-        Counts of the dataset; ``made`` is 0 if it was finished before.
-    max_failed : int
-        ``source.max_failed`` as prepared; 0 if the dataset was finished before.
-
-    Raises
-    ------
-    ConfigError
-        If ``out`` was not prepared, or by another version or with other settings.
-    MachineError
-        If parts are left, which the message names; nothing is written then. If a file cannot be read or written.
-    LockedError
-        If a run holds the folder.
+    Raises ConfigError if ``out`` was not prepared, or by another version or with other settings; MachineError if parts
+    are left, which the message names; nothing is written then. If a file cannot be read or written; LockedError if a
+    run holds the folder.
     """
     started = time.monotonic()
     status = parts_status(out)
     if status.complete:
         facts = Workspace(out, "").facts()
         assert facts is not None
-        return summary_of(out, facts, started), 0
+        return Summary.of(out, facts, started), 0
     if status.left:
         raise MachineError(
             f"merge: {out}: parts left: {left_text(status.left)} (of {status.parts}), "
@@ -307,33 +206,23 @@ def merge(out: str) -> tuple[Summary, int]:
             "then merge again; nothing was written"
         )
     run = FrozenRun(out)
+    settings = PairSettings(run.config)
+    with suppress(ConfigError, MachineError):  # parts may be merged where the dark frames are not
+        settings = run.settings
     with Workspace(out, run.storage.read("config.yaml")) as workspace:
         workspace.storage.hold()
-        parts = _parts(run.storage, out)
+        plan, parts = run.plan, _parts(run.plan, out)
         facts = workspace.finish(
-            run.plan.shards,
-            lambda tally: dataset_json_facts(
-                run.config, run.plan.not_matched, run.plan.skipped_links, tally, {"parts": parts}
-            ),
+            plan.shards,
+            lambda tally: dataset_json_facts(settings, plan.not_matched, plan.skipped_links, tally, {"parts": parts}),
             run.config.output.parquet,
         )
-    found = summary_of(out, facts, started)
-    return replace(found, made=found.rows), run.plan.max_failed
+    summary = Summary.of(out, facts, started)
+    return replace(summary, made=summary.rows), plan.max_failed
 
 
 def left_text(parts: Sequence[int]) -> str:
-    """Return numbers as ranges, as batch systems take them: ``3,7-9``.
-
-    Parameters
-    ----------
-    parts : sequence of int
-        Ascending numbers.
-
-    Returns
-    -------
-    str
-        Both ends of a range are included; empty without numbers.
-    """
+    """Return numbers as ranges, as batch systems take them: ``3,7-9``."""
     runs: list[tuple[int, int]] = []
     for part in parts:
         if runs and runs[-1][1] == part - 1:
@@ -347,19 +236,7 @@ def _is_complete(out: str) -> bool:
     return Workspace(out, "").is_complete()
 
 
-def _parts(storage: Storage, out: str) -> int:
-    parts = _read_parts(storage, out)
-    if parts is None:
+def _parts(plan: FrozenPlan, out: str) -> int:
+    if plan.parts is None:
         raise ConfigError(f"out={out}: has no parts; expected a folder that gen-dataset prepare has begun; prepare it")
-    return parts
-
-
-def _read_parts(storage: Storage, out: str) -> int | None:
-    try:
-        return int(json.loads(storage.read(PARTS))["parts"])
-    except FileNotFoundError:
-        return None
-    except (ValueError, KeyError, TypeError) as error:
-        raise DamageError(
-            f"{out}/{PARTS}: cannot be read ({error_in_one_line(error)}); remove the folder and start again"
-        ) from error
+    return plan.parts

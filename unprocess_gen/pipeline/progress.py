@@ -11,23 +11,34 @@ import shutil
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from contextlib import suppress
-from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING, TypeVar
 
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from unprocess_gen.pipeline.tasks import RunContext
+
+Item = TypeVar("Item")
 
 LOGGER = logging.getLogger("unprocess_gen")
 LINE_S = 5.0
 """Seconds between progress lines if stderr is not a terminal."""
-COMPILING = "compiling kernels, once per machine and version"
-COMPILING_POLL_S = 0.1
+COMPILING = "compiling kernels for this kind of noise and frames, once per machine and version"
+POLL_S = 0.1
+"""Time between two looks at the files by which workers report what they do."""
+BAR_DELAY_S = 2.0
+"""Time after which `with_bar` shows a bar."""
 COLUMNS = 80
 """Width of the bar on a terminal that reports none."""
 
 
 class Progress:
     """Count finished items of a run and report them on stderr.
+
+    The time left follows from the rate since the first finished item, so that it leaves out compiling.
 
     Parameters
     ----------
@@ -40,9 +51,10 @@ class Progress:
     """
 
     def __init__(self, total: int, done: int = 0, label: str = "", unit: str = "image") -> None:
-        self._total, self._done, self._first, self._failed = total, done, done, 0
+        self._total, self._done, self._shown, self._failed = total, done, done, 0
         self._prefix, self._unit = f"{label}: " if label else "", unit
         self._started = self._last_line = time.monotonic()
+        self._first, self._has_begun = done, False
         enabled = LOGGER.isEnabledFor(logging.INFO)
         terminal = enabled and sys.stderr is not None and sys.stderr.isatty()
         self._lines = enabled and not terminal
@@ -55,7 +67,7 @@ class Progress:
             disable=not terminal,
             ncols=shutil.get_terminal_size((COLUMNS, 24)).columns or COLUMNS,
         )
-        self._over = threading.Event()
+        self._over, self._lock = threading.Event(), threading.Lock()
 
     def __enter__(self) -> Progress:
         return self
@@ -69,16 +81,29 @@ class Progress:
         self._failed += failed
         self._done += items
         self._bar.set_postfix(failed=self._failed, refresh=False)
-        self._bar.update(items)
-        now = time.monotonic()
-        if self._lines and (now - self._last_line >= LINE_S or self._done == self._total):
-            self._last_line = now
-            rate = (self._done - self._first) / max(now - self._started, 1e-9)
-            left = (self._total - self._done) / rate
-            LOGGER.info(
-                "%s%d/%d %ss, %.1f %ss/s, %d failed, %.0f s left",
-                *(self._prefix, self._done, self._total, self._unit, rate, self._unit, self._failed, left),
-            )
+        self._show(self._done)
+
+    def _show(self, done: int) -> None:
+        """Show the number of finished items, unless more were shown before."""
+        with self._lock:
+            now = time.monotonic()
+            if done < self._shown or (done == self._shown and done < self._total):
+                return
+            if not self._has_begun and done < self._total:  # compiling ends with the first item
+                self._started, self._first = now, done
+                self._bar.unpause()
+            self._has_begun = True
+            self._bar.update(done - self._shown)
+            self._shown = done
+            is_due = now - self._last_line >= LINE_S and done > self._first
+            if self._lines and (is_due or done == self._total):
+                self._last_line = now
+                rate = (done - self._first) / max(now - self._started, 1e-9)
+                left_s = (self._total - done) / rate if done < self._total else 0
+                LOGGER.info(
+                    "%s%d/%d %ss, %.1f %ss/s, %d failed, %.0f s left",
+                    *(self._prefix, done, self._total, self._unit, rate, self._unit, self._failed, left_s),
+                )
 
     def warn(self, message: str) -> None:
         """Log a warning; a bar is cleared first and redrawn below it."""
@@ -92,18 +117,23 @@ class Progress:
         if self._lines:
             LOGGER.info("%s%d/%d %ss, %s", self._prefix, self._done, self._total, self._unit, COMPILING)
 
-    def watch_compiling(self, marker: Path) -> None:
-        """Report that kernels are being compiled as soon as the file ``marker`` exists.
+    def watch(self, context: RunContext) -> None:
+        """Report what worker processes do: compiling kernels, and images of shards that are not committed yet."""
+        threading.Thread(target=self._watch, args=(context,), daemon=True).start()
 
-        Only workers know whether the kernels they need are compiled, so they report it by creating the file.
-        """
-        threading.Thread(target=self._watch, args=(marker,), daemon=True).start()
+    def _watch(self, context: RunContext) -> None:
+        is_compiling = False
+        while not self._over.wait(POLL_S):
+            if not is_compiling and context.compiling_path.exists():
+                is_compiling = True
+                self.report_compiling()
+            self._show(min(self._done + context.images_in_progress(), self._total - 1))
 
-    def _watch(self, marker: Path) -> None:
-        while not marker.exists():
-            if self._over.wait(COMPILING_POLL_S):
-                return
-        self.report_compiling()
+
+def with_bar(items: Iterable[Item], unit: str, total: int | None = None) -> Iterable[Item]:
+    """Return the items; iterating over them shows a bar on a terminal if it takes longer than `BAR_DELAY_S`."""
+    is_shown = LOGGER.isEnabledFor(logging.INFO) and sys.stderr is not None and sys.stderr.isatty()
+    return tqdm(items, total=total, unit=unit, file=_Unfailing(), leave=False, delay=BAR_DELAY_S, disable=not is_shown)
 
 
 class _Unfailing:

@@ -16,18 +16,19 @@ import numpy as np
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error
-from unprocess_gen.core.object_store import AnyPath, ObjectPath, any_path, is_url
+from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.output_paths import check_output_folder
+from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Plan, Row, Source
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, read_rows, rows_with_offsets
+from unprocess_gen.pipeline.pairs import PlannedImage
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.sources import listing
 from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.patches import crop_patch
+from unprocess_gen.sources.names import decode_name
+from unprocess_gen.sources.reading import source_file
 
 NO_LIMIT = 2**40
 """Pixels that a replay accepts; ``source.max_pixels`` applied when the row was made."""
@@ -66,40 +67,12 @@ class ReplayResult:
 
 
 def source_root(manifest: AnyPath, root: str | None) -> str | None:
-    """Return the folder of the sources.
-
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        The manifest, next to its ``dataset.json``.
-    root : str or None
-        The folder that the user names; None for the recorded one.
-
-    Returns
-    -------
-    str or None
-        ``root``, or the root that ``dataset.json`` records; None for built-in scenes or without a record.
-    """
+    """Return the folder of the sources."""
     return root if root is not None else _recorded_root(manifest, "source")
 
 
 def dark_places(manifest: AnyPath, frames: str | None = None, shading: str | None = None) -> DarkPlaces:
-    """Return where the dark frames of a dataset and their dark-shading map are.
-
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        The manifest, next to its ``dataset.json``.
-    frames : str or None
-        The folder of the dark frames that the user names; None for the recorded one.
-    shading : str or None
-        The map, or folder of maps, that the user names; None for the recorded one.
-
-    Returns
-    -------
-    DarkPlaces
-        What the user names, or ``dataset.json`` records; None without a record.
-    """
+    """Find the dark frames of a dataset and their dark-shading map."""
     return DarkPlaces(
         frames if frames is not None else _recorded_root(manifest, "dark_frames"),
         shading if shading is not None else _recorded_root(manifest, "dark_frames", "shading"),
@@ -118,31 +91,21 @@ def _recorded_root(manifest: AnyPath, what: str, key: str = "root") -> str | Non
 def check_source_sizes(manifest: AnyPath, root: str) -> None:
     """Compare the sizes of the source files with those that a manifest records; opens no source.
 
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        The manifest.
-    root : str
-        Folder of the sources, or the single photograph, or the URL of either; it exists.
-
-    Raises
-    ------
-    SourceChangedError
-        If a file is missing or has another size; names the first one.
-    DamageError
-        If the manifest cannot be read.
+    Raises SourceChangedError if a file is missing or has another size; names the first one; DamageError if the manifest
+    cannot be read.
     """
     last = ""
     # one listing instead of a request for each object
-    sizes = {found.key: found.size for found in ObjectPath(root).objects()} if is_url(root) else None
+    place = any_path(root)
+    sizes = {entry.path: entry.size for entry in place.walk_entries()} if isinstance(place, ObjectPath) else None
     for row in read_rows(manifest):
         name, recorded = str(row["source"]), row["source_bytes"]
         if name == last or not recorded:  # built-in scenes and unreadable files have no size
             continue
         last = name
-        path = listing.decode_name(name)
+        path = decode_name(name)
         try:
-            size = sizes[path] if sizes else any_path(listing.source_file(root, path)).stat().st_size
+            size = sizes[path] if sizes else source_file(root, path).stat().st_size
         except (OSError, ValueError, KeyError, SourceError):
             raise SourceChangedError(f"source {name}: is missing from {root}; {ADVICE}") from None
         if size != recorded:
@@ -154,17 +117,8 @@ def check_source_sizes(manifest: AnyPath, root: str) -> None:
 def check_source_digests(old: AnyPath, new: AnyPath) -> None:
     """Compare the digests of sources that two manifests record.
 
-    Parameters
-    ----------
-    old, new : Path or ObjectPath
-        The manifests.
-
-    Raises
-    ------
-    SourceChangedError
-        If a source that is in both has another SHA-256; names the first one.
-    DamageError
-        If a manifest cannot be read.
+    Raises SourceChangedError if a source that is in both has another SHA-256; names the first one; DamageError if a
+    manifest cannot be read.
     """
     recorded = {row["source"]: row["source_sha256"] for row in read_rows(old)}
     for row in read_rows(new):
@@ -176,20 +130,7 @@ def check_source_digests(old: AnyPath, new: AnyPath) -> None:
 
 
 def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
-    """Return rows of pairs, evenly spaced over a manifest.
-
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        The manifest.
-    count : int
-        Number of rows; all rows if there are fewer.
-
-    Returns
-    -------
-    iterator of Row
-        Rows with status ``ok``, in the order of the manifest.
-    """
+    """Return rows of pairs, evenly spaced over a manifest."""
     pairs = (at for at, row in rows_with_offsets(manifest) if row["status"] == "ok")
     places = np.fromiter(pairs, dtype=np.int64)  # 8 bytes a row; a list takes 40
     return (read_row(manifest, int(places[number])) for number in evenly_spaced(range(len(places)), count))
@@ -200,28 +141,8 @@ def replay(
 ) -> Iterator[ReplayResult]:
     """Regenerate the pairs of rows and compare them with the rows' digests.
 
-    Parameters
-    ----------
-    rows : iterable of Row
-        Manifest rows; failed ones are skipped.
-    root : str or None
-        Folder of the sources; None if all rows are of built-in scenes.
-    to : Path, optional
-        Folder to write the arrays to, as ``KEY.clean.npy`` and ``KEY.noisy.npy``.
-    dark : DarkPlaces
-        Where the dark frames and their map are, if rows name any.
-
-    Yields
-    ------
-    ReplayResult
-        One for each row of a pair.
-
-    Raises
-    ------
-    ConfigError
-        If a row was made from a file and ``root`` is None, or ``to`` is inside a dataset or no folder.
-    MachineError
-        If the self-test fails, or the arrays cannot be written.
+    Raises ConfigError if a row was made from a file and ``root`` is None, or ``to`` is inside a dataset or no folder;
+    MachineError if the self-test fails, or the arrays cannot be written.
     """
     if to is not None:
         check_output_folder(to, f"--to {to}")
@@ -276,21 +197,24 @@ class PairRegenerator:
         if sha256 != row["source_sha256"]:
             raise SourceChangedError(_changed(sha256, row))
         patch = patch_from_row(row)
-        pixels = crop_patch(photograph.srgb, patch)
-        if pixels.shape[:2] != (patch.height, patch.width):
+        height, width = photograph.srgb.shape[:2]
+        if patch.y + patch.height > height or patch.x + patch.width > width:
             raise DamageError(
                 f"its patch of {patch.width} x {patch.height} pixels at row {patch.y}, column {patch.x} "
-                f"exceeds its source of {photograph.srgb.shape[1]} x {photograph.srgb.shape[0]} pixels"
+                f"exceeds its source of {width} x {height} pixels"
             )
-        return make_pair(pixels, plan, patch.origin, self._dark_pixels(plan))
+        image = PlannedImage(photograph.srgb, (plan,), (patch,), dark_folder=self._dark_pixels(plan))
+        _, _, pair = next(image.pairs())
+        return pair
 
     def _dark_pixels(self, plan: Plan) -> DarkFolder | None:
         """Return access to the dark frames; SourceChangedError if the plan needs one and there is no folder."""
-        if not plan.dark_frame:
+        sha256 = plan.noise.dark.sha256
+        if not sha256:
             return None
         if self._dark.frames is None:
             raise SourceChangedError(
-                f"noise.dark_frames is missing: the row names the dark frame {plan.dark_frame}; expected the folder of "
+                f"noise.dark_frames is missing: the row names the dark frame {sha256}; expected the folder of "
                 "the dark frames; give noise.dark_frames=…"
             )
         try:
@@ -349,19 +273,8 @@ def _save(pair: Pair, to: Path, key: str) -> None:
 
 
 def source_of(row: Row) -> Source:
-    """Return the source that a row was made from.
-
-    Parameters
-    ----------
-    row : Row
-        A manifest row.
-
-    Returns
-    -------
-    Source
-        With the size that the row records, and its place in a clip.
-    """
+    """Return the source that a row was made from."""
     name, size = str(row["source"]), row["source_bytes"]
-    path = listing.decode_name(name)
+    path = decode_name(name)
     clip, frame = str(row["clip"]) or NO_CLIP, int(row["frame"] or 0)
     return Source(int(image_key(row)), name, path, size if isinstance(size, int) else None, clip=clip, frame=frame)

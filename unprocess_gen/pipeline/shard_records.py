@@ -90,7 +90,7 @@ class ShardRecords:
         self._storage, self._place = storage, place
 
     def committed(self, shards: Iterable[int]) -> set[int]:
-        """Return which of some shards are committed: their record is readable, not provisional, and fits the file."""
+        """Find the committed ones among shards: their record is readable, not provisional, and fits the file."""
         sizes = self._storage.names("shards")
         candidates = sorted(self.recorded(shards))
         are_committed = self._storage.each(
@@ -99,12 +99,12 @@ class ShardRecords:
         return {shard for shard, is_committed in zip(candidates, are_committed, strict=True) if is_committed}
 
     def recorded(self, shards: Iterable[int]) -> set[int]:
-        """Return which of some shards have a record, provisional ones included."""
+        """Find the shards that have a record, provisional ones included."""
         names = self._storage.names(ROWS)
         return {shard for shard in shards if _file_name(shard) in names}
 
     def is_committed(self, shard: int) -> bool:
-        """Return whether one shard is committed."""
+        """Check whether a shard is committed."""
         return self._is_committed(shard, self._storage.size(f"shards/{shard_name(shard)}"))
 
     def _is_committed(self, shard: int, size: int | None) -> bool:

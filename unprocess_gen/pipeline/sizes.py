@@ -16,19 +16,19 @@ from unprocess_gen.config.schema import AUTO, Config, OutputConfig
 from unprocess_gen.config.serialization import parse_dataset_yaml
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.core.files import free_bytes
-from unprocess_gen.core.object_store import AnyPath, ObjectPath
+from unprocess_gen.core.object_store import ObjectPath
+from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import PACKED, Source
 from unprocess_gen.dataset.manifest import json_size
 from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes
-from unprocess_gen.pipeline.executors.local import effective_jobs
-from unprocess_gen.pipeline.storage import Storage
+from unprocess_gen.pipeline.storage import open_storage
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
-from unprocess_gen.sources.listing import read_bytes
 from unprocess_gen.sources.loader import load_source
 from unprocess_gen.sources.patches import list_patches
 from unprocess_gen.sources.read_ahead import Read, reading_ahead
+from unprocess_gen.sources.reading import read_bytes
 from unprocess_gen.sources.scenes import synthetic
 
 SAMPLE = 32
@@ -82,8 +82,8 @@ def source_bytes(config: Config, name: str, height: int, width: int) -> int:
     return sum(image_bytes(form, json_bytes, pairs, of_clean) for form, of_clean in zip(noisy, clean, strict=True))
 
 
-def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:
-    """Estimate the bytes of shards from the headers of at most `SAMPLE` sources.
+def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = SAMPLE) -> SizeEstimate:
+    """Estimate the bytes of shards from at most ``headers`` headers of evenly spaced sources.
 
     The estimate is exact if there are no more sources and all of them are pictures that decode.
     """
@@ -91,7 +91,7 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:
     if not sources:
         return SizeEstimate(0, 0)
     film: dict[str, int] = {}
-    sample = evenly_spaced(sources, SAMPLE)
+    sample = evenly_spaced(sources, headers)
     with reading_ahead(config.source.root, read_bytes, sample) as read:
         sizes = [_header_bytes(config, source, film, read) for source in sample]
     if len(sizes) < len(sources):
@@ -105,35 +105,21 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask]) -> SizeEstimate:
     return SizeEstimate(sum(of_shards), max(of_shards))
 
 
-def with_pairs_per_shard(config: Config, sources: Sequence[Source], storage: Storage) -> Config:
-    """Return a config whose ``output.pairs_per_shard`` is a number.
+def resolve_pairs_per_shard(config: Config, sources: Sequence[Source]) -> Config:
+    """Replace ``output.pairs_per_shard=auto`` by the number of a begun dataset, or by an estimate.
 
-    Parameters
-    ----------
-    config : Config
-        Validated config.
-    sources : sequence of Source
-        The listing.
-    storage : Storage
-        Place of the dataset. If it has a ``config.yaml``, the number there has priority over an estimate, so that a
-        dataset is resumed as it was begun.
-
-    Returns
-    -------
-    Config
-        The config itself if it has a number, otherwise a copy with one. It decides the bytes of the dataset, and
-        follows from the names and headers of the sources, not from the machine.
+    The estimate follows from names and headers of the sources, not from the machine, because it decides the bytes.
     """
     if config.output.pairs_per_shard != AUTO:
         return config
-    number = _recorded_pairs_per_shard(storage) or fitting_pairs_per_shard(config, sources)
+    number = _recorded_pairs_per_shard(config.out) or fitting_pairs_per_shard(config, sources)
     return replace(config, output=replace(config.output, pairs_per_shard=number))
 
 
-def _recorded_pairs_per_shard(storage: Storage) -> int | None:
-    """Return the number in ``config.yaml``, None if there is none; later checks report what is wrong with the file."""
+def _recorded_pairs_per_shard(out: str) -> int | None:
+    """Read the number in ``config.yaml``, None without one; later checks report what is wrong with the file."""
     try:
-        config, _ = parse_dataset_yaml(storage.read("config.yaml"))
+        config, _ = parse_dataset_yaml(open_storage(out).read("config.yaml"))
     except (OSError, ValueError, ConfigError):
         return None
     number = config.output.pairs_per_shard
@@ -189,14 +175,14 @@ def shards_warning(config: Config, sources: Sequence[Source]) -> str:
     return f"output.pairs_per_shard={per_shard}: {shards:,} shards; expected at most {MAX_SHARDS:,}{advice}"
 
 
-def check_free_space(config: Config, tasks: Sequence[ShardTask], out: AnyPath) -> None:
-    """Raise MachineError if the shards of ``tasks`` do not fit the free space of ``out``.
+def check_free_space(config: Config, tasks: Sequence[ShardTask], workers: int) -> None:
+    """Raise MachineError if shards do not fit the free space of ``out``.
 
     Shards of an object store are in local temporary space until they are put, one for each worker.
     """
-    needed = estimate_shards(config, tasks)
+    needed, out = estimate_shards(config, tasks), any_path(config.out)
     if isinstance(out, ObjectPath):
-        _check_temporary_space(needed.largest_shard * effective_jobs(config.n_jobs, len(tasks)), out)
+        _check_temporary_space(needed.largest_shard * workers, out)
     elif needed.total > (free := free_bytes(out)):
         raise MachineError(
             f"out={out}: not enough disk space for {len(tasks)} shards; expected about {needed.total} free bytes "

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import NO_CLIP, DarkFrames, Row, Source, Value
+from unprocess_gen.core.types import NO_CLIP, Row, Source, Value
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.shards import shard_name
-from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
+from unprocess_gen.pipeline.pairs import PairSettings
 
 Item = TypeVar("Item")
+
+SHOWN = 3
+"""Failed sources that a run names; the manifest lists all."""
 
 
 @dataclass(slots=True)
@@ -32,28 +35,19 @@ class StageTimes:
     simulate_s: float = 0.0
 
     @contextmanager
-    def decoding(self) -> Iterator[None]:
-        """Add the time of the body to ``decode_s``, even if it fails."""
+    def adding(self, stage: str) -> Iterator[None]:
+        """Add the time of the body to a stage, ``decode_s`` or ``simulate_s``, even if it fails."""
         started = time.thread_time()
         try:
             yield
         finally:
-            self.decode_s += time.thread_time() - started
-
-    @contextmanager
-    def simulating(self) -> Iterator[None]:
-        """Add the time of the body to ``simulate_s``."""
-        started = time.thread_time()
-        try:
-            yield
-        finally:
-            self.simulate_s += time.thread_time() - started
+            setattr(self, stage, getattr(self, stage) + time.thread_time() - started)
 
     def each_simulated(self, pairs: Iterable[Item]) -> Iterator[Item]:
         """Yield the items, and add the time that each of them takes to ``simulate_s``."""
         remaining = iter(pairs)
         while True:
-            with self.simulating():
+            with self.adding("simulate_s"):
                 try:
                     pair = next(remaining)
                 except StopIteration:
@@ -67,13 +61,34 @@ class StageTimes:
 
 
 @dataclass(frozen=True, slots=True)
+class ShardLog:
+    """Hold what a worker notes while it makes a shard.
+
+    Attributes
+    ----------
+    failures : dict of str to None
+        Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
+    times : StageTimes
+        Processor time of the stages.
+    """
+
+    failures: dict[str, None] = field(default_factory=dict)
+    times: StageTimes = field(default_factory=StageTimes)
+
+    @property
+    def self_test(self) -> str | None:
+        """Failures of the self-test in one line, None without any."""
+        return "; ".join(self.failures) or None
+
+
+@dataclass(frozen=True, slots=True)
 class RunContext:
     """Hold what all tasks of a run share.
 
     Attributes
     ----------
-    config : Config
-        The config; its ``out`` is where shards are committed.
+    settings : PairSettings
+        The settings; ``config.out`` is where shards are committed.
     scratch : str
         Local folder for unfinished files.
     coordinator_pid : int or None
@@ -82,29 +97,21 @@ class RunContext:
         Whether each worker hashes and writes in a second thread (more cores than workers).
     counts_deaths : bool
         Whether the deaths of workers at a shard are counted below ``out`` (`deaths`), because nothing else sees them.
-    marker : str
-        Name below ``out`` of the file that contains the index of the source in progress; empty without one.
     on_compiling : callable or None
         Called before kernels are compiled; None for contexts that travel to workers, which write `compiling_path`.
-    dark_frames, dark_folder : DarkFrames, DarkFolder, or None
-        The dark frames of the config, and access to their pixels; None if it uses none, or a worker is to read them.
     """
 
-    config: Config
+    settings: PairSettings
     scratch: str
     coordinator_pid: int | None
     core_to_spare: bool = False
     counts_deaths: bool = False
-    marker: str = ""
     on_compiling: Callable[[], object] | None = None
-    dark_frames: DarkFrames | None = None
-    dark_folder: DarkFolder | None = None
 
-    def dark(self) -> tuple[DarkFrames | None, DarkFolder | None]:
-        """Return the dark frames of the config, and access to their pixels; this process reads them if it has to."""
-        if self.dark_folder is None:
-            return open_dark_frames(self.config)[1:]
-        return self.dark_frames, self.dark_folder
+    @property
+    def config(self) -> Config:
+        """The config of the run."""
+        return self.settings.config
 
     def report_compiling(self) -> None:
         """Report that this process is about to compile kernels."""
@@ -116,6 +123,14 @@ class RunContext:
     def compiling_path(self) -> Path:
         """The file that a worker creates before it compiles kernels."""
         return Path(self.scratch) / "compiling"
+
+    def images_in_progress(self) -> int:
+        """Count the images that workers have finished in shards that are not committed."""
+        per_shard, count = self.config.output.pairs_per_shard, 0
+        for busy in Path(self.scratch).glob("*.busy"):
+            with suppress(OSError, ValueError):  # the shard was finished, or its file is being written
+                count += int(busy.read_text()) % per_shard
+        return count
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,10 +171,8 @@ class ShardResult:
         Manifest rows, in source order.
     killer : str or None
         Source at which workers died, and how often. The rows are then provisional and there is no file.
-    self_test : str or None
-        Failures of the worker's self-test, if ``self_test=go_on`` accepts them.
-    times : StageTimes
-        Processor time of the worker's stages.
+    log : ShardLog
+        What the worker noted.
     """
 
     shard: int
@@ -168,15 +181,14 @@ class ShardResult:
     sha256: str | None
     rows: tuple[Row, ...]
     killer: str | None = None
-    self_test: str | None = None
-    times: StageTimes = field(default_factory=StageTimes)
+    log: ShardLog = field(default_factory=ShardLog)
 
     def entry(self) -> dict[str, Any]:
         """Return the shard's entry in ``dataset.json``."""
         pairs = sum(row["status"] == "ok" for row in self.rows)
         return {
             **({"provisional": True} if self.killer else {}),
-            **({"self_test": self.self_test} if self.self_test else {}),
+            **({"self_test": self.log.self_test} if self.log.self_test else {}),
             "file": None if self.path is None else f"shards/{shard_name(self.shard)}",
             "pairs": pairs,
             "failed": len(self.rows) - pairs,
@@ -188,21 +200,22 @@ class ShardResult:
     def _source_noise(self) -> dict[str, list[Value]]:
         """Return the column ``source_noise_dn`` of each image, from which a lost manifest is restored."""
         pairs = (row for row in self.rows if row["status"] == "ok")
-        values = [of_image[0]["source_noise_dn"] for of_image in group_by_image(pairs)]
+        values = [rows[0]["source_noise_dn"] for rows in group_by_image(pairs)]
         return {"source_noise_dn": values} if any(value is not None for value in values) else {}
 
     def report(self) -> ShardReport:
-        """Return what the coordinator needs to know of the shard."""
-        of_images = [rows[0] for rows in group_by_image(self.rows)]
+        """Describe the shard for the coordinator."""
+        images = [rows[0] for rows in group_by_image(self.rows)]
         clips = {
             (str(row["clip"]), int(row["width"] or 0), int(row["height"] or 0)): None
             for row in self.rows
             if row["status"] == "ok" and row["clip"] != NO_CLIP and row["patch"] == 0
         }
-        failed = sum(row["status"] == "failed" for row in of_images)
-        return ShardReport(
-            self.shard, len(of_images), failed, len(self.rows), tuple(clips), self.killer, self.self_test, self.times
-        )
+        failed = [row for row in images if row["status"] == "failed"]
+        details = [f"{row['source']}: {row['reason']}: {row['detail']}" for row in failed[:SHOWN]]
+        failures = () if self.killer else tuple(details)
+        counts = len(images), len(failed), len(self.rows)
+        return ShardReport(self.shard, *counts, tuple(clips), self.killer, self.log, failures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,8 +230,10 @@ class ShardReport:
         Number of its sources, of those that failed, and of its rows.
     frame_sizes : tuple of (str, int, int)
         Name of each clip with each width and height of its frames.
-    killer, self_test, times
+    killer, log
         As in `ShardResult`.
+    failures : tuple of str
+        The first sources that failed, and why.
     """
 
     shard: int
@@ -227,5 +242,5 @@ class ShardReport:
     rows: int
     frame_sizes: tuple[tuple[str, int, int], ...] = ()
     killer: str | None = None
-    self_test: str | None = None
-    times: StageTimes = field(default_factory=StageTimes)
+    log: ShardLog = field(default_factory=ShardLog)
+    failures: tuple[str, ...] = ()

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_error
-from unprocess_gen.core.object_store import AnyPath, local_copy, open_text
+from unprocess_gen.core.paths import AnyPath, any_path, open_text
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
@@ -37,6 +38,7 @@ from unprocess_gen.dataset.shards import (
     noisy_member,
     shard_name,
 )
+from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import read_dataset
 
 
@@ -65,22 +67,7 @@ class SweepVerification:
 def verify(folder: AnyPath) -> list[Damage]:
     """Compare every byte of a finished dataset with what it records.
 
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Folder of the dataset.
-
-    Returns
-    -------
-    list of Damage
-        Empty if every byte is as it was written.
-
-    Raises
-    ------
-    DamageError
-        If the folder contains no finished dataset.
-    MachineError
-        If a file exists but cannot be read.
+    Raises DamageError if the folder contains no finished dataset; MachineError if a file exists but cannot be read.
     """
     try:
         return _verify(folder)
@@ -114,39 +101,14 @@ def _verify(folder: AnyPath) -> list[Damage]:
 
 
 def is_sweep(folder: AnyPath) -> bool:
-    """Return whether a folder is a sweep's: it has a ``sweep.csv`` and is no dataset.
-
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Any folder.
-
-    Returns
-    -------
-    bool
-        True for the folder of a sweep.
-    """
+    """Check whether a folder is a sweep's: it has a ``sweep.csv`` and is no dataset."""
     return (folder / SWEEP_TABLE).is_file() and not (folder / "dataset.json").exists()
 
 
 def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
     """Verify every dataset that ``sweep.csv`` lists, and find those that an ended sweep left unfinished.
 
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Folder of the sweep.
-
-    Yields
-    ------
-    SweepVerification
-        One for each job, in the order of ``sweep.csv``; then one for each unfinished dataset that it does not list.
-        A job without a finished dataset has one damage.
-
-    Raises
-    ------
-    DamageError
-        If ``sweep.csv`` cannot be read or names a folder elsewhere.
+    Raises DamageError if ``sweep.csv`` cannot be read or names a folder elsewhere.
     """
     jobs = read_sweep_table(folder / SWEEP_TABLE)
     for name, exit_code in jobs:
@@ -164,30 +126,31 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
 
 
 def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
-    """Return whether a new manifest has the rows of an older one, in every column that the older one has.
+    """Check whether a new manifest has the rows of an older one, in every column that the older one has.
 
-    Parameters
-    ----------
-    old, new : Path or ObjectPath
-        Manifests; ``new`` may have columns that a later version added.
-
-    Returns
-    -------
-    bool
-        True if the number of rows and all cells of the columns of ``old`` are equal.
+    The reason ``too_small`` was ``unsupported`` up to version 0.2.
     """
-    if file_sha256(old) == file_sha256(new):
-        return True
+    try:
+        return file_sha256(old) == file_sha256(new) or _have_equal_cells(old, new)
+    except (OSError, ValueError, csv.Error) as error:  # the new one was written just now
+        raise DamageError(f"{old}: cannot be read ({error_in_one_line(error)})") from error
+
+
+def _have_equal_cells(old: AnyPath, new: AnyPath) -> bool:
     with open_text(old) as first, open_text(new) as second:
         rows, others = csv.reader(first), csv.reader(second)
         names, other_names = next(rows, []), next(others, [])
         if not set(names) <= set(other_names):
             return False
         places = [other_names.index(name) for name in names]
-        try:
-            return all(row == [other[at] for at in places] for row, other in zip(rows, others, strict=True))
-        except (ValueError, IndexError):
-            return False
+        no_cells: list[str] = []
+        for row, other in itertools.zip_longest(rows, others, fillvalue=no_cells):
+            if len(other) != len(other_names):
+                return False
+            cells = [other[place] for place in places]
+            if row != cells and row != ["unsupported" if cell == "too_small" else cell for cell in cells]:
+                return False
+    return True
 
 
 def _without_path(error: DamageError) -> str:
@@ -218,22 +181,7 @@ ShardRows = tuple[int, list[Row]]
 def shard_rows(manifest: AnyPath) -> Iterator[ShardRows]:
     """Read the rows of a manifest shard by shard.
 
-    Parameters
-    ----------
-    manifest : Path or ObjectPath
-        A ``manifest.csv``.
-
-    Yields
-    ------
-    int
-        Number of a shard.
-    list of Row
-        All its rows, failed ones too.
-
-    Raises
-    ------
-    DamageError
-        If the manifest cannot be read, or its shards are not in ascending order.
+    Raises DamageError if the manifest cannot be read, or its shards are not in ascending order.
     """
     last = -1
     for number, rows in itertools.groupby(read_rows(manifest), key=_shard_of):
@@ -263,7 +211,8 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifes
     present = {path.name for path in (folder / "shards").iterdir()} if (folder / "shards").is_dir() else set()
     foreign, damages = set(present), list[Damage]()
     first = next(of_manifest, None)
-    for number, rows in _merged(listed, itertools.chain([] if first is None else [first], of_manifest)):
+    shards = _merged(listed, itertools.chain([] if first is None else [first], of_manifest))
+    for number, rows in with_bar(shards, "shard", len(listed)):
         pairs = [row for row in rows if row["status"] == "ok"]
         if not pairs and number not in listed:
             continue
@@ -272,7 +221,7 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifes
         if path.name not in present:
             damages.append(Damage(f"shards/{path.name}", "is missing"))
             continue
-        with local_copy(path) as file:
+        with any_path(path).local_copy() as file:
             found = [] if first is None else list(_check_members(file, pairs))
             damages += found or _check_sha256(file, listed.get(number))
     return [Damage(f"shards/{name}", "is not part of this dataset") for name in sorted(foreign)] + damages

@@ -13,33 +13,29 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import RESUME, MachineError, SourceError
 from unprocess_gen.core.files import array_xxh3, machine_error
-from unprocess_gen.core.object_store import any_path
-from unprocess_gen.core.types import Pair, Plan, Row, Source
+from unprocess_gen.core.paths import any_path
+from unprocess_gen.core.types import Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
 from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
 from unprocess_gen.pipeline.deaths import LIMIT, Deaths
+from unprocess_gen.pipeline.pairs import plan_pixels
 from unprocess_gen.pipeline.shard_records import commit_shard
 from unprocess_gen.pipeline.storage import open_storage
-from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardResult, ShardTask, StageTimes
-from unprocess_gen.planning.effect_selection import facts_for
-from unprocess_gen.planning.plan import plan_pairs
+from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
-from unprocess_gen.simulation.pair import make_pairs
-from unprocess_gen.sources.listing import read_bytes, source_file
 from unprocess_gen.sources.loader import load_source
-from unprocess_gen.sources.patches import crop_patch, list_patches
 from unprocess_gen.sources.read_ahead import Read, reading_ahead
+from unprocess_gen.sources.reading import read_bytes, source_file
 
 PARENT_POLL_S = 0.5
 WATCHDOG = "unprocess_gen watchdog"
@@ -48,9 +44,12 @@ M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 KEPT_BYTES = 2**29
 """Freed memory that a worker keeps: the working memory of one 50-megapixel image."""
 
+Mark = Callable[[Source], object]
+"""Function that a worker calls with each source before it reads the source."""
+
 
 def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
-    """Make one shard, commit it and describe it; raise MachineError as `make_shard`, or if it cannot be committed.
+    """Make one shard and commit it; raise MachineError if disk, memory or self-test fail.
 
     If deaths are counted and `deaths.LIMIT` workers have died at the shard, commit provisional rows.
     """
@@ -62,9 +61,8 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
         if deaths.count >= LIMIT:
             report = commit_provisional(context, task, deaths.source(task.sources), LIMIT)
         else:
-            with deaths.marked() as marker:
-                with_marker = replace(context, marker=marker if deaths.count else "")
-                report = commit_shard(storage, make_shard(with_marker, task))
+            with deaths.marked() as mark:
+                report = commit_shard(storage, make_shard(context, task, mark))
         deaths.forget()
     except OSError as error:
         raise machine_error(error, any_path(context.config.out), RESUME) from error
@@ -76,77 +74,48 @@ DEATHS = {2: ("two workers died", "its worker died twice"), 4: ("four workers di
 
 
 def commit_provisional(context: RunContext, task: ShardTask, source: Source, deaths: int) -> ShardReport:
-    """Commit rows with the reason ``worker_died`` for a shard that ended its workers, and describe it.
-
-    Parameters
-    ----------
-    context : RunContext
-        Context of the run.
-    task : ShardTask
-        The shard.
-    source : Source
-        The source at which the workers died.
-    deaths : int
-        Number of the workers, a key of `DEATHS`.
-
-    Returns
-    -------
-    ShardReport
-        With ``killer``. The next run retries the shard.
-    """
+    """Commit rows with the reason ``worker_died`` for a shard that ended ``deaths`` workers, the last at ``source``."""
     in_row, in_progress = DEATHS[deaths]
     detail = f"{in_row} at {source.name}; its shard is retried by the next run"
-    rows = [failed_row(one, None, task.shard, context.config.seed, "worker_died", detail) for one in task.sources]
-    result = ShardResult(task.shard, None, 0, None, tuple(rows), killer=f"{source.name}: {in_progress}")
+    seed = context.config.seed
+    rows = tuple(failed_row(lost, None, task.shard, seed, "worker_died", detail) for lost in task.sources)
+    result = ShardResult(task.shard, None, 0, None, rows, killer=f"{source.name}: {in_progress}")
     try:
         return commit_shard(open_storage(context.config.out), result)
     except OSError as error:
         raise machine_error(error, any_path(context.config.out), RESUME) from error
 
 
-def make_shard(context: RunContext, task: ShardTask) -> ShardResult:
-    """Write one shard to a temporary file and return its rows; raise MachineError if disk, memory or self-test fail."""
-    _prepare_process(context.coordinator_pid)
-    with _one_opencv_thread():
-        return _make_shard(context, task)
+def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source: None) -> ShardResult:
+    """Write one shard to a temporary file; raise MachineError if disk, memory or self-test fail.
 
-
-@dataclass(frozen=True, slots=True)
-class ShardLog:
-    """Hold what a worker notes while it makes a shard.
-
-    Attributes
-    ----------
-    failures : dict of str to None
-        Failures of the self-test, each once, if ``self_test=go_on`` accepts them.
-    times : StageTimes
-        Processor time of the stages.
+    ``mark`` is called with each source before it is read.
     """
-
-    failures: dict[str, None] = field(default_factory=dict)
-    times: StageTimes = field(default_factory=StageTimes)
-
-
-def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
-    log = ShardLog()
+    _prepare_process(context.coordinator_pid)
+    log, busy = ShardLog(), task.busy_path(context)
     path = Path(context.scratch) / f"{shard_name(task.shard)}.{os.getpid()}.{time.monotonic_ns()}"
-    busy = task.busy_path(context)
+    rows: list[Row] = []
     try:
-        with ShardWriter(path, threaded=context.core_to_spare) as writer:
-            rows = tuple(_make_rows(context, task, writer, log))
+        with (
+            _one_opencv_thread(),
+            ShardWriter(path, threaded=context.core_to_spare) as writer,
+            reading_ahead(context.config.source.root, read_bytes, task.sources) as read,
+        ):
+            for source in task.sources:
+                busy.write_text(str(source.index))
+                mark(source)
+                rows += make_image(context, task.shard, source, writer, log, read)
         busy.unlink(missing_ok=True)
         if any(row["status"] == "ok" for row in rows):
-            self_test_failures = "; ".join(log.failures) or None
-            return ShardResult(
-                task.shard, str(path), writer.bytes, writer.sha256, rows, self_test=self_test_failures, times=log.times
-            )
+            return ShardResult(task.shard, str(path), writer.bytes, writer.sha256, tuple(rows), log=log)
         path.unlink()
-        return ShardResult(task.shard, None, 0, None, rows, times=log.times)
+        return ShardResult(task.shard, None, 0, None, tuple(rows), log=log)
     except MemoryError as error:
         if os.getpid() != context.coordinator_pid:
             os._exit(1)  # same path as an OOM kill: the coordinator retries the shard alone
-        source = task.busy_source(context)
-        raise MachineError(f"source {source.name if source else task.shard}: out of memory; {RESUME}") from error
+        source_in_progress = task.busy_source(context)
+        name = source_in_progress.name if source_in_progress else task.shard
+        raise MachineError(f"source {name}: out of memory; {RESUME}") from error
     except OSError as error:
         for unfinished in (path, busy):
             with suppress(OSError):
@@ -154,68 +123,49 @@ def _make_shard(context: RunContext, task: ShardTask) -> ShardResult:
         raise machine_error(error, Path(context.scratch), RESUME) from error
 
 
-def _make_rows(context: RunContext, task: ShardTask, writer: ShardWriter, log: ShardLog) -> Iterator[Row]:
-    with reading_ahead(context.config.source.root, read_bytes, task.sources) as read:
-        for source in task.sources:
-            task.busy_path(context).write_text(str(source.index))
-            if context.marker:
-                open_storage(context.config.out).write(context.marker, str(source.index))
-            yield from make_image(context, task.shard, source, writer, log, read)
-
-
 def make_image(
     context: RunContext, shard: int, source: Source, writer: ShardWriter, log: ShardLog, read: Read = read_bytes
 ) -> list[Row]:
-    """Append one image, or its patches, to a shard and return the rows; add failures and times to ``log``."""
+    """Append the samples of one image to a shard, and return its rows; failures and times go to ``log``."""
     config = context.config
     try:
-        with log.times.decoding():
+        with log.times.adding("decode_s"):
             sha256, photograph = load_source(config.source, source, config.output.layout, read)
     except SourceError as error:
-        if error.reason == "unreadable" and source.reason is None and not _exists(config, source):
-            raise MachineError(
-                f"source.root={config.source.root}: {source.name} was deleted or moved after listing; expected the "
-                "listed files; restore it and run the same command again"
-            ) from error
+        _check_not_deleted(config, source, error)
         return [failed_row(source, error.sha256, shard, config.seed, error.reason, error.text)]
-    rule = patch_rule(config.source)
-    dark_frames, dark_folder = context.dark()
-    with log.times.simulating():
-        facts = facts_for(config, photograph.srgb, source.frames)
-        plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, dark_frames)
-        noise_dn = None if config.source.root is None else source_noise_dn(photograph.srgb, plans[0])
-    log.failures.update(dict.fromkeys(_self_test(context, plans)))
+    with log.times.adding("simulate_s"):
+        image = plan_pixels(context.settings, photograph.srgb, source, sha256)
+        noise_dn = None if config.source.root is None else source_noise_dn(photograph.srgb, image.plans[0])
+    log.failures.update(dict.fromkeys(_self_test(context, image.plans)))
+    is_cut = patch_rule(config.source) is not None
     rows: list[Row] = []
-    height, width = photograph.srgb.shape[:2]
-    for patch in list_patches(rule, plans[0].stream_key, height, width, config.output.layout):
-        key = patch_key(source.index, patch, several=rule is not None)
-        sample: list[Row] = []
-        with log.times.simulating():
-            pairs = make_pairs(crop_patch(photograph.srgb, patch), plans, patch.origin, dark_folder)
-        for plan, pair, digests in _add_frames(writer, key, plans, log.times.each_simulated(pairs)):
-            row_key = pair_key(key, plan, several=len(plans) > 1)
-            row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
-            sample.append(row)
-        writer.add_rows(key, row_json(sample))
-        rows += sample
+    sample: list[Row] = []
+    for patch, plan, pair in log.times.each_simulated(image.pairs()):
+        key = patch_key(source.index, patch, several=is_cut)
+        if plan is image.plans[0]:
+            sample, clean_xxh3 = [], array_xxh3(pair.clean)
+            writer.add_frame(key, CLEAN, pair.clean)
+        writer.add_frame(key, noisy_member(plan.noise.level, plan.noise.draw), pair.noisy)
+        digests = clean_xxh3, array_xxh3(pair.noisy)
+        row_key = pair_key(key, plan, several=len(image.plans) > 1)
+        row = pair_row(row_key, source, sha256, photograph.orientation, shard, plan, pair, digests, patch, noise_dn)
+        sample.append(row)
+        if plan is image.plans[-1]:
+            writer.add_rows(key, row_json(sample))
+            rows += sample
     return rows
 
 
-def _add_frames(
-    writer: ShardWriter, key: str, plans: Sequence[Plan], pairs: Iterable[Pair]
-) -> Iterator[tuple[Plan, Pair, tuple[str, str]]]:
-    """Append the clean frame of a patch and all its noisy frames; yield each pair with its digests."""
-    clean_xxh3 = ""
-    for plan, pair in zip(plans, pairs, strict=True):
-        if plan is plans[0]:
-            clean_xxh3 = array_xxh3(pair.clean)
-            writer.add_frame(key, CLEAN, pair.clean)
-        writer.add_frame(key, noisy_member(plan.level, plan.draw), pair.noisy)
-        yield plan, pair, (clean_xxh3, array_xxh3(pair.noisy))
-
-
-def _exists(config: Config, source: Source) -> bool:
-    return any_path(source_file(config.source.root or "", source.path)).exists()
+def _check_not_deleted(config: Config, source: Source, error: SourceError) -> None:
+    """Raise MachineError if a source cannot be read because it was deleted after the listing."""
+    if error.reason != "unreadable" or source.reason is not None:
+        return
+    if not source_file(config.source.root or "", source.path).exists():
+        raise MachineError(
+            f"source.root={config.source.root}: {source.name} was deleted or moved after listing; expected the "
+            "listed files; restore it and run the same command again"
+        ) from error
 
 
 def _self_test(context: RunContext, plans: Sequence[Plan]) -> list[str]:

@@ -23,6 +23,7 @@ import itertools
 import json
 import operator
 import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -34,16 +35,16 @@ from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
 from unprocess_gen.core.files import file_sha256, machine_error
-from unprocess_gen.core.object_store import AnyPath, any_path
+from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import MAX_BYTES, PARQUET_SHA256, check_dataset_json
 from unprocess_gen.dataset.manifest import header_text, read_rows
-from unprocess_gen.pipeline.listing_record import RecordedFile, read_record, recorded_files, write_listing
+from unprocess_gen.pipeline.listing_record import INDEX, RecordedFile, recorded_files, write_listing
 from unprocess_gen.pipeline.shard_records import ShardRecords
 from unprocess_gen.pipeline.storage import WORK, cannot_write, open_storage
 from unprocess_gen.pipeline.tally import Tally
-from unprocess_gen.sources.listing import content_sha256
+from unprocess_gen.sources.reading import content_sha256
 
 REPORT = "report.html"
 """The page of a dataset, the one file in its folder that is not part of the dataset."""
@@ -62,19 +63,7 @@ Digest = Callable[[Source, str | None], str | None]
 class Workspace:
     """Hold an output folder for this process, from `open` until `close`.
 
-    Parameters
-    ----------
-    out : str or Path
-        Folder of the dataset.
-    config_yaml : str
-        Text of its ``config.yaml``.
-
-    Attributes
-    ----------
-    storage : Storage
-        Where the dataset is written.
-    records : ShardRecords
-        The committed shards.
+    ``config_yaml`` is the text of the dataset's ``config.yaml``; ``records`` are the committed shards.
     """
 
     def __init__(self, out: str | Path, config_yaml: str) -> None:
@@ -133,7 +122,7 @@ class Workspace:
         Files that the earlier run hashed, because others had their size and end, are hashed again: if one of them has
         changed, another one can have another number among identical files, and so other noise.
         """
-        self._check_same_settings()
+        self._check_same_settings(root)
         known = partial(recorded_files, self.storage, self.out)
         if next(known(), None) is not None:
             self._check_same_sources(known, sources, partial(_digest_if_recorded, root))
@@ -145,7 +134,7 @@ class Workspace:
         """
         try:
             self._check_same_settings()  # another run may have begun since `check_begun`, where there are no locks
-            if read_record(self.storage, self.out) is None:
+            if self.storage.size(INDEX) is None:
                 write_listing(self.storage, self.out, sources)
             if not self.storage.create("config.yaml", self.config_yaml):
                 self._check_same_settings()
@@ -175,7 +164,7 @@ class Workspace:
                 "--repair restores it"
             )
         self._check_same_settings()
-        known = partial(_files_of_rows, self.storage.fetch("manifest.csv"))
+        known = partial(_files_of_rows, any_path(self.out) / "manifest.csv")
         self._check_same_sources(known, sources, lambda source, _: source.sha256)
         facts = self.facts()
         assert facts is not None
@@ -196,7 +185,7 @@ class Workspace:
                 "--repair restores it"
             )
 
-    def _check_same_settings(self) -> None:
+    def _check_same_settings(self, root: str | None = None) -> None:
         if self.storage.size("config.yaml") is None:
             return
         try:
@@ -206,8 +195,13 @@ class Workspace:
                 f"{self.out}/config.yaml: cannot be read ({error_in_one_line(error)}); choose another out"
             ) from error
         if differing:
+            remedy = "remove it"
+            if not self.is_complete():
+                out = shlex.quote(self.out)
+                sources = f" source.root={shlex.quote(root)}" if root is not None else ""
+                remedy = f"finish it with its own settings: gen-dataset again {out} out={out}{sources}"
             raise ConfigError(
-                f"out={self.out}: was begun with other settings: {_first(differing)}; choose another out, or remove it"
+                f"out={self.out}: was begun with other settings: {_first(differing)}; choose another out, or {remedy}"
             )
 
     def _check_same_sources(
@@ -226,22 +220,9 @@ class Workspace:
             file and source and file[0] == source.name and _is_same(file[1], source, digest) for file, source in pairs
         ):
             return
-        files, found = dict(known()), {source.name: source for source in sources}
-        both = [source for name, source in found.items() if name in files]
-        differing = [
-            *(f"{name} is new" for name in found if name not in files),
-            *(f"{name} was deleted" for name in files if name not in found),
-            *(
-                f"{source.name} has {source.size_bytes} bytes, had {files[source.name][0]}"
-                for source in both
-                if source.size_bytes != files[source.name][0]
-            ),
-            *(
-                f"{source.name} has other bytes than it had"
-                for source in both
-                if source.size_bytes == files[source.name][0] and not _is_same(files[source.name], source, digest)
-            ),
-        ]
+        files, listed = dict(known()), {source.name: source for source in sources}
+        changes = (_change(name, files.get(name), listed.get(name), digest) for name in listed | files)
+        differing = [change for change in changes if change]
         if differing:
             raise ConfigError(
                 f"out={self.out}: was begun with other sources: {_first(differing)}; choose another out, or remove it"
@@ -252,23 +233,8 @@ class Workspace:
     ) -> dict[str, Any]:
         """Write ``manifest.csv``, then ``dataset.json``, and return the latter's contents.
 
-        If a shard is provisional, ``.work`` is kept, so that the next run retries it.
-
-        Parameters
-        ----------
-        shards : int
-            Number of shards; all of them have records.
-        facts_of : callable
-            Takes the counts of all rows; returns what else than digests and shards ``dataset.json`` holds.
-        with_parquet : bool
-            Whether to write ``manifest.parquet`` too.
-
-        Raises
-        ------
-        MachineError
-            If a file cannot be read or written.
-        DamageError
-            If a record is damaged.
+        If a shard is provisional, ``.work`` is kept, so that the next run retries it. Raises MachineError or
+        DamageError.
         """
         entries: list[dict[str, Any]] = []
         tally = Tally()
@@ -316,11 +282,20 @@ def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) 
     return content_sha256(root, source)
 
 
-def _files_of_rows(manifest: Path) -> Iterator[KnownFile]:
+def _files_of_rows(manifest: AnyPath) -> Iterator[KnownFile]:
     """Yield the file of every row."""
     for row in read_rows(manifest):
         size, sha256 = row["source_bytes"], row["source_sha256"]
         yield str(row["source"]), RecordedFile(size if isinstance(size, int) else None, str(sha256))
+
+
+def _change(name: str, file: RecordedFile | None, source: Source | None, digest: Digest) -> str:
+    """Describe how a source differs from the known file of its name; empty if it does not."""
+    if file is None or source is None:
+        return f"{name} is new" if file is None else f"{name} was deleted"
+    if source.size_bytes != file.size_bytes:
+        return f"{name} has {source.size_bytes} bytes, had {file.size_bytes}"
+    return "" if _is_same(file, source, digest) else f"{name} has other bytes than it had"
 
 
 def _is_same(file: RecordedFile, source: Source, digest: Digest) -> bool:
@@ -361,20 +336,7 @@ def dataset_text(facts: dict[str, Any]) -> str:
 def read_dataset(path: AnyPath) -> dict[str, Any]:
     """Read a ``dataset.json`` and check it against its own SHA-256.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    dict
-        Its contents, without ``dataset_sha256``.
-
-    Raises
-    ------
-    DamageError
-        If the file cannot be read or any byte of it was changed.
+    Raises DamageError.
     """
     try:
         if path.stat().st_size > MAX_BYTES:

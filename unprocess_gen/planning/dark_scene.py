@@ -14,22 +14,7 @@ from unprocess_gen.config.yaml_files import read_yaml_mapping
 
 
 def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Sequence[int] = ()) -> str:
-    """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text.
-
-    Parameters
-    ----------
-    config : Config
-        Validated config of the run.
-    ratios : sequence of float
-        Exposure ratios of the images that were read; by default, the limits of those that can be drawn.
-    levels : sequence of int
-        Distinct DN in the clean frames of these images; empty if they are not known.
-
-    Returns
-    -------
-    str
-        One sentence that names the physical profiles.
-    """
+    """Return a warning if a two-parameter profile is used in a dark scene, whose ISO it ignores; else an empty text."""
     if is_physical(config.noise):
         return ""
     if not ratios:
@@ -48,12 +33,6 @@ def dark_scene_warning(config: Config, ratios: Sequence[float] = (), levels: Seq
 
 
 def physical_profiles() -> list[str]:
-    """Return the names of the built-in physical noise profiles.
-
-    Returns
-    -------
-    list of str
-        Options of the group ``noise``.
-    """
+    """Return the names of the built-in physical noise profiles."""
     folder = conf_dir() / "noise"
     return [name for name in group_options("noise") if "branches" in read_yaml_mapping(folder / f"{name}.yaml")]

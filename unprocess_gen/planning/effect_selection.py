@@ -1,6 +1,6 @@
 """Decide which sensor effects to simulate, and record the numbers behind each decision.
 
-`effect_contributions` predicts the ratio of each effect to the masking noise: shot, dark-current, read and rounding
+`frame_model` predicts the ratio of each effect to the masking noise: shot, dark-current, read and rounding
 noise of the other effects that stay on. Under ``auto``, the weakest effects are omitted while all omitted ones together
 stay within the tolerance in every statistic. Random parts add in quadrature, offsets linearly. The idea is imSim's:
 thresholds in units of the noise.
@@ -18,86 +18,39 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from unprocess_gen.config.interpretation import (
-    BRANCH_NUMBERS,
-    EFFECT_NUMBERS,
     assumed_numbers,
     effect_switch,
     is_normalised,
     is_physical,
     missing_number,
+    needed_numbers,
     uses_assumed,
     uses_dark_frames,
 )
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import Facts, Physics, Srgb
-from unprocess_gen.planning.effect_contributions import (
-    OUTLIERS,
-    STATISTICS,
-    FrameModel,
-    SignalRange,
-    ratio_to_noise,
-)
-from unprocess_gen.simulation.reference.noise import EFFECTS, REPLACED
-
-LATER_EFFECTS = ("lens_shading", "gain_by_colour", "column_temporal")
-"""Effects that version 0.1 did not have. Rows of profiles without their numbers do not name them."""
+from unprocess_gen.core.types import Facts, Srgb
+from unprocess_gen.planning.frame_model import FrameModel, SignalRange, ratio_to_noise
+from unprocess_gen.simulation.effects import BY_NAME, PHYSICAL_EFFECTS, Physics
+from unprocess_gen.simulation.effects.prediction import STATISTICS
 
 MIN_OUTLIERS = 0.1
 """Expected outliers per frame from which hot and dead pixels are simulated."""
 
-COST_NS = {
-    "heteroscedastic": 1.8, "lens_shading": 15.1, "prnu": 3.3, "shot": 9.5, "dark_current": 15.5, "hot_pixels": 1.0,
-    "full_well": 0.1, "gain_by_colour": 0.3, "read": 1.8, "row": 0.1, "column": 0.1, "column_temporal": 0.6,
-    "black_error": 0.1, "dead_pixels": 1.1, "quantise": 0.3, "dark_frame": 4.0,
-}  # fmt: skip
-"""Cost of each effect, nanoseconds per pixel (``tests/benchmarks/bench_scenes.py``; AVX2, one thread).
-
-The verb ``plan`` prints it; it decides nothing. Conditions: ``docs/design/effect_selection.md``.
-"""
-
 
 def facts_of(srgb: Srgb, frames: int = 1) -> Facts:
-    """Return the integer facts about decoded pixels that planning may use.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    frames : int
-        Number of frames of the clip; 1 for a photograph.
-
-    Returns
-    -------
-    Facts
-        Size, number of codes, lowest and highest code, number of frames.
-    """
+    """Return the integer facts about decoded pixels that planning may use; ``frames`` is the length of the clip."""
     height, width = srgb.shape[:2]
     return Facts(width, height, int(np.iinfo(srgb.dtype).max) + 1, int(srgb.min()), int(srgb.max()), frames)
 
 
 def facts_for(config: Config, srgb: Srgb, frames: int = 1) -> Facts | None:
-    """Return the facts about decoded pixels if a plan needs them.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    frames : int
-        Number of frames of the clip; 1 for a photograph.
-
-    Returns
-    -------
-    Facts or None
-        `facts_of` for a physical noise profile; None for one with two numbers.
-    """
+    """Return `facts_of` the pixels for a physical noise profile; None for one with two numbers, which needs none."""
     return facts_of(srgb, frames) if is_physical(config.noise) else None
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Hold what was decided about one effect, and why.
+    """Decision about one effect, and why.
 
     Attributes
     ----------
@@ -128,7 +81,7 @@ class Prediction:
 
     @property
     def reason(self) -> str:
-        """Return the reason that rows record for a skipped effect."""
+        """Reason that rows record for a skipped effect."""
         if self.forced:
             return self.why
         return (
@@ -137,7 +90,7 @@ class Prediction:
 
     @property
     def ratio(self) -> float:
-        """Return the ratio of the contribution to the masking noise."""
+        """Ratio of the contribution to the masking noise."""
         return ratio_to_noise(self.predicted_dn, self.masking_dn)
 
 
@@ -151,52 +104,46 @@ IN_DARK_FRAMES = "contained in the dark frames"  # recorded: decides bytes of da
 
 @dataclass(frozen=True, slots=True)
 class ForcedDecision:
-    """Hold whether the configuration turns an effect on or off, and why."""
+    """Decision of the configuration to turn an effect on or off, and its reason."""
 
     on: bool
     reason: str
 
 
-def _forced_decision(config: Config, effect: str) -> ForcedDecision | None:
-    """Return the decision of the configuration about an effect; None if the image decides."""
-    switch = effect_switch(config.effects, effect)
-    if uses_dark_frames(config.noise) and effect == "read":
-        return ForcedDecision(True, "sampled from dark frames")
-    if uses_dark_frames(config.noise) and effect in REPLACED:
-        return ForcedDecision(False, IN_DARK_FRAMES)
-    if effect == "quantise":
-        return (
-            ForcedDecision(False, NOT_ROUNDED)
-            if is_normalised(config)
-            else ForcedDecision(True, "integer output is always rounded and clipped")
-        )
-    if switch == "off":
-        return ForcedDecision(False, "switched off")  # recorded: decides bytes of datasets
-    number = missing_number(config.noise, effect)
-    if number is not None:
-        return ForcedDecision(
-            False, f"noise={config.noise.name} gives no {number}"
-        )  # recorded: decides bytes of datasets
-    if switch == "on":
-        return ForcedDecision(True, "switched on")
-    if effect == "lens_shading":  # not noise that other noise could hide, and the levels of an image share it
-        return ForcedDecision(True, "part of the clean frame")
-    needed = (*EFFECT_NUMBERS.get(effect, ()), *BRANCH_NUMBERS.get(effect, ()))
-    assumed = next((key for key in needed if key in config.noise.assumed), None)
-    if assumed is not None and not uses_assumed(config):
-        advice = "on only where switched on"  # recorded: decides bytes of datasets
-        return ForcedDecision(False, f"{assumed} is assumed, no source gives it: {advice}")
-    return None
+def _forced_decision(config: Config, name: str) -> ForcedDecision | None:
+    """Return the decision of the configuration about an effect; None if the image decides.
+
+    The first rule that holds decides. Rows record the reasons of effects that are off, so bytes depend on them.
+    """
+    effect, switch, sampled = BY_NAME[name], effect_switch(config.effects, name), uses_dark_frames(config.noise)
+    missing = missing_number(config.noise, name)
+    assumed = next((key for key in needed_numbers(name) if key in config.noise.assumed), None)
+    rules: tuple[tuple[bool, bool, str], ...] = (
+        (sampled and name == "read", True, "sampled from dark frames"),
+        (sampled and effect.is_in_dark_frames, False, IN_DARK_FRAMES),
+        (name == "quantise" and is_normalised(config), False, NOT_ROUNDED),
+        (name == "quantise", True, "integer output is always rounded and clipped"),
+        (switch == "off", False, "switched off"),
+        (missing is not None, False, f"noise={config.noise.name} gives no {missing}"),
+        (switch == "on", True, "switched on"),
+        (effect.in_both_frames, True, "part of the clean frame"),  # no noise hides it, and the levels share it
+        (
+            assumed is not None and not uses_assumed(config),
+            False,
+            f"{assumed} is assumed, no source gives it: on only where switched on",
+        ),
+    )
+    return next((ForcedDecision(on, reason) for holds, on, reason in rules if holds), None)
 
 
 @dataclass(frozen=True, slots=True)
 class EffectRules:
-    """Decisions of a configuration about the effects of a physical noise profile.
+    """Decisions of a configuration about the effects of a physical noise profile, the same for all images.
 
     Attributes
     ----------
     forced : mapping of str to ForcedDecision or None
-        For each of `noise.EFFECTS` the decision of the configuration; None if the image decides.
+        For each of `PHYSICAL_EFFECTS` the decision of the configuration; None if the image decides.
     tolerance : float
         Largest ratio of the omitted effects to the masking noise.
     black_level_dn : float
@@ -204,7 +151,7 @@ class EffectRules:
     assumed : mapping of str to tuple of str
         Assumed numbers that each effect uses; empty with ``effects.assumed=off``.
     unnamed : frozenset of str
-        Effects that rows do not name as skipped.
+        Effects of later versions whose numbers the profile lacks; rows do not name them as skipped.
     dark_frames : bool
         Whether ``dark_frame`` takes the place of ``read``. Its variance is then the read variance of `Physics`.
     """
@@ -218,38 +165,21 @@ class EffectRules:
 
 
 def effect_rules(config: Config) -> EffectRules:
-    """Return what a configuration decides about the effects of its physical noise profile.
-
-    Parameters
-    ----------
-    config : Config
-        Switches, numbers of the profile, tolerance and black level.
-
-    Returns
-    -------
-    EffectRules
-        The same for all images.
-    """
-    forced = {effect: _forced_decision(config, effect) for effect in EFFECTS}
-    assumed = {effect: assumed_numbers(config.noise, effect) for effect in EFFECTS} if uses_assumed(config) else {}
-    unnamed = frozenset(effect for effect in LATER_EFFECTS if missing_number(config.noise, effect) is not None)
-    black_dn, dark_frames = float(config.sensor.black_level_dn), uses_dark_frames(config.noise)
-    return EffectRules(forced, config.effects.tolerance, black_dn, assumed, unnamed, dark_frames)
+    """Return the decisions of a configuration about the effects of its physical noise profile."""
+    noise, effects = config.noise, PHYSICAL_EFFECTS
+    return EffectRules(
+        {effect: _forced_decision(config, effect) for effect in effects},
+        config.effects.tolerance,
+        float(config.sensor.black_level_dn),
+        {effect: assumed_numbers(noise, effect) for effect in effects} if uses_assumed(config) else {},
+        frozenset(effect for effect in effects if BY_NAME[effect].since and missing_number(noise, effect) is not None),
+        uses_dark_frames(noise),
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """The effects selected for one image, and predictions for all effects on demand.
-
-    Attributes
-    ----------
-    rules : EffectRules
-        What the configuration decides.
-    frame : FrameModel
-        The frame, with `Facts` and numbers of the sensor.
-    on : frozenset of str
-        Simulated effects.
-    """
+    """Effects that are simulated for one image (``on``), and predictions for all effects on demand."""
 
     rules: EffectRules
     frame: FrameModel
@@ -258,7 +188,7 @@ class Selection:
     @property
     def effects(self) -> tuple[str, ...]:
         """Return the simulated effects, in the order of image formation."""
-        on = (effect for effect in EFFECTS if effect in self.on)
+        on = (effect for effect in PHYSICAL_EFFECTS if effect in self.on)
         return tuple("dark_frame" if self.rules.dark_frames and effect == "read" else effect for effect in on)
 
     @property
@@ -273,7 +203,7 @@ class Selection:
 
         Effects that version 0.1 did not have are named only if the profile gives their numbers.
         """
-        off = (effect for effect in EFFECTS if effect not in self.on and effect not in self.rules.unnamed)
+        off = (effect for effect in PHYSICAL_EFFECTS if effect not in self.on and effect not in self.rules.unnamed)
         replaced = (f"read: {IN_DARK_FRAMES}",) if self.rules.dark_frames else ()
         return (*replaced, *(f"{effect}: {self._reason(effect)}" for effect in off))
 
@@ -287,29 +217,12 @@ class Selection:
         return replace(found, effect="dark_frame") if self.rules.dark_frames and effect == "read" else found
 
     def predictions(self) -> tuple[Prediction, ...]:
-        """Return the prediction of each of `noise.EFFECTS`, in the order of image formation."""
-        return tuple(self.prediction(effect) for effect in EFFECTS)
+        """Return the prediction of each of `PHYSICAL_EFFECTS`, in the order of image formation."""
+        return tuple(self.prediction(effect) for effect in PHYSICAL_EFFECTS)
 
 
 def select_effects(rules: EffectRules, physics: Physics, facts: Facts, signals: SignalRange) -> Selection:
-    """Decide about every effect of a physical noise profile.
-
-    Parameters
-    ----------
-    rules : EffectRules
-        What the configuration decides.
-    physics : Physics
-        Numbers of the sensor for this image.
-    facts : Facts
-        Integer facts about the pixels.
-    signals : SignalRange
-        Signal range of the image.
-
-    Returns
-    -------
-    Selection
-        The simulated effects, and why.
-    """
+    """Decide about every effect of a physical noise profile for one image."""
     frame = FrameModel(physics, facts, signals, rules.black_level_dn)
     free = [effect for effect, decision in rules.forced.items() if decision is None]
     on = frozenset(effect for effect, decision in rules.forced.items() if decision is None or decision.on)
@@ -330,7 +243,7 @@ def omit_weakest(tolerance: float, frame: FrameModel, on: frozenset[str], free: 
     for effect in sorted(free, key=strength):
         omitted.append(effect)
         rest = on - {effect}
-        if any(frame.outliers(each, rest) >= MIN_OUTLIERS for each in omitted if each in OUTLIERS):
+        if any(frame.outliers(each, rest) >= MIN_OUTLIERS for each in omitted):
             break
         if frame.ratio(omitted, rest) > tolerance:
             break
@@ -350,7 +263,7 @@ def _prediction(
     predicted_dn = math.sqrt(contribution.variances[at] + contribution.offset_dn * contribution.offset_dn)
     simulated, outliers = effect in on, frame.outliers(effect, on)
     why = f"{ratios[at]:.3g} of the noise there"  # recorded: decides bytes of datasets
-    if effect in OUTLIERS:
+    if BY_NAME[effect].has_outliers:
         why += f", {outliers:.3g} outliers"  # recorded: decides bytes of datasets
     if simulated and ratios[at] <= tolerance and outliers < MIN_OUTLIERS:
         why += ", too much together with the omitted effects"

@@ -9,7 +9,7 @@ of libm's results differs between machines. `core.fixed_point` finds nearly all 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from decimal import Decimal, localcontext
 from typing import Any
 
@@ -20,24 +20,18 @@ from unprocess_gen.config.schema import BranchConfig, Config
 from unprocess_gen.core import fixed_point
 from unprocess_gen.core.exact_distributions import DIGITS, normal_quantile, tukey_std
 from unprocess_gen.core.random_streams import body_key, scatter_uniforms
-from unprocess_gen.core.types import Distribution, Physics
+from unprocess_gen.core.types import Distribution
+from unprocess_gen.planning.draws import Draw
+from unprocess_gen.simulation.effects import NUMBERS, Physics
+from unprocess_gen.simulation.effects.numbers import DN, RATE, SHAPE, SITES, Number
 from unprocess_gen.simulation.reference import cfa
-
-SCATTER_NAMES = ("read_shape", "read_std", "row_std", "column_std", "column_temporal_std")
-"""Draws of a camera body at an ISO; the position is the counter in the stream. Datasets depend on it: append only."""
 
 MIDDLE = 0.5
 """Uniform at which a line has no scatter."""
 
 
 class PhysicalNoise:
-    """A physical noise profile in a scene and on a sensor, with its distributions parsed.
-
-    Parameters
-    ----------
-    config : Config
-        A configuration with a physical noise profile that `validate_config` accepts, and that does not change.
-    """
+    """A physical noise profile in a scene and on a sensor, with its distributions parsed."""
 
     def __init__(self, config: Config) -> None:
         noise, scene, sensor = config.noise, config.scene, config.sensor
@@ -51,92 +45,77 @@ class PhysicalNoise:
         self.scatter = SCATTER.word(noise.scatter)
         self.scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
 
-    def draw(self, uniforms: Mapping[str, float], stream_key: int, seed: int) -> Physics:
+    def draw(self, uniforms: Sequence[float], stream_key: int, seed: int) -> Physics:
         """Draw ISO, exposure, temperature and the scatter of the profile, and convert its numbers to the sensor's DN.
 
-        DN of the profile become DN of the sensor by the factor s = (W - B) / (W_profile - B_profile).
-
-        Parameters
-        ----------
-        uniforms : mapping of str to float
-            A uniform in (0, 1) for each name of `plan.PARAMETERS`.
-        stream_key : int
-            Key of the image's random stream; identifies the camera body if ``sensor.units=image``.
-        seed : int
-            Seed of the dataset.
-
-        Returns
-        -------
-        Physics
-            Numbers of the sensor for this image: electrons before the gain, DN of the sensor behind it.
+        DN of the profile become DN of the sensor by the factor s = (W - B) / (W_profile - B_profile). ``uniforms`` are
+        those of `draws`; ``stream_key`` identifies the camera body if ``sensor.units=image``.
         """
-        noise, sensor, scale = self.noise, self.sensor, self.scale
-        iso = draw_parameter(self.iso, uniforms["iso"])
-        seconds = draw_parameter(self.exposure_s, uniforms["exposure_s"])
-        celsius = draw_parameter(self.temperature_c, uniforms["temperature_c"])
+        noise, sensor = self.noise, self.sensor
+        iso = draw_parameter(self.iso, uniforms[Draw.ISO])
+        seconds = draw_parameter(self.exposure_s, uniforms[Draw.EXPOSURE_S])
+        celsius = draw_parameter(self.temperature_c, uniforms[Draw.TEMPERATURE_C])
         branch = branch_of(noise, iso)
         assert branch is not None
-        gain = number(branch.dn_per_e, iso=iso)
-        warmth = _doublings(celsius, noise.dark_reference_c, noise.dark_doubling_c)
-        unit = f"{stream_key:016x}" if sensor.units == "image" else str(int(uniforms["sensor_unit"] * sensor.units))
-        uniforms = self._scatter(uniforms, iso, seed, unit)
-        shape = self._shape(branch, iso, uniforms["read_shape"])
-        read_std = number(branch.read_std_dn, iso=iso, gain=gain, uniform=uniforms["read_std"], shape=shape)
-        errors = _black_error(branch, iso, sensor.pattern)
-        of_columns = number(branch.column_temporal_std_dn, iso=iso, gain=gain, uniform=uniforms["column_temporal_std"])
+        units = sensor.units
+        unit = f"{stream_key:016x}" if units == "image" else str(int(uniforms[Draw.SENSOR_UNIT] * units))
+        exposure = seconds, _doublings(celsius, noise.dark_reference_c, noise.dark_doubling_c)
         return Physics(
             iso=iso,
             exposure_s=seconds,
             temperature_c=celsius,
-            dn_per_e=gain * scale,
-            prnu_std=noise.prnu_std or 0.0,
-            dark_e=(noise.dark_e_per_s or 0.0) * seconds * warmth,
             dark_offset=sensor.dark_offset,
-            hot_pixel_share=noise.hot_pixel_share or 0.0,
-            hot_pixel_e=(noise.hot_pixel_e_per_s or 0.0) * seconds * warmth,
-            full_well_e=noise.full_well_e or 0.0,
-            read_law=branch.read_law,
-            read_shape=shape,
-            read_std_dn=read_std * scale,
-            row_std_dn=number(branch.row_std_dn, iso=iso, gain=gain, uniform=uniforms["row_std"]) * scale,
-            column_std_dn=number(branch.column_std_dn, iso=iso, gain=gain, uniform=uniforms["column_std"]) * scale,
-            black_error_dn=(errors[0] * scale, errors[1] * scale, errors[2] * scale, errors[3] * scale),
-            dead_pixel_share=noise.dead_pixel_share or 0.0,
             sensor_unit=unit,
             body_key=body_key(seed, noise.name, unit),
             fixed_pattern_in_clean=self.fixed_pattern_in_clean,
-            row_correlation=noise.row_correlation or 0.0,
-            column_temporal_std_dn=of_columns * scale,
-            gain_by_colour=_three(noise.gain_by_colour or (1.0, 1.0, 1.0)),
-            lens_shading=_three(noise.lens_shading or (0.0, 0.0, 0.0)),
+            **self._numbers(branch, iso, exposure, self._scatter(uniforms, iso, seed, unit)),
         )
 
-    def _scatter(self, uniforms: Mapping[str, float], iso: float, seed: int, unit: str) -> Mapping[str, float]:
-        """Return the uniforms at which the numbers of a body are drawn, by the names of `SCATTER_NAMES`.
+    def _numbers(
+        self, branch: BranchConfig, iso: float, exposure: tuple[float, float], uniform: Callable[[Number], float]
+    ) -> dict[str, Any]:
+        """Return the numbers of the effects that the profile has; ``exposure`` is the time and the warmth."""
+        gain, shape = number(branch.dn_per_e, iso=iso), 0.0
+        values: dict[str, Any] = {}
+        for name, declared in NUMBERS.items():
+            value = getattr(branch if declared.in_branch else self.noise, declared.key or name)
+            if value is None:
+                continue
+            if declared.kind == RATE:
+                value = value * exposure[0] * exposure[1]
+            elif declared.kind == SHAPE:
+                value = shape = self._shape(branch, iso, uniform(declared))
+            elif declared.kind == DN:
+                value = number(value, iso=iso, gain=gain, uniform=uniform(declared), shape=shape) * self.scale
+            elif declared.kind == SITES:
+                value = tuple(error * self.scale for error in _values_of_sites(value, branch, iso, self.sensor.pattern))
+            elif declared.count > 1:
+                value = tuple(map(float, value))
+            values[name] = value
+        return values
+
+    def _scatter(self, uniforms: Sequence[float], iso: float, seed: int, unit: str) -> Callable[[Number], float]:
+        """Return the uniform at which a number is drawn.
 
         With ``sensor.units=image`` every image has its own fixed patterns. Its noise is still that of the calibrated
         camera: the scatter of a fit does not say how bodies differ.
         """
         if self.scatter == "image":
-            return uniforms
+            return lambda declared: uniforms[declared.counter]
         if self.scatter == "off":
-            return dict.fromkeys(SCATTER_NAMES, MIDDLE)
+            return lambda declared: MIDDLE
         body = body_key(seed, self.noise.name, "" if self.sensor.units == "image" else unit)
-        return _scatter_of_body(body, iso)
+        scatter = _scatter_of_body(body, iso)
+        return lambda declared: scatter[declared.scatter]
 
     def _shape(self, branch: BranchConfig, iso: float, uniform: float) -> float:
         """Return the shape of the read noise; without scatter, the median of a distribution."""
         shapes = self.read_shapes[self.noise.branches.index(branch)]
         if shapes is None:
-            return _shape_of_iso(branch.read_shape, iso)
+            return _shape_at(branch.read_shape, iso)
         if self.scatter == "off":
             return sorted(shapes.numbers)[len(shapes.numbers) // 2]
         return draw_parameter(shapes, uniform)
-
-
-def _three(numbers: Sequence[float]) -> tuple[float, float, float]:
-    first, second, third = map(float, numbers)
-    return first, second, third
 
 
 def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, shape: float = 0.0) -> float:
@@ -147,7 +126,7 @@ def number(form: Any, *, iso: float, gain: float = 1.0, uniform: float = 0.5, sh
     """
     if form is None:
         return 0.0
-    if not isinstance(form, list):
+    if not isinstance(form, list | tuple):
         return float(form)
     kind, *numbers = form
     if kind not in LINES:
@@ -186,9 +165,9 @@ def _number_of_line(
 
 
 @functools.lru_cache(maxsize=256)
-def _scatter_of_body(body: int, iso: float) -> Mapping[str, float]:
-    """Return the uniforms at which the numbers of a body are drawn at an ISO, by the names of `SCATTER_NAMES`."""
-    return dict(zip(SCATTER_NAMES, scatter_uniforms(body, iso, len(SCATTER_NAMES)), strict=True))
+def _scatter_of_body(body: int, iso: float) -> list[float]:
+    """Return the uniforms at which the numbers of a body are drawn at an ISO, by `Number.scatter`."""
+    return scatter_uniforms(body, iso, max(declared.scatter for declared in NUMBERS.values()) + 1)
 
 
 @functools.lru_cache(maxsize=256)
@@ -276,25 +255,22 @@ ROW_DIGITS = 28
 this product rounds up to the row; datasets depend on it."""
 
 
-def _black_error(branch: BranchConfig, iso: float, pattern: str) -> Sequence[float]:
-    """Return the black-level errors of the four sites of the CFA pattern, DN of the profile.
+def _values_of_sites(value: Any, branch: BranchConfig, iso: float, pattern: str) -> Sequence[float]:
+    """Return the values of the four sites of the CFA pattern, DN of the profile.
 
     A branch has one for all sites, four, or a table of rows. ``by_log_iso``: rows divide the branch's range of ln ISO
     into equal parts. ``by_stop``: two rows for each full stop. ``by_colour``: fours are R, G1, B, G2, where G1 is the
     green of the red rows; otherwise they are sites, row by row.
     """
-    value = branch.black_error_dn
-    if value is None:
-        return (0.0,) * 4
-    if not isinstance(value, list):
+    if not isinstance(value, list | tuple):
         return (float(value),) * 4
     words, rest = table_words(value)
     if "by_stop" in words:
         rest = rest[row_of_stop(iso)]
     elif "by_log_iso" in words:
         rest = rest[_row_of_range(iso, branch.iso[0], branch.iso[1], len(rest))]
-    errors = [float(each) for each in rest]
-    return _by_site(errors, pattern) if "by_colour" in words else errors
+    values = list(map(float, rest))
+    return _by_site(values, pattern) if "by_colour" in words else values
 
 
 def _row_of_range(iso: float, low: float, high: float, rows: int) -> int:
@@ -306,7 +282,7 @@ def _row_of_range(iso: float, low: float, high: float, rows: int) -> int:
 
 
 def _by_site(by_colour: Sequence[float], pattern: str) -> list[float]:
-    """Return errors in the order of the sites (0, 0), (0, 1), (1, 0), (1, 1) from R, G1, B, G2."""
+    """Return values in the order of the sites (0, 0), (0, 1), (1, 0), (1, 1) from R, G1, B, G2."""
     red, green_1, blue, green_2 = by_colour
     by_plane = dict(zip(cfa.plane_sites(pattern), (red, green_1, green_2, blue), strict=True))
     return [by_plane[y, x] for y in (0, 1) for x in (0, 1)]
@@ -319,7 +295,7 @@ def _parse_shape(value: Any) -> Distribution | None:
     )
 
 
-def _shape_of_iso(table: Sequence[Any], iso: float) -> float:
+def _shape_at(table: Sequence[Any], iso: float) -> float:
     """Return the shape at an ISO from a table ``by_stop``, or ``by_iso``: linear in ln ISO."""
     kind, *numbers = table
     return float(numbers[row_of_stop(iso)]) if kind == "by_stop" else _interpolated(iso, *numbers)

@@ -1,16 +1,15 @@
 """Draw every parameter of an image once, and record them in a `Plan`.
 
 A pair is a pure function of pixels and plan. Draws come from the stream ``parameters`` of the image
-(`core.random_streams`), with one counter for each name in `PARAMETERS`; so a draw that is not used moves no other.
+(`core.random_streams`), with a counter for each (`draws`); so a draw that is not used moves no other.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
@@ -30,10 +29,23 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
-from unprocess_gen.config.snapshot import restored, snapshot
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, stream_key
-from unprocess_gen.core.types import FLOAT32, DarkFrames, Facts, Plan, inverse_gains
-from unprocess_gen.planning.effect_contributions import SignalRange, signal_range
+from unprocess_gen.core.types import (
+    FLOAT32,
+    AccuracyPlan,
+    CameraPlan,
+    DarkFramePlan,
+    DarkFrames,
+    Facts,
+    IspPlan,
+    NoisePlan,
+    OutputPlan,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+)
+from unprocess_gen.planning.draws import COUNT, NOISE_COUNTERS, Draw
 from unprocess_gen.planning.effect_selection import (
     NOT_ROUNDED,
     Prediction,
@@ -41,19 +53,10 @@ from unprocess_gen.planning.effect_selection import (
     effect_rules,
     select_effects,
 )
+from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.noise_profile import PhysicalNoise
 from unprocess_gen.simulation.reference import colour
 from unprocess_gen.simulation.reference.sensor import noise_in_dn
-
-PARAMETERS = (
-    *("weight_0", "weight_1", "weight_2", "weight_3", "choice", "red", "blue", "inverse_rgb", "a", "b"),
-    *("iso", "exposure_s", "temperature_c", "exposure_ratio", "read_shape", "read_std", "row_std", "column_std"),
-    *("sensor_unit", "column_temporal_std"),
-)
-"""Names of the draws; the position is the counter in the stream. All datasets depend on it: append, never reorder."""
-
-NOISE_PARAMETERS = ("a", "b", "iso", "read_shape", "read_std", "row_std", "column_std", "column_temporal_std")
-"""Parameters that every noise level draws separately."""
 
 
 def plan_image(
@@ -66,29 +69,6 @@ def plan_image(
     """Draw every parameter of one image, at the first noise level.
 
     All draws are functions of ``config.seed``, ``source_sha256`` and ``occurrence``.
-
-    Parameters
-    ----------
-    config : Config
-        A configuration that `validate_config` accepts.
-    source_sha256 : str
-        Hex digest of the bytes of the source.
-    occurrence : int
-        Number of identical files before this one.
-    facts : Facts or None
-        `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
-    dark_frames : DarkFrames or None
-        Frames from which noise is sampled; needed with ``noise.dark_frames`` only.
-
-    Returns
-    -------
-    Plan
-        All parameters of the pair.
-
-    Raises
-    ------
-    ValueError
-        If the noise profile is physical and ``facts`` is None, or the dark frames of the config are not given.
     """
     plan, _ = next(_planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames))
     return plan if dark_frames is None or facts is None else with_dark_frame(plan, dark_frames, facts)
@@ -102,57 +82,16 @@ def plan_pairs(
     frame: int = 0,
     dark_frames: DarkFrames | None = None,
 ) -> tuple[Plan, ...]:
-    """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level.
-
-    Parameters
-    ----------
-    config : Config
-        A configuration that `validate_config` accepts.
-    source_sha256 : str
-        Hex digest of the bytes of the source. For a frame of a clip, of the clip: its frames share their parameters.
-    occurrence : int
-        Number of identical sources before this one.
-    facts : Facts or None
-        `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
-    frame : int
-        Number of the frame in its clip; each frame has its own noise. 0 for a photograph.
-    dark_frames : DarkFrames or None
-        Frames from which noise is sampled; needed with ``noise.dark_frames`` only.
-
-    Returns
-    -------
-    tuple of Plan
-        Level by level, and draw by draw within a level. The pairs share their clean frame.
-
-    Raises
-    ------
-    ValueError
-        If the noise profile is physical and ``facts`` is None, or the dark frames of the config are not given.
-    """
+    """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level."""
     levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
     plans = with_draws(config, (plan for plan, _ in levels), frame)
     return plans if dark_frames is None or facts is None else with_dark_frames(plans, dark_frames, facts)
 
 
 def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
-    """Return a plan for each draw of the noise at each level.
-
-    Parameters
-    ----------
-    config : Config
-        ``noise.draws`` is the number of draws.
-    levels : iterable of Plan
-        One plan for each noise level, of draw 0 and frame 0.
-    frame : int
-        Number of the frame in its clip.
-
-    Returns
-    -------
-    tuple of Plan
-        Draw by draw within each level.
-    """
+    """Return a plan for each draw of the noise at each level."""
     return tuple(
-        replace(plan, draw=draw, frame=frame) if draw or frame else plan
+        plan.replace(draw=draw, frame=frame) if draw or frame else plan
         for plan in levels
         for draw in range(config.noise.draws)
     )
@@ -163,58 +102,23 @@ def with_dark_frames(plans: Sequence[Plan], dark_frames: DarkFrames, facts: Fact
 
     The first is chosen at random for each image, and the frames of a clip, the levels and the draws take the next ones
     in turn. All use the same part of the frames, so that the fixed pattern of the camera does not move.
-
-    Parameters
-    ----------
-    plans : sequence of Plan
-        Plans of one image: every draw of every level.
-    dark_frames : DarkFrames
-        The frames.
-    facts : Facts
-        Size of the image.
-
-    Returns
-    -------
-    tuple of Plan
-        The plans with the columns of dark frames.
     """
     return tuple(
-        with_dark_frame(plan, dark_frames, facts, plan.frame * len(plans) + number) for number, plan in enumerate(plans)
+        with_dark_frame(plan, dark_frames, facts, plan.noise.frame * len(plans) + number)
+        for number, plan in enumerate(plans)
     )
 
 
 def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int = 0) -> Plan:
-    """Choose the dark frame of one pair.
-
-    Parameters
-    ----------
-    plan : Plan
-        The plan of the pair.
-    dark_frames : DarkFrames
-        The frames.
-    facts : Facts
-        Size of the image.
-    number : int
-        Number of the pair among those of its image or clip.
-
-    Returns
-    -------
-    Plan
-        The plan with the columns of dark frames. The part of the frame lies inside it if the image fits.
-    """
+    """Choose the dark frame of one pair."""
     chosen, row, column = dark_frame_words(plan.stream_key)
     count = len(dark_frames.frames)
     frame = dark_frames.frames[((chosen * count >> 32) + number) % count]
     shift = _even_place(row, frame.height, facts.height), _even_place(column, frame.width, facts.width)
     shading = dark_frames.shading
-    return replace(
-        plan,
-        dark_frame=frame.sha256,
-        dark_shift=shift,
-        dark_black_dn=dark_frames.black_dn if shading is None else shading.black_dn,
-        dark_scale=dark_frames.scale,
-        dark_shading="" if shading is None else shading.sha256,
-    )
+    black_dn = dark_frames.black_dn if shading is None else shading.black_dn
+    dark = DarkFramePlan(frame.sha256, shift, black_dn, dark_frames.scale, "" if shading is None else shading.sha256)
+    return plan.replace(dark=dark)
 
 
 def _even_place(word: int, available: int, needed: int) -> int:
@@ -234,42 +138,19 @@ def plan_levels(
     facts: Facts | None = None,
     dark_frames: DarkFrames | None = None,
 ) -> tuple[PlanAndPredictions, ...]:
-    """Draw the parameters of one image at every noise level, with the predictions behind the selected effects.
-
-    Parameters
-    ----------
-    config : Config
-        A configuration that `validate_config` accepts.
-    source_sha256 : str
-        Hex digest of the bytes of the source.
-    occurrence : int
-        Number of identical sources before this one.
-    facts : Facts or None
-        `effect_selection.facts_of` the pixels; needed by physical noise profiles only.
-    dark_frames : DarkFrames or None
-        Frames from which noise is sampled; needed with ``noise.dark_frames`` only.
-
-    Returns
-    -------
-    tuple of (Plan, tuple of Prediction)
-        One for each noise level; no predictions for a profile with two numbers.
-    """
+    """Draw the parameters of one image at every noise level, with the predictions behind the selected effects."""
     levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
     return tuple((plan, () if selection is None else selection.predictions()) for plan, selection in levels)
 
 
-# --------------------------------------------------------------------------------------------------------- one config
-
-
 def _planner(config: Config) -> Planner:
-    """Return the planner of a config's content: a config that was changed has another one."""
-    content = snapshot(config)
-    return Planner(config) if content is None else _planner_of(content)
+    """Return the planner of a config, whatever its seed."""
+    return _planner_without_seed(replace(config, seed=0))
 
 
 @functools.lru_cache(maxsize=64)
-def _planner_of(content: bytes) -> Planner:
-    return Planner(restored(content))
+def _planner_without_seed(config: Config) -> Planner:
+    return Planner(config)
 
 
 class Planner:
@@ -289,34 +170,23 @@ class Planner:
         self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
         levels = [replace(config, noise=noise) for noise in noise_levels(config.noise)]
         self._is_physical = is_physical(config.noise)
-        self._levels = [PhysicalLevel(one) if self._is_physical else TwoNumberLevel(one) for one in levels]
+        kind = PhysicalLevel if self._is_physical else TwoNumberLevel
+        self._levels = [kind(level, number) for number, level in enumerate(levels)]
         budget, counts_electrons = accuracy_budget(config.accuracy), uses_physics(config.noise)
-        self._methods, self._steep_methods = (
-            choose_methods(budget, counts_electrons, is_normalised(config), steep or has_float_clean(config))
+        self._accuracy, self._steep_accuracy = (
+            AccuracyPlan(
+                config.accuracy.name,
+                choose_methods(budget, counts_electrons, is_normalised(config), steep or has_float_clean(config)),
+                config.accuracy.law_distance,
+            )
             for steep in (False, True)
         )
-        self._recorded: dict[str, Any] = {
-            "downscale": config.source.downscale,
-            "dequantize": dequantize_method(config.source),
-            "scene": config.scene.name,
-            "tone": config.isp.tone,
-            "gamma": "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma),
-            "highlight": config.gains.highlight,
-            "highlight_threshold": config.gains.threshold,
-            "pattern": config.sensor.pattern,
-            "bits": config.sensor.bits,
-            "black_level_dn": config.sensor.black_level_dn,
-            "white_level_dn": config.sensor.white_level_dn,
-            "sensor_clip": config.sensor.clip,
-            "saturated": saturated_as(config),
-            "noise": config.noise.name,
-            "noise_law": config.noise.law,
-            "accuracy": config.accuracy.name,
-            "law_distance": config.accuracy.law_distance,
-            "dtype": config.output.dtype,
-            "layout": config.output.layout,
-            "clean_dtype": FLOAT32 if has_float_clean(config) else "",
-        }
+        self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
+        self._source = SourcePlan(config.source.downscale, dequantize_method(config.source))
+        self._isp = IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
+        sensor = config.sensor
+        self._sensor = SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
+        self._output = OutputPlan(config.output.dtype, config.output.layout, FLOAT32 if has_float_clean(config) else "")
 
     def levels(
         self,
@@ -326,58 +196,46 @@ class Planner:
         facts: Facts | None = None,
         dark_frames: DarkFrames | None = None,
     ) -> Iterator[tuple[Plan, Selection | None]]:
-        """Yield the plan of one image at each noise level, and the selection of effects of a physical profile.
-
-        Parameters
-        ----------
-        seed : int
-            Seed of the dataset.
-        source_sha256, occurrence, facts, dark_frames : str, int, Facts or None, DarkFrames or None
-            As for `plan_pairs`.
-
-        Yields
-        ------
-        plan : Plan
-            Of draw 0 and frame 0.
-        selection : Selection or None
-            None for a profile with two numbers.
-
-        Raises
-        ------
-        ValueError
-            If the noise profile is physical and ``facts`` is None, or the dark frames of the config are not given.
-        """
+        """Yield the plan of one image at each noise level, and the selection of effects of a physical profile."""
         if self._needs_dark_frames and dark_frames is None:
             raise ValueError("noise.dark_frames: the plan needs the dark frames")
         if self._is_physical and facts is None:
             raise ValueError("a physical profile needs the facts of the pixels")
         key = stream_key(seed, source_sha256, occurrence)
-        uniforms = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS)), strict=True))
-        clean = self._clean(uniforms)
-        image = Image(seed, key, facts, _signals(clean, facts) if self._is_physical and facts else None, dark_frames)
+        uniforms = parameter_uniforms(key, COUNT)
+        scene = ScenePlan(self._scene_name, draw_parameter(self._exposure_ratio, uniforms[Draw.EXPOSURE_RATIO]))
+        camera = self._draw_camera(uniforms)
+        steep = self._steep_accuracy != self._accuracy and is_steep(camera, scene.exposure)
+        accuracy = self._steep_accuracy if steep else self._accuracy
+        signals = None
+        if self._is_physical and facts is not None:
+            signals = signal_range(facts, self._isp, camera, scene.exposure, float(self._sensor.span_dn))
+        image = Image(seed, key, facts, signals, dark_frames)
         for number, level in enumerate(self._levels):
             if number:
-                at_level = dict(zip(PARAMETERS, parameter_uniforms(key, len(PARAMETERS), number), strict=True))
-                uniforms |= {name: at_level[name] for name in NOISE_PARAMETERS}
+                drawn_again = parameter_uniforms(key, COUNT, number)
+                for counter in NOISE_COUNTERS:
+                    uniforms[counter] = drawn_again[counter]
             noise, selection = level.draw(image, uniforms)
-            plan = Plan(seed=seed, stream_key=key, methods=self._methods, level=number, **clean, **noise)
-            if self._steep_methods != self._methods and is_steep(plan):
-                plan = replace(plan, methods=self._steep_methods)
+            plan = Plan(seed, key, self._source, scene, camera, self._isp, self._sensor, noise, accuracy, self._output)
             yield plan, selection
 
-    def _clean(self, uniforms: Mapping[str, float]) -> dict[str, Any]:
-        """Return the fields of a plan that all noise levels of an image share."""
-        camera, weights, rgb2cam = plan_camera(self._camera, uniforms)
-        return {
-            "exposure_ratio": draw_parameter(self._exposure_ratio, uniforms["exposure_ratio"]),
-            "camera": camera,
-            "weights": weights,
-            "rgb2cam": rgb2cam,
-            "red_gain": draw_parameter(self._red, uniforms["red"]),
-            "blue_gain": draw_parameter(self._blue, uniforms["blue"]),
-            "inverse_rgb_gain": draw_parameter(self._inverse_rgb, uniforms["inverse_rgb"]),
-            **self._recorded,
-        }
+    def _draw_camera(self, uniforms: Sequence[float]) -> CameraPlan:
+        """Draw colours and gains."""
+        name, weights, rgb2cam = plan_camera(self._camera, uniforms)
+        return CameraPlan(
+            name,
+            weights,
+            rgb2cam,
+            draw_parameter(self._red, uniforms[Draw.RED]),
+            draw_parameter(self._blue, uniforms[Draw.BLUE]),
+            draw_parameter(self._inverse_rgb, uniforms[Draw.INVERSE_RGB]),
+            *self._highlight,
+        )
+
+
+NoiseAndSelection = tuple[NoisePlan, Selection | None]
+"""Noise of a plan, and the selection of effects of a physical profile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,23 +259,6 @@ class Image:
     dark_frames: DarkFrames | None
 
 
-def _signals(clean: Mapping[str, Any], facts: Facts) -> SignalRange:
-    """Return the signal range of an image, from the fields of its plan."""
-    return signal_range(
-        facts,
-        clean["tone"],
-        clean["gamma"],
-        inverse_gains(clean["red_gain"], clean["blue_gain"], clean["inverse_rgb_gain"]),
-        1 / clean["exposure_ratio"],
-        float(clean["white_level_dn"] - clean["black_level_dn"]),
-        clean["rgb2cam"],
-    )
-
-
-LevelFields = tuple[dict[str, Any], Selection | None]
-"""Fields of a plan that depend on the noise level, and the selection of effects of a physical profile."""
-
-
 class TwoNumberLevel:
     """One noise level of a profile with two numbers.
 
@@ -425,24 +266,30 @@ class TwoNumberLevel:
     ----------
     config : Config
         The configuration, with the profile of this level.
+    number : int
+        Number of the level.
     """
 
-    def __init__(self, config: Config) -> None:
-        self._config = config
+    def __init__(self, config: Config, number: int) -> None:
+        self._config, self._number, self._saturated = config, number, saturated_as(config)
         self._distributions = noise_distributions(config.noise)
         self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
 
-    def draw(self, image: Image, uniforms: Mapping[str, float]) -> LevelFields:
+    def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
         """Draw the two numbers and select the effects of an image at this level."""
         a_dn, b_dn2 = self.two_numbers(uniforms)
         effects, skipped = plan_effects(self._config, a_dn, b_dn2, self._span_dn)
-        return {"a_dn": a_dn, "b_dn2": b_dn2, "effects": effects, "skipped": skipped}, None
+        noise, clip = self._config.noise, self._config.sensor.clip
+        plan = NoisePlan(
+            noise.name, noise.law, a_dn, b_dn2, effects, skipped, clip, self._saturated, level=self._number
+        )
+        return plan, None
 
-    def two_numbers(self, uniforms: Mapping[str, float]) -> tuple[float, float]:
+    def two_numbers(self, uniforms: Sequence[float]) -> tuple[float, float]:
         """Draw the two numbers and convert them to the sensor's DN: (a_dn, b_dn2)."""
         noise, sensor = self._config.noise, self._config.sensor
-        a = draw_parameter(self._distributions[0], uniforms["a"])
-        b = draw_parameter(self._distributions[1], uniforms["b"], a)
+        a = draw_parameter(self._distributions[0], uniforms[Draw.A])
+        b = draw_parameter(self._distributions[1], uniforms[Draw.B], a)
         return noise_in_dn(
             a,
             b,
@@ -460,13 +307,16 @@ class PhysicalLevel:
     ----------
     config : Config
         The configuration, with the profile of this level.
+    number : int
+        Number of the level.
     """
 
-    def __init__(self, config: Config) -> None:
-        self._noise = PhysicalNoise(config)
+    def __init__(self, config: Config, number: int) -> None:
+        self._noise, self._number = PhysicalNoise(config), number
+        self._clip, self._saturated = config.sensor.clip, saturated_as(config)
         self._rules = effect_rules(config)
 
-    def draw(self, image: Image, uniforms: Mapping[str, float]) -> LevelFields:
+    def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
         """Draw the numbers of the sensor and select the effects of an image at this level."""
         assert image.facts is not None and image.signals is not None
         physics = self._noise.draw(uniforms, image.stream_key, image.seed)
@@ -476,15 +326,21 @@ class PhysicalLevel:
         if any(physics.lens_shading):
             physics = replace(physics, frame_size=(image.facts.height, image.facts.width))
         selection = select_effects(self._rules, physics, image.facts, image.signals)
-        fields = {
-            "physics": physics,
-            "a_dn": physics.dn_per_e,
-            "b_dn2": physics.read_std_dn * physics.read_std_dn,
-            "effects": selection.effects,
-            "skipped": selection.skipped,
-            "assumed": selection.assumed,
-        }
-        return fields, selection
+        profile = self._noise.noise
+        plan = NoisePlan(
+            profile.name,
+            profile.law,
+            physics.dn_per_e,
+            physics.read_std_dn * physics.read_std_dn,
+            selection.effects,
+            selection.skipped,
+            self._clip,
+            self._saturated,
+            physics,
+            self._number,
+            assumed=selection.assumed,
+        )
+        return plan, selection
 
 
 # ---------------------------------------------------------------------------------------------------------- camera
@@ -492,7 +348,7 @@ class PhysicalLevel:
 Weights = tuple[float, float, float, float]
 
 
-def plan_camera(camera: CameraConfig, uniforms: Mapping[str, float]) -> tuple[str, Weights, colour.Matrix]:
+def plan_camera(camera: CameraConfig, uniforms: Sequence[float]) -> tuple[str, Weights, colour.Matrix]:
     """Return the name of the camera, the weights of the four known cameras in it, and its matrix from linear sRGB."""
     names = tuple(colour.CAMERAS)
     if camera.law == "identity":
@@ -502,14 +358,14 @@ def plan_camera(camera: CameraConfig, uniforms: Mapping[str, float]) -> tuple[st
     if camera.law == "convex":
         weights = convex_weights(uniforms)
         return camera.name, weights, colour.rgb2cam(colour.mix(tuple(colour.CAMERAS.values()), weights))
-    name = names[int(uniforms["choice"] * len(names))] if camera.law == "choice" else camera.name
+    name = names[int(uniforms[Draw.CHOICE] * len(names))] if camera.law == "choice" else camera.name
     w0, w1, w2, w3 = (float(name == other) for other in names)
     return name, (w0, w1, w2, w3), colour.rgb2cam(colour.CAMERAS[name])
 
 
-def convex_weights(uniforms: Mapping[str, float]) -> Weights:
+def convex_weights(uniforms: Sequence[float]) -> Weights:
     """Return four uniforms, each divided by their sum (Brooks et al. 2019, random_ccm())."""
-    u0, u1, u2, u3 = (uniforms[f"weight_{i}"] for i in range(4))
+    u0, u1, u2, u3 = uniforms[Draw.WEIGHT_0 : Draw.WEIGHT_3 + 1]
     total = u0 + u1 + u2 + u3
     return u0 / total, u1 / total, u2 / total, u3 / total
 

@@ -57,28 +57,16 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
     1996); edges raise it. Tiles are therefore sorted by its value in the codes of the source, where noise depends
     little on brightness, and only the quieter half is used. Tiles with a code at either end of the range have less
     noise than the others and are left out.
-
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes as they are unprocessed, before dithering.
-    plan : Plan
-        Parameters of the pair: curve, matrix, gains, exposure, pattern and levels.
-
-    Returns
-    -------
-    TileNoise
-        Empty if no tile fits or every tile is clipped. The same on every machine: sums of integers.
     """
-    codes = _green_sites(srgb, plan.pattern)
+    codes = _green_sites(srgb, plan.sensor.pattern)
     last = int(np.iinfo(srgb.dtype).max)
     codes = codes[((codes > 0) & (codes < last)).all(axis=(1, 2, 3))]
     quiet = np.argsort(_laplacian_sums(codes[..., 1].astype(np.int64)), kind="stable")[: (len(codes) + 1) // 2]
     if not quiet.size:
         return TileNoise(np.zeros(0), np.zeros(0))
-    light = camera_light(codes[quiet], plan, linear_table(plan.tone, plan.gamma, last + 1))[..., 1]
-    span = float(plan.white_level_dn - plan.black_level_dn)
-    steps = np.rint(np.clip(light, 0, 1) * (plan.exposure * span * STEPS_PER_DN)).astype(np.int64)
+    light = camera_light(codes[quiet], plan, linear_table(plan.isp.tone, plan.isp.gamma, last + 1))[..., 1]
+    span = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
+    steps = np.rint(np.clip(light, 0, 1) * (plan.scene.exposure * span * STEPS_PER_DN)).astype(np.int64)
     _, height, width = steps.shape
     sites = (height - 2) * (width - 2)
     std_dn = _laplacian_sums(steps) * (LAPLACIAN_SCALE / (sites * STEPS_PER_DN))
@@ -86,38 +74,15 @@ def tile_noise(srgb: Srgb, plan: Plan) -> TileNoise:
 
 
 def source_noise_dn(srgb: Srgb, plan: Plan) -> float | None:
-    """Estimate the standard deviation of the noise of a source in the clean frame.
-
-    Parameters
-    ----------
-    srgb, plan : ndarray, Plan
-        As for `tile_noise`.
-
-    Returns
-    -------
-    float or None
-        Median over the quieter half of the tiles, DN, rounded to `DECIMALS`; None if no tile can be used. Because the
-        quieter tiles are used, white noise is underestimated, by 7 % for many tiles.
-    """
+    """Estimate the standard deviation of the noise of a source in the clean frame."""
     std_dn = np.sort(tile_noise(srgb, plan).std_dn)
     return round(float(std_dn[(std_dn.size - 1) // 2]), DECIMALS) if std_dn.size else None
 
 
 def noise_ratio(srgb: Srgb, plan: Plan) -> float | None:
-    """Return the noise of a source relative to the simulated shot and read noise at the same signal.
-
-    Parameters
-    ----------
-    srgb, plan : ndarray, Plan
-        As for `tile_noise`.
-
-    Returns
-    -------
-    float or None
-        Median over the quieter half of the tiles; None if no tile can be used or no noise is simulated there.
-    """
+    """Return the noise of a source relative to the simulated shot and read noise at the same signal."""
     tiles = tile_noise(srgb, plan)
-    slope, intercept = plan.variance_line
+    slope, intercept = plan.noise.variance_line
     variance = np.maximum(slope * tiles.signal_dn + intercept, 0)
     ratios = np.sort(tiles.std_dn[variance > 0] / np.sqrt(variance[variance > 0]))
     return float(ratios[(ratios.size - 1) // 2]) if ratios.size else None

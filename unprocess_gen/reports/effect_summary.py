@@ -6,14 +6,14 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from unprocess_gen.config.interpretation import HEAT, assumed_numbers, missing_number, uses_dark_frames
-from unprocess_gen.config.schema import Config, NoiseConfig
-from unprocess_gen.config.values import value_range
+from unprocess_gen.config.interpretation import assumed_numbers, missing_number, uses_dark_frames
+from unprocess_gen.config.schema import BRANCH_FIELDS, Config, NoiseConfig
+from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Plan
-from unprocess_gen.planning.effect_contributions import OUTLIERS
-from unprocess_gen.planning.effect_selection import COST_NS, MIN_OUTLIERS, Prediction
+from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
 from unprocess_gen.reports.formatting import counted, short_number
-from unprocess_gen.simulation.reference.noise import REPLACED
+from unprocess_gen.simulation.effects import BY_NAME, REPLACED
+from unprocess_gen.simulation.effects.dark_current import HEAT
 
 Predictions = Sequence[Sequence[Prediction]]
 """For each noise level of each image, the prediction of every effect."""
@@ -23,20 +23,7 @@ Predictions = Sequence[Sequence[Prediction]]
 
 
 def effect_sentences(config: Config, predictions: Predictions) -> list[str]:
-    """Return sentences on what is simulated, what is too small to see, and what is left out though it would show.
-
-    Parameters
-    ----------
-    config : Config
-        Config with a physical noise profile.
-    predictions : sequence of sequence of Prediction
-        Predictions of all effects, in the same order, for each noise level of each image.
-
-    Returns
-    -------
-    list of str
-        One sentence per item. Rounding is not named: it is the last step of every integer frame.
-    """
+    """Return sentences on what is simulated, what is too small to see, and what is left out though it would show."""
     effects = [
         EffectOverview(config, of_effect)
         for of_effect in zip(*predictions, strict=True)
@@ -110,7 +97,7 @@ class EffectOverview:
     def size_text(self) -> str:
         """Return how strong the effect is: outliers, or its ratio to the noise."""
         one = self.strongest
-        if self.name in OUTLIERS:
+        if BY_NAME[self.name].has_outliers:
             return _pixels(one.outliers)
         return f"{short_number(one.ratio)} of the noise" if math.isfinite(one.ratio) else "no other noise"
 
@@ -131,7 +118,6 @@ def _pixels(outliers: float) -> str:
 
 
 ASSUMED_TEXTS: dict[str, Callable[[NoiseConfig], str]] = {
-    "prnu_std": lambda noise: f"{100 * (noise.prnu_std or 0):g} %",
     "dark_e_per_s": lambda noise: f"{noise.dark_e_per_s:g} e⁻/s at {noise.dark_reference_c:g} °C",
     "dark_reference_c": lambda noise: f"measured at {noise.dark_reference_c:g} °C",
     "dark_doubling_c": lambda noise: f"doubled every {noise.dark_doubling_c:g} °C",
@@ -143,30 +129,30 @@ ASSUMED_TEXTS: dict[str, Callable[[NoiseConfig], str]] = {
     "column_std_dn": lambda noise: f"{noise.branches[0].column_std_dn} DN",
     "black_error_dn": lambda noise: "offsets of the black level",
 }
-"""Value of each number that a profile may mark as assumed."""
+"""Value of a number that a profile may mark as assumed; others are shown as `_key_text` does."""
 
 
 def assumed_text(noise: NoiseConfig, effect: str) -> str:
-    """Return the assumed numbers of an effect, such as ``assumed 0.5 %``; empty if all are published.
-
-    Parameters
-    ----------
-    noise : NoiseConfig
-        Physical profile.
-    effect : str
-        One of `noise.EFFECTS`.
-
-    Returns
-    -------
-    str
-        Words for a bracket.
-    """
+    """Return the assumed numbers of an effect, such as ``assumed 0.5 %``; empty if all are published."""
     keys = assumed_numbers(noise, effect)
     if effect == "hot_pixels":  # the dark current names the temperature and the doubling
         keys = tuple(key for key in keys if key not in HEAT)
-    values = [ASSUMED_TEXTS[key](noise) for key in keys]
+    values = [ASSUMED_TEXTS[key](noise) if key in ASSUMED_TEXTS else _key_text(noise, key) for key in keys]
     return f"assumed {', '.join(values)}" if values else ""
 
+
+def _key_text(noise: NoiseConfig, key: str) -> str:
+    """Relative standard deviations in percent, electrons with their unit, other numbers with their key."""
+    if key.endswith("_std"):
+        return f"{100 * (getattr(noise, key) or 0):g} %"
+    if key.endswith("_std_e"):
+        return f"{getattr(noise, key):g} e⁻"
+    value = value_text(getattr(noise.branches[0] if key in BRANCH_FIELDS else noise, key))
+    return f"{key}={value if len(value) <= LONGEST_VALUE else '…'}"
+
+
+LONGEST_VALUE = 20
+"""Characters of the longest assumed value that is shown."""
 
 # --------------------------------------------------------------------------------------------------------------- table
 
@@ -176,30 +162,18 @@ def effect_table(config: Config, predictions: Predictions) -> list[str]:
 
     Hot and dead pixels are judged by the number of pixels that exceed the noise, other effects by their ratio to
     the noise that hides them.
-
-    Parameters
-    ----------
-    config : Config
-        Config with a physical noise profile.
-    predictions : sequence of sequence of Prediction
-        As for `effect_sentences`.
-
-    Returns
-    -------
-    list of str
-        Lines of at most 160 characters, the head first.
     """
     lines = [_TABLE_LINE.format("effect", "adds", "seen in", "noise there", "ratio", "images", "ns/pixel", "decision")]
     for of_effect in zip(*predictions, strict=True):
         overview = EffectOverview(config, of_effect)
         one = overview.strongest
         adds, seen, noise, ratio = f"{one.predicted_dn:.3g} DN", one.statistic, f"{one.masking_dn:.3g} DN", one.ratio
-        if overview.name in OUTLIERS:
+        if BY_NAME[overview.name].has_outliers:
             pixels = one.outliers if one.outliers >= 1e-6 else 0
             adds, seen, noise, shown = f"{pixels:.3g} pixels", "outliers", "", ""
         else:
             shown = f"{ratio:.3g}" if math.isfinite(ratio) else "no noise"
-        images, cost = f"{overview.count} of {len(of_effect)}", f"{COST_NS[overview.name]:.1f}"
+        images, cost = f"{overview.count} of {len(of_effect)}", f"{BY_NAME[overview.name].cost_ns:.1f}"
         line = _TABLE_LINE.format(overview.name, adds, seen, noise, shown, images, cost, _decision(overview))
         lines.append(line.rstrip())
     return lines
@@ -223,29 +197,16 @@ def _decision(overview: EffectOverview) -> str:
 
 
 def scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
-    """Return the scene, and what of it the noise profile uses.
-
-    Parameters
-    ----------
-    config : Config
-        Config of the run.
-    plans : sequence of Plan
-        At least one plan.
-
-    Returns
-    -------
-    str
-        Name, ISO, exposure, temperature and division of the light; then what is used and what is ignored.
-    """
-    physics = [plan.physics for plan in plans if plan.physics is not None]
+    """Return the scene, and what of it the noise profile uses."""
+    physics = [plan.noise.physics for plan in plans if plan.noise.physics is not None]
     scene, noise = config.scene, config.noise
     if physics:
         iso, seconds = value_range([one.iso for one in physics]), value_range([one.exposure_s for one in physics])
         celsius = value_range([one.temperature_c for one in physics])
     else:
         iso, seconds, celsius = (_written(value) for value in (scene.iso, scene.exposure_s, scene.temperature_c))
-    ratio = value_range([plan.exposure_ratio for plan in plans], 4)
-    text = f"{plans[0].scene}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}"
+    ratio = value_range([plan.scene.exposure_ratio for plan in plans], 4)
+    text = f"{plans[0].scene.name}: ISO {iso}, {seconds} s, {celsius} °C, light divided by {ratio}"
     if not physics:
         return f"{text}; {noise.name} uses only the light, and ignores ISO, time and temperature"
     used: list[str] = ["light"]
@@ -261,7 +222,7 @@ def scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
 
 def _written(value: object) -> str:
     """Return a number of the config, or the numbers of a distribution."""
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         numbers = [f"{one:g}" for one in value if isinstance(one, int | float)]
         return " to ".join(numbers) if value and value[0] == "uniform" else ", ".join(numbers)
     return f"{value:g}" if isinstance(value, int | float) else str(value)
@@ -277,38 +238,13 @@ def rounding_psnr_db(span_dn: float, exposure_ratio: float) -> float:
     The rounding error is uniform in ±½ DN, so its mean square is 1/12 DN². White of the darkened scene is
     ``span_dn / exposure_ratio`` above black. A denoiser that returned the unrounded mean would have
     20 log10(√12 · span / ratio).
-
-    Parameters
-    ----------
-    span_dn : float
-        White level minus black level, DN.
-    exposure_ratio : float
-        Divisor of the light.
-
-    Returns
-    -------
-    float
-        Decibels, with the white of the darkened scene as the peak.
     """
     return 20 * math.log10(math.sqrt(12) * span_dn / exposure_ratio)
 
 
 def posterisation_warning(plans: Sequence[Plan], levels: Sequence[int]) -> str | None:
-    """Return a warning if rounded clean frames have few levels.
-
-    Parameters
-    ----------
-    plans : sequence of Plan
-        Plans of the images that were read.
-    levels : sequence of int
-        Distinct DN in their clean frames; empty for float32.
-
-    Returns
-    -------
-    str or None
-        One sentence with the levels, the limit of the PSNR and the remedy.
-    """
-    spans = [(plan.white_level_dn - plan.black_level_dn, plan.exposure_ratio) for plan in plans]
+    """Return a warning if rounded clean frames have few levels."""
+    spans = [(plan.sensor.white_level_dn - plan.sensor.black_level_dn, plan.scene.exposure_ratio) for plan in plans]
     if not levels or min(span / ratio for span, ratio in spans) >= POSTERISED_BELOW:
         return None
     limits = [rounding_psnr_db(span, ratio) for span, ratio in spans]
@@ -324,20 +260,7 @@ NOISY_SOURCE = 0.2
 
 
 def source_noise_sentences(ratios: Sequence[float], downscale: int) -> list[str]:
-    """Return how many sources bring visible noise into the clean frame, and the remedy.
-
-    Parameters
-    ----------
-    ratios : sequence of float
-        For each source, its noise relative to the simulated noise (`source_noise.noise_ratio`).
-    downscale : int
-        The setting ``source.downscale``.
-
-    Returns
-    -------
-    list of str
-        One sentence; empty without a ratio.
-    """
+    """Return how many sources bring visible noise into the clean frame, and the remedy."""
     if not ratios:
         return []
     noisy = sum(ratio > NOISY_SOURCE for ratio in ratios)
@@ -350,20 +273,7 @@ def source_noise_sentences(ratios: Sequence[float], downscale: int) -> list[str]
 
 
 def dark_frames_sentence(config: Config, dark_frames: DarkFrames) -> str:
-    """Return what `plan` says about dark frames.
-
-    Parameters
-    ----------
-    config : Config
-        Config of the run.
-    dark_frames : DarkFrames
-        The frames.
-
-    Returns
-    -------
-    str
-        Number, sizes, what is subtracted, and standard deviation of the noise with dither, DN of the sensor.
-    """
+    """Return what `plan` says about dark frames."""
     sizes = sorted({f"{frame.width} x {frame.height}" for frame in dark_frames.frames})
     text = (
         f"{counted(len(dark_frames.frames), 'dark frame')} in {config.noise.dark_frames}: {', '.join(sizes)} pixels, "

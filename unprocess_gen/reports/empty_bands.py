@@ -13,6 +13,7 @@ import numpy as np
 
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
+from unprocess_gen.reports.formatting import percentage
 from unprocess_gen.simulation.reference.unprocess import invert_gains
 
 WIDE = 0.02
@@ -24,14 +25,9 @@ SITES = (0.25, 0.5, 0.25)
 
 
 class EmptyBands(NamedTuple):
-    """Describe the empty bands of a photograph.
+    """The fraction of the sites whose code is next to an empty band, and the widest band of R, G and B.
 
-    Attributes
-    ----------
-    share : float
-        Fraction of the sites whose code is next to an empty band; white sites are not counted.
-    widest : tuple of three floats
-        Width of the widest band of each channel, as a fraction of the raw range, for gray pixels.
+    White sites are not counted. Widths are fractions of the raw range, for gray pixels.
     """
 
     share: float
@@ -44,19 +40,9 @@ NONE = EmptyBands(0.0, (0.0, 0.0, 0.0))
 def empty_bands(srgb: Srgb, plan: Plan) -> EmptyBands:
     """Find the empty bands of a photograph and count the sites next to them.
 
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    plan : Plan
-        Parameters of the pair.
-
-    Returns
-    -------
-    EmptyBands
-        `NONE` for 16-bit codes and for dithered highlights. Their widest band is next to white: up to 6 % of the range.
+    `NONE` for 16-bit codes and for dithered highlights. Their widest band is next to white: up to 6 % of the range.
     """
-    if srgb.dtype != np.uint8 or plan.dequantize == "dither_all":
+    if srgb.dtype != np.uint8 or plan.source.dequantize == "dither_all":
         return NONE
     widths = band_widths(plan)
     wide = widths >= WIDE
@@ -64,38 +50,27 @@ def empty_bands(srgb: Srgb, plan: Plan) -> EmptyBands:
     edges[:255] |= wide
     edges[1:255] |= wide[:-1]
     counts = [np.bincount(srgb[..., channel].ravel(), minlength=256) for channel in range(3)]
-    shares = (count[edge].sum() / count.sum() for count, edge in zip(counts, edges.T, strict=True))
-    share = sum(part * one for part, one in zip(SITES, shares, strict=True))
+    shares = [count[edge].sum() / count.sum() for count, edge in zip(counts, edges.T, strict=True)]
+    share = np.dot(SITES, shares)
     red, green, blue = np.where(wide, widths, 0).max(axis=0).tolist()
     return EmptyBands(float(share), (red, green, blue))
 
 
 def highlight_sentence(bands: Sequence[EmptyBands]) -> str:
-    """Return what `plan` says about empty bands; empty if no site is next to one.
-
-    Parameters
-    ----------
-    bands : sequence of EmptyBands
-        Of the photographs that were read.
-
-    Returns
-    -------
-    str
-        One sentence with the mean share of the sites, the widest bands and the remedy.
-    """
-    share = sum(one.share for one in bands) / len(bands) if bands else 0.0
+    """Return the mean share of the sites, the widest bands and the remedy; empty if no site is next to a band."""
+    share = float(np.mean([band.share for band in bands])) if bands else 0.0
     if not share:
         return ""
-    widest = (max(one.widest[channel] for one in bands) for channel in range(3))
-    widths = ", ".join(f"{width:.0%} in {name}" for name, width in zip(CHANNELS, widest, strict=True) if width)
+    widest = np.max([band.widest for band in bands], axis=0)
+    widths = ", ".join(f"{100 * width:.0f} % ({name})" for name, width in zip(CHANNELS, widest, strict=True) if width)
     return (
-        f"{share:.2%} of the sites have highlights next to an empty band: two 8-bit codes are up to {widths} of the "
-        "raw range apart; source.dequantize=dither_all fills the bands"
+        f"{percentage(share)} of the sites are highlights where 8-bit codes are coarse: neighbouring codes are up to "
+        f"{widths} of the raw range apart; source.dequantize=dither_all fills the bands"
     )
 
 
 def band_widths(plan: Plan) -> Float:
     """Return the distance in raw between each code and the next, [255, 3], for gray pixels before the exposure."""
-    gray = np.repeat(linear_table(plan.tone, plan.gamma, 256)[:, None], 3, axis=1)
-    light = invert_gains(gray, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
+    gray = np.repeat(linear_table(plan.isp.tone, plan.isp.gamma, 256)[:, None], 3, axis=1)
+    light = invert_gains(gray, plan.camera.inverse_gains, plan.camera.highlight, plan.camera.highlight_threshold)
     return np.diff(np.minimum(light, 1), axis=0)

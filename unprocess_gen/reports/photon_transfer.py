@@ -1,14 +1,11 @@
 """Fit the noise in a dataset's arrays by photon transfer, as cameras are measured (EMVA 1288), and draw the fits.
 
 A line is fitted to the variance of the noise against the signal; slope and intercept are compared with the numbers of
-the row. The variance at each clean DN follows from the mean of cos z (`noise_check.scores`), which is efficient for
-normal noise, and not dominated by the tails of others. Alarms are raised by `noise_check.checks`, not by the fits.
+the row. Alarms are raised by `noise_check.checks`, not by the fits.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -16,13 +13,13 @@ from typing import BinaryIO
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_file
-from unprocess_gen.core.types import DarkPixels, Float, Frame, Row
+from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.types import DarkPixels, Float
 from unprocess_gen.dataset.reader import RawPairs
-from unprocess_gen.reports.noise_check.checks import Checker, NoiseChecks, pair_sums
-from unprocess_gen.reports.noise_check.scores import planes_of
-from unprocess_gen.reports.noise_check.sums import Sums
+from unprocess_gen.reports.noise_check.checks import Checker, pair_sums
+from unprocess_gen.reports.noise_check.scores import joined, row_offsets, variance_points
+from unprocess_gen.reports.noise_check.sums import Plane, Sums
 from unprocess_gen.reports.report_files import require_libraries
 
 FITS_DRAWN = 8
@@ -39,87 +36,48 @@ class NoiseFit:
     ----------
     key : str
         Key of the pair.
-    slope, slope_error : float
-        Slope of the variance in DN, and its standard error.
-    intercept, intercept_error : float
-        Intercept of the variance in DN², and its standard error.
-    expected : (float, float)
-        Slope and intercept according to the row.
+    estimate, error, expected : ndarray of float64, [2]
+        Slope (DN) and intercept (DN²) of the variance, their standard errors, and their values according to the row.
     signal_dn, variance_dn2 : ndarray of float64, [N]
-        The fitted points: signal above black and variance.
-    rounding_dn2 : float
-        Part of the variance that is due to rounding.
+        The fitted points: signal above black, and variance without that of rounding.
     """
 
     key: str
-    slope: float
-    slope_error: float
-    intercept: float
-    intercept_error: float
-    expected: tuple[float, float]
+    estimate: Float
+    error: Float
+    expected: Float
     signal_dn: Float
     variance_dn2: Float
-    rounding_dn2: float = 1 / 6
 
     @property
     def deviation(self) -> float:
         """Difference from the expected line in standard errors, the larger of slope and intercept."""
-        return max(
-            abs(self.slope - self.expected[0]) / self.slope_error,
-            abs(self.intercept - self.expected[1]) / self.intercept_error,
-        )
+        return float((np.abs(self.estimate - self.expected) / self.error).max())
 
     def __str__(self) -> str:
-        return (
-            f"{self.key}: a {self.slope:.6g} ± {1.96 * self.slope_error:.2g} DN (expected {self.expected[0]:.6g}), "
-            f"b {self.intercept:.6g} ± {1.96 * self.intercept_error:.2g} DN² (expected {self.expected[1]:.6g}): "
-            f"{self.deviation:.1f} standard errors"
+        numbers = (
+            f"{name} {estimate:.6g} ± {1.96 * error:.2g} {unit} (expected {expected:.6g})"
+            for name, unit, estimate, error, expected in zip(
+                "ab", ("DN", "DN²"), self.estimate, self.error, self.expected, strict=True
+            )
         )
+        return f"{self.key}: {', '.join(numbers)}: {self.deviation:.1f} standard errors"
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseSummary:
-    """The fits and the checks of a dataset.
-
-    Attributes
-    ----------
-    count : int
-        Number of fits.
-    worst : NoiseFit or None
-        The fit farthest from its row.
-    first : list of NoiseFit
-        The first `FITS_DRAWN` fits.
-    checks : NoiseChecks
-        Checks of all pairs, one by one and together.
-    """
+    """Number of fits of a dataset, the fit farthest from its row, the first `FITS_DRAWN` fits, and the checks."""
 
     count: int
     worst: NoiseFit | None
     first: list[NoiseFit]
-    checks: NoiseChecks
+    checks: Checker
 
 
 def examine_dataset(folder: AnyPath, dark_pixels: DarkPixels | None = None) -> NoiseSummary:
     """Fit and check the noise of every pair of a dataset, one pair at a time.
 
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Folder of the dataset.
-    dark_pixels : DarkPixels or None
-        Access to its dark frames; without it, pairs with dark frames are not checked.
-
-    Returns
-    -------
-    NoiseSummary
-        Fits and alarms; pairs with too few usable sites are counted as unchecked.
-
-    Raises
-    ------
-    DamageError
-        If the dataset is damaged.
-    SourceChangedError
-        If a dark frame is missing or has changed.
+    Pairs with too few usable sites are counted as unchecked; those with dark frames too if there is no access to them.
     """
     count, worst = 0, None
     first: list[NoiseFit] = []
@@ -133,93 +91,57 @@ def examine_dataset(folder: AnyPath, dark_pixels: DarkPixels | None = None) -> N
         count += 1
         worst = fit if worst is None or fit.deviation > worst.deviation else worst
         first += [fit] if len(first) < FITS_DRAWN else []
-    return NoiseSummary(count, worst, first, checker.result())
-
-
-def iterate_fits(folder: AnyPath) -> Iterator[NoiseFit]:
-    """Yield the fit of each pair that has enough sites; DamageError if the dataset is damaged."""
-    for clean, noisy, row in RawPairs(folder):
-        fit = fit_pair(clean, noisy, row)
-        if fit is not None:
-            yield fit
-
-
-def fit_pair(clean: Frame, noisy: Frame, row: Row) -> NoiseFit | None:
-    """Fit the noise of one pair.
-
-    Parameters
-    ----------
-    clean, noisy : ndarray
-        Frames in the dtype and layout of the dataset.
-    row : Row
-        Row of the pair.
-
-    Returns
-    -------
-    NoiseFit or None
-        None if the pair has too few usable sites, or fewer than three clean DN.
-    """
-    sums = pair_sums(clean, noisy, row)
-    return None if sums is None else fit_sums(str(row["key"]), sums)
+    return NoiseSummary(count, worst, first, checker)
 
 
 def fit_sums(key: str, sums: Sums) -> NoiseFit | None:
-    """Fit the noise of one pair.
+    """Fit the noise of a pair by weighted least squares; None if fewer than three clean values are used.
 
-    Parameters
-    ----------
-    key : str
-        Key of the pair.
-    sums : Sums
-        Its filled sums.
-
-    Returns
-    -------
-    NoiseFit or None
-        None if fewer than three clean DN are used.
+    The covariance of slope and intercept is (XᵀWX)⁻¹ for independent sites, and that of the offsets of rows is added.
     """
-    law, planes = sums.law, planes_of(sums)
-    signal = np.concatenate([plane.expected.signal for plane in planes])
-    if len(np.unique(signal)) < 3:
+    planes = [plane for plane in sums.planes if len(plane.bins)]
+    points = joined(map(variance_points, planes))
+    if len(np.unique(points.signal)) < 3:
         return None
-    points = [plane.variance_points() for plane in planes]
-    difference, error = (np.concatenate(some) for some in zip(*points, strict=True))
-    columns = np.stack([signal, np.ones_like(signal)])
-    normal = (columns / error) @ columns.T
-    inverse = np.linalg.inv(normal)
-    slope, intercept = inverse @ ((columns / error) @ difference)
-    expected = law.line
-    shared = law.rows.variance * math.sqrt(2 * law.rows.squares / sums.height)
-    count = np.concatenate([plane.count for plane in planes])
+    design = np.stack([points.signal, np.ones_like(points.signal)])
+    inverse = np.linalg.inv((design * points.weight) @ design.T)
+    influence = inverse @ (design * points.weight)
+    count, std = (np.concatenate(values) for values in zip(*((p.count, p.expected.std) for p in planes), strict=True))
+    temporal = np.concatenate([plane.noise.temporal_variance(plane.expected.signal) for plane in planes])
+    rounding_dn2 = 0.0 if sums.plan.output.normalised else 1 / 12
+    expected = influence @ (temporal - rounding_dn2)
     drawn = count >= LEAST_SITES_OF_POINT
-    predicted = np.concatenate([law.of_site(plane.number).variance(plane.expected.signal) for plane in planes])
-    variance = difference + predicted + (0.0 if law.plan.clean_normalised else 1 / 12)
     return NoiseFit(
         key=key,
-        slope=expected[0] + float(slope),
-        slope_error=math.sqrt(inverse[0, 0]),
-        intercept=expected[1] + float(intercept),
-        intercept_error=math.sqrt(inverse[1, 1] + shared * shared),
+        estimate=expected + influence @ points.difference,
+        error=np.sqrt(influence**2 @ points.noise + _row_variances(sums, planes, influence)),
         expected=expected,
-        signal_dn=signal[drawn],
-        variance_dn2=variance[drawn],
-        rounding_dn2=law.rounding_dn2 + (0.0 if law.plan.clean_normalised else 1 / 12),
+        signal_dn=points.signal[drawn],
+        variance_dn2=(points.difference + std**2 - rounding_dn2)[drawn],
+    )
+
+
+def _row_variances(sums: Sums, planes: list[Plane], influence: Float) -> Float:
+    """Variances of slope and intercept due to the offsets of rows, which all sites of a row have in common.
+
+    An offset r changes the variance that a row shows by r² - σ², and the mean noise, which estimates x, by r. With l
+    and m the sums of the influences of a row's sites, the changes add to Σ l·(r² - σ²) + m·r over the rows.
+    """
+    offsets, ends = row_offsets(planes[0].noise), np.cumsum([len(plane.bins) for plane in planes])
+    by_square, by_offset = np.zeros((2, 2, 2, sums.height // 2))  # slope and intercept, even and odd rows
+    for plane, of_plane in zip(planes, np.split(influence, ends[:-1], axis=1), strict=True):
+        y, expected = plane.noise.site.place[0], plane.expected
+        for parameter, values in enumerate(of_plane / plane.count):
+            by_square[parameter, y] += plane.row_sums(values)
+            by_offset[parameter, y] += plane.row_sums(values * expected.slope / expected.by_variance)
+    squares, linear = ((values**2).sum(axis=(1, 2)) for values in (by_square, by_offset))
+    return np.asarray(
+        2 * offsets.variance**2 * offsets.squares * squares + offsets.variance * offsets.magnitudes * linear
     )
 
 
 def check_figure_file(to: Path) -> None:
-    """Check, before the pairs are fitted, that a figure can be drawn and written.
-
-    Parameters
-    ----------
-    to : Path
-        The PNG file.
-
-    Raises
-    ------
-    ConfigError
-        If matplotlib is missing, the suffix is not .png, or the file cannot be written or is not an earlier figure.
-    """
+    """Refuse a file for the figure, before the pairs are fitted, if it is no PNG or cannot be written."""
     if to.suffix.lower() != ".png":
         raise ConfigError(f"--to {to}: is not a PNG file; expected a name that ends with .png")
     check_output_file(to, f"--to {to}", "an earlier figure", b"matplotlib")
@@ -227,20 +149,7 @@ def check_figure_file(to: Path) -> None:
 
 
 def draw_fits(fits: list[NoiseFit], to: Path | BinaryIO) -> None:
-    """Draw variance against signal with the expected lines, as PNG.
-
-    Parameters
-    ----------
-    fits : list of NoiseFit
-        The fits to draw.
-    to : Path or binary file
-        Where to write the PNG.
-
-    Raises
-    ------
-    ConfigError
-        If matplotlib is not installed.
-    """
+    """Draw variance against signal with the expected lines, as PNG."""
     require_libraries(f"--to {to}", ("matplotlib",))
     from matplotlib.figure import Figure
 
@@ -250,7 +159,7 @@ def draw_fits(fits: list[NoiseFit], to: Path | BinaryIO) -> None:
         colour = f"C{number % 10}"
         axes.plot(fit.signal_dn, fit.variance_dn2, ".", color=colour, markersize=2, alpha=0.5)
         ends = np.array([fit.signal_dn.min(initial=0.0), fit.signal_dn.max(initial=0.0)])
-        axes.plot(ends, fit.expected[0] * ends + fit.expected[1] + fit.rounding_dn2, color=colour, label=fit.key)
-    axes.set(xlabel="signal above black (DN)", ylabel="variance of noisy - clean (DN²)", title="Photon transfer")
+        axes.plot(ends, fit.expected[0] * ends + fit.expected[1], color=colour, label=fit.key)
+    axes.set(xlabel="signal above black (DN)", ylabel="variance of the noise (DN²)", title="Photon transfer")
     axes.legend(title="line: expected from the manifest")
     figure.savefig(to, dpi=120)

@@ -1,7 +1,7 @@
 """Simulate the clean and noisy raw frame of one image: the module to read first.
 
 `reference_pair` defines a pair with the NumPy reference, in the order of the article. `make_pair` computes the same
-frames with compiled kernels, about 50 times as fast; datasets are made with it. Tests compare both on photographs and
+frames with compiled kernels, much faster; datasets are made with it. Tests compare both on photographs and
 on every option.
 
 In both, a pair is computed in three steps: unprocess the image to the clean frame, add the effects of the sensor, then
@@ -17,8 +17,9 @@ import numpy as np
 
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import PACKED, Counts, DarkPixels, Float, Frame, Pair, Plan, Srgb
+from unprocess_gen.simulation.effects import order
+from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.kernels.render import pass_key, render_pairs
-from unprocess_gen.simulation.reference import noise
 from unprocess_gen.simulation.reference.cfa import pack
 from unprocess_gen.simulation.reference.sensor import noisy_limits, normalise, quantise, to_dn
 from unprocess_gen.simulation.reference.unprocess import dequantise, unprocess
@@ -85,7 +86,7 @@ def make_pairs(
     """
     for plan in plans:
         _check_image(srgb, plan, origin)
-    if any(_clean_frame_parameters(plan) != _clean_frame_parameters(plans[0]) for plan in plans[1:]):
+    if any(plan.clean != plans[0].clean for plan in plans[1:]):
         raise ValueError(
             "the clean frames of the plans differ; expected plans that differ in noise, level and draw only"
         )
@@ -101,7 +102,7 @@ def _pairs(
     srgb = _dequantise(srgb, plans[0], origin)
     clean: Frame | None = None
     for some in _passes(plans):
-        if some[0].uses_reference:
+        if some[0].accuracy.uses_reference:
             for plan in some:
                 pair = _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
                 yield _arrange_pair(pair, plan, origin)
@@ -128,20 +129,6 @@ def _passes(plans: Sequence[Plan]) -> Iterator[list[Plan]]:
         some.append(plan)
     if some:
         yield some
-
-
-def _clean_frame_parameters(plan: Plan) -> tuple[object, ...]:
-    """Return all parameters of a plan that affect the clean frame."""
-    without_noise = replace(
-        plan, sensor_clip="", saturated="", noise="", noise_law="", a_dn=0.0, b_dn2=0.0,
-        effects=(), skipped=(), assumed=(), physics=None, level=0, draw=0, frame=0,
-        dark_frame="", dark_shift=(0, 0), dark_black_dn=0.0, dark_scale=1.0, dark_shading="",
-    )  # fmt: skip
-    physics = plan.physics
-    shading = None
-    if physics is not None and "lens_shading" in plan.effects:
-        shading = physics.lens_shading, physics.frame_size
-    return without_noise, plan.brightest, shading, plan.averaged and (physics, plan.effects, plan.sensor_clip)
 
 
 def reference_pair(
@@ -190,15 +177,15 @@ def _reference_pair(
 def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None) -> Float:
     """Return the light of the scene at each CFA site, 0 at black and 1 at white, before clipping."""
     light = unprocess(srgb, plan, origin, curve)
-    if plan.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
-        light = np.minimum(light, 1) * plan.exposure
-    factor = noise.light_factor(plan, light.shape, origin)
+    if plan.scene.exposure != 1:  # clip at white first; otherwise light above white would reappear once darkened
+        light = np.minimum(light, 1) * plan.scene.exposure
+    factor = order.light_factor(plan, light.shape, origin)
     return light if factor is None else light * factor
 
 
 def _clean_dn(light: Float, plan: Plan) -> Float:
     """Return the clipped clean frame in DN, unrounded."""
-    return to_dn(light, plan.black_level_dn, plan.white_level_dn, plan.brightest)
+    return to_dn(light, plan.sensor.black_level_dn, plan.sensor.white_level_dn, plan.brightest)
 
 
 def _count_clipped(light: Float, plan: Plan) -> tuple[int, int]:
@@ -217,25 +204,25 @@ def _read_out(
 
     ``clipped`` is the result of `_count_clipped` for the clean frame.
     """
-    noisy_dn = noise.noisy(clean_dn, plan, origin, dark_pixels)
-    if plan.saturated == "pinned":
+    noisy_dn = order.noisy(clean_dn, plan, origin, dark_pixels)
+    if plan.noise.saturated == "pinned":
         noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
-    averaged_dn = noise.average(clean_dn, plan, origin) if plan.averaged else clean_dn
+    averaged_dn = order.average(clean_dn, plan, origin) if plan.noise.averaged else clean_dn
 
     low, high = _limits_dn(plan)
-    levels_dn = plan.black_level_dn, plan.white_level_dn
-    lowest, highest = (low, high) if plan.averaged else levels_dn
-    read_dn = noisy_dn if plan.normalised else np.rint(noisy_dn)
-    clean = _frame_of(averaged_dn, lowest, highest, plan.clean_normalised, levels_dn)
-    noisy = _frame_of(noisy_dn, low, high, plan.normalised, levels_dn)
+    levels_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn
+    lowest, highest = (low, high) if plan.noise.averaged else levels_dn
+    read_dn = noisy_dn if plan.output.normalised else np.rint(noisy_dn)
+    clean = _frame_of(averaged_dn, lowest, highest, plan.output.clean_normalised, levels_dn)
+    noisy = _frame_of(noisy_dn, low, high, plan.output.normalised, levels_dn)
 
     counts = Counts(
         clean_clipped_low=clipped[0],
         clean_clipped_high=clipped[1],
         noisy_clipped_low=int((read_dn < low).sum()),
         noisy_clipped_high=int((read_dn > high).sum()),
-        saturated=int((clean == (1 if plan.clean_normalised else plan.white_level_dn)).sum()),
-        zero_variance=int((noise.noise_variance(clean_dn, plan) == 0).sum()),
+        saturated=int((clean == (1 if plan.output.clean_normalised else plan.sensor.white_level_dn)).sum()),
+        zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
     )
     return Pair(clean, noisy, counts)
 
@@ -255,24 +242,24 @@ def _arrange_pair(pair: Pair, plan: Plan, origin: tuple[int, int]) -> Pair:
 
 def _arrange(mosaic: Frame, plan: Plan, origin: tuple[int, int]) -> Frame:
     """Convert a mosaic to the plan's layout."""
-    return pack(mosaic, plan.pattern, origin) if plan.layout == PACKED else mosaic
+    return pack(mosaic, plan.sensor.pattern, origin) if plan.output.layout == PACKED else mosaic
 
 
 def _dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
     """Dither 8-bit codes to 16 bits if the plan asks for it."""
-    if plan.dequantize == "off" or srgb.dtype != np.uint8:
+    if plan.source.dequantize == "off" or srgb.dtype != np.uint8:
         return srgb
-    return dequantise(srgb, plan, linear_table(plan.tone, plan.gamma, 256), origin)
+    return dequantise(srgb, plan, linear_table(plan.isp.tone, plan.isp.gamma, 256), origin)
 
 
 def _curve(srgb: Srgb, plan: Plan) -> Float:
     """Return the exact curve from the image's codes to linear light."""
-    return linear_table(plan.tone, plan.gamma, int(np.iinfo(srgb.dtype).max) + 1)
+    return linear_table(plan.isp.tone, plan.isp.gamma, int(np.iinfo(srgb.dtype).max) + 1)
 
 
 def _limits_dn(plan: Plan) -> tuple[float, float]:
     """Return the lowest and highest DN of the noisy frame."""
-    return noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip)
+    return noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
 
 
 _DTYPES = np.dtype(np.uint8), np.dtype(np.uint16)
@@ -283,10 +270,10 @@ def _check_image(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> None:
     """Raise ValueError if an image has an unusable dtype or shape, or is not inside the frame of the lens shading."""
     if srgb.dtype not in _DTYPES or srgb.ndim != 3 or srgb.shape[2] != 3:
         raise ValueError(f"srgb={srgb.dtype} {list(srgb.shape)}: unusable array; expected uint8 or uint16 [H, W, 3]")
-    if plan.layout == PACKED and (srgb.shape[0] % 2 or srgb.shape[1] % 2):
+    if plan.output.layout == PACKED and (srgb.shape[0] % 2 or srgb.shape[1] % 2):
         raise ValueError(f"srgb={list(srgb.shape)}: odd side; expected even height and width for layout={PACKED}")
-    if plan.physics is not None and "lens_shading" in plan.effects:
-        _check_inside(srgb.shape, plan.physics.frame_size, origin)
+    if plan.noise.physics is not None and "lens_shading" in plan.noise.effects:
+        _check_inside(srgb.shape, plan.noise.physics.frame_size, origin)
 
 
 def _check_inside(shape: tuple[int, ...], frame_size: tuple[int, int], origin: tuple[int, int]) -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -26,10 +25,25 @@ from unprocess_gen.core.jit import has_run, kernel, note_run
 from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import FLOAT32, FLOAT32_METHOD, REFERENCE_METHOD, Float, Physics, Plan, Srgb
+from unprocess_gen.core.types import (
+    FLOAT32,
+    FLOAT32_METHOD,
+    NEAR_NORMAL,
+    REFERENCE_METHOD,
+    AccuracyPlan,
+    CameraPlan,
+    Float,
+    IspPlan,
+    NoisePlan,
+    Plan,
+    ScenePlan,
+    SensorPlan,
+    SourcePlan,
+    Srgb,
+)
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS, Physics
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.reference.noise import EFFECTS
 
 KNOWN_ANSWERS = (
     # Random123's kat_vectors, philox4x32-10: counter, key, output.
@@ -45,34 +59,31 @@ KNOWN_ANSWERS = (
 GOLDEN_PLAN = Plan(
     seed=0,
     stream_key=0x0123456789ABCDEF,
-    downscale=1,
-    dequantize="off",
-    scene="daylight",
-    exposure_ratio=1.0,
-    camera="custom",
-    weights=(0.0, 0.0, 0.0, 0.0),
-    rgb2cam=(0.5625, 0.3125, 0.125, 0.125, 0.75, 0.125, 0.03125, 0.21875, 0.75),
-    red_gain=2.15,
-    blue_gain=1.7,
-    inverse_rgb_gain=0.8,
-    tone="smoothstep",
-    gamma=2.2,
-    highlight="per_channel",
-    highlight_threshold=0.9,
-    pattern="GRBG",
-    bits=10,
-    black_level_dn=64,
-    white_level_dn=1023,
-    sensor_clip="sensor",
-    saturated="noisy",
-    noise="imx385_iso25600",
-    noise_law="gaussian",
-    a_dn=55.0,
-    b_dn2=2500.0,
-    effects=("heteroscedastic",),
-    skipped=(),
-    accuracy="exact",
-    methods=(),
+    source=SourcePlan(downscale=1, dequantize="off"),
+    scene=ScenePlan("daylight", exposure_ratio=1.0),
+    camera=CameraPlan(
+        "custom",
+        weights=(0.0, 0.0, 0.0, 0.0),
+        rgb2cam=(0.5625, 0.3125, 0.125, 0.125, 0.75, 0.125, 0.03125, 0.21875, 0.75),
+        red_gain=2.15,
+        blue_gain=1.7,
+        inverse_rgb_gain=0.8,
+        highlight="per_channel",
+        highlight_threshold=0.9,
+    ),
+    isp=IspPlan("smoothstep", gamma=2.2),
+    sensor=SensorPlan("GRBG", bits=10, black_level_dn=64, white_level_dn=1023),
+    noise=NoisePlan(
+        "imx385_iso25600",
+        "gaussian",
+        a_dn=55.0,
+        b_dn2=2500.0,
+        effects=("heteroscedastic",),
+        skipped=(),
+        sensor_clip="sensor",
+        saturated="noisy",
+    ),
+    accuracy=AccuracyPlan("exact", methods=()),
 )
 GOLDEN_PHYSICS = Physics(
     iso=3200.0,
@@ -97,33 +108,21 @@ GOLDEN_PHYSICS = Physics(
     fixed_pattern_in_clean=False,
     frame_size=(4096, 4096),
 )
+_COUNTS = GOLDEN_PLAN.replace(physics=GOLDEN_PHYSICS, effects=("shot", "read", "row", "black_error", "quantise"))
+_NEAR = _COUNTS.replace(effects=("shot", "read", "quantise"), law_distance=0.01, methods=(NEAR_NORMAL,))
+_PHYSICAL = _COUNTS.replace(effects=PHYSICAL_EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3)
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
-    "gray_mean": replace(GOLDEN_PLAN, highlight="gray_mean"),
-    "float32": replace(GOLDEN_PLAN, methods=(FLOAT32_METHOD,), bits=16, black_level_dn=4096, white_level_dn=65535),
-    "reference": replace(GOLDEN_PLAN, methods=(REFERENCE_METHOD,)),
-    "plain": replace(
-        GOLDEN_PLAN,
-        physics=GOLDEN_PHYSICS,
-        effects=("shot", "read", "row", "black_error", "quantise"),
-    ),
-    "near": replace(
-        GOLDEN_PLAN,
-        highlight="gray_mean",
-        physics=GOLDEN_PHYSICS,
-        effects=("shot", "read", "quantise"),
-        law_distance=0.01,
-        methods=("shot:gaussian_where_near",),
-    ),
-    "physical": replace(
-        GOLDEN_PLAN, physics=GOLDEN_PHYSICS, effects=EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3
-    ),
-}
-GOLDEN_PLANS |= {
-    "normalised": replace(GOLDEN_PLAN, dtype=FLOAT32, sensor_clip="none"),
-    "normalised_counts": replace(GOLDEN_PLANS["physical"], dtype=FLOAT32, sensor_clip="none"),
-    "float_clean": replace(GOLDEN_PLAN, clean_dtype=FLOAT32),
-    "float_clean_counts": replace(GOLDEN_PLANS["physical"], clean_dtype=FLOAT32),
+    "gray_mean": GOLDEN_PLAN.replace(highlight="gray_mean"),
+    "float32": GOLDEN_PLAN.replace(methods=(FLOAT32_METHOD,), bits=16, black_level_dn=4096, white_level_dn=65535),
+    "reference": GOLDEN_PLAN.replace(methods=(REFERENCE_METHOD,)),
+    "plain": _COUNTS,
+    "near": _NEAR.replace(highlight="gray_mean"),
+    "physical": _PHYSICAL,
+    "normalised": GOLDEN_PLAN.replace(dtype=FLOAT32, sensor_clip="none"),
+    "normalised_counts": _PHYSICAL.replace(dtype=FLOAT32, sensor_clip="none"),
+    "float_clean": GOLDEN_PLAN.replace(clean_dtype=FLOAT32),
+    "float_clean_counts": _PHYSICAL.replace(clean_dtype=FLOAT32),
 }
 GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
@@ -139,97 +138,39 @@ GOLDEN = {
     "float_clean_counts": ("db1e51d036e01d5eaca3d0ebedbab809", "034a49f0e3f78996ab8d340da875038e"),
     "physical": ("ae069ed854a5cf392b7ed42acbf49489", "034a49f0e3f78996ab8d340da875038e"),
 }
-GOLDEN_PAIRS = {
-    "gaussian": ("per_channel", "gray_mean"),
-    "float32": ("float32",),
-    "electrons": ("plain", "near", "physical"),
-    "reference": ("reference",),
-    "normalised": ("normalised",),
-    "normalised_electrons": ("normalised_counts",),
-    "float_clean": ("float_clean",),
-    "float_clean_electrons": ("float_clean_counts",),
-}
-"""Golden pairs for each form of the renderer. A run tests only the forms that it needs: compiling one takes seconds."""
-
-
-def are_compiled(kernels: str) -> bool:
-    """Return whether a set of kernels has machine code, so that the first pair does not wait for the compiler.
-
-    Parameters
-    ----------
-    kernels : str
-        Key of `GOLDEN_PAIRS`.
-
-    Returns
-    -------
-    bool
-        True if its golden pairs were simulated by this process, or by one that shares its cache.
-    """
-    return kernels == "reference" or has_run(kernels)
 
 
 def kernels(plan: Plan) -> str:
-    """Return the set of kernels that simulates the pair of a plan.
-
-    Parameters
-    ----------
-    plan : Plan
-        Parameters of the pair.
-
-    Returns
-    -------
-    str
-        Key of `GOLDEN_PAIRS`.
-    """
-    if plan.uses_reference:
+    """Return the name of the set of kernels that simulates a plan; sets are compiled one by one, in seconds."""
+    if plan.accuracy.uses_reference:
         return "reference"
-    noise = "electrons" if plan.counts_electrons else "gaussian"
-    if plan.clean_normalised:
-        form = "normalised" if plan.normalised else "float_clean"
-        return f"{form}_electrons" if noise == "electrons" else form
+    noise = "electrons" if plan.noise.counts_electrons else "gaussian"
+    if plan.output.clean_normalised:
+        return f"{'normalised' if plan.output.normalised else 'float_clean'}_{noise}"
     return "float32" if uses_scene32(plan) else noise
 
 
-def check(kernels: str, advice: str = "") -> None:
-    """Raise an error if this process computes other values than every other machine.
+def are_compiled(kernel_set: str) -> bool:
+    """Return whether a set of kernels has machine code, so that the first pair does not wait for the compiler."""
+    return kernel_set == "reference" or has_run(kernel_set)
 
-    Parameters
-    ----------
-    kernels : str
-        Key of `GOLDEN_PAIRS`.
-    advice : str
-        Text appended to the message.
 
-    Raises
-    ------
-    MachineError
-        If a test fails; the message names every failed test.
-    """
-    if failures(kernels):
+def check(kernel_set: str, advice: str = "") -> None:
+    """Raise MachineError if this process computes other values than every other machine; end it with ``advice``."""
+    if failures(kernel_set):
         raise MachineError(
-            f"the self-test failed: results differ ({'; '.join(failures(kernels))}); expected those of every machine; "
-            f"try other versions of numpy and numba{advice}"
+            f"the self-test failed: results differ ({'; '.join(failures(kernel_set))}); expected those of every "
+            f"machine; try other versions of numpy and numba{advice}"
         )
 
 
-@functools.lru_cache(maxsize=len(GOLDEN_PAIRS))
-def failures(kernels: str) -> tuple[str, ...]:
-    """Run the tests for a set of kernels, once per process.
-
-    Parameters
-    ----------
-    kernels : str
-        Key of `GOLDEN_PAIRS`.
-
-    Returns
-    -------
-    tuple of str
-        One description for each failed test.
-    """
-    return tuple(_failures(kernels))
+@functools.cache
+def failures(kernel_set: str) -> tuple[str, ...]:
+    """Return a description of each failed test of a set of kernels, tested once per process."""
+    return tuple(_failures(kernel_set))
 
 
-def _failures(kernels: str) -> Iterator[str]:
+def _failures(kernel_set: str) -> Iterator[str]:
     """Yield a description of each failed test."""
     try:
         _ = linear_table("smoothstep", 2.2, 256), normal_table()
@@ -244,13 +185,14 @@ def _failures(kernels: str) -> Iterator[str]:
     _product_and_sum(np.full(8, 1 + 2.0**-30), np.full(8, -1 - 2.0**-29), difference)
     if difference.any():
         yield "a kernel uses a fused multiply-add"
-    for name in GOLDEN_PAIRS[kernels]:
-        expected = GOLDEN[name]
+    for name in (name for name, plan in GOLDEN_PLANS.items() if kernels(plan) == kernel_set):
         pair = make_pair(golden_image(), GOLDEN_PLANS[name], (1, 57))
-        for name_of_frame, frame, digest in zip(("clean", "noisy"), (pair.clean, pair.noisy), expected, strict=True):
+        for name_of_frame, frame, digest in zip(
+            ("clean", "noisy"), (pair.clean, pair.noisy), GOLDEN[name], strict=True
+        ):
             if (found := array_xxh3(frame)) != digest:
                 yield f"the golden {name_of_frame} frame ({name}) is {found}, expected {digest}"
-    note_run(kernels)  # also after a failure: nothing is left to compile
+    note_run(kernel_set)  # also after a failure: nothing is left to compile
 
 
 @kernel

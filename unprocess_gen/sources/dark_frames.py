@@ -50,14 +50,8 @@ BRIGHTEST_MEDIAN = 0.05
 class DarkFolder:
     """Read the dark frames of a folder by their digests.
 
-    Parameters
-    ----------
-    folder : str
-        The folder.
-    files : mapping of str to str
-        Name of each file by its SHA-256; of twins the last by name.
-    shading_place : str or None
-        Dark-shading map, or folder of such maps; None to know only the mean of the frames.
+    ``files`` has the name of each file by its SHA-256; of twins the last by name. ``shading_place`` is a dark-shading
+    map, or a folder of such maps; None to know only the mean of the frames.
     """
 
     folder: str
@@ -70,23 +64,7 @@ class DarkFolder:
         return hashlib.sha256("\n".join(["dark frames 1", *sorted(self.files)]).encode()).hexdigest()
 
     def frame(self, sha256: str) -> Raw:
-        """Return the mosaic of a frame, cropped to even sides.
-
-        Parameters
-        ----------
-        sha256 : str
-            SHA-256 of its file.
-
-        Returns
-        -------
-        ndarray of uint16, [H, W]
-            Read-only if the file is mapped.
-
-        Raises
-        ------
-        SourceChangedError
-            If the folder has no such file, or its bytes have changed.
-        """
+        """Return the mosaic of a frame, uint16 [H, W] with even sides; read-only if the file is mapped."""
         name = self.files.get(sha256)
         if name is None:
             raise SourceChangedError(
@@ -96,22 +74,9 @@ class DarkFolder:
         return even_sides((_mapped if name.lower().endswith(".npy") else _decoded)(Path(self.folder) / name, sha256))
 
     def shading(self, sha256: str) -> NDArray[np.float32]:
-        """Return the map that is subtracted from the frames.
+        """Return the map that is subtracted from the frames, float32 [H, W] in DN of the frames.
 
-        Parameters
-        ----------
-        sha256 : str
-            SHA-256 of the set (`DarkFolder.sha256`) for the mean of all frames, or of the file of a map.
-
-        Returns
-        -------
-        ndarray of float32, [H, W]
-            DN of the frames.
-
-        Raises
-        ------
-        SourceChangedError
-            If the folder has another set of frames, and there is no map with this digest.
+        ``sha256`` is that of the set for the mean of all frames, or that of the file of a map.
         """
         if sha256 == self.sha256:
             return _mean(self.folder, tuple(sorted(self.files)), self)
@@ -130,24 +95,7 @@ class DarkFolder:
 def dark_folder(folder: str, shading_place: str | None = None) -> DarkFolder:
     """Return access to the dark frames of a folder.
 
-    Parameters
-    ----------
-    folder : str
-        The folder.
-    shading_place : str or None
-        Dark-shading map, or folder of such maps.
-
-    Returns
-    -------
-    DarkFolder
-        With the digests of all files; no file has been decoded.
-
-    Raises
-    ------
-    ConfigError
-        If the folder does not exist or contains no file with one of `SUFFIXES`.
-    MachineError
-        If a file cannot be read.
+    Raises ConfigError or MachineError.
     """
     try:
         names = sorted(path.name for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
@@ -173,12 +121,7 @@ class DarkPlaces:
     def open(self) -> DarkFolder | None:
         """Return access to the dark frames, None without a folder.
 
-        Raises
-        ------
-        ConfigError
-            As `dark_folder`, or if the place of the map does not exist.
-        MachineError
-            As `dark_folder`.
+        Raises ConfigError or MachineError.
         """
         if self.frames is None:
             return None
@@ -194,46 +137,22 @@ NO_DARK_FRAMES = DarkPlaces()
 """For datasets without dark frames."""
 
 
-def set_dark_places(config: Config, places: DarkPlaces) -> None:
-    """Add the places of dark frames and of their map to a recorded configuration, which has their digests.
+def with_dark_places(config: Config, places: DarkPlaces) -> Config:
+    """Return a recorded config, which has the digests of dark frames and of their map, with their places.
 
-    Parameters
-    ----------
-    config : Config
-        Configuration from a ``config.yaml``; it is changed.
-    places : DarkPlaces
-        Where they are. The place of the map is ignored if the configuration records no map.
+    The place of the map is ignored if the config records no map.
     """
-    config.noise.dark_frames = places.frames
-    if config.noise.dark_shading_sha256 is not None and places.shading is not None:
-        config.noise.dark_shading = places.shading
+    noise = replace(config.noise, dark_frames=places.frames)
+    if noise.dark_shading_sha256 is not None and places.shading is not None:
+        noise = replace(noise, dark_shading=places.shading)
+    return replace(config, noise=noise)
 
 
 def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFolder | None]:
-    """Read and check the dark frames of a run.
+    """Read and check the dark frames of a run; return its config, what plans need, and access to the pixels.
 
-    Parameters
-    ----------
-    config : Config
-        Validated configuration.
-
-    Returns
-    -------
-    config : Config
-        The configuration with the digests of the set and of the map, which ``config.yaml`` records.
-    dark_frames : DarkFrames or None
-        What plans need; None without ``noise.dark_frames``.
-    folder : DarkFolder or None
-        Access to the pixels.
-
-    Raises
-    ------
-    ConfigError
-        If a file is no dark frame of this camera, or there is no map for the ISO of the run, or it does not fit.
-    SourceChangedError
-        If the configuration records another set of frames, or another map.
-    MachineError
-        If a file cannot be read.
+    The config contains the digests of the set and of the map, which ``config.yaml`` records. Without dark frames, the
+    others are None. Raises ConfigError, SourceChangedError or MachineError.
     """
     if not uses_dark_frames(config.noise):
         return config, None, None
@@ -395,7 +314,7 @@ def _check(folder: DarkFolder, name: str, mosaic: Mosaic, rules: _Rules) -> None
 def _black_level(folder: DarkFolder, stated: set[float | None]) -> float | None:
     """Return the black level that all files state; None if no file states one."""
     if len(stated) > 1:
-        levels = ", ".join("none" if one is None else f"{one:g}" for one in sorted(stated, key=str))
+        levels = ", ".join("none" if level is None else f"{level:g}" for level in sorted(stated, key=str))
         raise ConfigError(
             f"noise.dark_frames={folder.folder}: the files state several black levels ({levels} DN); expected one; "
             "set noise.dark_frames_black_dn"

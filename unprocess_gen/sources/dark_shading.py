@@ -58,22 +58,7 @@ Map = NDArray[np.float32]
 def choose_map(place: str, iso: float) -> Path:
     """Return the file of the map for an ISO.
 
-    Parameters
-    ----------
-    place : str
-        A map, or a folder of maps with their ISO in their names.
-    iso : float
-        ISO of the run.
-
-    Returns
-    -------
-    Path
-        A file. A single map may have a name without ISO.
-
-    Raises
-    ------
-    ConfigError
-        If there is none for this ISO, or several.
+    Raises ConfigError.
     """
     start, path = f"{KEY}={place}", Path(place)
     if path.is_file():
@@ -83,47 +68,34 @@ def choose_map(place: str, iso: float) -> Path:
         return path
     if not path.is_dir():
         raise ConfigError(f"{start}: no such file or folder; expected keep, remove, or a dark-shading map")
-    by_iso = [(stated, one) for one in maps_of(place) if (stated := _iso_of(one)) is not None]
+    by_iso = [(iso_in_name, path) for path in maps_of(place) if (iso_in_name := _iso_of(path)) is not None]
     if not by_iso:
         raise ConfigError(f"{start}: contains no map with its ISO in its name; expected a file such as iso{iso:g}.npy")
-    chosen = [one for stated, one in by_iso if stated == iso]
+    chosen = [path for iso_in_name, path in by_iso if iso_in_name == iso]
     if not chosen:
-        isos = ", ".join(str(stated) for stated in sorted({stated for stated, _ in by_iso}))
+        isos = ", ".join(map(str, sorted({iso_in_name for iso_in_name, _ in by_iso})))
         raise ConfigError(f"{start}: contains no map of ISO {iso:g}; expected one; its maps are of ISO {isos}")
     if len(chosen) > 1:
-        names = ", ".join(one.name for one in chosen)
+        names = ", ".join(path.name for path in chosen)
         raise ConfigError(f"{start}: contains several maps of ISO {iso:g}: {names}; expected one")
     return chosen[0]
 
 
 def _iso_of(path: Path) -> int | None:
-    found = ISO_IN_NAME.search(path.name)
-    return int(found[1]) if found else None
+    match = ISO_IN_NAME.search(path.name)
+    return int(match[1]) if match else None
 
 
 def maps_of(place: str) -> list[Path]:
     """Return the files of a folder that may be maps, sorted; or the file itself.
 
-    Parameters
-    ----------
-    place : str
-        A file or a folder.
-
-    Returns
-    -------
-    list of Path
-        Files with a suffix of `mosaics.SUFFIXES`; empty if the place does not exist.
-
-    Raises
-    ------
-    MachineError
-        If the folder cannot be read.
+    Raises MachineError.
     """
     path = Path(place)
     if not path.is_dir():
         return [path] if path.is_file() else []
     try:
-        return sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES and one.is_file())
+        return sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise MachineError(f"{KEY}={place}: cannot be read ({error.strerror})") from error
 
@@ -131,32 +103,17 @@ def maps_of(place: str) -> list[Path]:
 def find_map(place: str, sha256: str) -> Path:
     """Return the map with a digest.
 
-    Parameters
-    ----------
-    place : str
-        A map, or a folder of maps with any names.
-    sha256 : str
-        SHA-256 of its file.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    SourceChangedError
-        If there is none.
+    Raises SourceChangedError.
     """
     files = maps_of(place)
     for path in files:
         try:
-            found = mosaic_sha256(path)
+            digest = mosaic_sha256(path)
         except OSError as error:
             raise SourceChangedError(f"{KEY}={place}: cannot be read ({error.strerror}); restore it") from error
-        if found == sha256:
+        if digest == sha256:
             return path
-    problem = f"has the SHA-256 {found}" if files and Path(place).is_file() else "has no such map"
+    problem = f"has the SHA-256 {digest}" if files and Path(place).is_file() else "has no such map"
     problem = problem if Path(place).exists() else "no such file or folder"
     raise SourceChangedError(
         f"{KEY}={place}: {problem}; expected the dark-shading map with the SHA-256 {sha256}, as recorded; restore the "
@@ -168,24 +125,7 @@ def find_map(place: str, sha256: str) -> Path:
 def shading_map(path: Path, sha256: str) -> Map:
     """Return the values of a map.
 
-    Parameters
-    ----------
-    path : Path
-        Its file.
-    sha256 : str
-        SHA-256 of the file, which `find_map` has compared.
-
-    Returns
-    -------
-    ndarray of float32, [H, W]
-        Even sides; read-only if the file is mapped.
-
-    Raises
-    ------
-    ConfigError
-        If the file is no map.
-    MachineError
-        If it cannot be read.
+    The result is float32, [H, W]. Raises ConfigError or MachineError.
     """
     is_mapped = path.suffix.lower() == ".npy"
     pixels: Any = map_mosaic(path, KEY, numbers=True) if is_mapped else read_mosaic(path, KEY, numbers=True).pixels
@@ -199,53 +139,18 @@ def shading_map(path: Path, sha256: str) -> Map:
 
 
 def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield the rows of blocks of about `BLOCK_SITES`, so that wider types take little memory.
-
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width.
-
-    Yields
-    ------
-    slice
-        Rows of one block.
-    """
+    """Yield the rows of blocks of about `BLOCK_SITES`, so that wider types take little memory."""
     step = max(1, BLOCK_SITES // shape[1])
     return (slice(top, top + step) for top in range(0, shape[0], step))
 
 
 def median_of(counts: Counts) -> int:
-    """Return the lower median of counted integers.
-
-    Parameters
-    ----------
-    counts : ndarray of int64
-        Number of each value, from 0.
-
-    Returns
-    -------
-    int
-        The median.
-    """
+    """Return the lower median of counted integers."""
     return int(np.searchsorted(np.cumsum(counts), (int(counts.sum()) + 1) // 2))
 
 
 def trimmed_variance(counts: Counts, steps: int) -> float:
-    """Return the variance of counted integers, without the `FARTHEST` at both ends; exact.
-
-    Parameters
-    ----------
-    counts : ndarray of int64
-        Number of each value, from 0.
-    steps : int
-        Steps of the values per DN.
-
-    Returns
-    -------
-    float
-        DN².
-    """
+    """Return the variance of counted integers, without the `FARTHEST` at both ends; exact."""
     cut = int(int(counts.sum()) * FARTHEST)
     ascending = np.cumsum(counts)
     kept = np.diff(np.clip(ascending, cut, int(ascending[-1]) - cut), prepend=cut)
@@ -259,12 +164,7 @@ def trimmed_variance(counts: Counts, steps: int) -> float:
 class Differences:
     """Count the differences of dark frames from a map, in steps of 1/16 DN.
 
-    Parameters
-    ----------
-    values : ndarray of float32, [H, W]
-        The map.
-    black_dn : float
-        Value that is subtracted too.
+    ``values`` is the map, float32 [H, W]; ``black_dn`` is subtracted too.
     """
 
     def __init__(self, values: Map, black_dn: float) -> None:
@@ -291,37 +191,13 @@ class Differences:
 
 
 def map_median(values: Map) -> float:
-    """Return the lower median of a map.
-
-    Parameters
-    ----------
-    values : ndarray of float32, [H, W]
-        The map.
-
-    Returns
-    -------
-    float
-        DN.
-    """
+    """Return the lower median of a map."""
     flat = values.reshape(-1)
     return float(np.partition(flat, (flat.size - 1) // 2)[(flat.size - 1) // 2])
 
 
 def is_above_black(values: Map, black_dn: float) -> bool:
-    """Return whether a map is in DN above black: its median is nearer to 0 than to the black level.
-
-    Parameters
-    ----------
-    values : ndarray of float32, [H, W]
-        The map.
-    black_dn : float
-        Black level of the frames.
-
-    Returns
-    -------
-    bool
-        False if the map contains the black level. Dark shading is much smaller than a black level.
-    """
+    """Return whether a map is in DN above black: its median is nearer to 0 than to the black level."""
     median_dn = map_median(values)
     return abs(median_dn) < abs(median_dn - black_dn)
 
@@ -329,17 +205,7 @@ def is_above_black(values: Map, black_dn: float) -> bool:
 def check_residual(path: Path, median_dn: float, variance_dn2: float) -> None:
     """Refuse a map that does not fit the frames, such as that of a camera with another black level.
 
-    Parameters
-    ----------
-    path : Path
-        File of the map.
-    median_dn, variance_dn2 : float
-        Median and variance of the frames minus the map, DN.
-
-    Raises
-    ------
-    ConfigError
-        If the median is farther from 0 than a standard deviation of the noise, and than `LARGEST_RESIDUAL_DN`.
+    Raises ConfigError.
     """
     if abs(median_dn) > max(LARGEST_RESIDUAL_DN, math.sqrt(variance_dn2)):
         raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 
@@ -13,31 +13,26 @@ import numpy as np
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
-from unprocess_gen.core.object_store import is_url
+from unprocess_gen.core.paths import local_path
 from unprocess_gen.core.types import MOSAIC, NO_CLIP, PACKED, Photograph, Source, Srgb
-from unprocess_gen.sources import listing
+from unprocess_gen.sources import reading
+from unprocess_gen.sources.clips import clip_warnings, number_clips
 from unprocess_gen.sources.image import decode
+from unprocess_gen.sources.listing import Listing, list_folder, matcher
 from unprocess_gen.sources.read_ahead import Read
 from unprocess_gen.sources.scenes import synthetic
+from unprocess_gen.sources.twins import number_twins
 from unprocess_gen.sources.video.decode import Video, is_installed
 
 OPEN_VIDEOS = 2
 """Videos that a process keeps open: that of the current shard, and the next one."""
 
 
-def list_photographs(config: SourceConfig) -> listing.Listing:
-    """List every source of the run in order, with identical files and frames of clips numbered.
+def list_photographs(config: SourceConfig) -> Listing:
+    """List every source of the run in order, with identical files and frames of clips numbered; decode no pixel.
 
-    Parameters
-    ----------
-    config : SourceConfig
-        Validated settings of the source. With ``clips``, a file that ``video`` matches becomes one source for each
-        frame, or one failed source if it has no readable frame.
-
-    Returns
-    -------
-    Listing
-        No pixel has been decoded for it.
+    With ``clips``, a file that ``video`` matches becomes one source for each frame, or one failed source if it has no
+    readable frame.
 
     Raises
     ------
@@ -49,43 +44,24 @@ def list_photographs(config: SourceConfig) -> listing.Listing:
     """
     if config.root is None:
         scenes = synthetic.listing(config.limit)
-        return listing.Listing(tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes)))
+        return Listing(tuple(Source(index, name, name, size_bytes=0) for index, name in enumerate(scenes)))
     include = [*config.include, *(config.video if config.clips else ())]
-    video = () if config.clips else config.video
-    listed = listing.list_folder(config.root, include, config.recursive, config.limit, video)
-    numbered = listing.number_twins(config.root, listed.sources)
-    if config.clips:
-        _refuse_remote_videos(config, numbered)
-        framed = itertools.islice(_framed(config, numbered), config.limit)
-        numbered = listing.number_clips(
-            config.root, [replace(source, index=index) for index, source in enumerate(framed)]
-        )
-    warnings = listing.clip_warnings(numbered) if config.clips else ()
-    return replace(listed, sources=numbered, warnings=warnings)
+    listed = list_folder(config.root, include, config.recursive, config.limit, () if config.clips else config.video)
+    numbered = number_twins(config.root, listed.sources)
+    if not config.clips:
+        return replace(listed, sources=numbered)
+    _refuse_remote_videos(config, config.root, numbered)
+    framed = itertools.islice(_framed(config, numbered), config.limit)
+    numbered = number_clips(config.root, [replace(source, index=index) for index, source in enumerate(framed)])
+    return replace(listed, sources=numbered, warnings=clip_warnings(numbered))
 
 
 def load_source(
-    config: SourceConfig, source: Source, layout: str = MOSAIC, read: Read = listing.read_bytes
+    config: SourceConfig, source: Source, layout: str = MOSAIC, read: Read = reading.read_bytes
 ) -> tuple[str, Photograph]:
-    """Read, decode and downscale one source.
+    """Read, decode and downscale one source; return the SHA-256 of its file, or of a scene's pixels, and the pixels.
 
-    Parameters
-    ----------
-    config : SourceConfig
-        Validated settings of the source.
-    source : Source
-        One entry of the listing.
-    layout : {"mosaic", "packed"}
-        Layout of the frames; packed planes need at least one 2 x 2 tile.
-    read : callable
-        Reads a photograph; `read_ahead.reading_ahead` provides one that has read ahead.
-
-    Returns
-    -------
-    sha256 : str
-        SHA-256 of the file's bytes; of the pixels for a built-in scene.
-    photograph : Photograph
-        Pixels, upright, downscaled by ``config.downscale``.
+    ``read`` reads a photograph; `read_ahead.reading_ahead` provides a function that has read ahead.
 
     Raises
     ------
@@ -99,10 +75,10 @@ def load_source(
     rule = patch_rule(config)
     if rule is not None and min(height, width) < rule.side:
         text = f"{width} x {height} pixels contain no patch of {rule.side} x {rule.side} (source.patch)"
-        raise SourceError("unsupported", text, digest)
+        raise SourceError("too_small", text, digest)
     if layout == PACKED and min(height, width) < 2:
         text = f"{width} x {height} pixels contain no 2 x 2 tile (output.layout=packed)"
-        raise SourceError("unsupported", text, digest)
+        raise SourceError("too_small", text, digest)
     return digest, photograph
 
 
@@ -113,24 +89,14 @@ def _full_frame(config: SourceConfig, source: Source, read: Read) -> tuple[str, 
     height, width = photograph.srgb.shape[:2]
     if min(height, width) < config.downscale:
         text = f"{width} x {height} pixels are less than one square of source.downscale={config.downscale}"
-        raise SourceError("unsupported", text, digest)
+        raise SourceError("too_small", text, digest)
     return digest, replace(photograph, srgb=downscaled(photograph.srgb, config.downscale))
 
 
 def downscaled(srgb: Srgb, side: int) -> Srgb:
-    """Average squares of pixels in integer arithmetic.
+    """Average squares of pixels in integer arithmetic; return uint16, the code nearest to each mean.
 
-    Parameters
-    ----------
-    srgb : ndarray of uint8 or uint16, [H, W, 3]
-        Display-referred codes.
-    side : int
-        Side of a square in pixels; rows and columns that fill no square are omitted.
-
-    Returns
-    -------
-    ndarray of uint16, [H // side, W // side, 3]
-        The code nearest to each mean; 8-bit code k counts as k·257.
+    8-bit code k counts as 257 k. Rows and columns that fill no square are omitted.
     """
     height, width = (length // side for length in srgb.shape[:2])
     squares = srgb[: height * side, : width * side].reshape(height, side, width, side, 3)
@@ -168,21 +134,22 @@ def _check_digest(source: Source, digest: str) -> None:
 # ------------------------------------------------------------------------------------------------------------ videos
 
 
-def _refuse_remote_videos(config: SourceConfig, found: tuple[Source, ...]) -> None:
+def _refuse_remote_videos(config: SourceConfig, root: str, sources: Iterable[Source]) -> None:
     """Refuse videos in an object store: each worker would download every video once."""
-    is_video = listing.matcher(config.video)
-    video = next((source for source in found if is_url(config.root) and is_video(source.path)), None)
+    is_video = matcher(config.video)
+    video = next((source for source in sources if is_video(source.path)), None)
     if video is not None:
-        raise ConfigError(
-            f"source.root={config.root}: {video.name} is a video in an object store; expected folders of frames; copy "
+        refusal = (
+            f"source.root={root}: {video.name} is a video in an object store; expected folders of frames; copy "
             "the videos to a local folder, or omit them with source.video=[]"
         )
+        local_path(root, refusal)
 
 
-def _framed(config: SourceConfig, found: tuple[Source, ...]) -> Iterator[Source]:
+def _framed(config: SourceConfig, sources: Iterable[Source]) -> Iterator[Source]:
     """Yield the sources; each video is replaced by one source for each of its frames."""
-    is_video = listing.matcher(config.video)
-    for source in found:
+    is_video = matcher(config.video)
+    for source in sources:
         if source.reason is not None or not is_video(source.path) or source.name == NO_CLIP:
             yield source
             continue
@@ -220,14 +187,14 @@ def _video(root: str, source: Source) -> tuple[str, Video]:
             "in the source folder, run: pip install '.[video]', or omit videos with source.video=[]"
         )
     whole = replace(source, index=0, occurrence=0, sha256=None, frame=0, frames=1, clip_sha256=None, clip_occurrence=0)
-    return _open_video(root, whole, listing.stamp(root, source))
+    return _open_video(root, whole, reading.stamp(root, source))
 
 
 @lru_cache(maxsize=OPEN_VIDEOS)
-def _open_video(root: str, source: Source, stamp: listing.Stamp) -> tuple[str, Video]:
+def _open_video(root: str, source: Source, stamp: reading.Stamp) -> tuple[str, Video]:
     if source.size_bytes == 0:
         raise SourceError("empty", f"{source.name} has 0 bytes")
-    file = listing.keep_open(root, source, stamp)
+    file = reading.keep_open(root, source)
     digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
     try:
         return digest, Video(file)

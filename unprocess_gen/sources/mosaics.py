@@ -34,26 +34,7 @@ class Mosaic:
 def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
     """Read a mosaic.
 
-    Parameters
-    ----------
-    path : Path
-        NPY, PNG, TIFF or raw file.
-    key : str
-        Setting that names the file, for messages.
-    numbers : bool
-        Whether integers and floats of other sizes than 16 bits are allowed.
-
-    Returns
-    -------
-    Mosaic
-        Pixels [H, W], uint16 unless ``numbers`` allows others; black level and pattern of raw files.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be decoded, is no mosaic of an allowed dtype, or needs an extra that is not installed.
-    MachineError
-        If the file cannot be read.
+    Raises ConfigError or MachineError.
     """
     suffix = path.suffix.lower()
     try:
@@ -77,26 +58,7 @@ def read_mosaic(path: Path, key: str, numbers: bool = False) -> Mosaic:
 def map_mosaic(path: Path, key: str, numbers: bool = False) -> NDArray[Any]:
     """Map the mosaic of an NPY file into memory.
 
-    Parameters
-    ----------
-    path : Path
-        NPY file.
-    key : str
-        Setting that names the file, for messages.
-    numbers : bool
-        As in `read_mosaic`.
-
-    Returns
-    -------
-    ndarray, [H, W]
-        Read-only.
-
-    Raises
-    ------
-    ConfigError
-        If the file is no mosaic of an allowed dtype.
-    MachineError
-        If it cannot be read.
+    The result is array, [H, W]. Raises ConfigError or MachineError.
     """
     try:
         pixels: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -111,15 +73,7 @@ def map_mosaic(path: Path, key: str, numbers: bool = False) -> NDArray[Any]:
 def even_sides(pixels: NDArray[Any]) -> NDArray[Any]:
     """Return a mosaic without its last row or column if their number is odd.
 
-    Parameters
-    ----------
-    pixels : ndarray, [H, W]
-        The mosaic.
-
-    Returns
-    -------
-    ndarray, [H, W]
-        Part of ``pixels``, whose tiles are complete.
+    The result is array, [H, W].
     """
     return pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2]
 
@@ -167,20 +121,7 @@ def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
 def mosaic_sha256(path: Path) -> str:
     """Return the SHA-256 of a file; a program that makes many pairs hashes each file once.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
+    Raises OSError.
     """
     status = path.stat()
     return _sha256_of(path, status.st_size, status.st_mtime_ns)
@@ -194,23 +135,11 @@ def _sha256_of(path: Path, size: int, modified_ns: int) -> str:
 def check_sha256(path: Path, what: str, sha256: str) -> None:
     """Compare the bytes of a file with a digest.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        Name of the file in messages, such as ``dark frame``.
-    sha256 : str
-        Expected SHA-256.
-
-    Raises
-    ------
-    SourceChangedError
-        If the file cannot be read, or has another digest.
+    Raises SourceChangedError.
     """
     try:
-        found = file_sha256(path)
+        digest = file_sha256(path)
     except OSError as error:
         raise SourceChangedError(f"{what} {path}: cannot be read ({error.strerror}); restore it") from error
-    if found != sha256:
-        raise SourceChangedError(f"{what} {path}: has the SHA-256 {found}; expected {sha256}; restore it")
+    if digest != sha256:
+        raise SourceChangedError(f"{what} {path}: has the SHA-256 {digest}; expected {sha256}; restore it")

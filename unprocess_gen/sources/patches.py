@@ -22,24 +22,7 @@ from unprocess_gen.core.types import MOSAIC, PACKED, Patch, PatchRule, Srgb
 def list_patches(
     rule: PatchRule | None, stream_key: int, height: int, width: int, layout: str = MOSAIC
 ) -> tuple[Patch, ...]:
-    """List the patches of an image in order.
-
-    Parameters
-    ----------
-    rule : PatchRule or None
-        How patches are placed; None makes the complete image one patch.
-    stream_key : int
-        Key of the image's random streams; random corners depend on it and on their number only.
-    height, width : int
-        Size of the image in pixels.
-    layout : {"mosaic", "packed"}
-        Packed planes omit the last row or column of an odd side, which has no complete 2 x 2 tile.
-
-    Returns
-    -------
-    tuple of Patch
-        A grid row by row from the top-left corner, or random patches in the order they were drawn.
-    """
+    """List the patches of an image in order."""
     if rule is None:
         side = 2 if layout == PACKED else 1
         return (Patch(0, 0, 0, height // side * side, width // side * side),)
@@ -61,36 +44,13 @@ def _random(rule: PatchRule, stream_key: int, height: int, width: int) -> Iterat
 def crop_patch(srgb: Srgb, patch: Patch) -> Srgb:
     """Return the pixels of a patch.
 
-    Parameters
-    ----------
-    srgb : ndarray, [H, W, 3]
-        The full frame.
-    patch : Patch
-        Position and size.
-
-    Returns
-    -------
-    ndarray, [patch.height, patch.width, 3]
-        A view of ``srgb``.
+    The result is array, [patch.height, patch.width, 3].
     """
     return srgb[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width]
 
 
 def pixels_in_none(cuts: tuple[Patch, ...], height: int, width: int) -> int:
-    """Return the number of pixels of an image that are in no patch.
-
-    Parameters
-    ----------
-    cuts : tuple of Patch
-        Patches of the image.
-    height, width : int
-        Size of the image in pixels.
-
-    Returns
-    -------
-    int
-        Number of pixels.
-    """
+    """Return the number of pixels of an image that are in no patch."""
     left = np.ones((height, width), dtype=bool)
     for patch in cuts:
         left[patch.y : patch.y + patch.height, patch.x : patch.x + patch.width] = False

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import itertools
-import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,32 +13,25 @@ import pytest
 from helpers.cases import slow_except
 from helpers.datasets import Settings
 from helpers.flats import (
-    BLACK,
-    COUNT,
     ISOS,
     SHA256,
-    SPAN,
-    WHITE,
     assert_same,
     flat,
     picture,
     plan_with,
     planned,
-    signal_dn,
     with_physics,
 )
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from unprocess_gen.core.random_streams import words
-from unprocess_gen.core.types import Patch, Physics, Plan, Source, Srgb
+from unprocess_gen.core.types import Patch, Plan, Source
 from unprocess_gen.dataset.manifest import pair_row, plan_from_row, read_rows, write_rows
+from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS as EFFECTS
+from unprocess_gen.simulation.effects import Physics
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.reference import noise as effects
 from unprocess_gen.simulation.reference.cfa import PATTERNS
-from unprocess_gen.simulation.reference.noise import EFFECTS
-from unprocess_gen.simulation.reference.poisson import gaussian_from
 
 PATCH = Patch(number=0, y=0, x=0, height=33, width=61)
 
@@ -62,16 +53,16 @@ def test_kernels_equal_reference_for_every_profile_and_scene(settings: Settings,
     group = (f"noise={noise}", f"scene={scene}", f"noise.iso={ISOS[noise]}")
     for forced, fixed in itertools.product([False, True], ["false", "true"]):
         plan = planned(settings, picture(), *group, f"clean.includes_fixed_pattern={fixed}", forced=forced)
-        assert set(EFFECTS) == set(plan.effects) or not forced
+        assert set(EFFECTS) == set(plan.noise.effects) or not forced
         for saturated in ("noisy", "pinned"):
-            assert_same(picture(), replace(plan, saturated=saturated))
+            assert_same(picture(), plan.replace(saturated=saturated))
 
 
 @pytest.mark.parametrize("noise", TWO_NUMBERS)
 def test_kernels_equal_reference_for_poisson_form_of_every_profile(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", *TWO_NUMBERS[noise], "noise.law=poisson")
     for saturated, clip in itertools.product(["noisy", "pinned"], ["sensor", "black"]):
-        assert_same(picture(), replace(plan, saturated=saturated, sensor_clip=clip))
+        assert_same(picture(), plan.replace(saturated=saturated, sensor_clip=clip))
 
 
 @pytest.mark.parametrize("noise", ["imx385_iso3200", "imx385_iso3200_rvdd", "heteroscedastic"])
@@ -100,7 +91,7 @@ def test_kernels_equal_reference_for_every_pattern_highlight_and_clip(
     for highlight, clip, offset in itertools.product(
         ["per_channel", "gray_mean", "none"], ["sensor", "black"], ["removed", "kept"]
     ):
-        plan = replace(everything, pattern=pattern, highlight=highlight, sensor_clip=clip)
+        plan = everything.replace(pattern=pattern, highlight=highlight, sensor_clip=clip)
         assert_same(picture()[:21], with_physics(plan, dark_offset=offset, fixed_pattern_in_clean=fixed))
 
 
@@ -115,9 +106,9 @@ def test_kernels_equal_reference_for_every_shape(everything: Plan, shape: tuple[
 @pytest.mark.parametrize("fixed", [False, True])
 def test_kernels_equal_reference_on_sixteen_bits(everything: Plan, fixed: bool) -> None:
     srgb = np.random.Generator(np.random.Philox(key=1)).integers(0, 65536, (37, 53, 3)).astype(np.uint16)
-    everything = replace(everything, tone="none", gamma=1.0)
+    everything = everything.replace(tone="none", gamma=1.0)
     for bits, black, white in ((16, 4096, 65535), (14, 0, 16383), (8, 0, 255)):
-        assert_same(srgb, replace(averaged(everything, fixed), bits=bits, black_level_dn=black, white_level_dn=white))
+        assert_same(srgb, averaged(everything, fixed).replace(bits=bits, black_level_dn=black, white_level_dn=white))
 
 
 PLAIN = ("shot", "read", "row", "black_error", "quantise")
@@ -133,7 +124,7 @@ def test_shot_and_read_noise_alone_equal_reference(
     srgb = np.random.Generator(np.random.Philox(key=3)).integers(0, 65536, (*shape, 3)).astype(np.uint16)
     srgb[:, : shape[1] // 8] = 0
     srgb[:, -1:] >>= 14
-    plan = replace(everything, effects=PLAIN, bits=bits, black_level_dn=black, white_level_dn=white)
+    plan = everything.replace(effects=PLAIN, bits=bits, black_level_dn=black, white_level_dn=white)
     for dn_per_e, ratio, distribution in (
         (1e-3, 1.0, "gaussian"),
         (0.7, 1.0, "tukey"),
@@ -141,13 +132,13 @@ def test_shot_and_read_noise_alone_equal_reference(
         (4.0, 1e25, "gaussian"),
     ):
         one = with_physics(plan, dn_per_e=dn_per_e, read_law=distribution, read_shape=-0.1, read_std_dn=1.3)
-        one = replace(one, exposure_ratio=ratio, a_dn=dn_per_e, b_dn2=1.69)
+        one = one.replace(exposure_ratio=ratio, a_dn=dn_per_e, b_dn2=1.69)
         assert_same(srgb, one, (1001, 1007))
         assert_same(srgb, one, (0, 63))
 
 
 def test_tile_of_shot_and_read_noise_is_crop_of_frame(everything: Plan) -> None:
-    plan = replace(everything, effects=PLAIN)
+    plan = everything.replace(effects=PLAIN)
     frame = make_pair(picture(), plan)
     for top, left in ((0, 1), (7, 15), (31, 60)):
         np.testing.assert_array_equal(
@@ -183,7 +174,7 @@ def test_kernels_equal_reference_for_any_numbers(
     on: set[str], changes: dict[str, Any], saturated: str, ratio: float, origin: tuple[int, int]
 ) -> None:
     plan = plan_with(*(effect for effect in EFFECTS if effect in on), **changes)
-    plan = replace(plan, saturated=saturated, exposure_ratio=ratio, bits=12, black_level_dn=240, white_level_dn=4095)
+    plan = plan.replace(saturated=saturated, exposure_ratio=ratio, bits=12, black_level_dn=240, white_level_dn=4095)
     assert_same(picture()[:9, :33], plan, origin)
 
 
@@ -204,10 +195,10 @@ def test_tile_is_crop_of_frame(everything: Plan, top: int, left: int, height: in
 
 @pytest.mark.parametrize("effect", [None, *EFFECTS])
 def test_pairs_equal_reference_with_and_without_every_effect(everything: Plan, effect: str | None) -> None:
-    plan = replace(everything, level=3, draw=2, frame=1)
+    plan = everything.replace(level=3, draw=2, frame=1)
     for on in ([one for one in EFFECTS if one != effect], [effect] if effect else []):
         for saturated, clip in itertools.product(["noisy", "pinned"], ["sensor", "black"]):
-            one = replace(plan, effects=tuple(on), saturated=saturated, sensor_clip=clip)
+            one = plan.replace(effects=tuple(on), saturated=saturated, sensor_clip=clip)
             assert_same(picture(), one, (3, 7))
 
 
@@ -215,80 +206,6 @@ def test_pairs_equal_reference_with_and_without_every_effect(everything: Plan, e
 def test_poisson_form_equals_reference_on_wide_images(settings: Settings, noise: str) -> None:
     plan = planned(settings, picture(), f"noise={noise}", *TWO_NUMBERS[noise], "noise.law=poisson")
     assert_same(np.random.default_rng(6).integers(0, 256, (3, 2049, 3)).astype(np.uint8), plan, (5, 9))
-
-
-# Normal approximation of counts ---------------------------------------------------------------------------------------
-
-
-def near_normal(plan: Plan, law_distance: float = 5e-3) -> Plan:
-    return replace(plan, methods=("shot:gaussian_where_near",), law_distance=law_distance)
-
-
-def at_mean(rate_e: float, read_std_e: float, *on: str) -> tuple[Srgb, Plan]:
-    """Return a flat with a mean of ``rate_e`` electrons, and a plan with shot and read noise."""
-    code = 10000
-    dn_per_e = signal_dn(code) / rate_e
-    return flat(code), plan_with(*(on or ("shot", "read")), dn_per_e=dn_per_e, read_std_dn=read_std_e * dn_per_e)
-
-
-@pytest.mark.parametrize("read_std_e", [0.0, 0.5, 2.0, 6.0])
-@pytest.mark.parametrize("edge", [0.5, 0.999, 1.001, 4.0])
-@pytest.mark.parametrize("which", [0, 1])
-def test_normal_for_counts_keeps_distance_mean_and_variance(read_std_e: float, edge: float, which: int) -> None:
-    rate_e = edge * (gaussian_from(read_std_e, 5e-3)[which] or 200.0)
-    srgb, plan = at_mean(rate_e, read_std_e)
-    assert plan.physics is not None
-    exact, ours = make_pair(srgb, plan).noisy, make_pair(srgb, near_normal(plan)).noisy
-    shares = np.bincount(exact.ravel(), minlength=2**16) - np.bincount(ours.ravel(), minlength=2**16)
-    assert np.abs(np.cumsum(shares)).max() / COUNT <= 5e-3 + 0.9 / 1024
-    frame, std_dn = ours - float(BLACK), plan.physics.dn_per_e * math.sqrt(rate_e + read_std_e**2)
-    variance_dn2 = std_dn**2 + 1 / 12
-    if ours.min() > 0 and ours.max() < WHITE:
-        assert abs(frame.mean() - rate_e * plan.physics.dn_per_e) <= 7 * math.sqrt(variance_dn2 / COUNT)
-        assert frame.var() == pytest.approx(variance_dn2, rel=7 * math.sqrt(3 / COUNT))
-
-
-def test_counts_are_used_between_limits_of_normal_approximation() -> None:
-    dn_per_e, read_std_e = 8.0, 2.0
-    low, high = gaussian_from(read_std_e, 5e-3)
-    assert 0 < low < high
-    plan = plan_with("shot", "read", dn_per_e=dn_per_e, read_std_dn=read_std_e * dn_per_e)
-    rates_e = np.linspace(0, 1.5 * high, 1500)
-    codes = np.rint(rates_e * dn_per_e / SPAN * 65535).astype(np.uint16)
-    srgb = np.ascontiguousarray(np.broadcast_to(codes[:, None], (300, 1500, 1)).repeat(3, axis=2))
-    rates_e = np.array([signal_dn(int(code)) / dn_per_e for code in codes])
-    changed = (make_pair(srgb, plan).noisy != make_pair(srgb, near_normal(plan)).noisy).any(axis=0)
-    assert not changed[(rates_e > low * 1.0001) & (rates_e < high * 0.9999)].any()
-    assert changed[rates_e > high * 1.0001].all()
-    assert changed[(rates_e > 0.5) & (rates_e < low * 0.9999)].all()
-
-
-def test_normal_for_counts_uses_word_of_shot_stream() -> None:
-    srgb, plan = at_mean(1000.0, 1.0)
-    n = effects.normals(words(plan.stream_key, "shot", (1024, 1024)))
-    assert plan.physics is not None
-    wanted = (1000.0 + math.sqrt(1000.0) * n) * plan.physics.dn_per_e + effects.read(plan, n)
-    off = np.abs(make_pair(srgb, near_normal(plan)).noisy - BLACK - wanted)
-    assert off.max() <= 0.5 + 1e-3 * math.sqrt(1000.0) * plan.physics.dn_per_e
-
-
-def test_counts_are_used_if_read_noise_shows_electron_steps() -> None:
-    for read_std_e, on in ((0.49, ("shot", "read")), (5.0, ("shot",))):
-        srgb, plan = at_mean(1e4, read_std_e, *on)
-        np.testing.assert_array_equal(make_pair(srgb, plan).noisy, make_pair(srgb, near_normal(plan)).noisy)
-
-
-@pytest.mark.parametrize("law_distance", [1e-3, 5e-3, 0.5])
-def test_other_effects_do_not_change_normal_for_counts(everything: Plan, law_distance: float) -> None:
-    """Nor does a response of 1 everywhere, whether it is stored for each pixel or not."""
-    plan = near_normal(replace(everything, effects=PLAIN), law_distance)
-    others = [with_physics(replace(plan, effects=("prnu", *PLAIN)), prnu_std=std) for std in (0.0, 1e-30)]
-    srgb = np.random.Generator(np.random.Philox(key=5)).integers(0, 256, (9, 1200, 3)).astype(np.uint8)
-    frame = make_pair(srgb, plan)
-    for other in others:
-        np.testing.assert_array_equal(frame.noisy, make_pair(srgb, other).noisy)
-    for one in (plan, *others):
-        np.testing.assert_array_equal(make_pair(srgb[3:, 70:], one, (3, 70)).noisy, frame.noisy[3:, 70:])
 
 
 # Replay ---------------------------------------------------------------------------------------------------------------

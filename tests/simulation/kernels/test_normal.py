@@ -13,11 +13,10 @@ import pytest
 from helpers.kernels import coarse_normals, exact_values, fine_normals, values_by_lines
 from helpers.promise_report import Figure
 
-from unprocess_gen.config.accuracy import method
-from unprocess_gen.core.lookup_tables import normal_table, tukey_table
+from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL
+from unprocess_gen.core.lookup_tables import LINES_PER_OCTAVE, normal_table, tukey_table
 from unprocess_gen.simulation.kernels.normal import (
     FINE_ERROR,
-    LINES_PER_OCTAVE,
     build_quantiles,
     normal_quantiles,
 )
@@ -91,7 +90,7 @@ def test_approximate_normals_are_within_their_error_for_every_word(figure: Figur
 
 POLYNOMIALS = {
     "fine": (fine_normals, FINE_ERROR),
-    "coarse": (coarse_normals, method("normal", "polynomial_float32").normal_error),
+    "coarse": (coarse_normals, POLYNOMIAL_NORMAL),
 }
 
 

@@ -3,81 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from unprocess_gen.core.jit import kernel
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    absolute,
-    from_bits,
-    less_than,
-    load,
-    load_columns,
-    maximum,
-    minimum,
-    movemask,
-    pointer_to,
-    pointers_of,
-    select,
-    square_root,
-    store,
-    to_bits,
-    to_float32,
-    to_float64,
-    to_uint32,
-    to_uint64,
-)
+from unprocess_gen.core.jit import inner, kernel
+from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, load, load_columns, pointer_to, pointers_of, store
 
 SINGLES = np.array([-np.inf, -1.5, -0.0, 0.0, 1e-40, 2.5, 7.25, np.inf], dtype=np.float32)
 OTHERS = np.array([3.0, -1.5, 0.0, -0.0, 1e-38, 0.1, -7.25, 1.0], dtype=np.float32)
+DOUBLES = np.array([1.1, -2.5e-11, 2.5e-10, 3.5e-10, 1e300, -0.0, 12345.678901234, 0.5e-10])
 WORDS = np.array([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 12345, 2**24 + 1, 77], dtype=np.uint32)
-NUMBER, TWO, ZERO = np.float32(0.3), np.float32(2), np.float32(0)
-_32, _EVERY_BIT = np.uint64(32), np.uint64(2**64 - 1)
-SHIFT, MASK = np.uint32(9), np.uint32(0x7FFFFFFF)
+LONG_WORDS = np.array(
+    [0, 1, 2**32 - 1, 2**32, 2**63, 2**64 - 1, 0x3F800000_BF000000, 0x0123456789ABCDEF], dtype=np.uint64
+)
+NUMBER, ZERO = np.float32(0.3), np.float32(0)
+SHIFT, MASK, _32 = np.uint32(9), np.uint32(0x7FFFFFFF), np.uint64(32)
+
+OPERATIONS: dict[str, tuple[Any, ...]] = {
+    "add": (lambda a, b: a + b, SINGLES, OTHERS),
+    "subtract": (lambda a, b: a - b, SINGLES, OTHERS),
+    "multiply and add": (lambda a, b: NUMBER * b + a * NUMBER, SINGLES, OTHERS),
+    "divide": (lambda a, b: a / simd.maximum(b, NUMBER), SINGLES, OTHERS),
+    "minimum": (lambda a, b: simd.minimum(a, NUMBER) + simd.maximum(a, b), SINGLES, OTHERS),
+    "square root": (lambda a, b: simd.square_root(simd.maximum(a, ZERO)) + simd.absolute(b), SINGLES, OTHERS),
+    "logic": (lambda a, b: (b & MASK) ^ simd.to_bits(a), SINGLES, WORDS),
+    "shift": (lambda b: (b >> SHIFT) | (b << SHIFT), WORDS),
+    "less than": (lambda a, b: simd.less_than(a, b), SINGLES, OTHERS),
+    "less than, words": (lambda b: simd.less_than(SHIFT, b), WORDS),
+    "words to float32": (lambda b: simd.to_float32(b & MASK) * NUMBER, WORDS),
+    "float32 to words": (lambda b: simd.to_uint32(simd.to_float32(b & MASK)), WORDS),
+    "bits": (lambda b: simd.to_bits(simd.from_bits(b ^ b)) + b, WORDS),
+    "float64 to float32": (lambda a: simd.to_float32(a * 1e10), DOUBLES),
+    "float64": (lambda a, b: simd.to_float64(a) * simd.to_float64(b) + 0.1, SINGLES, OTHERS),
+    "select": (lambda a, b: simd.select(simd.less_than(a, b), a, b), SINGLES, OTHERS),
+    "high and low words": (lambda a: simd.to_uint32(a >> _32) ^ simd.to_uint32(a), LONG_WORDS),
+    "words to uint64": (lambda a: simd.to_uint64(a) << _32 | simd.to_uint64(a >> SHIFT), WORDS),
+    "words to float64": (lambda a: simd.to_bits(simd.to_float64(a & MASK) + 0.5), WORDS),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
+def test_compiled_operations_equal_numpy(name: str) -> None:
+    function, *operands = OPERATIONS[name]
+    compiled = inner(function)
+
+    @kernel
+    def of_one(x: np.ndarray, out: np.ndarray) -> None:
+        store(pointer_to(out, 0), 0, compiled(load(pointer_to(x, 0), 0)))
+
+    @kernel
+    def of_two(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+        store(pointer_to(out, 0), 0, compiled(load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0)))
+
+    with np.errstate(all="ignore"):
+        expected = function(*operands)
+    out = np.zeros_like(expected)
+    (of_one if len(operands) == 1 else of_two)(*operands, out)
+    assert out.tobytes() == expected.tobytes()
 
 
 @kernel
-def _arithmetic(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    store(target, 0, a + b)
-    store(target, 8, a - b)
-    store(target, 16, a * b)
-    store(target, 24, NUMBER * b + a * TWO)
-    store(target, 32, maximum(a, b))
-    store(target, 40, minimum(a, NUMBER))
-    store(target, 48, square_root(maximum(a, ZERO)))
-    store(target, 56, a / maximum(b, NUMBER))
-
-
-@kernel
-def _bits(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    store(target, 0, (b & MASK) ^ to_bits(a))
-    store(target, 8, (b >> SHIFT) | (b << SHIFT))
-    store(target, 16, less_than(a, NUMBER))
-    store(target, 24, to_bits(to_float32(b & MASK)))
-    store(target, 32, to_uint32(to_float32(b & MASK) * NUMBER))
-    store(target, 40, to_bits(from_bits(b ^ b)) + b)
-
-
-@kernel
-def _float64(x: np.ndarray, out: np.ndarray) -> None:
+def _masks(x: np.ndarray, out: np.ndarray) -> None:
     a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
-    store(target, 0, to_float32(a))
-    store(target, 8, to_float32((a * 1e10 + 6755399441055744.0) - 6755399441055744.0))
+    target[0], target[1] = simd.movemask(a), simd.movemask(simd.less_than(a, MASK))
+    target[2], target[3] = np.uint32(simd.has_any_bit(a)), np.uint32(simd.has_any_bit(a ^ a))
 
 
-@kernel
-def _masks(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    target[0] = movemask(b)
-    target[1] = movemask(less_than(a, a * TWO))
-    target[2] = movemask(less_than(ZERO, a))
-    target[3] = movemask(less_than(b, MASK))
-    store(target, 8, less_than(SHIFT, b))
+def test_first_lane_is_lowest_bit_of_mask() -> None:
+    """Integers are compared without sign."""
+    for form in (_masks, _masks.py_func):  # type: ignore[attr-defined]
+        out = np.zeros(4, dtype=np.uint32)
+        form(WORDS, out)
+        assert out.tolist() == [0b00011000, 0b11100011, 1, 0]
+    assert VECTOR_WIDTH == 8
 
 
 @kernel
@@ -85,50 +87,26 @@ def _uint16(x: np.ndarray, out: np.ndarray) -> None:
     store(pointer_to(out, 3), 0, load(pointer_to(x, 0), 0))
 
 
-@kernel
-def _scalars(codes: np.ndarray, wide: np.ndarray, out: np.ndarray) -> None:
-    from_second, target = pointer_to(codes, 3), pointer_to(out, 0)
-    for at in range(3):
-        target[at] = from_second[at]
-    numbers = pointer_to(pointer_to(wide, 1), 1)
-    target[3] = numbers[np.uint16(40000)]
-
-
-@kernel
-def _wide(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    a, b, target = load(pointer_to(x, 0), 0), load(pointer_to(y, 0), 0), pointer_to(out, 0)
-    store(target, 0, to_float64(a))
-    store(target, 8, to_float64(a) * to_float64(b) + 0.1)
-    store(target, 16, square_root(maximum(to_float64(b), 0.1)) / minimum(to_float64(a), 1e300))
-    store(target, 24, to_float64(absolute(a)))
-    store(target, 32, to_float64(select(less_than(a, b), a, b)))
-    store(target, 40, select(less_than(to_float64(a), 0.5) ^ _EVERY_BIT, to_float64(b), to_float64(a)))
-
-
-@kernel
-def _halves(x: np.ndarray, out: np.ndarray) -> None:
-    a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
-    store(target, 0, to_uint32(a))
-    store(target, 8, to_uint32(a >> _32))
-    store(target, 16, select(less_than(from_bits(to_uint32(a)), NUMBER), to_uint32(a >> _32), to_uint32(a)))
-    target[24] = movemask(less_than(to_float64(from_bits(to_uint32(a))), 0.5))
+def test_store_truncates_to_16_bits_and_writes_eight_values_only() -> None:
+    out = np.full(12, 7, dtype=np.uint16)
+    _uint16(WORDS, out)
+    assert out.tolist() == [7, 7, 7, *(int(word) % 2**16 for word in WORDS), 7]
 
 
 @kernel
 def _columns(table: np.ndarray, starts: np.ndarray, out: np.ndarray) -> None:
-    target = pointer_to(out, 0)
     first, second, third = load_columns(pointer_to(table, 0), pointer_to(starts, 0), 1)
-    store(target, 0, first)
-    store(target, 8, second)
-    store(target, 16, third)
+    store(pointer_to(out, 0), 0, first)
+    store(pointer_to(out, 0), 8, second)
+    store(pointer_to(out, 0), 16, third)
 
 
-@kernel
-def _uint64(x: np.ndarray, out: np.ndarray) -> None:
-    a, target = load(pointer_to(x, 0), 0), pointer_to(out, 0)
-    store(target, 0, to_uint64(a) << _32 | to_uint64(a >> SHIFT))
-    store(target, 8, to_bits(from_bits(to_uint64(a) << _32) * 0.5))
-    store(target, 16, to_bits(to_float64(a & MASK) + 0.5))
+def test_columns_are_those_of_the_rows_that_begin_there() -> None:
+    table, rows = np.arange(4000) * 0.1, np.array([7, 999, 0, 3, 3, 512, 40, 998, 1], dtype=np.uint32)
+    for form in (_columns, _columns.py_func):  # type: ignore[attr-defined]
+        out = np.zeros(24)
+        form(table, 4 * rows, out)
+        assert np.array_equal(out.reshape(3, 8), table.reshape(1000, 4)[rows[1:], :3].T)
 
 
 class Inside(NamedTuple):
@@ -157,112 +135,11 @@ def _record(record: Record, out: np.ndarray) -> None:
     store(target, 5, load(pointers.inside.values, 2) + load(again.first, 0))
 
 
-def record() -> Record:
-    """Return a record of arrays of one and of two dimensions, with one inside."""
-    doubles = np.arange(12, dtype=np.float64)
-    return Record(doubles.reshape(3, 4) * 2, Inside(doubles + 0.5, 3.0), doubles.reshape(2, 6) * -1, 40, (5, 6))
-
-
-LONG_WORDS = np.array(
-    [0, 1, 2**32 - 1, 2**32, 2**63, 2**64 - 1, 0x3F800000_BF000000, 0x0123456789ABCDEF], dtype=np.uint64
-)
-STARTS = np.array([7, 999, 0, 3, 3, 512, 40, 998, 1], dtype=np.uint32)
-DOUBLES = np.array([1.1, -2.5e-11, 2.5e-10, 3.5e-10, 1e300, -0.0, 12345.678901234, 0.5e-10])
-CASES: dict[str, tuple[Any, tuple[np.ndarray, ...], np.ndarray]] = {
-    "arithmetic": (_arithmetic, (SINGLES, OTHERS), np.zeros(64, dtype=np.float32)),
-    "bits": (_bits, (SINGLES, WORDS), np.zeros(48, dtype=np.uint32)),
-    "float64": (_float64, (DOUBLES,), np.zeros(16, dtype=np.float32)),
-    "wide": (_wide, (SINGLES, OTHERS), np.zeros(48)),
-    "halves": (_halves, (LONG_WORDS,), np.zeros(25, dtype=np.uint32)),
-    "columns": (_columns, (np.arange(4000) * 0.1, 4 * STARTS), np.zeros(24)),
-    "uint64": (_uint64, (WORDS,), np.zeros(24, dtype=np.uint64)),
-    "masks": (_masks, (OTHERS, WORDS), np.zeros(16, dtype=np.uint32)),
-    "uint16": (_uint16, (WORDS,), np.zeros(12, dtype=np.uint16)),
-    "scalars": (
-        _scalars,
-        (np.arange(200, 212, dtype=np.uint8).reshape(2, 2, 3), np.arange(50000, dtype=np.uint32)),
-        np.zeros(4, dtype=np.uint32),
-    ),
-}
-
-
-def uncompiled(kernel_function: Any) -> Callable[..., None]:
-    return cast(Callable[..., None], getattr(kernel_function, "py_func", kernel_function))
-
-
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.filterwarnings("ignore:overflow")
-def test_compiled_vectors_equal_numpy_implementation(case: str) -> None:
-    kernel_function, arguments, empty = CASES[case]
-    compiled, expected = empty.copy(), empty.copy()
-
-    kernel_function(*arguments, compiled)
-    with np.errstate(all="ignore"):
-        uncompiled(kernel_function)(*arguments, expected)
-
-    assert compiled.tobytes() == expected.tobytes()
-    assert compiled.tobytes() != empty.tobytes()
-
-
-def test_first_lane_is_lowest_bit_of_mask() -> None:
-    out = np.zeros(16, dtype=np.uint32)
-    _masks(OTHERS, WORDS, out)
-    assert out[:3].tolist() == [0b00011000, 0b10110001, 0b10110001]
-    assert VECTOR_WIDTH == 8
-
-
-def test_integers_are_compared_without_sign() -> None:
-    out = np.zeros(16, dtype=np.uint32)
-    _masks(OTHERS, WORDS, out)
-    assert out[3] == 0b11100011
-    assert (out[8:] == np.where(WORDS > SHIFT, 2**32 - 1, 0)).all()
-
-
-def test_store_truncates_to_16_bits_and_writes_eight_values_only() -> None:
-    out = np.full(12, 7, dtype=np.uint16)
-    _uint16(WORDS, out)
-    assert out.tolist() == [7, 7, 7, *(int(word) % 2**16 for word in WORDS), 7]
-
-
-def test_index_of_16_bits_is_unsigned() -> None:
-    out = np.zeros(4, dtype=np.uint32)
-    _scalars(*CASES["scalars"][1], out)
-    assert out.tolist() == [203, 204, 205, 40002]
-
-
-def test_select_takes_lanes_of_set_masks() -> None:
-    out = np.zeros(48)
-    _wide(SINGLES, OTHERS, out)
-    is_less = SINGLES < OTHERS
-    assert out[32:40].tolist() == np.where(is_less, SINGLES, OTHERS).tolist()
-    assert out[40:].tolist() == np.where(SINGLES >= 0.5, OTHERS, SINGLES).tolist()
-    assert 0 < is_less.sum() < VECTOR_WIDTH
-
-
-def test_absolute_clears_the_sign_of_zero_and_infinity() -> None:
-    out = np.zeros(48)
-    _wide(SINGLES, OTHERS, out)
-    assert out[24:32].tobytes() == np.abs(SINGLES.astype(np.float64)).tobytes()
-    assert not np.signbit(out[24:32]).any()
-
-
-def test_columns_are_those_of_the_rows_that_begin_there() -> None:
-    out = np.zeros(24)
-    _columns(*CASES["columns"][1], out)
-    assert np.array_equal(out.reshape(3, 8), (np.arange(4000) * 0.1).reshape(1000, 4)[STARTS[1:], :3].T)
-
-
-def test_conversion_to_uint32_drops_the_high_bits() -> None:
-    out = np.zeros(25, dtype=np.uint32)
-    _halves(LONG_WORDS, out)
-    assert out[:8].tolist() == [int(word) % 2**32 for word in LONG_WORDS]
-    assert out[8:16].tolist() == [int(word) >> 32 for word in LONG_WORDS]
-
-
 @pytest.mark.parametrize("form", [_record, _record.py_func], ids=["compiled", "uncompiled"])  # type: ignore[attr-defined]
 def test_pointers_of_a_record_reach_all_arrays(form: Callable[..., None]) -> None:
     """Numbers and tuples are copied, arrays are not."""
-    given, out = record(), np.zeros(13)
+    doubles, out = np.arange(12, dtype=np.float64), np.zeros(13)
+    given = Record(doubles.reshape(3, 4) * 2, Inside(doubles + 0.5, 3.0), doubles.reshape(2, 6) * -1, 40, (5, 6))
     form(given, out)
     assert out[:5].tolist() == [6.0, 4.5, -4.0, 46.0, 99.0]
     assert out[5:].tolist() == [2.5 + n + 2 * n for n in range(8)]

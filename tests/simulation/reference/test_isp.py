@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -60,9 +59,7 @@ def colours(step: int) -> Iterator[np.ndarray]:
 def plan_with(plan: Plan, camera: str, gains: str, highlight: str) -> Plan:
     red, blue, inverse_rgb = GAINS[gains]
     matrix = colour.rgb2cam(colour.CAMERAS[camera])
-    return replace(
-        plan, rgb2cam=matrix, red_gain=red, blue_gain=blue, inverse_rgb_gain=inverse_rgb, highlight=highlight
-    )
+    return plan.replace(rgb2cam=matrix, red_gain=red, blue_gain=blue, inverse_rgb_gain=inverse_rgb, highlight=highlight)
 
 
 def unclipped(light: np.ndarray) -> np.ndarray:
@@ -103,7 +100,7 @@ def test_colours_return_for_every_highlight_method(plan: Plan, highlight: str) -
 
 @pytest.mark.parametrize(("tone", "gamma"), [("smoothstep", 2.2), ("none", 2.2), ("none", "srgb"), ("none", 1.0)])
 def test_every_16_bit_gray_returns_through_every_curve(plan: Plan, tone: str, gamma: float | str) -> None:
-    planned = replace(plan, tone=tone, gamma=gamma)
+    planned = plan.replace(tone=tone, gamma=gamma)
     grays = np.arange(65536, dtype=np.uint16).reshape(256, 256, 1).repeat(3, axis=2)
 
     light = np.clip(unprocess.camera_light(grays, planned), 0, 1)
@@ -117,7 +114,7 @@ def test_every_16_bit_gray_returns_through_every_curve(plan: Plan, tone: str, ga
 def test_kernels_give_the_references_dn_for_every_colour(plan: Plan, camera: str, gains: str, step: int) -> None:
     """Four origins put each of the four sites on every pixel, so that every filter records every colour."""
     planned = plan_with(plan, camera, gains, "per_channel")
-    black, white = planned.black_level_dn, planned.white_level_dn
+    black, white = planned.sensor.black_level_dn, planned.sensor.white_level_dn
     for srgb in colours(step):
         light = unprocess.camera_light(srgb, planned)
         dn = quantise(to_dn(light, black, white), black, white)
@@ -135,7 +132,7 @@ def test_white_and_black_are_preserved_for_any_camera_and_gains(plan: Plan) -> N
         black, white = unprocess.camera_light(ends, planned)[0]
 
         assert black.tolist() == [0, 0, 0], case
-        gained = np.array(planned.inverse_gains)
+        gained = np.array(planned.camera.inverse_gains)
         assert white.tolist() == (gained if "none" in case else np.maximum(gained, 1)).tolist(), case
 
 
@@ -188,7 +185,7 @@ def test_srgb_by_hand() -> None:
 
 
 def test_colours_outside_the_cube_are_clipped(plan: Plan) -> None:
-    found = process.process(np.array([[[-0.5, 0.0, 2.0]]]), replace(plan, rgb2cam=(1, 0, 0, 0, 1, 0, 0, 0, 1)))
+    found = process.process(np.array([[[-0.5, 0.0, 2.0]]]), plan.replace(rgb2cam=(1, 0, 0, 0, 1, 0, 0, 0, 1)))
 
     assert found.tolist() == [[[0.0, 0.0, 1.0]]]
 
@@ -204,7 +201,7 @@ LEVELS_DN = {16: (4096, 65535), 14: (1024, 16383), 12: (240, 4095), 10: (64, 102
 
 def on_sensor(plan: Plan, bits: int) -> Plan:
     black, white = LEVELS_DN[bits]
-    return replace(plan, bits=bits, black_level_dn=black, white_level_dn=white)
+    return plan.replace(bits=bits, black_level_dn=black, white_level_dn=white)
 
 
 def codes_lost(plan: Plan, step: int) -> float:
@@ -213,7 +210,7 @@ def codes_lost(plan: Plan, step: int) -> float:
     for srgb in colours(step):
         light = unprocess.camera_light(srgb, plan)
         inside = unclipped(light)
-        dn = quantise(to_dn(light[inside], plan.black_level_dn, plan.white_level_dn), 0, 65535)
+        dn = quantise(to_dn(light[inside], plan.sensor.black_level_dn, plan.sensor.white_level_dn), 0, 65535)
         codes = process.to_codes(process.process(process.to_light(dn, plan), plan))
         worst = max(worst, float(np.abs(codes - srgb[inside]).max(initial=0)))
     return worst
@@ -229,19 +226,17 @@ def test_rounding_to_dn_changes_codes_within_the_stated_bound(plan: Plan, bits: 
 
 @pytest.mark.parametrize("camera", colour.CAMERAS)
 def test_colours_return_from_14_bits_at_mean_gains(plan: Plan, camera: str) -> None:
-    planned = replace(
-        plan_with(plan, camera, "most", "per_channel"), red_gain=2.15, blue_gain=1.7, inverse_rgb_gain=0.8
-    )
+    planned = plan_with(plan, camera, "most", "per_channel").replace(red_gain=2.15, blue_gain=1.7, inverse_rgb_gain=0.8)
 
     assert codes_lost(on_sensor(planned, 14), 15) == 0
 
 
 def test_developing_restores_the_brightness_of_a_darkened_scene(plan: Plan) -> None:
-    planned = replace(on_sensor(plan_with(plan, "sony_a7r", "less", "per_channel"), 16), exposure_ratio=8.0)
+    planned = on_sensor(plan_with(plan, "sony_a7r", "less", "per_channel"), 16).replace(exposure_ratio=8.0)
     grays = np.arange(0, 256, 5, dtype=np.uint8).reshape(1, -1, 1).repeat(3, axis=2)
-    light = np.minimum(unprocess.camera_light(grays, planned), 1) * planned.exposure
+    light = np.minimum(unprocess.camera_light(grays, planned), 1) * planned.scene.exposure
 
-    dn = quantise(to_dn(light, planned.black_level_dn, planned.white_level_dn), 0, 65535)
+    dn = quantise(to_dn(light, planned.sensor.black_level_dn, planned.sensor.white_level_dn), 0, 65535)
 
     found = process.to_codes(process.process(process.to_light(dn, planned), planned))
     assert np.abs(found - grays).max() <= LOST[14]  # 16 bits less the three that the scene takes
@@ -337,7 +332,7 @@ def test_flat_colours_return_from_a_raw_frame(plan: Plan, pattern: str, highligh
     side = 8
     levels = np.array(list(itertools.product((0, 100, 250, 255), repeat=3)), dtype=np.uint8).reshape(8, 8, 3)
     source = levels.repeat(side, axis=0).repeat(side, axis=1)
-    planned = on_sensor(replace(plan_with(plan, "nexus_6p", "less", highlight), pattern=pattern), 16)
+    planned = on_sensor(plan_with(plan, "nexus_6p", "less", highlight).replace(pattern=pattern), 16)
 
     found = process.to_codes(process.develop(make_pair(source, planned).clean, planned))
 
@@ -368,7 +363,7 @@ def developed_codes(source: np.ndarray, plan: Plan) -> np.ndarray:
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_a_smooth_image_returns_within_two_codes(plan: Plan, pattern: str) -> None:
     """Colours change by one code per pixel; demosaicking loses no more than rounding to 8 bits and to 14."""
-    planned = replace(plan_with(plan, "sony_a7r", "more", "per_channel"), pattern=pattern)
+    planned = plan_with(plan, "sony_a7r", "more", "per_channel").replace(pattern=pattern)
     y, x = np.mgrid[:140, :180]
     source = np.stack([40 + y, 60 + x // 2, 200 - (x + y) // 2], axis=-1).astype(np.uint8)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 from decimal import Decimal
 from statistics import NormalDist
 
@@ -19,7 +18,8 @@ from unprocess_gen.core import exact_distributions
 from unprocess_gen.core.random_streams import words
 from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.simulation.reference.noise import heteroscedastic, noise_variance, normals
+from unprocess_gen.simulation.effects.heteroscedastic import heteroscedastic, noise_variance
+from unprocess_gen.simulation.reference.noise import normals
 
 SIGN = np.uint32(1 << 31)
 LAST = 2**31 - 1
@@ -155,19 +155,19 @@ def test_the_distribution_is_normal(z: np.ndarray) -> None:
 
 
 def test_variance_is_linear_above_black(plan: Plan) -> None:
-    made = replace(plan, a_dn=2.0, b_dn2=3.0, black_level_dn=240)
+    made = plan.replace(a_dn=2.0, b_dn2=3.0, black_level_dn=240)
     assert noise_variance(np.array([[240.0, 240.5, 241.0, 4095.0]]), made).tolist() == [[3, 4, 5, 7713]]
 
 
 def test_negative_variance_becomes_zero(plan: Plan) -> None:
-    made = replace(plan, a_dn=8.0, b_dn2=-120.0, black_level_dn=240)
+    made = plan.replace(a_dn=8.0, b_dn2=-120.0, black_level_dn=240)
     assert noise_variance(np.array([[240.0, 254.0, 255.0, 256.0]]), made).tolist() == [[0, 0, 0, 8]]
 
 
 def test_noise_is_the_standard_deviation_times_the_streams_normals(plan: Plan) -> None:
     clean = np.linspace(240, 4095, 12 * 70).reshape(12, 70)
     n = normals(words(plan.stream_key, "heteroscedastic", (12, 70)))
-    expected = clean + np.sqrt(plan.a_dn * (clean - 240) + plan.b_dn2) * n
+    expected = clean + np.sqrt(plan.noise.a_dn * (clean - 240) + plan.noise.b_dn2) * n
     assert (heteroscedastic(clean, plan) == expected).all()
 
 
@@ -179,7 +179,7 @@ def test_noise_of_a_crop_is_the_crop_of_the_noise(plan: Plan, top: int, left: in
 
 
 def test_noise_is_neither_rounded_nor_clipped(plan: Plan) -> None:
-    made = replace(plan, a_dn=0.0, b_dn2=1e8)
+    made = plan.replace(a_dn=0.0, b_dn2=1e8)
     noisy = heteroscedastic(np.full((64, 64), 240.0), made)
     assert noisy.min() < 0
     assert noisy.max() > 4095

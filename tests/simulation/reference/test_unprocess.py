@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 from fractions import Fraction
 
 import mpmath
@@ -288,7 +287,7 @@ def test_each_channel_uses_its_own_gain() -> None:
 
 
 def test_inverse_gains_are_the_inverse_brightening_over_the_forward_gains(plan: Plan) -> None:
-    assert replace(plan, red_gain=2.0, blue_gain=1.6, inverse_rgb_gain=0.8).inverse_gains == (0.4, 0.8, 0.5)
+    assert plan.replace(red_gain=2.0, blue_gain=1.6, inverse_rgb_gain=0.8).camera.inverse_gains == (0.4, 0.8, 0.5)
 
 
 # All steps together ---------------------------------------------------------------------------------------------------
@@ -304,9 +303,9 @@ def test_black_is_0_and_white_1_or_a_larger_gain(plan: Plan, camera: str) -> Non
     ):
         ends = np.zeros((2, 4, 3), dtype=dtype)
         ends[:, 2:] = np.iinfo(dtype).max
-        made = replace(plan, rgb2cam=matrix, highlight=highlight, inverse_rgb_gain=inverse, red_gain=2.1, blue_gain=1.7)
+        made = plan.replace(rgb2cam=matrix, highlight=highlight, inverse_rgb_gain=inverse, red_gain=2.1, blue_gain=1.7)
         light = unprocess.unprocess(ends, made)
-        red, green, blue = (max(1.0, gain) for gain in made.inverse_gains)
+        red, green, blue = (max(1.0, gain) for gain in made.camera.inverse_gains)
         assert light.tolist() == [[0, 0, red, green], [0, 0, green, blue]], made
         assert to_dn(light, 240, 4095).tolist() == [[240, 240, 4095, 4095]] * 2, made
 
@@ -315,7 +314,7 @@ def test_black_is_0_and_white_1_or_a_larger_gain(plan: Plan, camera: str) -> Non
 def test_without_highlights_white_is_the_inverse_gain(plan: Plan, camera: str) -> None:
     matrix = colour.rgb2cam(colour.CAMERAS[camera]) if camera in colour.CAMERAS else colour.IDENTITY
     white = np.full((2, 2, 3), 255, dtype=np.uint8)
-    made = replace(plan, rgb2cam=matrix, highlight="none", inverse_rgb_gain=0.8, red_gain=2.0, blue_gain=1.6)
+    made = plan.replace(rgb2cam=matrix, highlight="none", inverse_rgb_gain=0.8, red_gain=2.0, blue_gain=1.6)
     assert unprocess.unprocess(white, made).tolist() == [[0.4, 0.8], [0.8, 0.5]]
 
 
@@ -324,7 +323,7 @@ def test_grays_stay_gray_for_any_camera(plan: Plan) -> None:
     gray = np.repeat(np.arange(256, dtype=np.uint8), 12).reshape(-1, 2, 2, 3)
     expected = unprocess.expand_gamma(tone_of(codes(255), 255), 2.2)
     for camera in colour.CAMERAS.values():
-        made = replace(plan, rgb2cam=colour.rgb2cam(camera), inverse_rgb_gain=1.0)
+        made = plan.replace(rgb2cam=colour.rgb2cam(camera), inverse_rgb_gain=1.0)
         for code in range(256):
             light = unprocess.unprocess(gray[code], made)
             assert np.abs(light - expected[code]).max() <= 3 * EPS * expected[code]

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import io
 import os
-import random
 import struct
-import time
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -150,32 +148,20 @@ def test_16_bit_pixels_are_exact(kind: str) -> None:
         np.testing.assert_array_equal(pixels_of(DEEP[kind](stored)), stored, f"{size}", strict=True)
 
 
-DEEP_GRAY: dict[str, Callable[[np.ndarray], bytes]] = {
-    "png": lambda pixels: cv2.imencode(".png", pixels)[1].tobytes(),
-    "tiff": lambda pixels: tiff(pixels, "minisblack"),
-    "tiff, white is zero": lambda pixels: tiff(65535 - pixels, "miniswhite"),
-}
-
-
-@pytest.mark.parametrize("kind", DEEP_GRAY)
-def test_16_bit_gray_becomes_three_equal_channels(kind: str) -> None:
-    stored = noise(7, 13, np.uint16, 1)
-    np.testing.assert_array_equal(pixels_of(DEEP_GRAY[kind](stored[..., 0])), np.repeat(stored, 3, 2), strict=True)
-
-
 GRAY: dict[str, Callable[[np.ndarray], bytes]] = {
-    "png": lambda pixels: pillow(pixels, "PNG"),
-    "bmp": lambda pixels: pillow(pixels, "BMP"),
-    "tiff": lambda pixels: tiff(pixels, "minisblack"),
-    "tiff, white is zero": lambda pixels: tiff(255 - pixels, "miniswhite"),
-    "jpeg": lambda pixels: pillow(np.full_like(pixels, 77), "JPEG", quality=100),
+    "png": lambda gray: cv2.imencode(".png", gray)[1].tobytes(),
+    "tiff": lambda gray: tiff(gray, "minisblack"),
+    "tiff, white is zero": lambda gray: tiff(np.iinfo(gray.dtype).max - gray, "miniswhite"),
+    "bmp": lambda gray: pillow(gray, "BMP"),
 }
 
 
-@pytest.mark.parametrize("kind", GRAY)
-def test_gray_becomes_three_equal_channels(kind: str) -> None:
-    stored = np.full((8, 8), 77, np.uint8) if kind == "jpeg" else noise(7, 13, channels=1)[..., 0]
-    np.testing.assert_array_equal(pixels_of(GRAY[kind](stored)), np.repeat(stored[..., None], 3, 2), strict=True)
+@pytest.mark.parametrize(
+    ("kind", "dtype"), [*((kind, np.uint8) for kind in GRAY), *((kind, np.uint16) for kind in GRAY if kind != "bmp")]
+)
+def test_gray_becomes_three_equal_channels(kind: str, dtype: Any) -> None:
+    stored = noise(7, 13, dtype, 1)
+    np.testing.assert_array_equal(pixels_of(GRAY[kind](stored[..., 0])), np.repeat(stored, 3, 2), strict=True)
 
 
 @pytest.mark.parametrize(
@@ -214,19 +200,10 @@ def test_jpeg_pixels_are_those_opencv_decodes_by_default(subsampling: int, progr
         np.testing.assert_array_equal(pixels_of(data), by_default[..., ::-1], f"{size}", strict=True)
 
 
-def test_lossy_webp_is_read_in_rgb_order() -> None:
-    difference = pixels_of(pillow(smooth(), "WEBP", quality=95)).astype(int) - smooth()
+@pytest.mark.parametrize(("kind", "options"), [("WEBP", {}), ("TIFF", {"compression": "jpeg"})], ids=str)
+def test_lossy_pixels_are_read_in_rgb_order(kind: str, options: dict[str, str]) -> None:
+    difference = pixels_of(pillow(smooth(), kind, quality=95, **options)).astype(int) - smooth()
     assert np.abs(difference).mean() < 8
-
-
-def test_jpeg_inside_tiff_is_read_in_rgb_order() -> None:
-    difference = pixels_of(pillow(smooth(), "TIFF", compression="jpeg", quality=95)).astype(int) - smooth()
-    assert np.abs(difference).mean() < 8
-
-
-@pytest.mark.parametrize("data", [pillow(smooth(), "JPEG", exif=exif(6)), tiff(noise(4, 5, np.uint16))])
-def test_the_array_is_contiguous(data: bytes) -> None:
-    assert pixels_of(data).flags.c_contiguous
 
 
 def test_a_bmp_stored_top_down_is_upright() -> None:
@@ -457,28 +434,8 @@ def test_the_limit_of_pixels_is_inclusive() -> None:
     assert reason_of(data, max_pixels=90) == "too_large"
 
 
-HUGE = {
-    "png": png(60_000, 8, 2, b"", height=60_000),
-    "bmp": bmp(60_000, 60_000, 24, b""),
-    "jpeg": pillow(smooth(), "JPEG").replace(struct.pack(">HH", 40, 61), struct.pack(">HH", 60_000, 60_000), 1),
-    "tiff": retagged(tiff(noise(40, 61), compression="zlib"), {256: 60_000, 257: 60_000, 278: 60_000}),
-    "webp": b"RIFF"
-    + struct.pack("<I4s4sIB3x6s", 22, b"WEBP", b"VP8X", 10, 0, b"\x5f\xea\0\x5f\xea\0")
-    + struct.pack("<4sI", b"VP8 ", 0),
-}
-
-
-@pytest.mark.parametrize("kind", HUGE)
-def test_a_header_that_claims_3600_megapixels_is_refused_at_once(kind: str) -> None:
-    start = time.process_time()
-    reason = reason_of(HUGE[kind] + bytes(10))
-    assert time.process_time() - start < 0.05
-    # A BMP is not compressed: one that claims so much is short of it.
-    assert reason == ("truncated" if kind == "bmp" else "too_large")
-
-
 def test_sizes_that_opencv_refuses_are_too_large() -> None:
-    assert reason_of(HUGE["png"], max_pixels=2**40) == "too_large"
+    assert reason_of(png(60_000, 8, 2, b"", height=60_000), max_pixels=2**40) == "too_large"
     assert reason_of(png(1_000_001, 8, 0, b""), max_pixels=CV2_MAX_PIXELS) == "too_large"
 
 
@@ -572,19 +529,6 @@ def test_every_cut_is_refused(kind: str, figure: Figure) -> None:
     figure("damaged-pictures", f"{len(data) - 12 - reasons['truncated']} of {len(data) - 12} truncations decoded")
 
 
-@pytest.mark.parametrize("kind", CUTTABLE)
-def test_a_cut_within_the_first_bytes_is_refused(kind: str) -> None:
-    assert {reason_of(CUTTABLE[kind][:length]) for length in range(12)} <= {"empty", "unsupported", "truncated"}
-
-
-@pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "png"])
-def test_random_cuts_of_a_larger_file_are_refused(kind: str) -> None:
-    size, options = smooth(700, 900), {"quality": 95, "progressive": "progressive" in kind}
-    data = pillow(size, "PNG") if kind == "png" else pillow(size, "JPEG", **options)
-    cuts = [random.Random(1).randrange(12, len(data)) for _ in range(60)] + [len(data) - 1, len(data) - 2]
-    assert {reason_of(data[:length]) for length in cuts} == {"truncated"}
-
-
 @pytest.mark.parametrize("kind", ["jpeg", "jpeg, progressive", "jpeg, thumbnail", "png", "webp", "bmp", "tiff"])
 @pytest.mark.parametrize("tail", [b"\0", b"\xff", pillow(smooth(), "JPEG"), b"\0\0\0\x18ftypmp42" + bytes(99)])
 def test_bytes_after_the_end_are_accepted(kind: str, tail: bytes) -> None:
@@ -629,23 +573,6 @@ def test_circular_chain_of_tiff_pages_ends() -> None:
     np.testing.assert_array_equal(pixels_of(bytes(data)), smooth())
 
 
-@pytest.mark.parametrize("kind", CUTTABLE)
-def test_random_damage_gives_pixels_or_a_reason(kind: str) -> None:
-    generator = random.Random(kind)
-    for _ in range(150):
-        data = bytearray(CUTTABLE[kind])
-        for _ in range(generator.choice((1, 2, 8))):
-            data[generator.randrange(min(len(data), generator.choice((64, 400, 10**6))))] = generator.choice(
-                (0, 255, 17)
-            )
-        try:
-            photograph = decode(bytes(data), max_pixels=2**20, icc="refuse")
-        except SourceError:
-            continue
-        header = probe(bytes(data))
-        assert sorted(photograph.srgb.shape[:2]) == sorted((header.height, header.width))
-
-
 # Headers --------------------------------------------------------------------------------------------------------------
 
 SECOND_OPINION = {**CUTTABLE, "jpeg, gray": pillow(GRADES, "JPEG"), "jpeg, inks": pillow(CMYK, "JPEG")}
@@ -664,10 +591,6 @@ def test_a_header_is_what_pillow_reads(kind: str) -> None:
 def test_header_has_size_colour_depth_and_alpha() -> None:
     data = cv2.imencode(".png", with_alpha(0, np.uint16))[1].tobytes()
     assert probe(data) == Header("png", 7, 5, "rgb", 16, has_alpha=True)
-
-
-def test_probing_a_cut_file_reports_what_is_missing() -> None:
-    assert probe(CUTTABLE["jpeg"][:-1]).missing == "its end-of-image marker"
 
 
 # What a file lost from its middle -------------------------------------------------------------------------------------

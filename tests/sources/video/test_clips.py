@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, Settings, TreeHash
+from helpers.datasets import Make, Settings
 from helpers.photographs import pixels
-from helpers.processes import committed, imported_first, kill_group, running, unfinished, wait_for
 from helpers.videos import (
     encode,
     film,
@@ -22,6 +21,7 @@ from helpers.videos import (
 from PIL import Image
 
 from unprocess_gen import RawPairs
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceError
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
@@ -76,15 +76,11 @@ def test_frames_of_a_video_have_its_digest_and_size(filmed: Path, films: Path) -
 
 
 def test_frames_share_their_draws_and_identical_videos_do_not(filmed: Path) -> None:
-    drawn = {
-        clip: {(row["stream_key"], row["red_gain"], row["body_key"], row["rgb2cam_00"]) for row in text_rows(filmed)}
-        for clip in ("h264.mp4",)
-    }
     by_clip: dict[str, set[tuple[str, ...]]] = {}
     for row in text_rows(filmed):
         by_clip.setdefault(row["clip"], set()).add((row["stream_key"], row["red_gain"], row["body_key"]))
-    assert {clip: len(some) for clip, some in by_clip.items()} == dict.fromkeys(by_clip, 1)
-    assert len(set.union(*by_clip.values())) == len(by_clip) == len(drawn["h264.mp4"]) == 5
+    assert [len(draws) for draws in by_clip.values()] == [1] * 5
+    assert len(set.union(*by_clip.values())) == 5
 
 
 def test_noise_of_frames_is_independent(filmed: Path) -> None:
@@ -92,13 +88,6 @@ def test_noise_of_frames_is_independent(filmed: Path) -> None:
     frames = [noisy.astype(float) - clean for clean, noisy, row in RawPairs(filmed) if row["clip"] == "h264.mp4"]
     found = np.corrcoef([(frame - frame.mean(axis=1, keepdims=True)).ravel() for frame in frames])
     assert np.abs(found - np.eye(20)).max() < 6 / np.sqrt(3072)
-
-
-def test_number_of_workers_changes_no_byte_of_videos(
-    films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
-) -> None:
-    make(films, tmp_path / "ds", *CLIPS, n_jobs=2)
-    assert tree_hash(tmp_path / "ds") == tree_hash(filmed)
 
 
 @pytest.mark.parametrize("per_shard", [1, 5])
@@ -111,21 +100,6 @@ def test_shard_size_leaves_frames_unchanged(
 
 def key(row: dict[str, str]) -> tuple[str, ...]:
     return row["source"], row["frame"], row["clean_xxh3"], row["noisy_xxh3"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n_jobs", [1, 2])
-def test_killed_run_of_videos_resumes_to_the_same_bytes(
-    n_jobs: int, films: Path, filmed: Path, make: Make, tree_hash: TreeHash, tmp_path: Path
-) -> None:
-    out = tmp_path / "ds"
-    env = imported_first(tmp_path, unfinished(out, 2))
-    with running(*CLIPS, f"source.root={films}", f"out={out}", f"n_jobs={n_jobs}", cwd=tmp_path, **env) as run:
-        wait_for(lambda: committed(out) or run.poll() is not None)
-        kill_group(run)
-    assert not (out / "dataset.json").exists()
-    assert make(films, out, *CLIPS).made > 0
-    assert tree_hash(out) == tree_hash(filmed)
 
 
 def test_removing_a_video_leaves_others_unchanged(films: Path, filmed: Path, make: Make, tmp_path: Path) -> None:
@@ -141,31 +115,6 @@ def test_frame_is_regenerated_from_its_row(filmed: Path, films: Path) -> None:
     replayed = list(replay(read_rows(filmed / "manifest.csv"), str(films)))
     assert len(replayed) == 38
     assert [one for one in replayed if one.complaint] == []
-
-
-def test_damaged_frame_is_repaired(films: Path, filmed: Path, run_main: RunMain, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(filmed, tmp_path / "ds"))
-    path = copy / "shards" / "shard-00001.tar"
-    content = bytearray(path.read_bytes())
-    content[content.index(b"00000010.noisy.npy") + 512 + 200] ^= 1
-    path.write_bytes(content)
-    done = run_main("verify", copy, "--repair", f"source.root={films}")
-    assert (done.code, "1 of 8 pairs regenerated" in done.out) == (0, True)
-    assert path.read_bytes() == (filmed / "shards" / "shard-00001.tar").read_bytes()
-
-
-def test_lost_shard_and_manifest_are_regenerated_from_videos(
-    films: Path, filmed: Path, run_main: RunMain, tmp_path: Path
-) -> None:
-    copy = Path(shutil.copytree(filmed, tmp_path / "ds"))
-    (copy / "shards" / "shard-00001.tar").unlink()
-    (copy / "manifest.csv").unlink()
-    assert run_main("verify", copy, "--repair", f"source.root={films}").code == 0
-    assert (copy / "manifest.csv").read_bytes() == (filmed / "manifest.csv").read_bytes()
-
-
-def test_finished_dataset_of_videos_is_complete(films: Path, filmed: Path, make: Make) -> None:
-    assert make(films, filmed, *CLIPS).made == 0
 
 
 def test_another_video_of_the_same_name_and_size_is_noticed(
@@ -244,13 +193,9 @@ def test_a_folder_of_videos_alone_needs_no_other_globs(films: Path, settings: Se
     from unprocess_gen.config.validation import validate_config
 
     config = settings("source.clips=true", "source.include=[]")
-    config.source.root = str(films)
+    config = replaced(config, {"source.root": str(films)})
     validate_config(config)
     assert len(list_photographs(config.source).sources) == 34
-
-
-def test_a_plan_counts_frames(films: Path, run_main: RunMain) -> None:
-    assert "sources   38 " in run_main("plan", f"source.root={films}", "source.clips=true").out
 
 
 def test_ffmpeg_knows_every_accepted_codec() -> None:

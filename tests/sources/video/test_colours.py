@@ -105,17 +105,6 @@ def test_lossless_rgb_is_decoded_exactly(pix_fmt: str, tmp_path: Path) -> None:
     assert [np.array_equal(rgb(video, number), frame) for number, frame in enumerate(wanted)] == [True] * 3
 
 
-def test_a_picture_survives_yuv444_to_the_rounding_of_its_codes(tmp_path: Path) -> None:
-    """From RGB by the formula's inverse, codes rounded: half a code of Y, U and V each, in 8 bits of limited range."""
-    picture = scene(1, 40, 30)[0].astype(float) / 255
-    kr, kb = WEIGHTS[1]
-    y = picture @ [kr, 1 - kr - kb, kb]
-    u, v = (picture[..., 2] - y) / (2 * (1 - kb)), (picture[..., 0] - y) / (2 * (1 - kr))
-    planes = [np.rint(one).astype(np.uint8) for one in (16 + 219 * y, 128 + 224 * u, 128 + 224 * v)]
-    path = film(tmp_path / "a.mkv", "ffv1", "yuv444p", [raw_frame("yuv444p", planes)], colorspace=1, color_range=1)
-    assert np.abs(rgb(opened(path), 0) - picture * 255).max() < 0.5 + 0.5 * 255 / 219 + 0.5 * 1.86 * 255 / 224
-
-
 @pytest.mark.parametrize(("bits", "pix_fmt"), [(8, "yuv444p"), (10, "yuv444p10le")])
 def test_a_gray_ramp_of_limited_range_maps_exactly(bits: int, pix_fmt: str, tmp_path: Path) -> None:
     unit, white = 1 << bits - 8, 255 if bits == 8 else 65535

@@ -88,18 +88,6 @@ def test_frames_and_their_order_are_those_of_a_player(kind: str, encoded: Callab
         assert np.abs(found - wanted)[inside].max() < 1
 
 
-def test_decoder_starts_at_each_closed_group(encoded: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    starts: list[int] = []
-    packets = Video._packets
-    monkeypatch.setattr(Video, "_packets", lambda self, start: starts.append(start) or packets(self, start))
-    for kind, groups in (("h264", 5), ("h264_open", 1), ("hevc", 5), ("mjpeg", 1), ("ffv1", 6), ("vp9", 3)):
-        starts.clear()
-        video = opened(encoded(kind))
-        for number in range(30):
-            rgb(video, number)
-        assert (kind, len(starts)) == (kind, groups)
-
-
 def test_times_of_any_spacing_make_frames_in_their_order(tmp_path: Path) -> None:
     wanted = scene(6)
     path = film(tmp_path / "a.mkv", "ffv1", "bgr0", wanted, times=[0, 1, 2, 30, 31, 90])

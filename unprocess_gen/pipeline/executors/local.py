@@ -20,30 +20,15 @@ import signal
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
 
 from unprocess_gen.pipeline.tasks import RunContext, ShardReport, ShardTask
 from unprocess_gen.pipeline.worker import commit_provisional, make_and_commit
 
-TRACKER_FILTER = "ignore:resource_tracker:UserWarning"
-"""Silences loky's tracker process, which reports objects of an interrupted run after it has removed them."""
-
 
 def effective_jobs(n_jobs: int, tasks: int) -> int:
-    """Return the number of workers to start.
-
-    Parameters
-    ----------
-    n_jobs : int
-        The setting; -1 means all cores that this process may use.
-    tasks : int
-        Number of shards to make; more workers than shards are never started.
-
-    Returns
-    -------
-    int
-        At least 1.
-    """
+    """Number of workers to start: -1 means all cores that this process may use, and there are no more than tasks."""
     if n_jobs == -1:
         from joblib import cpu_count
 
@@ -102,7 +87,8 @@ def _run_pool(context: RunContext, tasks: Sequence[ShardTask], n_jobs: int) -> I
         warnings.filterwarnings("ignore", message=".*tasks.*", module="joblib")  # tasks cancelled by an interrupt
         # where psutil is installed, loky replaces a worker that keeps 300 MB of freed memory, and no work is lost
         warnings.filterwarnings("ignore", message="A worker stopped", module="joblib")
-        with interrupts_ignored(), _tracker_silenced():
+        with interrupts_ignored():
+            start_tracker()
             results = parallel(delayed(make_and_commit)(context, task) for task in tasks)
         with closing(results):
             yield from results
@@ -127,15 +113,15 @@ def interrupts_ignored() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-@contextmanager
-def _tracker_silenced() -> Iterator[None]:
-    """Let processes that start now inherit `TRACKER_FILTER`."""
-    before = os.environ.get("PYTHONWARNINGS")
-    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [before, TRACKER_FILTER]))
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["PYTHONWARNINGS"]
-        else:
-            os.environ["PYTHONWARNINGS"] = before
+def start_tracker() -> None:
+    """Start loky's tracker process without stderr, where it prints tracebacks after the death of a worker."""
+    from joblib.externals.loky.backend.resource_tracker import ensure_running
+
+    with ExitStack() as stack:
+        with suppress(OSError):  # stderr is closed
+            stderr = os.dup(2)
+            stack.callback(os.close, stderr)
+            stack.callback(os.dup2, stderr, 2)
+            with Path(os.devnull).open("wb") as nothing:
+                os.dup2(nothing.fileno(), 2)
+        ensure_running()

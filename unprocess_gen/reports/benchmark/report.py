@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, fields
+from functools import partial
 from pathlib import Path
 
+from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
 from unprocess_gen.reports.benchmark.figure import benchmark_figure
-from unprocess_gen.reports.benchmark.measure import BenchmarkReport
-from unprocess_gen.reports.benchmark.tables import (
-    csv_text,
-    method_table,
-    recommendation_table,
-    run_table,
-    runs_csv_text,
-    text_table,
-)
-from unprocess_gen.reports.html_pages import data_uri, render_page
+from unprocess_gen.reports.benchmark.measure import BenchmarkReport, Measurement
+from unprocess_gen.reports.benchmark.session import EXACT, FAST, GIVEN, REFERENCE
+from unprocess_gen.reports.formatting import percentage, short_number
+from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
 from unprocess_gen.reports.report_files import write_files
 
 __all__ = ["FILES", "benchmark_page", "report_text", "write_benchmark"]
@@ -25,20 +25,13 @@ COLUMNS = 120
 
 FILES = ("accuracy.csv", "accuracy_runs.csv", "accuracy.png", "accuracy.html")
 
+ratio_text = partial(short_number, digits=3)
+nanoseconds = partial(short_number, digits=3)
+
 
 def report_text(report: BenchmarkReport) -> str:
-    """Return what the verb prints: methods, complete runs, the conclusion, and the recommended tiers.
-
-    Parameters
-    ----------
-    report : BenchmarkReport
-        The measurements.
-
-    Returns
-    -------
-    str
-        Several lines without a final newline.
-    """
+    """Text that the verb prints: methods, complete runs, the conclusion, and the recommended tiers."""
+    advice = (f"{use}: {tier}; {reason}" for use, tier, reason in RECOMMENDATIONS.lines)
     return "\n".join(
         [
             text_table(method_table(report.rows)),
@@ -46,73 +39,156 @@ def report_text(report: BenchmarkReport) -> str:
             "complete runs, from files to committed shards: processor time and its shares; errors of the noisy frames",
             text_table(run_table(report.runs)),
             "",
-            textwrap.fill(report.conclusion, COLUMNS, break_on_hyphens=False),
+            textwrap.fill(conclude(report), COLUMNS, break_on_hyphens=False),
             "",
             "recommended tiers",
-            *(_recommended(*line) for line in recommendation_table().lines),
+            *(textwrap.fill(line, COLUMNS, initial_indent="  ", subsequent_indent="    ") for line in advice),
         ]
     )
 
 
-def _recommended(use: str, tier: str, reason: str) -> str:
-    text = f"{use}: {tier}; {reason}"
-    return textwrap.fill(text, COLUMNS, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
-
-
 def write_benchmark(report: BenchmarkReport, out: Path) -> None:
-    """Write the files of a report, replacing those of an earlier one.
-
-    Parameters
-    ----------
-    report : BenchmarkReport
-        The measurements.
-    out : Path
-        Folder to write to.
-
-    Raises
-    ------
-    MachineError
-        If a file cannot be written.
-    """
+    """Write the files of a report, replacing those of an earlier one; MachineError if that fails."""
     picture = benchmark_figure(report.rows, report.runs)
-    texts = (csv_text(report.rows), runs_csv_text(report.runs))
+    texts = (csv_text(kind, rows) for kind, rows in ((Measurement, report.rows), (RunMeasurement, report.runs)))
     contents = (*(text.encode() for text in texts), picture, benchmark_page(report, picture).encode())
     write_files(out, dict(zip(FILES, contents, strict=True)))
 
 
-NOTES = (
-    "Errors of the stages curve, colour, mosaic and quantise: clean frame at 14 bits, in DN, with all other stages "
-    "exact. Error of normal: in σ, against the exact quantile. Error of shot: the maximum is the largest difference of "
-    "the distribution functions of shot plus read noise; the RMS is measured on photographs, in σ of shot and read "
-    "noise. Error of effects: noisy frame at 14 bits without shot noise, in DN.",
-    "End-to-end rows of the tiers: tier is the clean frame at 14 bits with two-parameter noise, tier_noisy its noisy "
-    "frame in σ, tier_electrons the noisy frame of the physical profile in σ, and tier_own the clean frame of the "
-    "given settings. The noisy frame of the given settings is in the table of complete runs.",
-    "Times of curve, colour and mosaic run from the codes to the end of the stage, because the kernels fuse these "
-    "stages. Times of effects are the differences they make to a pair. The last column is the median of the ratios "
-    "within a round. A dash means that the value was not measured separately.",
-)
-
-RUN_NOTES = (
-    "A run reads files and commits shards with one worker. Time is processor time of all threads; of exact is its "
-    "ratio to the exact tier. Decode, simulate and write are shares of the run; write includes hashing and committing.",
-    "Errors are those of the noisy frames against the reference, which uses the same uniform random numbers: the share "
-    "of sites that differ, and the largest and RMS error in DN and in standard deviations (σ) of shot, read and "
-    "rounding noise. The settings given are those of the command, whose clean frames are the stage tier_own below.",
-)
-
-
 def benchmark_page(report: BenchmarkReport, picture: bytes) -> str:
-    """Return ``accuracy.html``, one file that contains the figure."""
+    """``accuracy.html``, one file that contains the figure."""
     return render_page(
         "benchmark.html",
         title="Cost of accuracy",
         figure=data_uri(picture),
-        conclusion=report.conclusion,
+        conclusion=conclude(report),
         runs=run_table(report.runs),
-        recommendations=recommendation_table(),
+        recommendations=RECOMMENDATIONS,
         measurements=method_table(report.rows),
-        run_notes=RUN_NOTES,
-        notes=NOTES,
         conditions=report.conditions,
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- conclusion
+
+
+RECOMMENDATIONS = PageTable(
+    ("use", "tier", "reason"),
+    (
+        ("training data", EXACT, "fast shortens only the simulation; the table of runs shows what it saves"),
+        ("benchmark whose files are published", EXACT, "every DN is that of the reference"),
+        ("proof, or comparison with the article", REFERENCE, "NumPy code to read; the same DN as exact"),
+        ("quick look", FAST, "its errors cannot be seen in pictures"),
+    ),
+    wrapped={2},
+)
+"""The tier recommended for each use."""
+
+
+def conclude(report: BenchmarkReport) -> str:
+    """One sentence about the given tier in runs with the given settings, or about `FAST` if `EXACT` is given."""
+    compared = FAST if report.given_tier == EXACT else report.given_tier
+    run = next(run for run in report.runs if (run.setting, run.tier) == (GIVEN, compared))
+    what = f"In a complete run of {report.photographs} with noise={run.noise}"
+    return f"{what}, the tier {run.tier} {time_clause(run)} and {error_clause(run)}."
+
+
+def time_clause(run: RunMeasurement) -> str:
+    """The time that a tier saves; a difference counts only if both quartiles of the ratios agree with it."""
+    if run.ratio_to_exact is None or run.lower_quartile_ratio is None or run.upper_quartile_ratio is None:
+        return "was too slow to be timed"
+    ratio = ratio_text(run.ratio_to_exact)
+    ratios = (run.ratio_to_exact, run.lower_quartile_ratio, run.upper_quartile_ratio)
+    if min(ratios) <= 1 <= max(ratios) or ratio == "1":
+        return f"takes about as long as {EXACT} (ratio {ratio}, no clear difference)"
+    return f"takes {ratio} {'of' if run.ratio_to_exact < 1 else 'times'} the processor time of {EXACT}"
+
+
+def error_clause(run: RunMeasurement) -> str:
+    """The errors of a tier."""
+    if run.noisy_changed_share == 0:
+        return "changes no noisy DN of the reference"
+    largest = (
+        f"{short_number(run.noisy_max_dn)} DN or {short_number(run.noisy_max_std)} standard deviations of the noise"
+    )
+    rms = f"RMS {short_number(run.noisy_rms_dn)} DN, {short_number(run.noisy_rms_std)} standard deviations"
+    return f"moves {percentage(run.noisy_changed_share)} of the noisy DN, by at most {largest} ({rms})"
+
+
+# --------------------------------------------------------------------------------------------------------------- tables
+
+
+def csv_text(kind: type, rows: Sequence[Measurement] | Sequence[RunMeasurement]) -> str:
+    """A CSV file with a column for each field of a kind of row; values that were not measured are empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(column.name for column in fields(kind))
+    for row in rows:
+        writer.writerow(f"{value:.6g}" if isinstance(value, float) else value for value in astuple(row))
+    return text.getvalue()
+
+
+Columns = dict[str, tuple[str, Callable[[float | None], str] | None]]
+"""Field and number format of each column by its heading; columns of text have no format."""
+
+METHOD_COLUMNS: Columns = {
+    "stage": ("stage", None),
+    "method": ("method", None),
+    "tiers": ("tier", None),
+    "max error": ("error_max", short_number),
+    "RMS error": ("error_rms", short_number),
+    "unit": ("error_unit", None),
+    "changed": ("changed_share", percentage),
+    "ns per pixel": ("ns_per_pixel", nanoseconds),
+    "of reference": ("ratio_to_reference", percentage),
+}
+
+RUN_COLUMNS: Columns = {
+    "settings": ("setting", None),
+    "noise": ("noise", None),
+    "tier": ("tier", None),
+    "of exact": ("ratio_to_exact", ratio_text),
+    "ns per pixel": ("ns_per_pixel", nanoseconds),
+    "decode": ("decode_share", percentage),
+    "simulate": ("simulate_share", percentage),
+    "write": ("write_share", percentage),
+    "changed": ("noisy_changed_share", percentage),
+    "max DN": ("noisy_max_dn", short_number),
+    "RMS DN": ("noisy_rms_dn", short_number),
+    "max σ": ("noisy_max_std", short_number),
+    "RMS σ": ("noisy_rms_std", short_number),
+}
+
+
+def method_table(rows: Sequence[Measurement]) -> PageTable:
+    """The table of methods and tiers, grouped by stage."""
+    return _table(METHOD_COLUMNS, rows)
+
+
+def run_table(runs: Sequence[RunMeasurement]) -> PageTable:
+    """The table of complete runs, grouped by setting: time and its shares, then errors of the noisy frames."""
+    return _table(RUN_COLUMNS, runs)
+
+
+def _table(columns: Columns, rows: Sequence[Measurement] | Sequence[RunMeasurement]) -> PageTable:
+    """A table that is grouped by its first column."""
+    lines = [
+        [getattr(row, field) if text is None else text(getattr(row, field)) for field, text in columns.values()]
+        for row in rows
+    ]
+    numeric = {index for index, (_, text) in enumerate(columns.values()) if text}
+    groups = {index for index, line in enumerate(lines) if index == 0 or line[0] != lines[index - 1][0]}
+    return PageTable(list(columns), lines, numeric, groups)
+
+
+def text_table(table: PageTable) -> str:
+    """A table as aligned lines for a terminal, without a final newline."""
+    lines = [table.headings, *table.lines]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if index in table.numeric else cell.ljust(width)
+            for index, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
     )

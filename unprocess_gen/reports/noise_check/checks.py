@@ -9,80 +9,61 @@ from __future__ import annotations
 import itertools
 import math
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from unprocess_gen.core.object_store import AnyPath
+from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_rows
 from unprocess_gen.dataset.reader import mosaic_dn
-from unprocess_gen.reports.noise_check.law import NoiseLaw, is_supported
 from unprocess_gen.reports.noise_check.scores import LEAST_SITES, Score, Scores, scores_of
 from unprocess_gen.reports.noise_check.sums import Sums
+from unprocess_gen.simulation.effects import BY_NAME
 
 FALSE_ALARM = 1e-6
 """Probability of any alarm for a dataset whose noise is as recorded."""
-
 SHARED_ROUNDING = 0.15
 """Fraction of the rounding error that pairs with other curves or gains share, because most histograms decrease."""
-
 CURVES = 4096
 """Groups of pairs whose rounding errors are added separately."""
-
 LISTED = 20
 """Pairs with wrong noise that are listed."""
 
 
 class Check(NamedTuple):
-    """Describe a check.
+    """Text of a check: estimated quantity, unit, what it is compared with, causes of a value too low and too high.
 
-    Attributes
-    ----------
-    rank : int
-        Order in which failed checks are named: the most specific first, equal ranks by significance.
-    unit : str
-        Unit of the estimate.
-    low, high : str
-        Likely causes of a value that is too low and too high.
-    column : str
-        Manifest columns with the expected value.
+    Failed checks are named by ``rank``, equal ranks by significance. Estimates are multiplied by ``scale``.
     """
 
     rank: int
+    quantity: str
     unit: str
+    expected: str
     low: str
     high: str
-    column: str
+    scale: float = 1.0
 
 
-_SWAPPED = "sites were swapped, or the frame has another CFA pattern"
-_OFFSET = "another black level, or an offset of the plane"
-_GAIN = "another exposure or gain of the noisy frame"
-_SCALE = "the noise has other numbers than the row"
+_OFFSET, _GAIN, _SWAPPED = "wrong black level or plane offset", "wrong exposure or gain", "swapped sites or CFA pattern"
+_WEAK, _STRONG = "weaker noise than recorded, or another distribution", "stronger noise, or another distribution"
+_ROWS, _COLUMNS = ("row noise is missing", "row noise is too strong"), ("column offsets are missing", "column stripes")
 CHECKS = {
-    "diagonal sites": Check(0, "of the difference of two sites", _SWAPPED, _SWAPPED, "pattern"),
-    "horizontal sites": Check(0, "of the difference of two sites", _SWAPPED, _SWAPPED, "pattern"),
-    "vertical sites": Check(0, "of the difference of two sites", _SWAPPED, _SWAPPED, "pattern"),
-    "mean": Check(0, "DN", _OFFSET, _OFFSET, "black_level_dn"),
-    "mean against signal": Check(0, "of the signal", _GAIN, _GAIN, "exposure_ratio"),
-    "row means": Check(1, "DN²", "row noise is missing", "row noise is too strong", "row_std_dn"),
-    "column means": Check(1, "DN²", "column offsets are missing", "stripes, or another fixed pattern", "column_std_dn"),
-    "row differences": Check(1, "DN²", "row noise is missing", "row noise is too strong", "row_std_dn"),
-    "column differences": Check(
-        1, "DN²", "column offsets are missing", "stripes, or another fixed pattern", "column_std_dn"
-    ),
-    "variance": Check(2, "DN²", _SCALE, _SCALE, "b_dn2"),
-    "variance against signal": Check(2, "DN", _SCALE, _SCALE, "a_dn"),
-    "kurtosis": Check(
-        2, "in the mean of cos 2z", "a distribution with lighter tails", "a distribution with heavier tails",
-        "read_law",
-    ),
-    "horizontal neighbours": Check(3, "correlation", "sharpened frames", "smoothed frames, or row noise", "row_std_dn"),
-    "vertical neighbours": Check(3, "correlation", "sharpened frames", "smoothed frames, or stripes", "column_std_dn"),
-}  # fmt: skip
+    "diagonal sites": Check(0, "share of the diagonal site's light", "%", "0", _SWAPPED, _SWAPPED, 100),
+    "mean": Check(0, "mean", "DN", "black_level_dn", _OFFSET, _OFFSET),
+    "mean against signal": Check(0, "signal", "%", "that of the clean frame", _GAIN, _GAIN, 100),
+    "row means": Check(1, "variance of row offsets", "DN²", "row_std_dn²", *_ROWS),
+    "row differences": Check(1, "variance of differences of rows", "DN²", "that by row_std_dn", *_ROWS),
+    "column means": Check(1, "variance of column offsets", "DN²", "the recorded one", *_COLUMNS),
+    "column differences": Check(1, "variance of differences of columns", "DN²", "the recorded one", *_COLUMNS),
+    "variance": Check(2, "variance", "DN²", "the recorded one", _WEAK, _STRONG),
+    "variance against signal": Check(2, "variance per signal", "DN", "a_dn", "smaller gain", "larger gain"),
+    "neighbours": Check(3, "correlation of neighbours", "%", "0", "sharpened frames", "smoothed frames", 100),
+}
 """Checks by name."""
 
 TESTS = len(CHECKS) + 8
@@ -91,89 +72,35 @@ TESTS = len(CHECKS) + 8
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """A score that contradicts the manifest.
-
-    Attributes
-    ----------
-    key : str
-        Key of the pair; empty for all pairs together.
-    check, plane : str
-        Names of the check and of the plane; the plane is empty if all planes are summed.
-    score : Score
-        The score.
-    others : int
-        Other failed checks of the same pair.
-    """
+    """Score that contradicts the manifest; ``key`` is empty for all pairs together, ``plane`` for all planes."""
 
     key: str
     check: str
     plane: str
     score: Score
-    others: int = 0
 
     def __str__(self) -> str:
         check, score = CHECKS[self.check], self.score
-        estimate, error = score.total / score.information, 1.96 * score.std / score.information
-        where = self.key or "all pairs together"
-        name = f"{self.check} of plane {self.plane}" if self.plane else self.check
-        others = f" ({self.others} other checks differ too)" if self.others > 1 else " (another check differs too)"
-        cause = check.high if score.excess > 0 else check.low
+        size, error = (check.scale * value / score.information for value in (abs(score.total), 1.96 * score.std))
+        decimals = max(0, -math.floor(math.log10(error)))
+        side, cause = ("above", check.high) if score.excess > 0 else ("below", check.low)
         return (
-            f"noise of {where}: {name}: {estimate:+.4g} ± {error:.2g} {check.unit} from what {check.column} records: "
-            f"{score.errors:+.1f} standard errors; likely cause: {cause}{others if self.others else ''}"
+            f"noise of {self.key or 'all pairs together'}: {check.quantity}{self.plane and f' of plane {self.plane}'} "
+            f"is {size:,.{decimals}f} ± {error:,.{decimals}f} {check.unit} {side} {check.expected} "
+            f"({abs(score.errors):,.0f} standard errors): {cause}"
         )
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseChecks:
-    """Result for a dataset.
-
-    Attributes
-    ----------
-    count, unchecked : int
-        Pairs that were checked, and pairs with too few usable sites or an unknown effect.
-    alarms : list of Alarm
-        All pairs together, with one failed check of each rank; then the first `LISTED` wrong pairs.
-    wrong_pairs : int
-        Number of wrong pairs.
-    """
-
-    count: int = 0
-    unchecked: int = 0
-    alarms: list[Alarm] = field(default_factory=list)
-    wrong_pairs: int = 0
-
-
 def pair_sums(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> Sums | None:
-    """Sum the statistics of a pair.
+    """Sum the statistics of a pair with its manifest row.
 
-    Parameters
-    ----------
-    clean, noisy : ndarray
-        Frames in the dtype and layout of the dataset.
-    row : Row
-        Manifest row of the pair.
-    dark_pixels : DarkPixels or None
-        Access to the dark frames of the dataset, which pairs with dark frames need.
-
-    Returns
-    -------
-    Sums or None
-        None if the pair has too few usable sites, or noise that `law.is_supported` excludes.
-
-    Raises
-    ------
-    DamageError
-        If the row is not a plan.
-    SourceChangedError
-        If its dark frame is missing or has changed.
+    None if the pair has too few usable sites, an unknown effect, or a dark frame without access to its pixels.
     """
     plan = plan_from_row(row)
-    if not is_supported(plan, dark_pixels):
+    if not BY_NAME.keys() >= set(plan.noise.effects) or (plan.noise.dark.sha256 and dark_pixels is None):
         return None
     with np.errstate(under="ignore"):
-        law = NoiseLaw(plan, patch_from_row(row), dark_pixels)
-        sums = Sums(law, mosaic_dn(clean, row), mosaic_dn(noisy, row))
+        sums = Sums(plan, patch_from_row(row), mosaic_dn(clean, row), mosaic_dn(noisy, row), dark_pixels)
         if sums.sites < LEAST_SITES:
             return None
         sums.fill()
@@ -181,150 +108,110 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | No
 
 
 def pair_scores(sums: Sums) -> Scores:
-    """Return the scores of a pair; `scores.scores_of` without floating-point warnings of tiny values."""
+    """Scores of a pair, without floating-point warnings of tiny values."""
     with np.errstate(under="ignore"):
         return scores_of(sums)
 
 
 def threshold(pairs: int) -> float:
-    """Return the surprise from which a score is an alarm, in a dataset with a number of pairs."""
+    """Surprise from which a score is an alarm, in a dataset with a number of pairs."""
     return math.log(2 * TESTS * (pairs + 1) / FALSE_ALARM)
 
 
 def failed_checks(key: str, scores: Scores, limit: float) -> list[Alarm]:
-    """Return the failed checks of a pair.
-
-    Parameters
-    ----------
-    key : str
-        Key of the pair; empty for all pairs together.
-    scores : Scores
-        Its scores.
-    limit : float
-        `threshold`.
-
-    Returns
-    -------
-    list of Alarm
-        The most specific check first.
-    """
+    """Scores with a surprise above ``limit``, the check that explains most first."""
     failed = [Alarm(key, *name, score) for name, score in scores.items() if score.surprise > limit]
     return sorted(failed, key=lambda alarm: (CHECKS[alarm.check].rank, -alarm.score.surprise))
 
 
 class Checker:
-    """Check the pairs of a dataset one after the other.
+    """Check the pairs of a dataset in a folder, one after the other.
 
-    Parameters
+    Attributes
     ----------
-    folder : Path or ObjectPath
-        Folder of the dataset.
+    count, unchecked, wrong_pairs : int
+        Pairs that were checked, those that cannot be, and those with wrong noise.
     """
 
     def __init__(self, folder: AnyPath) -> None:
-        self._overlaps = np.fromiter(overlaps(folder), dtype=np.float64)
+        self._overlaps = np.array(list(overlaps(folder))).reshape(-1, 2)
         self._limit = threshold(len(self._overlaps))
-        self._pooled: dict[tuple[str, str], PooledScore] = {}
-        self._count = self._seen = self._wrong = 0
-        self._alarms: list[Alarm] = []
+        self._pool, self._alarms = Pool(), list[Alarm]()
+        self.count = self.unchecked = self.wrong_pairs = 0
 
     def add(self, row: Row, sums: Sums | None) -> None:
         """Check the next pair of the dataset; ``sums`` is the result of `pair_sums`."""
-        overlap = self._overlaps[self._seen]
-        self._seen += 1
+        in_sites, in_rows = self._overlaps[self.count + self.unchecked].tolist()
         if sums is None:
+            self.unchecked += 1
             return
-        self._count += 1
+        self.count += 1
         scores = pair_scores(sums)
-        for name, score in scores.items():
-            self._pooled.setdefault(name, PooledScore()).add(score, float(overlap), curve_group(sums.law.plan))
+        self._pool.add(scores, in_rows if sums.planes[0].noise.row_variance else in_sites, curve_group(sums.plan))
         failed = failed_checks(str(row["key"]), scores, self._limit)
-        self._wrong += bool(failed)
-        if failed and self._wrong <= LISTED:
-            self._alarms.append(replace(failed[0], others=len(failed) - 1))
+        self.wrong_pairs += bool(failed)
+        self._alarms += failed[:1] if self.wrong_pairs <= LISTED else []
 
-    def result(self) -> NoiseChecks:
-        """Return the result for the pairs that were added."""
-        pooled = {name: score.score() for name, score in self._pooled.items()} if self._count > 1 else {}
-        failed = failed_checks("", pooled, self._limit)
-        # checks of one rank find the same faults
-        ranks = {CHECKS[alarm.check].rank: alarm for alarm in reversed(failed)}
-        first = [ranks[rank] for rank in sorted(ranks)]
-        return NoiseChecks(self._count, self._seen - self._count, first + self._alarms, self._wrong)
+    @property
+    def alarms(self) -> list[Alarm]:
+        """Alarm of each rank for all pairs together, because one rank finds the same faults, and of the first pairs."""
+        failed = failed_checks("", self._pool.scores(), self._limit) if self.count > 1 else []
+        ranks = itertools.groupby(failed, key=lambda alarm: CHECKS[alarm.check].rank)
+        return [*(next(alarms) for _, alarms in ranks), *self._alarms]
 
 
-class PooledScore:
-    """Add the scores of one check over pairs.
+class Pool:
+    """Sums of the scores of pairs.
 
     Noise of different pairs is independent, so variances add. Patterns of the body, and rounding errors of clean frames
     with the same curve and gains, may be equal, so their standard deviations add.
     """
 
     def __init__(self) -> None:
-        self._sums = np.zeros(6)
-        self._step = 0.0
-        self._one_sided = False
-        self._rounding: dict[int, float] = {}
+        self._sums: Scores = {}
+        self._rounding: defaultdict[tuple[str, str], defaultdict[int, float]] = defaultdict(lambda: defaultdict(float))
 
-    def add(self, score: Score, overlap: float, group: int) -> None:
-        """Add the score of a pair.
+    def add(self, scores: Scores, overlap: float, group: int) -> None:
+        """Add a pair that has noise in common with ``overlap`` pairs, itself included; ``group``: `curve_group`."""
+        for name, score in scores.items():
+            score = score._replace(variance=score.variance * overlap, step=score.step * overlap)
+            before = self._sums.get(name, Score(0.0, 0.0, 0.0))
+            total = Score(*map(sum, zip(before, score, strict=True)))
+            self._sums[name] = total._replace(step=max(before.step, score.step))
+            self._rounding[name][group] += score.rounding
 
-        Parameters
-        ----------
-        score : Score
-            The score.
-        overlap : float
-            Number of pairs whose noise may have values in common with this pair.
-        group : int
-            `curve_group` of the pair.
-        """
-        below = score.below if math.isfinite(score.below) else 0.0
-        self._one_sided = not math.isfinite(score.below)
-        self._sums += score.total, score.variance * overlap, score.fixed, score.above, below, score.information
-        self._step = max(self._step, score.step * overlap)
-        self._rounding[group] = self._rounding.get(group, 0.0) + score.rounding
-
-    def score(self) -> Score:
-        """Return the score of all pairs."""
-        total, variance, fixed, above, below, information = self._sums.tolist()
-        groups = list(self._rounding.values())
-        rounding = math.hypot(*groups, SHARED_ROUNDING * sum(groups))
-        below = math.inf if self._one_sided else below
-        return Score(total, variance, rounding, fixed, self._step, above, below, information)
+    def scores(self) -> Scores:
+        """Scores of all pairs together."""
+        return {
+            name: score._replace(rounding=math.hypot(SHARED_ROUNDING * score.rounding, *self._rounding[name].values()))
+            for name, score in self._sums.items()
+        }
 
 
 def curve_group(plan: Plan) -> int:
-    """Return the number of the group of a plan; plans that map codes to the same clean values are in one group."""
-    curve = plan.rgb2cam, plan.inverse_gains, plan.exposure_ratio, plan.tone, plan.gamma, plan.highlight
-    return zlib.crc32(repr((curve, plan.black_level_dn, plan.white_level_dn)).encode()) % CURVES
+    """Group of plans that map codes to the same clean values."""
+    curve = plan.scene.exposure_ratio, plan.camera, plan.isp, plan.sensor
+    return zlib.crc32(repr(curve).encode()) % CURVES
 
 
-def overlaps(folder: AnyPath) -> Iterator[int]:
-    """Yield, for each pair of a dataset, how many pairs can have noise values in common with it, including itself.
+def overlaps(folder: AnyPath) -> Iterator[tuple[int, int]]:
+    """Yield, for each pair of a dataset, how many pairs have common sites with it, and common rows, including itself.
 
-    Patches of a frame share the noise of their common sites. With row or column noise they also share the offsets of
-    common rows and columns.
+    Patches of a frame share the noise of their common sites, and the offsets of their common rows.
     """
     rows = (row for row in read_rows(folder / "manifest.csv") if row["status"] == "ok")
-    for _, group in itertools.groupby(rows, key=lambda row: (row["stream_key"], row["frame"])):
-        yield from _overlaps_of(list(group))
-
-
-def _overlaps_of(rows: Sequence[Row]) -> Iterator[int]:
-    """Yield the overlaps of the patches of one frame, each at several levels and draws."""
     names = ("patch_y", "patch_x", "height", "width", "level", "draw")
-    y, x, height, width, level, draw = np.array([[int(row[name] or 0) for name in names] for row in rows]).T
-    for n, row in enumerate(rows):
-        same = (level == level[n]) & (draw == draw[n])
-        in_rows = (y < y[n] + height[n]) & (y[n] < y + height)
-        in_columns = (x < x[n] + width[n]) & (x[n] < x + width)
-        shared = in_rows & in_columns
-        if "row" in str(row["effects"]).split(";"):
+    for _, group in itertools.groupby(rows, key=lambda row: (row["stream_key"], row["frame"])):
+        patches = list(group)
+        y, x, height, width, level, draw = np.array([[int(row[name] or 0) for name in names] for row in patches]).T
+        for n, row in enumerate(patches):
+            same = (level == level[n]) & (draw == draw[n])
+            gaps = np.maximum(y - y[n] - height[n], y[n] - y - height)
+            in_columns = (x < x[n] + width[n]) & (x[n] < x + width)
             reach = _row_reach(float(row.get("row_correlation") or 0.0))
-            shared = (y < y[n] + height[n] + reach) & (y[n] < y + height + reach)
-        yield int((same & shared).sum())
+            yield int((same & (gaps < 0) & in_columns).sum()), int((same & (gaps < reach)).sum())
 
 
 def _row_reach(correlation: float) -> int:
-    """Return the distance of rows whose offsets have a correlation below 1 %."""
+    """Distance of rows whose offsets have a correlation below 1 %."""
     return 0 if correlation == 0 else math.ceil(math.log(0.01) / math.log(abs(correlation)))

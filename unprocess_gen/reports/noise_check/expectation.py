@@ -1,245 +1,163 @@
-"""Compute what the noise law predicts for every DN of the clean frame.
+"""Compute what is expected of the noise at the sites of one plane, for each DN of the clean frame.
 
-A rounded clean value c means that the unrounded x is within half a DN of it. Expectations are therefore computed for
-the lowest, the middle and the highest x. They are split into their mean over the interval, the part that is linear in
-x, which `scores` removes, and the rest, whose size is recorded as unknown.
+``z`` is noisy minus expected DN over the standard deviation of the noise, limited to ±`LARGEST_Z`. A rounded clean
+value c means that the unrounded x is within half a DN of it; unrounded values are collected in narrow bins instead.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Float
-from unprocess_gen.reports.noise_check.law import Factors, NoiseLaw
-
-Mask = NDArray[np.bool_]
+from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, Complex, Site
+from unprocess_gen.simulation.reference.sensor import noisy_limits
 
 LEAST_STD_DN = 1.0
 """Least standard deviation of noise in rounded frames; below it, rounding errors depend on the noise."""
-LEAST_FLOAT_STD = 1e-6
-"""Least standard deviation in float32 frames, as a fraction of white minus black: 30 times the rounding error."""
+MOST_BINS = 2**16
+"""Bins of an unrounded frame."""
 MOST_ELECTRON = 2.0
 """Largest effect of a single electron, in standard deviations of the noise; beyond it, z is too skewed."""
 LARGEST_Z = 8.0
 """Bound of z. It changes the mean of z by less than 1e-5 if `MOST_ELECTRON` holds."""
 ROUNDING_SQUARE = 1 / 12
-"""Standard deviation of ε², with ε the rounding error in units of the interval's width.
-
-It is 0.0745 for an ε drawn from the interval, and 1/12 if all sites are in the middle.
-"""
+"""Standard deviation of the square of the rounding error in bins: 0.0745 if uniform, 1/12 if all are 0."""
 
 
-@dataclass(frozen=True, slots=True)
-class Cosine:
-    """Expectations of cos kz for N clean DN.
+class PlaneNoise:
+    """Noise that a plan predicts for the sites of one plane: the sum of its effects."""
 
-    Attributes
-    ----------
-    mean, slope : ndarray of float64, [N]
-        Expectation of ``cos kz - slope · (noisy - c)``, and the derivative of the expectation of cos kz by x (per DN).
-    unknown : ndarray of float64, [N]
-        Standard deviation of that expectation due to the rounding of x; without rounding, error of ``by_square``.
-    by_clean, by_square : ndarray of float64, [N]
-        For frames without rounding: coefficients of the difference d of x from the nearest DN, and of d², by which the
-        expectation at x differs. 0 for rounded frames.
-    by_variance : ndarray of float64, [N]
-        Derivative by the variance of the noise (per DN²).
-    variance, fixed_variance : ndarray of float64, [N]
-        Variance of cos kz at one site, and the part of it that frames of one body share.
-    """
+    def __init__(self, site: Site) -> None:
+        self.site = site
+        self.effects = [BY_NAME[name].expected(site) for name in site.plan.noise.effects]
+        self.offset_dn = np.asarray(sum(effect.offset_dn for effect in self.effects), dtype=np.float32)
+        self.clean_offset_dn = sum(effect.clean_offset_dn for effect in self.effects)
+        self.defects = sum(effect.defects for effect in self.effects)
+        self.row_variance = sum(effect.row_variance for effect in self.effects)
+        self.row_correlation = sum(effect.row_correlation for effect in self.effects)
 
-    mean: Float
-    slope: Float
-    unknown: Float
-    by_clean: Float
-    by_square: Float
-    by_variance: Float
-    variance: Float
-    fixed_variance: Float
+    def signal(self, clean_dn: Float) -> Float:
+        """Signal above black that causes shot noise, for DN of the clean frame."""
+        return np.maximum(clean_dn - self.site.plan.sensor.black_level_dn - self.clean_offset_dn, 0.0)
+
+    def variance(self, signal: Float) -> Float:
+        """Variance without defects, DN²."""
+        return np.asarray(np.sum([effect.variance(signal) for effect in self.effects], axis=0))
+
+    def temporal_variance(self, signal: Float) -> Float:
+        """Part of the variance that is new in every frame, DN²."""
+        return np.asarray(np.sum([(not effect.is_fixed) * effect.variance(signal) for effect in self.effects], axis=0))
+
+    def defect_mean(self, signal: Float, bound: Float) -> Float:
+        """Mean of the noise at defects, limited by a bound, times their fraction, DN."""
+        return np.asarray(np.sum([effect.defect_mean(signal, bound) for effect in self.effects], axis=0))
+
+    def characteristic(self, signal: Float, tau: Float) -> Complex:
+        """Characteristic function E[exp(iτ·noise)] for signals and frequencies (radians per DN)."""
+        value: Complex = np.ones_like(signal)
+        for effect in self.effects:
+            value = value * effect.factor(signal, tau)
+        for effect in self.effects:
+            if effect.replacement is not None:
+                value = (1 - effect.defects) * value + effect.defects * effect.replacement(signal, tau)
+        return value
+
+    def is_usable(self, clean_dn: Float, bin_dn: float) -> NDArray[np.bool_]:
+        """Mask of DN whose noise is strong enough, and hardly ever at a limit of the sensor."""
+        plan, signal = self.site.plan, self.signal(clean_dn)
+        std = np.sqrt(self.variance(signal))
+        low, high = noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
+        tail_dn = sum(effect.tail_dn for effect in self.effects)
+        distance = NORMAL_DISTANCE * std + tail_dn + float(np.nanmax(np.abs(self.offset_dn), initial=0.0))
+        usable = (clean_dn - distance > low) & (clean_dn + distance < high) & (clean_dn < plan.brightest_dn - 0.5)
+        usable &= signal + distance < min((effect.largest_dn for effect in self.effects), default=math.inf)
+        if plan.noise.averaged:
+            usable &= clean_dn > max(low, 0.0)  # dead pixels
+        least = bin_dn if plan.output.normalised else max(LEAST_STD_DN, bin_dn)
+        return np.asarray(usable & (std >= least) & (self.site.gain_dn <= MOST_ELECTRON * std))
 
 
-@dataclass(frozen=True, slots=True)
-class Expectation:
-    """Expectations for N clean DN at the sites of one plane.
+def bin_width(noise: PlaneNoise) -> float:
+    """Width of the bins of clean values, DN: 1, or at most half of the standard deviation at black if not rounded."""
+    plan = noise.site.plan
+    if not plan.output.clean_normalised:
+        return 1.0
+    std = math.sqrt(float(noise.variance(np.zeros(1))[0]))
+    narrowest = 2.0**plan.sensor.bits / MOST_BINS
+    return min(1.0, max(narrowest, 2.0 ** math.floor(math.log2(max(std, narrowest) / 2))))
+
+
+class Expectation(NamedTuple):
+    """Expectations for N clean values c in the middle of bins; x is the clean value before rounding.
 
     Attributes
     ----------
     signal, std : ndarray of float64, [N]
-        Signal above black, and standard deviation of the noise without outliers, DN.
+        Signal above black, and standard deviation of the noise without defects, DN.
     rounding_mean, rounding_std : ndarray of float64, [N]
-        Mean and standard deviation of x minus the rounded value, DN.
-    outlier_mean, variance, fixed_variance : ndarray of float64, [N]
-        Mean of z due to hot and dead pixels; variance of z, and the part of it that frames of one body share.
-    cosine, double : Cosine
-        Expectations of cos z and cos 2z.
-    covariance : ndarray of float64, [N]
-        Covariance of cos z and cos 2z.
+        Mean and standard deviation of x - c, DN; 0 in frames that are not rounded.
+    defect_mean, variance : ndarray of float64, [N]
+        Mean of z due to defects, and variance of z.
+    fixed : ndarray of float64, [N]
+        Fraction of the variance that frames of one body share.
+    cosine, slope : ndarray of float64, [N]
+        Expectation of ``cos z - slope · (x - c)``, which hardly depends on x; slope is per DN.
+    unknown : ndarray of float64, [N]
+        Standard deviation of that expectation, because x is not known.
+    by_variance : ndarray of float64, [N]
+        Derivative of the expectation by the variance of the noise (per DN²).
+    cosine_variance : ndarray of float64, [N]
+        Variance of cos z at one site.
     """
 
     signal: Float
     std: Float
     rounding_mean: Float
     rounding_std: Float
-    outlier_mean: Float
+    defect_mean: Float
     variance: Float
-    fixed_variance: Float
-    cosine: Cosine
-    double: Cosine
-    covariance: Float
+    fixed: Float
+    cosine: Float
+    slope: Float
+    unknown: Float
+    by_variance: Float
+    cosine_variance: Float
 
 
-def usable_values(law: NoiseLaw, clean_dn: Float, site: tuple[int, int]) -> Mask:
-    """Return which DN of the clean frame can be checked.
+def expectation(noise: PlaneNoise, clean_dn: Float, bin_dn: float) -> Expectation:
+    """Expectations for clean values that `PlaneNoise.is_usable` accepts."""
+    plan, signal = noise.site.plan, noise.signal(clean_dn)
+    std, is_rounded = np.sqrt(noise.variance(signal)), not plan.output.clean_normalised
+    low, high = np.full(len(signal), -bin_dn / 2), np.full(len(signal), bin_dn / 2)
+    if not plan.noise.averaged:  # the clean frame has no values below black
+        low[clean_dn == plan.sensor.black_level_dn] = 0.0
 
-    Parameters
-    ----------
-    law : NoiseLaw
-        The predicted noise.
-    clean_dn : ndarray of float64, [N]
-        DN of the clean frame.
-    site : (int, int)
-        Row and column of the site in the tile.
+    def mean_cosine(k: int, error: Float) -> Float:
+        """E[cos(k·(noisy - c) / std)] for x = c + error; without rounding, of noisy - x."""
+        shift = np.exp(1j * k / std * error) if is_rounded else 1.0
+        return np.real(noise.characteristic(np.maximum(signal + error, 0.0), k / std) * shift)
 
-    Returns
-    -------
-    ndarray of bool, [N]
-        False near the limits of the sensor, and if the noise is too weak or too few electrons cause it.
-    """
-    plan = law.plan
-    std = np.sqrt(law.variance(law.signal(clean_dn, site)))
-    least = LEAST_FLOAT_STD * (plan.white_level_dn - plan.black_level_dn) if plan.normalised else LEAST_STD_DN
-    return law.is_far_from_limits(clean_dn, site) & (std >= least) & (law.gain_dn <= MOST_ELECTRON * std)
-
-
-def expectations(law: NoiseLaw, clean_dn: Float, site: tuple[int, int]) -> Expectation:
-    """Compute the expectations for usable DN of the clean frame.
-
-    Parameters
-    ----------
-    law : NoiseLaw
-        The predicted noise.
-    clean_dn : ndarray of float64, [N]
-        DN that `usable_values` accepts.
-    site : (int, int)
-        Row and column of the site in the tile.
-
-    Returns
-    -------
-    Expectation
-        One value for each DN.
-    """
-    plan = law.plan
-    signal = law.signal(clean_dn, site)
-    std = np.sqrt(law.variance(signal))
-    half = 0.0 if plan.clean_normalised else 0.5
-    low, high = np.full(signal.shape, -half), np.full(signal.shape, half)
-    if not plan.averaged:  # the clean frame has no values below black
-        low[clean_dn == plan.black_level_dn] = 0.0
-    at = {k: law.factors(signal, k / std) for k in (1, 2, 3, 4)}
-    one, two, three = (at[k].value.real for k in (1, 2, 3))
-    hot_z = law.hot.value_dn / std
-    hot_mean = hot_z * -np.expm1(-LARGEST_Z / np.maximum(hot_z, 1e-3))
-    dead_mean = np.clip((law.dead.value_dn - clean_dn) / std, -LARGEST_Z, LARGEST_Z)
-    outliers = law.hot.share * np.minimum(2 * hot_z * hot_z, LARGEST_Z**2) + law.dead.share * LARGEST_Z**2
+    middle, width = (low + high) / 2, high - low
+    at_low, cosine, at_high = (mean_cosine(1, error) for error in (low, middle, high))
+    slope, bend = (at_high - at_low) / width, at_high + at_low - 2 * cosine
+    bounded = np.full(len(signal), noise.defects * LARGEST_Z**2)
     return Expectation(
         signal=signal,
         std=std,
-        rounding_mean=(low + high) / 2,
-        rounding_std=(high - low) / math.sqrt(12),
-        outlier_mean=law.hot.share * hot_mean + law.dead.share * dead_mean,
-        variance=1 + outliers,
-        fixed_variance=law.fixed_variance(signal) / std**2 + outliers,
-        cosine=_cosine(law, at[1], at[2], low, high),
-        double=_cosine(law, at[2], at[4], low, high),
-        covariance=(three + one) / 2 - one * two,
-    )
-
-
-def _cosine(law: NoiseLaw, at: Factors, at_double: Factors, low: Float, high: Float) -> Cosine:
-    """Return the expectations of cos kz if x is between ``signal + low`` and ``signal + high``.
-
-    ``at`` and ``at_double`` are the factors of the characteristic function at k / std and at 2k / std.
-    """
-    known = _unrounded(law, at) if law.plan.clean_normalised else _rounded(law, at, low, high)
-    one, two = at.value.real, at_double.value.real
-    # variance, over fixed patterns, of the mean over frames: E[Re(φ exp(iτF))²] - Re(E[φ exp(iτF)])²
-    square = ((at.temporal**2 * at_double.fixed).real + np.abs(at.temporal) ** 2) / 2
-    return Cosine(
-        *known,
-        by_variance=-0.5 * at.tau * at.tau * one,
-        variance=(1 + two) / 2 - one * one,
-        fixed_variance=np.maximum(square - (at.temporal * at.fixed).real ** 2, 0.0) + 4 * law.dead.share,
-    )
-
-
-def _rounded(law: NoiseLaw, at: Factors, low: Float, high: Float) -> tuple[Float, Float, Float, Float, Float]:
-    """Return the attributes of `Cosine` that depend on x, for rounded frames."""
-    middle, width = (low + high) / 2, high - low
-
-    def expected(error: Float) -> Float:
-        values, moved = at.value.real.copy(), error != 0
-        if moved.any():
-            tau, error = at.tau[moved], error[moved]
-            signal = np.maximum(at.signal[moved] + error, 0.0)
-            values[moved] = (law.factors(signal, tau).value * np.exp(1j * tau * error)).real
-        return values
-
-    at_low, at_middle, at_high = expected(low), expected(middle), expected(high)
-    slope = np.divide(at_high - at_low, width, out=np.zeros_like(width), where=width > 0)
-    bend = at_high + at_low - 2 * at_middle  # the parabola through the three has the coefficient 2 bend / width²
-    nothing = np.zeros_like(slope)
-    return at_middle + bend / 6 - slope * middle, slope, 2 * np.abs(bend) * ROUNDING_SQUARE, nothing, nothing
-
-
-def _unrounded(law: NoiseLaw, at: Factors) -> tuple[Float, Float, Float, Float, Float]:
-    """Return the attributes of `Cosine` that depend on x, for frames without rounding.
-
-    The expectation between two DN is the parabola through those half a DN below, at and above the nearest one. Its
-    error is computed a quarter of a DN from it.
-    """
-    k = at.tau * np.sqrt(law.variance(at.signal))
-
-    def expected(distance: float) -> Float:
-        signal = np.maximum(at.signal + distance, 0.0)
-        std = np.maximum(np.sqrt(law.variance(signal)), 1e-3 * k / at.tau)
-        return np.asarray(law.factors(signal, k / std).value.real)
-
-    middle, low, high = at.value.real, expected(-0.5), expected(0.5)
-    slope, square = high - low, 2 * (high + low - 2 * middle)
-    error = [np.abs(expected(d) - middle - d * slope - d * d * square) for d in (-0.25, 0.25)]
-    return middle, np.zeros_like(slope), np.maximum(*error), slope, square
-
-
-def spread(values: Expectation, at: NDArray[np.intp], size: int) -> Expectation:
-    """Return expectations in arrays of ``size``, with the values at the places ``at`` and zeros elsewhere."""
-
-    def full(array: Float) -> Float:
-        wide = np.zeros(size)
-        wide[at] = array
-        return wide
-
-    changed: Expectation = _changed(values, full)
-    return changed
-
-
-def chosen(values: Expectation, at: NDArray[np.intp]) -> Expectation:
-    """Return the expectations at some places."""
-    changed: Expectation = _changed(values, lambda array: array[at])
-    return changed
-
-
-def _changed(record: Any, change: Callable[[Float], Float]) -> Any:
-    """Return an `Expectation` or a `Cosine` with a function applied to each of its arrays."""
-    values = {one.name: getattr(record, one.name) for one in fields(record)}
-    return type(record)(
-        **{
-            n: change(value) if isinstance(value, np.ndarray) else _changed(value, change)
-            for n, value in values.items()
-        }
+        rounding_mean=middle * is_rounded,
+        rounding_std=width / math.sqrt(12) * is_rounded,
+        defect_mean=noise.defect_mean(signal, LARGEST_Z * std) / std,
+        variance=1 + bounded,
+        fixed=1 - noise.temporal_variance(signal) / noise.variance(signal) + bounded,
+        # the parabola through the three has the coefficient 2 · bend / width²
+        cosine=cosine + bend / 6 - slope * middle,
+        slope=slope,
+        unknown=2 * np.abs(bend) * ROUNDING_SQUARE,
+        by_variance=-0.5 * cosine / std**2,
+        cosine_variance=(1 + mean_cosine(2, middle)) / 2 - cosine**2,
     )

@@ -1,9 +1,9 @@
 """Draw Figures 2 to 7 of the article from a photograph: ``fig2.png`` … ``fig7.png`` and a page with captions.
 
-The figures are computed with the code that makes datasets. Captions give the numbers of the photograph, and differences
-from the article's text. Raw frames are grey, from the lowest DN (black) to the highest (white), as in the article. The
-article's photographs are not published, so its claims are checked on other photographs: those of Figure 6 on up to
-`PHOTOGRAPHS_COUNTED`.
+The figures are computed with the code that makes datasets. The template of the page has the captions, with differences
+from the article's text; the functions give it the numbers of the photograph. Raw frames are grey, from the lowest DN
+(black) to the highest (white), as in the article. The article's photographs are not published, so its claims are
+checked on other photographs: those of Figure 6 on up to `PHOTOGRAPHS_COUNTED`.
 
 Figure 6 of the article has two interpretations (`paper.sources.INTERPRETATIONS`). The formula divides by g_rgb, so the
 largest g_rgb gives the darkest raw frame. The caption describes the most saturation for the largest g_rgb, which
@@ -14,110 +14,274 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from unprocess_gen.config.schema import Config
+from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.sequences import evenly_spaced
+from unprocess_gen.core.types import Float, Frame, Plan
 from unprocess_gen.reports.html_pages import PageTable, render_page
-from unprocess_gen.reports.paper.curves import draw_gamma, draw_highlight_function, draw_tone
-from unprocess_gen.reports.paper.pictures import PaperFigure
-from unprocess_gen.reports.paper.raw_frames import draw_default_raw, draw_highlights, draw_saturation
-from unprocess_gen.reports.paper.sources import (
-    AUTHORS_NOISE,
-    GAINS,
-    PaperOptions,
-    count_saturation,
-    load_figure_source,
-)
+from unprocess_gen.reports.paper import pictures, sources
+from unprocess_gen.reports.paper.pictures import BLUE, GREEN, GREY, INK, ORANGE, PaperFigure, percent, show_picture
+from unprocess_gen.reports.paper.sources import AUTHORS_NOISE, DEFAULT_GAINS, GAINS, FigureSource, PaperOptions
 from unprocess_gen.reports.report_files import write_files
+from unprocess_gen.simulation.pair import make_pair
+from unprocess_gen.simulation.reference import isp, unprocess
+from unprocess_gen.simulation.reference.cfa import tile
 from unprocess_gen.sources.loader import list_photographs
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["AUTHORS_NOISE", "GAINS", "PaperFigure", "PaperOptions", "draw_figures", "write_figures"]
 
 PAGE = "figures.html"
+
 PHOTOGRAPHS_COUNTED = 40
 """Largest number of photographs, evenly spaced, whose saturated sites are counted."""
 
+GAMMA = 2.2
+"""Section 2 of the article, after Brooks et al. 2019."""
+
+HIGHLIGHT_THRESHOLD = 0.9
+"""Fraction of white from which the article's function keeps highlights."""
+
+CODES = np.arange(256, dtype=np.uint8)
+
+CROP_PX = 64
+"""Side of the crops in Figure 5."""
+
+SMALL_GAINS, LARGE_GAINS = "paper_max", "fig6_bottom"
+"""The options of `GAINS` with the smallest and the largest inverse gains."""
+
 
 def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
-    """Draw all figures for the first readable photograph of the source.
+    """Figures 2 to 7 for the first readable photograph of the source of a validated config.
 
-    Parameters
-    ----------
-    config : Config
-        Validated config; source, camera, sensor and seed are used.
-    options : PaperOptions
-        Gains and noise profile that the article fixes.
-
-    Returns
-    -------
-    list of PaperFigure
-        Figures 2 to 7.
-
-    Raises
-    ------
-    ConfigError
-        If no photograph can be read, or ``source.patch`` is set.
+    ConfigError if no photograph can be read, or ``source.patch`` is set.
     """
+    from matplotlib import rc_context
+
     if config.source.patch is not None:
         raise ConfigError(
-            f"source.patch={config.source.patch}: the figures show complete photographs; expected null; leave it out"
+            f"source.patch={value_text(config.source.patch)}: the figures show complete photographs; expected null; "
+            "leave it out"
         )
-    sources = list_photographs(config.source).sources
-    source = load_figure_source(config, options, sources)
-    counts = count_saturation(config, options, evenly_spaced(sources, PHOTOGRAPHS_COUNTED))
-    return [
-        draw_tone(source),
-        draw_gamma(source),
-        draw_highlight_function(source),
-        draw_default_raw(source),
-        draw_saturation(source, counts),
-        draw_highlights(source),
-    ]
+    listed = list_photographs(config.source).sources
+    source = sources.load_figure_source(config, options, listed)
+    counts = sources.count_saturation(config, options, evenly_spaced(listed, PHOTOGRAPHS_COUNTED))
+    with rc_context(pictures.STYLE):
+        curves = [draw_tone(source), draw_gamma(source), draw_highlight_function(source)]
+        return [*curves, draw_default_raw(source), draw_saturation(source, counts), draw_highlights(source)]
 
 
 def write_figures(figures: Sequence[PaperFigure], out: Path, command: str) -> list[str]:
-    """Write the figures and their page.
-
-    Parameters
-    ----------
-    figures : sequence of PaperFigure
-        The figures.
-    out : Path
-        Folder to write to.
-    command : str
-        The command line, which the page quotes.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-
-    Raises
-    ------
-    MachineError
-        If a file cannot be written.
-    """
+    """Write the figures and their page to a folder, and return the names of the files; MachineError if that fails."""
     contents = {**{figure.file: figure.png for figure in figures}, PAGE: figures_page(figures, command).encode()}
     write_files(out, contents)
     return list(contents)
 
 
 def figures_page(figures: Sequence[PaperFigure], command: str) -> str:
-    """Return the page of all figures with captions; it refers to the PNG files next to it."""
-    return render_page(
-        "paper_figures.html",
-        title="Figures of the article",
-        command=command,
-        figures=[
-            {
-                "title": figure.title,
-                "file": figure.file,
-                "caption": figure.caption,
-                "table": PageTable(figure.table[0], figure.table[1:], range(1, len(figure.table[0])))
-                if figure.table
-                else None,
-            }
-            for figure in figures
-        ],
+    """The page of all figures with captions; it refers to the PNG files next to it."""
+    return render_page("paper_figures.html", title="Figures of the article", command=command, figures=figures)
+
+
+def draw_tone(source: FigureSource) -> PaperFigure:
+    """Figure 2: the tone curve, its inverse, and the photograph before and after the inverse."""
+    figure, (curves, before, after, histogram) = pictures.panel_grid(2, 2, 8.4, 0.85)
+    x = np.linspace(0, 1, 256)
+    inverse = unprocess.linear_light(CODES, "smoothstep", 1.0)
+    curves.plot(x, x, color=GREY, linewidth=1, linestyle=":", label="identity")
+    curves.plot(x, isp.smoothstep(x), color=ORANGE, label="tone curve 3x² − 2x³")
+    curves.plot(x, unprocess.inverse_smoothstep(x, 1 - x), color=BLUE, label="inverse")
+    curves.set(xlabel="input", ylabel="output", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    small = pictures.small_photograph(source.srgb)
+    show_picture(before, small, "photograph")
+    show_picture(after, unprocess.inverse_smoothstep(small, 1 - small), "after the inverse tone curve")
+    codes = source.srgb if source.srgb.dtype == np.uint8 else (source.srgb >> 8).astype(np.uint8)
+    shares = np.bincount(codes.ravel(), minlength=256) / codes.size
+    for values, label, colour in ((CODES / 255, "photograph", ORANGE), (inverse, "after the inverse", BLUE)):
+        histogram.hist(values, bins=64, range=(0, 1), weights=shares, histtype="step", color=colour, label=label)
+    histogram.set(xlabel="value", ylabel="fraction of all values", xlim=(0, 1))
+    for axes, title in ((curves, "curves"), (histogram, "histogram")):
+        axes.set_title(title, loc="left")
+        axes.legend(frameon=False)
+    as_written = 0.5 - np.sin(np.arcsin(1 - 2 * (CODES / 255)) / 3)
+    numbers = {
+        "name": source.name,
+        "examples": ", ".join(f"{code} to {inverse[code] * 255:.0f}" for code in (16, 64, 192, 240)),
+        "difference": f"{np.abs(as_written - inverse).max():.1g}",
+    }
+    return PaperFigure("fig2.png", pictures.png(figure), numbers)
+
+
+def draw_gamma(source: FigureSource) -> PaperFigure:
+    """Figure 3: gamma compression, its inverse, and the photograph in linear light."""
+    from matplotlib.figure import Figure
+
+    u = np.arange(256) / 255
+    figure = Figure(figsize=(8.4, 7.0), layout="constrained")
+    panels = figure.subplot_mosaic(
+        [["curve", "gradient"], ["curve", "compressed"], ["untoned", "linear"], ["untoned", "linear"]]
     )
+    curve = panels["curve"]
+    curve.plot(u * 255, u * 255, color=GREY, linewidth=1, linestyle=":", label="identity")
+    curve.plot(u * 255, isp.compress_gamma(u, GAMMA) * 255, color=ORANGE, label="v = u^(1/2.2)")
+    curve.plot(u * 255, unprocess.expand_gamma(u, GAMMA) * 255, color=BLUE, label="inverse, u = v^2.2")
+    curve.set(xlabel="input", ylabel="output", xlim=(0, 255), ylim=(0, 255), aspect="equal")
+    curve.set_title("curves", loc="left")
+    curve.legend(frameon=False, loc="upper left")
+    compressed = np.tile(isp.compress_gamma(u, GAMMA), (48, 1))
+    show_picture(panels["gradient"], np.tile(u, (48, 1)), "linear gradient, 0 to 255")
+    show_picture(panels["compressed"], compressed, "gradient after gamma compression")
+    small = pictures.small_photograph(source.srgb)
+    untoned = unprocess.inverse_smoothstep(small, 1 - small)
+    show_picture(panels["untoned"], untoned, "after the inverse tone curve")
+    show_picture(panels["linear"], unprocess.expand_gamma(untoned, GAMMA), "linear light: after the inverse gamma, too")
+    linear = unprocess.linear_light(CODES, "smoothstep", GAMMA)
+    examples = ", ".join(f"{code}: {linear[code]:.2g}" for code in (16, 64, 128, 192, 240))
+    return PaperFigure("fig3.png", pictures.png(figure), {"name": source.name, "examples": examples})
+
+
+def draw_highlight_function(source: FigureSource) -> PaperFigure:
+    """Figure 4: the function f that inverts gains and keeps highlights."""
+    figure, panels = pictures.panel_grid(1, 2, 8.4, 0.9)
+    i = np.linspace(0, 1, 1001)
+    inverse_gains = source.plans[DEFAULT_GAINS].camera.inverse_gains
+    named = zip(inverse_gains, ("red", "green", "blue"), strict=True)
+    gains = {f"{gain:.3g} ({name})": gain for gain, name in named} | {"1.18": 1 / 0.85, "2.05": 2.05}
+    for axes, limits, title in zip(panels, ((0.0, 1.0), (0.85, 1.0)), ("f on [0, 1]", "near white"), strict=True):
+        for (name, gain), colour in zip(gains.items(), (ORANGE, GREEN, BLUE, GREY, INK), strict=True):
+            function = unprocess.invert_gains_per_channel(i, np.asarray(gain), HIGHLIGHT_THRESHOLD)
+            axes.plot(i, function, color=colour, label=name)
+            if gain < 1:
+                axes.plot(i, i * gain, color=colour, linewidth=0.8, linestyle="--")
+        axes.axvline(HIGHLIGHT_THRESHOLD, color=GREY, linewidth=0.8, linestyle=":")
+        axes.axhline(1, color=GREY, linewidth=0.8)
+        axes.set(xlabel="intensity i", ylabel="f(i)", xlim=limits, ylim=(0, 1.25))
+        axes.set_title(title, loc="left")
+    panels[0].legend(title="inverse gain 1/g", frameon=False, fontsize=8)
+    weakest = min(inverse_gains)
+    slope = weakest + (1 - weakest) * (1 + 2 / (1 - HIGHLIGHT_THRESHOLD))
+    return PaperFigure("fig4.png", pictures.png(figure), {"weakest": f"{weakest:.3g}", "slope": f"{slope:.0f}"})
+
+
+def draw_default_raw(source: FigureSource) -> PaperFigure:
+    """Figure 5: the clean and noisy raw frame with the default gains, crops, and the noise curves."""
+    plan, authors = source.plans[DEFAULT_GAINS], source.authors
+    pair, authors_pair = make_pair(source.srgb, plan), make_pair(source.srgb, authors)
+    figure, axes = pictures.panel_grid(2, 3, 9.4, max(pictures.panel_aspect(source.srgb), 0.8))
+    show_picture(axes[0], pictures.small_photograph(source.srgb), "(a) photograph")
+    pictures.show_stretched(axes[1], pair.clean, "(b) clean raw frame")
+    pictures.show_stretched(axes[2], pair.noisy, "(c) noisy raw frame")
+    crop = _typical_crop(pair.clean)
+    limits = float(pair.clean[crop].min()), float(pair.clean[crop].max())
+    show_picture(axes[3], pair.clean[crop].astype(np.float64), "(d) crop of the clean frame", *limits)
+    show_picture(axes[4], pair.noisy[crop].astype(np.float64), "(d) same crop, noisy", *limits)
+    signal = np.linspace(0, 400, 401)
+    for noise, label, colour in ((plan.noise, "in (c)", BLUE), (authors.noise, "author's line", ORANGE)):
+        axes[5].plot(signal, np.sqrt(np.maximum(noise.a_dn * signal + noise.b_dn2, 0)), color=colour, label=label)
+    axes[5].set(xlabel="DN above black", ylabel="standard deviation, DN", xlim=(0, 400))
+    axes[5].set_ylim(bottom=0)
+    axes[5].set_title("noise", loc="left")
+    axes[5].legend(frameon=False)
+    numbers = {
+        "name": source.name,
+        "plan": plan,
+        "authors": authors.noise,
+        "saturated": percent(pair.counts.saturated, pair.clean.size),
+        "before": percent(sources.saturated_sites(source.srgb, plan.sensor.pattern).sum(), pair.clean.size),
+        "zero_variance": percent(authors_pair.counts.zero_variance, pair.clean.size),
+    }
+    return PaperFigure("fig5.png", pictures.png(figure), numbers)
+
+
+def _typical_crop(clean: Frame) -> tuple[slice, slice]:
+    """The square of `CROP_PX` sites with the median standard deviation; its corner has even coordinates."""
+    side = min(CROP_PX, *(max(length - length % 2, 1) for length in clean.shape))
+    rows, columns = (range(0, length - side + 1, side) for length in clean.shape)
+    squares = [(slice(y, y + side), slice(x, x + side)) for y in rows for x in columns]
+    return sorted(squares, key=lambda square: float(clean[square].std()))[len(squares) // 2]
+
+
+def draw_saturation(source: FigureSource, counts: sources.SaturationCounts) -> PaperFigure:
+    """Figure 6: clean frames and their saturated sites at the extreme gains, in both interpretations."""
+    figure, axes = pictures.panel_grid(2, 4, 11.0, pictures.panel_aspect(source.srgb))
+    for column, reading in enumerate(sources.INTERPRETATIONS):
+        for row, name in enumerate((reading.top, reading.bottom)):
+            plan = source.plans[name]
+            clean = make_pair(source.srgb, plan).clean
+            saturated = clean == plan.sensor.white_level_dn
+            pictures.show_stretched(axes[row * 4 + column * 2], clean, f"{'bottom' if row else 'top'}: {name}")
+            fractions = pictures.channel_fractions(saturated, plan.sensor.pattern)
+            title = f"saturated: {percent(saturated.sum(), clean.size)}"
+            show_picture(axes[row * 4 + column * 2 + 1], fractions, title)
+    lines = []
+    for name in GAINS:
+        first, images = counts.by_gains[name][0], counts.by_gains[name]  # the first is the one in the figure
+        sites, before, after = (sum(image[index] for image in images) for index in range(3))
+        inverse_gains = ", ".join(f"{gain:.3g}" for gain in source.plans[name].camera.inverse_gains)
+        of_first = [f"{count:,} ({percent(count, first.sites)})" for count in (first.before, first.after)]
+        more = f"{sum(image.after > image.before for image in images)} of {len(images)}"
+        lines.append((name, inverse_gains, *of_first, percent(before, sites), percent(after, sites), more))
+    headings = (
+        *("gains", "inverse gains R, G, B", "saturated in the photograph", "in its raw frame"),
+        *("in all photographs", "in all raw frames", "photographs with more than before"),
+    )
+    numbers = {
+        "name": source.name,
+        "readings": [(reading, counts.count_matching(reading)) for reading in sources.INTERPRETATIONS],
+        "counted": len(counts.by_gains[DEFAULT_GAINS]),
+        "failed": counts.failed,
+    }
+    return PaperFigure("fig6.png", pictures.png(figure), numbers, PageTable(headings, lines, range(1, len(headings))))
+
+
+def draw_highlights(source: FigureSource) -> PaperFigure:
+    """Figure 7: the highlights that the function creates with small inverse gains."""
+    small, large = source.plans[SMALL_GAINS], source.plans[LARGE_GAINS]
+    frames = {
+        LARGE_GAINS: make_pair(source.srgb, large).clean,
+        SMALL_GAINS: make_pair(source.srgb, small).clean,
+        f"{SMALL_GAINS}, no function": make_pair(source.srgb, small.replace(highlight="none")).clean,
+    }
+    large_frame, with_function, without = frames.values()
+    added = with_function.astype(np.float64) - without
+    black_dn, white_dn = small.sensor.black_level_dn, small.sensor.white_level_dn
+    figure, axes = pictures.panel_grid(2, 3, 9.4, pictures.panel_aspect(source.srgb))
+    show_picture(axes[0], pictures.small_photograph(source.srgb), "(a) photograph")
+    pictures.show_stretched(axes[1], large_frame, "(b) large inverse gains")
+    pictures.show_stretched(axes[2], with_function, "(c) small inverse gains")
+    limits = float(without.min()), float(with_function.max())
+    show_picture(axes[3], pictures.block_means(without, is_mosaic=True), "without the function", *limits)
+    fraction = pictures.block_means(added, is_mosaic=True) / (white_dn - black_dn)
+    most = float(fraction.max())
+    show_picture(axes[4], fraction, f"added light, up to {most:.0%} of white", high=most)
+    _draw_profile(axes[5], with_function, without, added, small)
+    axes[5].set_box_aspect(pictures.panel_aspect(source.srgb))
+    bright_dn = black_dn + HIGHLIGHT_THRESHOLD * (white_dn - black_dn)
+    lines = [
+        (name, percent((clean == white_dn).sum(), clean.size), percent((clean >= bright_dn).sum(), clean.size))
+        for name, clean in frames.items()
+    ]
+    headings = ("gains", "saturated", f"highlights, from {HIGHLIGHT_THRESHOLD:.0%} of white")
+    numbers = {"name": source.name, "changed": percent((added > 0).sum(), added.size), "adds": bool(added.any())}
+    return PaperFigure("fig7.png", pictures.png(figure), numbers, PageTable(headings, lines, (1, 2)))
+
+
+def _draw_profile(axes: Axes, with_function: Frame, without: Frame, added: Float, plan: Plan) -> None:
+    """Draw the green sites of the row where the function adds most, with and without it."""
+    black_dn, white_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn
+    row = int(added.sum(axis=1).argmax())
+    start = tile(plan.sensor.pattern)[row % 2].index(1)
+    columns = np.arange(added.shape[1])[start::2]
+    for frame, label, colour in ((with_function, "with the function", BLUE), (without, "without", ORANGE)):
+        values = (frame[row, start::2].astype(np.float64) - black_dn) / (white_dn - black_dn)
+        axes.plot(columns, values, color=colour, linewidth=0.8, label=label)
+    axes.set(xlabel="column", ylabel="fraction of white", ylim=(-0.03, 1.03))
+    axes.set_title(f"green sites of row {row}", loc="left")
+    axes.legend(frameon=False, loc="upper left")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import Frame, Srgb
-from unprocess_gen.simulation.reference.cfa import CHANNELS, tile
+from unprocess_gen.reports.html_pages import PageTable
+from unprocess_gen.simulation.reference.cfa import CHANNELS, mosaic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,25 +19,25 @@ if TYPE_CHECKING:
 INK, BLUE, ORANGE, GREEN, GREY = "#000000", "#0072B2", "#D55E00", "#009E73", "#999999"
 """Colours of Okabe and Ito, which people with colour vision deficiency can distinguish."""
 
+STYLE: dict[Any, Any] = {"font.size": 9, "axes.titlesize": 9.5, "axes.titleweight": "bold"}
+
 MOST_PX = 720
 """Longest side of a picture in a figure."""
 
 FloatImage = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class PaperFigure:
-    """A figure of the article: file name, title, PNG, paragraphs of its caption, and a table (headings first)."""
+class PaperFigure(NamedTuple):
+    """A figure of the article: file name, PNG, and the numbers of its caption and its table in the template."""
 
     file: str
-    title: str
     png: bytes
-    caption: tuple[str, ...]
-    table: tuple[tuple[str, ...], ...] = ()
+    numbers: dict[str, Any]
+    table: PageTable | None = None
 
 
 def block_means(image: NDArray[Any], most: int = MOST_PX, is_mosaic: bool = False) -> FloatImage:
-    """Return means over square blocks, so that no side is longer than about ``most`` pixels.
+    """Means over square blocks, so that no side is longer than about ``most`` pixels.
 
     Blocks of a mosaic have even sides, so that each contains the four CFA sites equally often; a mosaic that is small
     enough is unchanged.
@@ -53,28 +52,24 @@ def block_means(image: NDArray[Any], most: int = MOST_PX, is_mosaic: bool = Fals
 
 
 def small_photograph(srgb: Srgb) -> FloatImage:
-    """Return a photograph at reduced size, ``[h, w, 3]`` in [0, 1]."""
+    """A photograph at reduced size, ``[h, w, 3]`` in [0, 1]."""
     return block_means(srgb) / float(np.iinfo(srgb.dtype).max)
 
 
 def channel_fractions(mask: NDArray[np.bool_], pattern: str, most: int = MOST_PX) -> FloatImage:
-    """Return the fraction of set sites of each channel at reduced size, ``[h, w, 3]`` in [0, 1]."""
-    channel = np.tile(np.array(tile(pattern)), tuple(-(-side // 2) for side in mask.shape))
-    channel = channel[: mask.shape[0], : mask.shape[1]]
-    planes = []
-    for number in range(len(CHANNELS)):
-        present = block_means(channel == number, most, is_mosaic=True)
-        chosen = block_means(mask & (channel == number), most, is_mosaic=True)
-        planes.append(np.divide(chosen, present, out=np.zeros_like(chosen), where=present > 0))
-    return np.stack(planes, axis=-1)
+    """The fraction of set sites of each channel at reduced size, ``[h, w, 3]`` in [0, 1]."""
+    channels = np.broadcast_to(np.arange(3.0), (*mask.shape, len(CHANNELS)))
+    sites = mosaic(channels, pattern)[..., np.newaxis] == channels
+    present = block_means(sites, most, is_mosaic=True)
+    chosen = block_means(sites & mask[..., np.newaxis], most, is_mosaic=True)
+    return np.divide(chosen, present, out=np.zeros_like(chosen), where=present > 0)
 
 
 def show_picture(axes: Axes, picture: FloatImage, title: str, low: float = 0.0, high: float = 1.0) -> None:
     """Show a grey or RGB picture without ticks; grey values from ``low`` (black) to ``high`` (white)."""
     axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest")
     axes.set_title(title, loc="left")
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
 
 
 def show_stretched(axes: Axes, raw: Frame, title: str) -> None:
@@ -83,31 +78,26 @@ def show_stretched(axes: Axes, raw: Frame, title: str) -> None:
 
 
 def panel_grid(rows: int, columns: int, width: float, aspect: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure ``width`` inches wide with equal panels whose heights are ``aspect`` times their widths."""
+    """A figure ``width`` inches wide with equal panels whose heights are ``aspect`` times their widths."""
     from matplotlib.figure import Figure
 
-    height = rows * (width / columns * aspect + 0.35)
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, rows * (width / columns * aspect + 0.35)), layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False).ravel())
 
 
 def panel_aspect(srgb: Srgb) -> float:
-    """Return height over width of a photograph, limited to 0.5 … 1.5."""
-    height, width = (float(length) for length in srgb.shape[:2])
-    return min(max(height / width, 0.5), 1.5)
+    """Height over width of a photograph, limited to 0.5 … 1.5."""
+    height, width = srgb.shape[:2]
+    return float(min(max(height / width, 0.5), 1.5))
 
 
-def figure_png(draw: Callable[[], Figure]) -> bytes:
-    """Return the figure that a function draws, as the bytes of a PNG."""
-    from matplotlib import rc_context
-
-    style: dict[Any, Any] = {"font.size": 9, "axes.titlesize": 9.5, "axes.titleweight": "bold"}
-    with rc_context(style):
-        content = io.BytesIO()
-        draw().savefig(content, format="png", dpi=110)
+def png(figure: Figure) -> bytes:
+    """The bytes of a PNG."""
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=110)
     return content.getvalue()
 
 
-def percent(part: int, total: int) -> str:
-    """Return a ratio as a percentage with three decimals."""
+def percent(part: int | np.integer[Any], total: int) -> str:
+    """A ratio as a percentage with three decimals."""
     return f"{part / total:.3%}"

@@ -15,7 +15,7 @@ from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.types import Plan, Source, Srgb
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.pair import make_pair
-from unprocess_gen.simulation.reference.cfa import tile
+from unprocess_gen.simulation.reference.cfa import mosaic
 from unprocess_gen.sources.loader import load_source
 
 
@@ -32,7 +32,7 @@ INTERPRETATIONS = (
     GainInterpretation("with the pictures, which multiply by it", "fig6_top", "fig6_bottom"),
 )
 DEFAULT_GAINS = "fixed"
-GAINS = (DEFAULT_GAINS, *(name for one in INTERPRETATIONS for name in (one.top, one.bottom)))
+GAINS = (DEFAULT_GAINS, *(name for reading in INTERPRETATIONS for name in (reading.top, reading.bottom)))
 """The options of ``conf/gains`` that the figures need."""
 
 AUTHORS_NOISE = "imx385_iso3200_rvdd"
@@ -41,7 +41,7 @@ AUTHORS_NOISE = "imx385_iso3200_rvdd"
 
 @dataclass(frozen=True, slots=True)
 class PaperOptions:
-    """Hold what the article fixes: the gains of `GAINS` by name, and its author's noise profile."""
+    """The settings that the article fixes: the gains of `GAINS` by name, and its author's noise profile."""
 
     gains: Mapping[str, GainsConfig]
     authors_noise: NoiseConfig
@@ -73,13 +73,13 @@ class SaturationCounts:
     failed: tuple[str, ...] = ()
 
     def count_matching(self, interpretation: GainInterpretation) -> int:
-        """Return how many photographs match the caption of Figure 6: more saturation in the bottom row only."""
+        """The number of photographs that match the caption of Figure 6: more saturation in the bottom row only."""
         both = zip(self.by_gains[interpretation.top], self.by_gains[interpretation.bottom], strict=True)
         return sum(top.after <= top.before and bottom.after > bottom.before for top, bottom in both)
 
 
 def load_figure_source(config: Config, options: PaperOptions, sources: Sequence[Source]) -> FigureSource:
-    """Return the first readable photograph with its plans; ConfigError if there is none."""
+    """The first readable photograph with its plans; ConfigError if there is none."""
     for source in sources:
         with suppress(SourceError):
             sha256, photograph = load_source(config.source, source)
@@ -115,8 +115,5 @@ def count_saturation(config: Config, options: PaperOptions, sources: Iterable[So
 
 
 def saturated_sites(srgb: Srgb, pattern: str) -> NDArray[np.bool_]:
-    """Return the sites whose channel has the highest code in the photograph, ``[H, W]``."""
-    saturated = np.empty(srgb.shape[:2], dtype=np.bool_)
-    for (y, x), channel in np.ndenumerate(np.array(tile(pattern))):
-        saturated[y::2, x::2] = srgb[y::2, x::2, channel] == np.iinfo(srgb.dtype).max
-    return saturated
+    """The sites whose channel has the highest code in the photograph, ``[H, W]``."""
+    return np.asarray(mosaic(srgb.astype(np.float64), pattern) == np.iinfo(srgb.dtype).max)

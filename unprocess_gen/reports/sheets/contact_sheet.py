@@ -4,9 +4,9 @@ Sheets need only shards and manifest. The source panel is omitted, with the reas
 not available or differs from the row's. Each panel shows the complete frame, averaged, and a detail at one pixel per
 site.
 
-Two stretches are used. ``own`` maps the least and greatest DN of a frame to the full range, as the article's demo
-does, so frames cannot be compared. ``common`` maps the black to the white level, square root, for every frame of a
-scene.
+Two stretches are used. ``own`` maps the percentiles `STRETCHED` of a picture to black and white, so that a few
+defective sites do not hide the picture; frames cannot be compared. ``common`` maps the black to the white level,
+square root, for every frame of a scene.
 
 Each PNG file contains the digest of the manifest that it shows. A folder with sheets of another dataset is refused,
 because their names are keys: sheets of two datasets would replace each other or be mixed.
@@ -25,26 +25,14 @@ import numpy as np
 
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import file_sha256, machine_error
-from unprocess_gen.core.object_store import AnyPath
 from unprocess_gen.core.output_paths import check_output_folder
-from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.types import Float
 from unprocess_gen.dataset.manifest import read_header
+from unprocess_gen.pipeline.progress import with_bar
+from unprocess_gen.reports.sheets import panels
 from unprocess_gen.reports.sheets.pairs import SheetPair, selected_pairs, sheet_heading
-from unprocess_gen.reports.sheets.panels import (
-    PANEL_PX,
-    STRIP_PX,
-    DetailWindow,
-    Mosaic,
-    Picture,
-    SheetPanel,
-    average_mosaic,
-    detail_window,
-    fit_image,
-    fit_mosaic,
-    lay_out,
-    tile_channels,
-    to_codes,
-)
+from unprocess_gen.reports.sheets.panels import Mosaic, Picture, SheetPanel, Window
 from unprocess_gen.reports.sheets.stages_sheet import stages_sheet
 from unprocess_gen.simulation.reference.isp import develop, process, to_light
 
@@ -69,35 +57,10 @@ class SheetFiles(NamedTuple):
 def write_sheets(
     folder: AnyPath, to: Path, keys: Sequence[str] = (), source: AnyPath | None = None, with_stages: bool = False
 ) -> Iterator[SheetFiles]:
-    """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for.
+    """Write ``KEY.png`` for each pair, and ``KEY.stages.png`` if asked for; yield the files once they are written.
 
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Folder of the dataset.
-    to : Path
-        Folder for the PNG files.
-    keys : sequence of str
-        As for `contact_sheet`.
-    source : Path or ObjectPath, optional
-        As for `contact_sheet`.
-    with_stages : bool
-        Whether to write the photograph after each step of unprocessing, too.
-
-    Yields
-    ------
-    SheetFiles
-        The files of each pair, once they are written.
-
-    Raises
-    ------
-    ConfigError
-        If ``to`` is inside a dataset, is not a folder or contains sheets of another dataset, and as for
-        `contact_sheet`.
-    DamageError
-        As for `contact_sheet`.
-    MachineError
-        If a file cannot be written.
+    ConfigError if ``to`` is inside a dataset, is not a folder or contains sheets of another dataset, and as for
+    `contact_sheet`.
     """
     check_output_folder(to, f"--to {to}")
     mark = _mark(folder)
@@ -105,37 +68,19 @@ def write_sheets(
     for pair in selected_pairs(folder, keys, source):
         pictures = {f"{pair.key}.png": pair_sheet(pair)}
         if with_stages and pair.source is not None:
-            pictures[f"{pair.key}.stages.png"] = stages_sheet(pair)
+            pictures[f"{pair.key}.stages.png"] = stages_sheet(pair, pair.source)
         files = tuple(_write(picture, to / name, mark) for name, picture in pictures.items())
         yield SheetFiles(pair.key, str(pair.row["source"]), files, pair.missing_source)
 
 
 def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | None = None) -> Picture:
-    """Return an overview of some pairs, one strip per pair in the order of the manifest.
+    """Return an overview, RGB, with one strip per pair in the order of the manifest.
 
-    Parameters
-    ----------
-    folder : Path or ObjectPath
-        Folder of the dataset.
-    keys : sequence of str
-        Keys of pairs, or of images and patches, which select all of their pairs. By default,
-        `pairs.PAIRS_SHOWN` evenly spaced pairs.
-    source : Path or ObjectPath, optional
-        Folder of the photographs; by default the one recorded in ``dataset.json``.
-
-    Returns
-    -------
-    ndarray of uint8, [H, W, 3]
-        The overview, RGB.
-
-    Raises
-    ------
-    ConfigError
-        If the manifest has no pair with a key, or ``source`` is not a folder.
-    DamageError
-        If the dataset is damaged.
+    ``keys`` are those of pairs, or of images and patches, which select all of their pairs; by default, `PAIRS_SHOWN`
+    evenly spaced pairs. ``source`` is the folder of the photographs, by default the recorded one. ConfigError for an
+    unknown key or folder; DamageError if the dataset is damaged.
     """
-    return np.vstack([_strip(pair) for pair in selected_pairs(folder, keys, source)])
+    return np.vstack([_strip(pair) for pair in with_bar(selected_pairs(folder, keys, source), "pair drawn")])
 
 
 def _mark(folder: AnyPath) -> bytes:
@@ -148,22 +93,18 @@ def _mark(folder: AnyPath) -> bytes:
 
 def _check_sheets(to: Path, mark: bytes, folder: AnyPath) -> None:
     """Raise ConfigError if a file named like a sheet is not one of this dataset."""
-    names = sorted(path.name for path in to.iterdir() if SHEET_NAME.fullmatch(path.name)) if to.is_dir() else []
-    for name in names:
-        if not _is_marked(to / name, mark):
+    sheets = sorted(path for path in to.iterdir() if SHEET_NAME.fullmatch(path.name)) if to.is_dir() else []
+    for path in sheets:
+        try:
+            with path.open("rb") as stream:
+                is_marked = mark in stream.read(PNG_HEADER_BYTES + len(mark))
+        except OSError:
+            is_marked = False
+        if not is_marked:
             raise ConfigError(
-                f"--to {to}: {name} is not a sheet of {folder}; expected a folder without sheets of other datasets; "
-                "choose another folder, or remove them"
+                f"--to {to}: {path.name} is not a sheet of {folder}; expected a folder without sheets of other "
+                "datasets; choose another folder, or remove them"
             )
-
-
-def _is_marked(path: Path, mark: bytes) -> bool:
-    try:
-        with path.open("rb") as stream:
-            stream.seek(PNG_HEADER_BYTES)
-            return stream.read(len(mark)) == mark
-    except OSError:
-        return False
 
 
 def _write(picture: Picture, path: Path, mark: bytes) -> Path:
@@ -182,121 +123,87 @@ def _write(picture: Picture, path: Path, mark: bytes) -> Path:
 
 def pair_sheet(pair: SheetPair) -> Picture:
     """Return the contact sheet of a pair: source, clean frame, difference, noisy frame, and both developed."""
-    window = detail_window(pair.clean.shape)
-    clean, noisy = average_mosaic(pair.clean, window.side), average_mosaic(pair.noisy, window.side)
-    panels = (
-        _source_panel(pair, window),
-        *_frame_panels("clean", pair.clean, clean, pair.plan, window),
+    window = panels.detail_window(pair.clean.shape)
+    clean, noisy = (panels.average_planes(raw, panels.PANEL_PX) for raw in (pair.clean, pair.noisy))
+    drawn = [
+        _source_panel(pair, window, panels.PANEL_PX),
+        *_frame_panels("clean", pair, clean, window),
         _difference_panel(pair, noisy - clean, window),
-        *_frame_panels("noisy", pair.noisy, noisy, pair.plan, window),
-    )
-    return lay_out(sheet_heading(pair, window), panels)
+        *_frame_panels("noisy", pair, noisy, window),
+    ]
+    return panels.lay_out(sheet_heading(pair, window), drawn)
 
 
 def _strip(pair: SheetPair) -> Picture:
     """Return the strip of a pair in an overview, without details."""
-    window = detail_window(pair.clean.shape, STRIP_PX)
-    clean, noisy = average_mosaic(pair.clean, window.side), average_mosaic(pair.noisy, window.side)
-    panels = (
-        _source_panel(pair, window, STRIP_PX),
-        *_frame_panels("clean", pair.clean, clean, pair.plan, window, STRIP_PX)[1:],
-        *_frame_panels("noisy", pair.noisy, noisy, pair.plan, window, STRIP_PX)[1:],
-        _difference_panel(pair, noisy - clean, window, STRIP_PX),
-    )
-    overviews = [SheetPanel(one.title, one.note if one.overview is None else "", one.overview) for one in panels]
-    return lay_out([f"{pair.key}   {pair.row['source']}"], overviews, STRIP_PX, len(overviews))
+    window = panels.detail_window(pair.clean.shape)
+    clean, noisy = (panels.average_planes(raw, panels.STRIP_PX) for raw in (pair.clean, pair.noisy))
+    drawn = [
+        _source_panel(pair, window, panels.STRIP_PX),
+        *_frame_panels("clean", pair, clean, window)[1:],
+        *_frame_panels("noisy", pair, noisy, window)[1:],
+        _difference_panel(pair, noisy - clean, window),
+    ]
+    overviews = [panel._replace(note=panel.note if panel.overview is None else "", detail=None) for panel in drawn]
+    return panels.lay_out([f"{pair.key}   {pair.row['source']}"], overviews, panels.STRIP_PX, len(overviews))
 
 
-def _source_panel(pair: SheetPair, window: DetailWindow, panel_px: tuple[int, int] = PANEL_PX) -> SheetPanel:
+def _source_panel(pair: SheetPair, window: Window, panel_px: tuple[int, int]) -> SheetPanel:
     if pair.source is None:
         return SheetPanel("source", f"not available: {pair.missing_source}", None)
     white = float(np.iinfo(pair.source.dtype).max)
-    overview, detail = fit_image(pair.source, panel_px), pair.source[window.rows, window.columns]
-    return SheetPanel(
-        "source", f"{8 * pair.source.itemsize} bits", to_codes(overview / white), to_codes(detail / white)
-    )
+    overview, detail = panels.fit_image(pair.source, panel_px) / white, pair.source[window] / white
+    return SheetPanel("source", f"{8 * pair.source.itemsize} bits", overview, detail)
 
 
-def _frame_panels(
-    name: str,
-    raw: Mosaic,
-    averaged: Float,
-    plan: Plan,
-    window: DetailWindow,
-    panel_px: tuple[int, int] = PANEL_PX,
-) -> tuple[SheetPanel, SheetPanel, SheetPanel]:
-    """Return a raw frame with its own and with the common stretch, and developed."""
-    low, high = float(raw.min()), float(raw.max())
-    overview, detail = fit_mosaic(averaged, panel_px), raw[window.rows, window.columns]
-
-    def stretch_own(dn: Mosaic) -> Picture:
-        return to_codes(np.asarray((dn - low) / max(high - low, 1.0), dtype=np.float64))
-
-    def stretch_common(dn: Mosaic) -> Picture:
-        return to_codes(np.sqrt(np.clip(to_light(dn, plan), 0, 1)))
-
-    white_dn = plan.black_level_dn + (plan.white_level_dn - plan.black_level_dn) * plan.exposure
-    return (
+def _frame_panels(name: str, pair: SheetPair, planes: Float, window: Window) -> list[SheetPanel]:
+    """Return a raw frame with its own and with the common stretch, and developed; ``planes`` are its averages."""
+    raw, plan, sensor = (pair.clean if name == "clean" else pair.noisy), pair.plan, pair.plan.sensor
+    overview, detail = planes.mean(axis=-1), raw[window]
+    stretched, ranges = zip(*map(stretch, (overview, detail)), strict=True)
+    white_dn = sensor.black_level_dn + (sensor.white_level_dn - sensor.black_level_dn) * plan.scene.exposure
+    common = (np.sqrt(np.clip(to_light(dn, plan), 0, 1)) for dn in (overview, detail))
+    rgb = process(to_light(panels.planes_to_rgb(planes, sensor.pattern), plan), plan)
+    has_all_colours = min(raw.shape) > 1
+    developed = rgb, _develop_detail(raw, pair, window) if has_all_colours else None
+    return [
+        SheetPanel(f"{name} raw, own stretch", f"{ranges[0]} (averaged), {ranges[1]} (detail)", *stretched),
         SheetPanel(
-            f"{name} raw, own stretch",
-            f"{low:.6g} to {high:.6g} DN, its minimum and maximum",
-            stretch_own(overview),
-            stretch_own(detail),
+            f"{name} raw, common stretch", f"{sensor.black_level_dn} to {white_dn:.5g} DN, square root", *common
         ),
-        SheetPanel(
-            f"{name} raw, common stretch",
-            f"{plan.black_level_dn} to {white_dn:.5g} DN, square root",
-            stretch_common(overview),
-            stretch_common(detail),
-        ),
-        _developed_panel(name, raw, averaged, plan, window, panel_px),
-    )
+        SheetPanel(f"{name} raw, developed", "with the parameters of the row", *developed),
+    ]
 
 
-def _developed_panel(
-    name: str, raw: Mosaic, averaged: Float, plan: Plan, window: DetailWindow, panel_px: tuple[int, int]
-) -> SheetPanel:
-    title = f"{name} raw, developed"
-    if min(raw.shape) < 2:
-        return SheetPanel(title, "not available: fewer than 2 x 2 sites do not contain all three colours", None)
-    if window.side == 1:
-        rgb = develop(averaged, plan)
-    else:
-        rgb = process(to_light(tile_channels(averaged, plan.pattern), plan), plan)
-    detail = _developed_detail(raw, plan, window)
-    return SheetPanel(title, "with the parameters of the row", to_codes(fit_image(rgb, panel_px)), to_codes(detail))
+STRETCHED = (0.1, 99.9)
+"""Percentiles of a picture that its own stretch maps to black and white."""
+
+
+def stretch(dn: Mosaic) -> tuple[Float, str]:
+    """Return a frame stretched to [0, 1] between its percentiles `STRETCHED`, and these in words."""
+    low, high = np.percentile(dn, STRETCHED)
+    return np.clip((dn - low) / max(high - low, 1.0), 0, 1), f"{low:.5g} to {high:.5g} DN"
 
 
 DEMOSAIC_REACH_PX = 2
 """Distance from which sites influence a demosaicked pixel (`isp.KERNELS`)."""
 
 
-def _developed_detail(raw: Mosaic, plan: Plan, window: DetailWindow) -> Float:
+def _develop_detail(raw: Mosaic, pair: SheetPair, window: Window) -> Float:
     """Develop the detail with a border as wide as the demosaicking filter, as if the complete frame were developed."""
-    reach = DEMOSAIC_REACH_PX  # even, so that y and x are even
-    y, x = (max(0, part.start - reach) for part in (window.rows, window.columns))
-    bordered = develop(raw[y : window.rows.stop + reach, x : window.columns.stop + reach], plan)
-    top, left = window.rows.start - y, window.columns.start - x
-    height, width = (part.stop - part.start for part in (window.rows, window.columns))
-    return bordered[top : top + height, left : left + width]
+    y, x = (max(0, part.start - DEMOSAIC_REACH_PX) for part in window)  # even, as the reach is
+    rows, columns = window
+    bordered = develop(raw[y : rows.stop + DEMOSAIC_REACH_PX, x : columns.stop + DEMOSAIC_REACH_PX], pair.plan)
+    return bordered[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
 
 
 RMS_SHOWN = 4.0
 
 
-def _difference_panel(
-    pair: SheetPair, averaged: Float, window: DetailWindow, panel_px: tuple[int, int] = PANEL_PX
-) -> SheetPanel:
+def _difference_panel(pair: SheetPair, planes: Float, window: Window) -> SheetPanel:
     """Show noisy minus clean around middle grey; black and white are `RMS_SHOWN` times its RMS, at least 1 DN."""
-    overview = fit_mosaic(averaged, panel_px)
-    clean = pair.clean[window.rows, window.columns]
-    detail = pair.noisy[window.rows, window.columns].astype(np.float64) - clean
-    limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(one * one))), 1.0) for one in (overview, detail)]
-    note = f"black to white: {_symmetric(limits[0])} (averaged), {_symmetric(limits[1])} (detail)"
-    pictures = [to_codes((one / dn + 1) / 2) for one, dn in zip((overview, detail), limits, strict=True)]
+    differences = planes.mean(axis=-1), pair.noisy[window].astype(np.float64) - pair.clean[window]
+    limits = [max(RMS_SHOWN * float(np.sqrt(np.mean(dn * dn))), 1.0) for dn in differences]
+    note = f"within {limits[0]:.3g} DN (averaged), {limits[1]:.3g} DN (detail) of middle grey"
+    pictures = ((dn / limit + 1) / 2 for dn, limit in zip(differences, limits, strict=True))
     return SheetPanel("noisy - clean", note, *pictures)
-
-
-def _symmetric(dn: float) -> str:
-    """Return the range from -dn to dn in words, because OpenCV's font lacks the plus-minus sign."""
-    return f"from -{dn:.3g} to {dn:.3g} DN"

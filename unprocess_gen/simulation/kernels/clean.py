@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.kernels.body import Response
+from unprocess_gen.simulation.kernels.body import SiteMap
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
@@ -86,28 +86,34 @@ class Scene32(Scene):
 
 def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] = Scene) -> Scene:
     """Return the parameters of a plan for sources of ``codes`` codes; ``kind`` is `Scene` or `Scene32`."""
-    in_float32, channels = kind is Scene32, _site_channels(plan.pattern, origin[0] % 2, origin[1] % 2)
+    in_float32, channels = kind is Scene32, _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2)
     f: Any = np.float32 if in_float32 else np.float64
-    gray_mean, gains, limit = plan.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
-    exposure, brightest, span_dn = plan.exposure, plan.brightest, float(plan.white_level_dn - plan.black_level_dn)
+    gray_mean, gains, limit = plan.camera.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
+    exposure, brightest, span_dn = (
+        plan.scene.exposure,
+        plan.brightest,
+        float(plan.sensor.white_level_dn - plan.sensor.black_level_dn),
+    )
     scale = tuple(gain * exposure * span_dn if in_float32 else 1.0 for gain in gains)
     numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
     limits, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
-    products: Any = _products(plan.rgb2cam, plan.tone, plan.gamma, codes)
+    products: Any = _products(plan.camera.rgb2cam, plan.isp.tone, plan.isp.gamma, codes)
     if in_float32:
-        products = _products32(plan.rgb2cam, plan.tone, plan.gamma, codes, (1.0,) * 3 if gray_mean else scale)
+        products = _products32(
+            plan.camera.rgb2cam, plan.isp.tone, plan.isp.gamma, codes, (1.0,) * 3 if gray_mean else scale
+        )
     return kind(
         products=products,
         code_count=codes,
         site_channels=channels,
-        inverse_gains=np.array(plan.inverse_gains, dtype=f),
+        inverse_gains=np.array(plan.camera.inverse_gains, dtype=f),
         gray_mean=gray_mean,
-        highlight_threshold=f(plan.highlight_threshold),
-        steepness=f(1 / (1 - plan.highlight_threshold)),
+        highlight_threshold=f(plan.camera.highlight_threshold),
+        steepness=f(1 / (1 - plan.camera.highlight_threshold)),
         exposure=f(exposure),
         brightest=f(brightest),
         clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
-        black_dn=np.uint32(plan.black_level_dn) if in_float32 else float(plan.black_level_dn),
+        black_dn=np.uint32(plan.sensor.black_level_dn) if in_float32 else float(plan.sensor.black_level_dn),
         span_dn=f(span_dn),
         dn_per_signal=f(exposure * span_dn if in_float32 else 1.0),
         limits=limits,
@@ -119,11 +125,11 @@ def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] 
     )
 
 
-def with_response(scene: Scene, response: Response) -> Scene:
+def with_response(scene: Scene, response: SiteMap) -> Scene:
     """Return the scene of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
     limits = np.full_like(scene.limits, -np.inf)
-    return scene._replace(response=response.factors, response_steps=response.steps, limits=limits)
+    return scene._replace(response=response.values, response_steps=response.steps, limits=limits)
 
 
 @functools.lru_cache(maxsize=4)
@@ -144,20 +150,24 @@ def _products32(
 
 def _site_gains(plan: Plan) -> tuple[float, float, float]:
     """Return the factors of the channels that remain: `_fill_gray_mean_signal` has inverted the gains already."""
-    return (1.0, 1.0, 1.0) if plan.highlight == "gray_mean" else plan.inverse_gains
+    return (1.0, 1.0, 1.0) if plan.camera.highlight == "gray_mean" else plan.camera.inverse_gains
 
 
 def _headroom(plan: Plan) -> list[float]:
     """Return the factor of the per-channel highlight term by channel; 0 without the term."""
-    return [max(1 - gain, 0.0) for gain in plan.inverse_gains] if plan.highlight == "per_channel" else [0.0] * 3
+    return (
+        [max(1 - gain, 0.0) for gain in plan.camera.inverse_gains]
+        if plan.camera.highlight == "per_channel"
+        else [0.0] * 3
+    )
 
 
 def _linear_limit(plan: Plan) -> float:
     """Return a signal up to which no site is a highlight, clipped or saturated, with a margin for rounding errors."""
-    span_dn = plan.white_level_dn - plan.black_level_dn
+    span_dn = plan.sensor.white_level_dn - plan.sensor.black_level_dn
     light = min(plan.brightest * 0.999, 1 - 1 / span_dn)
-    unclipped = min(1.0, light / plan.exposure) / max(_site_gains(plan)) * 0.999
-    return min(unclipped, plan.highlight_threshold) if any(_headroom(plan)) else unclipped
+    unclipped = min(1.0, light / plan.scene.exposure) / max(_site_gains(plan)) * 0.999
+    return min(unclipped, plan.camera.highlight_threshold) if any(_headroom(plan)) else unclipped
 
 
 @functools.lru_cache(maxsize=16)

@@ -1,10 +1,33 @@
 """Sample noise effect by effect, in electrons and then in DN: the order of `reference.noise.physical`.
 
-Counts of electrons are exact (`poisson`). Their conversion to DN and the read noise are approximate, float32, with an
-error bound; the read-out asks for the exact value of sites whose bound reaches a rounding boundary, and of defects. The
-fixed patterns of the body are prepared once (`body`). The Poisson form of two-parameter noise is shot and read noise.
+The way of a strip of a noisy frame. Left, the function; right, the buffers of the `Workspace` that it fills::
 
-Timings and rejected alternatives: ``docs/design/kernels.md``.
+    clean frame of the strip      unrounded_dn, rounded_dn, residual_dn          clean.fill_clean
+              |
+      count_electrons
+        _fill_rates               rates           mean electrons of light
+        fill_counts               light_e         counts of light       + light_error_e   0: the count is certain
+        _count_dark               dark_e          counts of one rate    + dark_error_e
+        _mark_defects             defects_e       counts of bright defects; negative: the pixel reads 0
+              |                   row_dn          the offset of the strip's row
+              |
+              +--------------------------------------------+
+              |  uint16 frames                             |  float32 frames
+      approximate_electrons                         exact_electrons
+        noise_dn    DN, float32                       exact_dn   DN, float64
+        error_dn    bound of its error                  |
+              |                                         |
+      readout rounds; where the bound                 readout normalises
+      reaches a rounding boundary, it asks
+      exact_electrons_site
+
+Most sites are rounded alike whatever the last bits of their DN are. So counts and DN are first approximate, in float32,
+with a bound of the error, eight sites at a time. Only the sites whose bound reaches a rounding boundary, some 0.2 % in
+daylight, are computed exactly, in float64, in the order of the reference. Defects are always among them, so that other
+sites pay nothing for them. Float32 frames are not rounded, so all of their sites are exact.
+
+The sum in DN is written once, in `_sum_dn`, for all three. Fixed patterns of the body are prepared once (`body`), and
+numbers of frames by `electron_records`. The Poisson form of two-parameter noise is counts and noise of the site alone.
 """
 
 from __future__ import annotations
@@ -15,72 +38,57 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
-from unprocess_gen.core.random_streams import purpose
 from unprocess_gen.core.types import Float
-from unprocess_gen.simulation.kernels.body import HOT, Body
-from unprocess_gen.simulation.kernels.normal import (
-    exact_value,
-    exact_values,
-    fill_rows,
-    fill_values_by_lines,
-)
+from unprocess_gen.simulation.kernels.body import Body
+from unprocess_gen.simulation.kernels.normal import exact_value, exact_values, fill_rows, fill_values_by_lines
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, first_word
 from unprocess_gen.simulation.kernels.poisson import (
     FLOAT32_RATE,
-    LOW_RATE,
     CountTables,
     exact_count,
     fill_counts,
     fill_counts_of_one_rate,
 )
-from unprocess_gen.simulation.kernels.rounding import ROUND
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
     Pointer,
     absolute,
-    from_bits,
     less_than,
     load,
-    maximum,
     minimum,
-    movemask,
     pointer_to,
-    select,
-    square_root,
     store,
     to_float32,
     to_float64,
 )
 from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, list_lanes
 
-SHOT, DARK, ROW = (np.uint64(purpose(stream)) for stream in ("shot", "dark_current", "row"))
-
 FLOAT32_ERROR_DN = 2.0**-21
-"""Error that float32 adds to an approximate DN, relative to the DN and to its summands."""
+"""Error that float32 adds to an approximate DN, relative to the DN and to its summands: eight roundings."""
 
 MAX_STEPS = 64
 """Most thresholds of `poisson.count_thresholds`."""
 
-_0, _8, _16, _INFINITE_BITS32 = np.uint64(0), np.uint64(8), np.uint64(16), np.uint32(0x7F800000)
-_ZERO32, _INFINITY32, _FLOAT32_ERROR32 = np.float32(0), np.float32(np.inf), np.float32(FLOAT32_ERROR_DN)
-_LOW_RATE32, _EVERY_LANE = np.float32(LOW_RATE), np.uint32(2**VECTOR_WIDTH - 1)
-_RATE_ERROR32, _NORMAL_ERROR32 = np.float32(FLOAT32_RATE), np.float32(2.0**-19)
+_8, _ZERO32, _FLOAT32_ERROR32 = np.uint64(8), np.float32(0), np.float32(FLOAT32_ERROR_DN)
+_RATE_ERROR32 = np.float32(FLOAT32_RATE)
 
 
 class Electrons(NamedTuple):
-    """Hold the effects of N frames of one body; P columns are those of complete blocks."""
+    """Hold the slots of N frames of one body; P columns are those of complete blocks."""
 
     numbers: Float  # [N, NUMBERS]: see `FrameNumbers`
-    read_lines: NDArray[np.uint64]  # [N, 4097]
-    read_quadratics: Float  # [N, 4096]
-    sites: Float  # [N, 2, 3, 8]: DN per electron, full well and black-level error of sites of even and odd rows
-    rows_dn: Float  # [N, H]: offsets of correlated rows; else one 0
-    rows_step: int  # H; 0 if rows are independent
-    columns_dn: Float  # [N, P]
-    fixed_columns_dn: Float  # [P]: without the part that is new in every frame
-    base_dn: Float32  # [N, 2, P]: black level, column and black-level error
-    dark_frames_dn: Float32  # [N, H, P]: values of dark frames above black; [P] zeros without them
-    dark_frames_steps: tuple[int, int]  # elements from frame to frame and from row to row; 0 without dark frames
+    site_lines: NDArray[np.uint64]  # [N, 4097]: quantiles of the noise of a site
+    site_quadratics: Float  # [N, 4096]
+    dn_per_e: Float  # [N, 2, 8]: of eight sites of even and of odd rows
+    full_well_e: Float  # [N, 2, 8]
+    planes_dn: Float  # [N, 2, 8]: offsets by plane
+    rows_dn: Float  # [N, H]: offsets by row that are prepared; else one 0
+    rows_step: int  # H; 0 if none is prepared
+    columns_dn: Float  # [N, P]: offsets by column
+    fixed_columns_dn: Float  # [P]: without those that are new in every frame
+    base_dn: Float32  # [N, 2, P]: black level, column and plane
+    sites_dn: Float32  # [N, H, P]: offsets by site; [P] zeros without them
+    sites_steps: tuple[int, int]  # elements from frame to frame and from row to row
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
@@ -90,35 +98,57 @@ class Electrons(NamedTuple):
 
 
 class FrameNumbers(NamedTuple):
-    """Hold the numbers of one frame; comments and defaults give the values that switch an effect off."""
+    """Hold the numbers of one frame; `load_frame` reads them from an array, in this order."""
 
-    shot: float  # 0
-    read_purpose: float  # word of the random words of read noise
-    read_std_dn: float  # 0
+    counts_light: bool  # otherwise the electrons of light are their mean
+    has_dark: bool  # counts of one rate at every site
+    has_thresholds: bool  # whether these are found by thresholds
+    light_stream: np.uint64  # words of the counters of random words (`random_streams.purpose`)
+    dark_stream: np.uint64
+    defect_stream: np.uint64
+    site_stream: np.uint64
+    row_stream: np.uint64
+    dark_e: float  # rate
+    removed_e: float  # mean that the camera subtracts from them
+    fewest_dark: np.float32  # smallest count by thresholds
+    dark_steps: np.int64  # number of thresholds
+    site_std_dn: float  # noise of a site
+    row_std_dn: float
     error_dn: float  # bound of the error of an approximate DN, in addition to FLOAT32_ERROR_DN times the DN
-    lowest_root: float  # roots of the mean electrons between which shot noise is counted
-    highest_root: float
-    dark_e: float = 0.0
-    dark_steps: float = 0.0  # thresholds of the dark signal; below 0 if it has too many
-    fewest_dark: float = 0.0  # smallest count of the dark signal
-    removed_e: float = 0.0  # mean dark signal that the camera subtracts
-    kept_dark_e: float = 0.0  # in a clean frame with fixed patterns
-    row_std_dn: float = 0.0
 
 
 NUMBERS = len(FrameNumbers._fields)
 
 
 @inner
-def _load_numbers(noise: Electrons, n: int) -> FrameNumbers:
+def load_frame(noise: Electrons, n: int) -> FrameNumbers:
+    """Return the numbers of frame ``n`` with their types."""
     v = pointer_to(noise.numbers, np.uint64(n * NUMBERS))
-    return FrameNumbers(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], v[10], v[11])
+    counts_light, has_dark, has_thresholds = v[0] != 0.0, v[1] != 0.0, v[2] != 0.0
+    light, dark, defect, site, row = np.uint64(v[3]), np.uint64(v[4]), np.uint64(v[5]), np.uint64(v[6]), np.uint64(v[7])
+    return FrameNumbers(
+        counts_light, has_dark, has_thresholds, light, dark, defect, site, row,
+        v[8], v[9], np.float32(v[10]), np.int64(v[11]), v[12], v[13], v[14],
+    )  # fmt: skip
 
 
 @inner
-def _sites_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
-    """Return the gains, full wells and black-level errors of eight sites of the strip's row."""
-    return pointer_to(noise.sites, 24 * (2 * n + (strip.y & 1)))
+def _first_site(n: int, strip: Strip) -> int:
+    """Return the index of the strip's row in the arrays ``[N, 2, 8]``."""
+    return VECTOR_WIDTH * (2 * n + (strip.y & 1))
+
+
+@inner
+def _first_column(strip: Strip) -> int:
+    """Return the column of the strip's first site in arrays of complete blocks."""
+    return strip.x + strip.lead
+
+
+@inner
+def _sites_dn(noise: Electrons, n: int, strip: Strip) -> Pointer:
+    """Return the offsets by site in a strip."""
+    frame_step, row_step = noise.sites_steps
+    return pointer_to(noise.sites_dn, n * frame_step + strip.y * row_step + _first_column(strip))
 
 
 # -------------------------------------------------------------------------------------------------- counts of electrons
@@ -126,252 +156,225 @@ def _sites_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
 
 @inner
 def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``electrons``, ``dark`` and ``total_e`` with bounds of their errors, ``defects``, all words, and normals."""
-    of, tables = _load_numbers(noise, n), noise.tables
-    first, after = _mark_defects(noise.body, strip, workspace)
-    for stream in range(4):  # loops, so that machine code contains each function once
-        purpose_word, words, is_needed = SHOT, workspace.words, True
-        if stream == 1:
-            purpose_word, words = np.uint64(of.read_purpose), workspace.read_words
-        elif stream == 2:
-            purpose_word, words, is_needed = DARK, workspace.dark_words, of.dark_e > 0.0
-        elif stream == 3:
-            purpose_word, words, is_needed = HOT, workspace.hot_words, first < after
-        if is_needed:
-            fill_word_blocks(key, strip, purpose_word, words)
-    row_dn = of.row_std_dn * exact_value(first_word(key, strip.row, ROW), tables.quadratics)
-    workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
-    limit = np.float32(of.highest_root * of.highest_root * (1 + 4 * FLOAT32_RATE))
-    for stream in range(0 if of.dark_steps < 0.0 else 1, 2):  # light last: its normals are kept
-        if stream == 0:
-            has_high, limit_of_stream = True, _INFINITY32
-            words, out, error = workspace.dark_words, workspace.dark, workspace.dark_error_e
-            for x in range(strip.total):
-                workspace.rates[x] = of.dark_e
-        else:
-            has_high, limit_of_stream = _fill_rates(noise, n, strip, workspace), limit
-            words, out, error = workspace.words, workspace.electrons, workspace.error_e
-        fill_counts(strip.total, words, workspace.rates, has_high, limit_of_stream, tables, workspace, out, error)
-    if of.shot == 0.0:
+    """Fill counts of electrons with bounds of their errors, the offset of the row, and the words of all sites."""
+    frame = load_frame(noise, n)
+    fill_word_blocks(key, strip, frame.light_stream, workspace.words)
+    fill_word_blocks(key, strip, frame.site_stream, workspace.site_words)
+    _fill_rates(noise, n, strip, workspace)
+    rates, light_e, light_error_e = workspace.rates, workspace.light_e, workspace.light_error_e
+    if frame.counts_light:
+        fill_counts(strip.total, workspace.words, rates, noise.tables, workspace, light_e, light_error_e)
+    else:
         for x in range(strip.total):
-            workspace.electrons[x] = workspace.rates[x]
-            workspace.error_e[x] = workspace.rates[x] * _RATE_ERROR32
-    elif of.lowest_root > 0.0 or of.highest_root < np.inf:
-        if not has_high:
-            fill_values_by_lines(strip.total, workspace.words, tables.lines, workspace.lines, workspace.normals)
-        _replace_by_normals(strip.total, of, limit, workspace)
-    if of.dark_e > 0.0:
-        _add_dark_signal(noise, n, of, strip, workspace)
-    _draw_defects(noise, first, after, workspace)
+            light_e[x] = rates[x]
+            light_error_e[x] = rates[x] * _RATE_ERROR32
+    if frame.has_dark:
+        fill_word_blocks(key, strip, frame.dark_stream, workspace.dark_words)
+        _count_dark(noise, n, frame, strip, workspace)
+    first, after = _mark_defects(noise.body, strip, workspace)
+    if first < after:
+        fill_word_blocks(key, strip, frame.defect_stream, workspace.defect_words)
+        _count_defects(noise, first, after, workspace)
+    row_dn = frame.row_std_dn * exact_value(first_word(key, strip.row, frame.row_stream), noise.tables.quadratics)
+    workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
 
 
 @inner
-def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> bool:
-    """Fill ``rates`` (float32) with the mean electrons of shot noise; return whether any is `LOW_RATE` or more.
+def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``rates`` (float32) with the mean electrons of light.
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
-    black, e_per_dn = np.float32(noise.black_dn), to_float32(1.0 / load(_sites_of(noise, n, strip), _0))
+    black = np.float32(noise.black_dn)
+    e_per_dn = to_float32(1.0 / load(noise.dn_per_e, np.uint64(_first_site(n, strip))))
     row, column = noise.body.response_steps
     response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
-    highest = load(workspace.rounded_dn, _0) - load(workspace.rounded_dn, _0)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
         light_dn = (load(workspace.rounded_dn, x) - black) + load(workspace.residual_dn, x)
-        rate = light_dn * e_per_dn * load(response, x)
-        highest = maximum(rate, highest)
-        store(workspace.rates, x, rate)
-    return bool(movemask(less_than(highest, _LOW_RATE32)) != _EVERY_LANE)
+        store(workspace.rates, x, light_dn * e_per_dn * load(response, x))
 
 
 @inner
-def _replace_by_normals(count: int, of: FrameNumbers, limit: np.float32, workspace: Workspace) -> None:
-    """Replace counts where a normal is near enough; sites at the limits, within the error of float32, are uncertain.
-
-    ``limit`` is the rate from which a normal replaces every count, in spite of the error of float32.
-    """
-    low, high = of.lowest_root * of.lowest_root, of.highest_root * of.highest_root
-    f, more, less = np.float32, 1 + 4 * FLOAT32_RATE, 1 - 4 * FLOAT32_RATE
-    low_less, low_more, high_less, high_more = f(low * less), f(low * more), f(high * less), limit
-    for v in range(count // VECTOR_WIDTH):
-        x = np.uint64(v) * _8
-        rate = load(workspace.rates, x)
-        root = square_root(rate)
-        is_counted = less_than(low_more, rate) & less_than(rate, high_less)
-        is_open = (less_than(low_less, rate) & less_than(rate, low_more)) | (
-            less_than(high_less, rate) & less_than(rate, high_more)
-        )
-        normal = rate + root * load(workspace.normals, x)
-        error = maximum((rate + root) * _NORMAL_ERROR32 + _NORMAL_ERROR32, from_bits(is_open & _INFINITE_BITS32))
-        store(workspace.electrons, x, select(is_counted, load(workspace.electrons, x), normal))
-        store(workspace.error_e, x, select(is_counted, load(workspace.error_e, x), error))
-
-
-@inner
-def _add_dark_signal(noise: Electrons, n: int, of: FrameNumbers, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``total_e`` with the counts of light and of the dark signal, less its mean if the camera subtracts it."""
-    if of.dark_steps >= 0.0:
-        ranks, steps = pointer_to(noise.dark_ranks, n * MAX_STEPS), np.int64(of.dark_steps)
-        fewest = np.float32(of.fewest_dark)
-        fill_counts_of_one_rate(strip.total, workspace.dark_words, fewest, ranks, steps, workspace.dark)
-        for x in range(strip.total):
-            workspace.dark_error_e[x] = 0.0
-    removed_e = np.float32(of.removed_e)
+def _count_dark(noise: Electrons, n: int, frame: FrameNumbers, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``dark_e`` with the counts of one rate; without thresholds they are counted like light."""
+    words, dark_e = workspace.dark_words, workspace.dark_e
+    if frame.has_thresholds:
+        ranks = pointer_to(noise.dark_ranks, n * MAX_STEPS)
+        fill_counts_of_one_rate(strip.total, words, frame.fewest_dark, ranks, frame.dark_steps, dark_e)
+        return
     for x in range(strip.total):
-        workspace.total_e[x] = workspace.electrons[x] + (workspace.dark[x] - removed_e)
-        workspace.total_error_e[x] = workspace.error_e[x] + workspace.dark_error_e[x]
+        workspace.rates[x] = frame.dark_e
+    fill_counts(strip.total, words, workspace.rates, noise.tables, workspace, dark_e, workspace.dark_error_e)
 
 
 @inner
-def _defects_of(body: Body, strip: Strip) -> tuple[int, int]:
+def _dark_buffers(frame: FrameNumbers, workspace: Workspace) -> tuple[Pointer, Pointer]:
+    """Return the counts of one rate and the bounds of their errors; zeros where there are none."""
+    dark_e = workspace.dark_e if frame.has_dark else workspace.zeros
+    is_certain = frame.has_thresholds or not frame.has_dark
+    return dark_e, workspace.zeros if is_certain else workspace.dark_error_e
+
+
+# -------------------------------------------------------------------------------------------------------------- defects
+
+
+@inner
+def defects_of(body: Body, strip: Strip) -> tuple[int, int]:
     """Return the range of a strip's defects in the lists of the body."""
     if body.strips == 0:
         return 0, 0
-    at = strip.y * body.strips + strip.x // STRIP
-    return body.starts[at], body.starts[at + 1]
+    number = strip.y * body.strips + strip.x // STRIP
+    return body.starts[number], body.starts[number + 1]
+
+
+@inner
+def count_defects(noise: Electrons, strip: Strip) -> int:
+    """Return the number of sites that `count_electrons` has listed as uncertain: the defects."""
+    first, after = defects_of(noise.body, strip)
+    count: int = after - first
+    return count
 
 
 @inner
 def _mark_defects(body: Body, strip: Strip, workspace: Workspace) -> tuple[int, int]:
-    """Fill ``defects`` with the means of hot pixels, less than 0 at dead ones, and list them as uncertain.
+    """Fill ``defects_e`` with the means of bright defects, less than 0 at dead pixels; list them as uncertain.
 
     Return their range in the lists of the body.
     """
     if body.strips > 0:  # otherwise no strip has filled it
         for x in range(strip.total):
-            workspace.defects[x] = 0.0
-    first, after = _defects_of(body, strip)
+            workspace.defects_e[x] = 0.0
+    first, after = defects_of(body, strip)
     for d in range(first, after):
-        workspace.defects[body.positions[d]] = body.means_e[d]
+        workspace.defects_e[body.positions[d]] = body.means_e[d]
         workspace.uncertain[d - first] = np.uint32(body.positions[d])
     return first, after
 
 
 @inner
-def _draw_defects(noise: Electrons, first: int, after: int, workspace: Workspace) -> None:
-    """Replace the means of hot pixels in ``defects`` with counts."""
+def _count_defects(noise: Electrons, first: int, after: int, workspace: Workspace) -> None:
+    """Replace the means of bright defects with counts."""
     for d in range(first, after):
         x, mean_e = noise.body.positions[d], noise.body.means_e[d]
         if mean_e >= 0.0:
-            workspace.defects[x] = exact_count(workspace.hot_words[x], mean_e, noise.tables)
+            workspace.defects_e[x] = exact_count(workspace.defect_words[x], mean_e, noise.tables)
 
 
 # ------------------------------------------------------------------------------------------------------------------ DN
 
 
 @inner
-def add_electrons(readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
-    """Fill ``noise_dn`` and ``error_dn``, in float32.
+def _sum_dn(
+    electrons: Any, full_well_e: Any, dn_per_e: Any, black_dn: Any, noise_dn: Any, offset_dn: Any, site_dn: Any
+) -> Any:
+    """Return DN in the order of `reference.noise.physical`: of one site, or of eight as vectors."""
+    dn = minimum(electrons, full_well_e) * dn_per_e + black_dn
+    return ((dn + noise_dn) + offset_dn) + site_dn
 
-    Return the base to which the read-out adds the noise, zeros, and the number of defects, which are listed already.
-    """
-    of, lines = _load_numbers(noise, n), pointer_to(noise.read_lines, n * 4097)
-    fill_values_by_lines(strip.total, workspace.read_words, lines, workspace.lines, workspace.noise_dn)
-    sites, f = _sites_of(noise, n, strip), np.float32
-    per_e, full_well_e = to_float32(load(sites, _0)), to_float32(load(sites, _8))
-    std, margin, row_dn = f(of.read_std_dn), f(of.error_dn), f(workspace.row_dn[0])
-    base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + strip.x + strip.lead)
-    dark_dn = _dark_frame_of(noise, n, strip)
-    has_dark = of.dark_e > 0.0
-    electrons = workspace.total_e if has_dark else workspace.electrons
-    error_e = workspace.total_error_e if has_dark else workspace.error_e
+
+@inner
+def approximate_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``noise_dn`` with the DN of all sites but defects, in float32, and bounds of the errors."""
+    frame, f = load_frame(noise, n), np.float32
+    lines = pointer_to(noise.site_lines, n * 4097)
+    fill_values_by_lines(strip.total, workspace.site_words, lines, workspace.lines, workspace.noise_dn)
+    first_site = np.uint64(_first_site(n, strip))
+    per_e, full_e = to_float32(load(noise.dn_per_e, first_site)), to_float32(load(noise.full_well_e, first_site))
+    std, margin, row_dn, removed_e = f(frame.site_std_dn), f(frame.error_dn), f(workspace.row_dn[0]), f(frame.removed_e)
+    base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + _first_column(strip))
+    site_dn, light_e, light_error_e = _sites_dn(noise, n, strip), workspace.light_e, workspace.light_error_e
+    dark_e, dark_error_e = _dark_buffers(frame, workspace)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        dn = minimum(load(electrons, x), full_well_e) * per_e + (
-            load(workspace.noise_dn, x) * std + (load(base, x) + load(dark_dn, x) + row_dn)
-        )
+        electrons = load(light_e, x) + (load(dark_e, x) - removed_e)
+        # the base is the sum of black level, column and plane
+        noise_dn = load(workspace.noise_dn, x) * std
+        dn = _sum_dn(electrons, full_e, per_e, load(base, x), noise_dn, row_dn, load(site_dn, x))
+        error_e = load(light_error_e, x) + load(dark_error_e, x)
         store(workspace.noise_dn, x, dn)
-        store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (load(error_e, x) * per_e + margin))
-    first, after = _defects_of(noise.body, strip)
-    return workspace.zeros, after - first
+        store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (error_e * per_e + margin))
 
 
 @inner
-def _dark_frame_of(noise: Electrons, n: int, strip: Strip) -> Pointer:
-    """Return the values of the dark frame of frame ``n`` in a strip."""
-    of_frame, of_row = noise.dark_frames_steps
-    return pointer_to(noise.dark_frames_dn, n * of_frame + strip.y * of_row + strip.x + strip.lead)
-
-
-@inner
-def exact_electrons_dn(noise: Electrons, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
-    """Return the noisy DN of one site, in the reference's order of operations."""
-    of, sites = _load_numbers(noise, n), pointer_to(_sites_of(noise, n, strip), x & 1)
-    electrons = np.float64(workspace.electrons[x])
-    if workspace.error_e[x] > _ZERO32:
-        electrons = _exact_shot(noise, of, n, x, strip, workspace)
-    if of.dark_e > 0.0:
-        dark = np.float64(workspace.dark[x])
-        if workspace.dark_error_e[x] > _ZERO32:
-            dark = exact_count(workspace.dark_words[x], of.dark_e, noise.tables)
-        electrons = electrons + (dark - of.removed_e)
-    electrons = electrons + workspace.defects[x]
-    dn = minimum(electrons, sites[8]) * sites[0] + noise.black_dn
-    dn = dn + of.read_std_dn * exact_value(workspace.read_words[x], pointer_to(noise.read_quadratics, n * 4096))
-    offset_dn = workspace.row_dn[0] + noise.columns_dn[n * noise.padded_width + strip.x + strip.lead + x]
-    dn = dn + (offset_dn + sites[16])
-    dn = dn + np.float64(_dark_frame_of(noise, n, strip)[x])
-    return float(dn) if workspace.defects[x] >= 0.0 else 0.0
-
-
-@inner
-def _exact_shot(noise: Electrons, of: FrameNumbers, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
-    """Return the electrons of light: a count, a normal in its place, or the mean."""
-    row, column = noise.body.response_steps
-    response = np.float64(noise.body.response[strip.y * row + (strip.x + strip.lead + x) * column])
-    rate = (workspace.unrounded_dn[x] - noise.black_dn) / _sites_of(noise, n, strip)[x & 1] * response
-    if of.shot == 0.0:
-        return float(rate)
-    root = np.sqrt(np.float32(rate))
-    if root > np.float32(of.lowest_root) and root < np.float32(of.highest_root):
-        return float(exact_count(workspace.words[x], rate, noise.tables))
-    rounded = (rate + ROUND) - ROUND
-    return float(np.float32(rounded) + (np.float32(rate - rounded) + root * workspace.normals[x]))
-
-
-@inner
-def fill_exact_electrons(
-    readout: Any, noise: Electrons, n: int, strip: Strip, workspace: Workspace
-) -> tuple[Pointer, int]:
-    """Return ``exact_dn``, filled with the noisy DN of all sites: of certain counts in loops, then of the others."""
-    of, quadratics, out = _load_numbers(noise, n), pointer_to(noise.read_quadratics, n * 4096), workspace.exact_dn
-    fill_rows(strip.total, workspace.read_words, workspace.scratch)
-    has_dark, sites = of.dark_e > 0.0, _sites_of(noise, n, strip)
-    dark, error_e = workspace.dark, workspace.error_e
-    if has_dark:
-        error_e = workspace.total_error_e
-    else:
-        dark = workspace.zeros  # adding 0 - 0 changes no bit
-    dn_per_e, full_well_e, errors_dn = load(sites, _0), load(sites, _8), load(sites, _16)
-    row_dn = workspace.row_dn[0]
-    columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + strip.x + strip.lead)
-    dark_frame_dn = _dark_frame_of(noise, n, strip)
-    first, after = _defects_of(noise.body, strip)
-    found = after - first
+def exact_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``exact_dn`` with the DN of all sites: of certain counts in vectors, then of the others one by one."""
+    frame, quadratics = load_frame(noise, n), pointer_to(noise.site_quadratics, n * 4096)
+    fill_rows(strip.total, workspace.site_words, workspace.scratch)
+    first_site, row_dn = np.uint64(_first_site(n, strip)), workspace.row_dn[0]
+    per_e, full_e, plane_dn = (
+        load(noise.dn_per_e, first_site),
+        load(noise.full_well_e, first_site),
+        load(noise.planes_dn, first_site),
+    )
+    columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + _first_column(strip))
+    sites_dn, light_e, light_error_e = _sites_dn(noise, n, strip), workspace.light_e, workspace.light_error_e
+    dark_e, dark_error_e = _dark_buffers(frame, workspace)
+    listed = count_defects(noise, strip)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        read = exact_values(workspace.read_words, workspace.scratch, x, quadratics)
-        electrons = to_float64(load(workspace.electrons, x)) + (to_float64(load(dark, x)) - of.removed_e)
-        dn = minimum(electrons, full_well_e) * dn_per_e + noise.black_dn + read * of.read_std_dn
-        dn = dn + ((load(columns_dn, x) + row_dn) + errors_dn)
-        store(out, x, dn + to_float64(load(dark_frame_dn, x)))
-        found = list_lanes(less_than(_ZERO32, load(error_e, x)), x, found, workspace)
-    for m in range(found):
-        at = np.int64(workspace.uncertain[m])
-        out[at] = exact_electrons_dn(noise, n, at, strip, workspace)
-    return out, found
+        electrons = to_float64(load(light_e, x)) + (to_float64(load(dark_e, x)) - frame.removed_e)
+        noise_dn = exact_values(workspace.site_words, workspace.scratch, x, quadratics) * frame.site_std_dn
+        offset_dn, site_dn = (load(columns_dn, x) + row_dn) + plane_dn, to_float64(load(sites_dn, x))
+        dn = _sum_dn(electrons, full_e, per_e, noise.black_dn, noise_dn, offset_dn, site_dn)
+        store(workspace.exact_dn, x, dn)
+        error_e = load(light_error_e, x) + load(dark_error_e, x)
+        listed = list_lanes(less_than(_ZERO32, error_e), x, listed, workspace)
+    for m in range(listed):
+        site = np.int64(workspace.uncertain[m])
+        workspace.exact_dn[site] = exact_electrons_site(noise, n, site, strip, workspace)
+
+
+@inner
+def exact_electrons_site(noise: Electrons, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
+    """Return the noisy DN of one site."""
+    if workspace.defects_e[x] < 0.0:
+        return 0.0
+    frame, site = load_frame(noise, n), _first_site(n, strip) + (x & 1)
+    dn_per_e, full_e = noise.dn_per_e[site], noise.full_well_e[site]
+    electrons = _exact_light(noise, frame, dn_per_e, x, strip, workspace)
+    if frame.has_dark:
+        electrons = electrons + (_exact_dark(noise, frame, x, workspace) - frame.removed_e)
+    electrons = electrons + workspace.defects_e[x]
+    value = exact_value(workspace.site_words[x], pointer_to(noise.site_quadratics, n * 4096))
+    column_dn = noise.columns_dn[n * noise.padded_width + _first_column(strip) + x]
+    offset_dn = (column_dn + workspace.row_dn[0]) + noise.planes_dn[site]
+    site_dn = np.float64(_sites_dn(noise, n, strip)[x])
+    return float(_sum_dn(electrons, full_e, dn_per_e, noise.black_dn, frame.site_std_dn * value, offset_dn, site_dn))
+
+
+@inner
+def _exact_light(
+    noise: Electrons, frame: FrameNumbers, dn_per_e: float, x: int, strip: Strip, workspace: Workspace
+) -> float:
+    """Return the electrons of light of one site: a count, or the mean."""
+    if workspace.light_error_e[x] == _ZERO32:
+        return float(workspace.light_e[x])
+    row, column = noise.body.response_steps
+    response = np.float64(noise.body.response[strip.y * row + (_first_column(strip) + x) * column])
+    rate = (workspace.unrounded_dn[x] - noise.black_dn) / dn_per_e * response
+    return float(exact_count(workspace.words[x], rate, noise.tables) if frame.counts_light else rate)
+
+
+@inner
+def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, workspace: Workspace) -> float:
+    """Return the count of one rate of one site."""
+    if frame.has_thresholds or workspace.dark_error_e[x] == _ZERO32:
+        return float(workspace.dark_e[x])
+    return float(exact_count(workspace.dark_words[x], frame.dark_e, noise.tables))
 
 
 @inner
 def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
     """Add the fixed patterns to the unrounded clean frame, as `reference.noise.average`."""
-    of, clean_dn, body = _load_numbers(noise, np.int64(0)), workspace.unrounded_dn, noise.body
-    _mark_defects(body, strip, workspace)
-    sites = _sites_of(noise, np.int64(0), strip)
+    frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), workspace.unrounded_dn, workspace.defects_e
+    _mark_defects(noise.body, strip, workspace)
+    kept_e, (row, column) = frame.dark_e - frame.removed_e, noise.body.sites_steps
+    sites_dn = pointer_to(noise.body.sites_dn, strip.y * row + strip.x * column + strip.lead)
     for x in range(strip.total):
-        gain = sites[x & 1]
-        dn = (clean_dn[x] + workspace.defects[x] * gain) + of.kept_dark_e * gain
-        dn = minimum(dn, noise.full_dn)
-        offset_dn = 0.0 + noise.fixed_columns_dn[strip.x + strip.lead + x]
-        dn = dn + (offset_dn + sites[16 + (x & 1)])
-        clean_dn[x] = dn if workspace.defects[x] >= 0.0 else 0.0
+        site = _first_site(np.int64(0), strip) + (x & 1)
+        gain = noise.dn_per_e[site]
+        dn = minimum((clean_dn[x] + defects_e[x] * gain) + kept_e * gain, noise.full_dn)
+        offset_dn = 0.0 + noise.fixed_columns_dn[_first_column(strip) + x]
+        dn = (dn + (offset_dn + noise.planes_dn[site])) + np.float64(sites_dn[x])
+        clean_dn[x] = dn if defects_e[x] >= 0.0 else 0.0

@@ -34,7 +34,6 @@ from unprocess_gen.simulation.kernels.normal import (
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
-    Pointer,
     from_bits,
     less_than,
     load,
@@ -45,8 +44,9 @@ from unprocess_gen.simulation.kernels.simd import (
     to_bits,
 )
 from unprocess_gen.simulation.kernels.strips import SIZE, Float32, Strip, Workspace
+from unprocess_gen.simulation.plan_slots import NORMAL_STREAM
 
-HETEROSCEDASTIC = np.uint64(purpose("heteroscedastic"))
+NORMAL_PURPOSE = np.uint64(purpose(NORMAL_STREAM))
 
 RELATIVE_NOISE_ERROR, RESIDUAL_ERROR_DN = np.float32(FINE_ERROR + 2.0**-16), np.float32(2.0**-22)
 """Bound of the error of the noise: this fraction of the standard deviation, plus this many DN."""
@@ -75,28 +75,30 @@ class Gaussian32(NamedTuple):
 def variance_lines(plans: Sequence[Plan], dtype: Any = np.float64) -> NDArray[Any]:
     """Return the variance lines of the plans' frames, [N, 2]."""
     with np.errstate(over="ignore"):  # a variance beyond float32 becomes infinite, and the site is clipped
-        return np.array([plan.variance_line for plan in plans]).astype(dtype)
+        return np.array([plan.noise.variance_line for plan in plans]).astype(dtype)
 
 
 def gaussian_noise(plans: Sequence[Plan]) -> Gaussian:
     """Return the noise of the plans' frames."""
-    return Gaussian(variance_lines(plans), float(plans[0].black_level_dn), normal_quantiles().quadratics)
+    return Gaussian(variance_lines(plans), float(plans[0].sensor.black_level_dn), normal_quantiles().quadratics)
 
 
 def gaussian_noise32(plans: Sequence[Plan]) -> Gaussian32:
     """Return the noise of the plans' frames in float32."""
-    return Gaussian32(variance_lines(plans, np.float32), np.full(SIZE, plans[0].black_level_dn, dtype=np.float32))
+    return Gaussian32(
+        variance_lines(plans, np.float32), np.full(SIZE, plans[0].sensor.black_level_dn, dtype=np.float32)
+    )
 
 
 @inner
 def draw_gaussian(noise: Gaussian | Gaussian32, n: int, key: PhiloxKey, strip: Strip, workspace: Workspace) -> None:
     """Fill ``words``."""
-    fill_word_blocks(key, strip, HETEROSCEDASTIC, workspace.words)
+    fill_word_blocks(key, strip, NORMAL_PURPOSE, workspace.words)
 
 
 @inner
-def add_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
-    """Fill ``noise_dn`` and ``error_dn``, in float32; return the base to which the read-out adds them."""
+def approximate_gaussian(noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``noise_dn`` with the noise on the rounded clean frame, in float32, and ``error_dn`` with its bounds."""
     fill_depths(strip.total, workspace.words, workspace.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     cancellation = np.float32(abs(b) * CANCELLATION_FRACTION if minimum(a, b) < 0.0 else 0.0)
@@ -110,11 +112,10 @@ def add_gaussian(readout: Any, noise: Gaussian, n: int, strip: Strip, workspace:
         store(workspace.noise_dn, x, residual + apply_signs(std * normal, load(workspace.words, x)))
         cancelled = less_than(from_bits(to_bits(variance) & _WITHOUT_SIGN), cancellation) & _ONE_BITS32
         store(workspace.error_dn, x, maximum(std * RELATIVE_NOISE_ERROR + RESIDUAL_ERROR_DN, from_bits(cancelled)))
-    return workspace.rounded_dn, 0
 
 
 @inner
-def exact_gaussian_dn(noise: Gaussian, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
+def exact_gaussian_site(noise: Gaussian, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
     """Return the noisy DN of one site, in the reference's order of operations."""
     a, b, clean_dn = noise.line[2 * n], noise.line[2 * n + 1], workspace.unrounded_dn[x]
     std = np.sqrt(maximum(a * (clean_dn - noise.black_dn) + b, 0.0))
@@ -122,10 +123,8 @@ def exact_gaussian_dn(noise: Gaussian, n: int, x: int, strip: Strip, workspace: 
 
 
 @inner
-def fill_exact_gaussian(
-    readout: Any, noise: Gaussian, n: int, strip: Strip, workspace: Workspace
-) -> tuple[Pointer, int]:
-    """Return ``exact_dn``, filled with the noisy DN of all sites."""
+def exact_gaussian(noise: Gaussian, n: int, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``exact_dn`` with the noisy DN of all sites."""
     fill_rows(strip.total, workspace.words, workspace.scratch)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     for v in range(strip.total // VECTOR_WIDTH):
@@ -134,12 +133,11 @@ def fill_exact_gaussian(
         std = square_root(maximum((clean_dn - noise.black_dn) * a + b, 0.0))
         normal = exact_values(workspace.words, workspace.scratch, x, noise.quadratics)
         store(workspace.exact_dn, x, clean_dn + std * normal)
-    return workspace.exact_dn, 0
 
 
 @inner
-def add_gaussian32(readout: Any, noise: Gaussian32, n: int, strip: Strip, workspace: Workspace) -> tuple[Pointer, int]:
-    """Fill ``noise_dn`` with clean and noise, in float32; return the base to which the read-out adds it: black."""
+def approximate_gaussian32(noise: Gaussian32, n: int, strip: Strip, workspace: Workspace) -> None:
+    """Fill ``noise_dn`` with clean and noise above black, in float32; no site needs more."""
     fill_coarse_depths(strip.total, workspace.words, workspace.depths)
     a, b = noise.line[2 * n], noise.line[2 * n + 1]
     for v in range(strip.total // VECTOR_WIDTH):
@@ -148,4 +146,3 @@ def add_gaussian32(readout: Any, noise: Gaussian32, n: int, strip: Strip, worksp
         std = square_root(maximum(clean_dn * a + b, _ZERO32))
         normal = coarse_normal(load(workspace.depths, x))
         store(workspace.noise_dn, x, clean_dn + apply_signs(std * normal, load(workspace.words, x)))
-    return noise.black_dn, 0

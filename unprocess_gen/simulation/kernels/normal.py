@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
-from unprocess_gen.core.lookup_tables import OCTAVES, SEGMENTS, normal_table
+from unprocess_gen.core.lookup_tables import FIRST_LINE, LINE_SHIFT, SEGMENTS, normal_table, quantile_lines
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.kernels.simd import (
     VECTOR_WIDTH,
@@ -46,16 +46,9 @@ from unprocess_gen.simulation.kernels.simd import (
 
 # --------------------------------------------------------------------------------------------------------------- tables
 
-LINES_PER_OCTAVE = 128
-_LINE_BITS = LINES_PER_OCTAVE.bit_length() - 1
-
-FLOAT32_ERROR = 2.0**-21
-"""Error that float32 adds, relative to the farthest quantile and to a line's rise over its octave."""
-
 _LOW31, _SIGN, _HALF = np.uint32(0x7FFFFFFF), np.uint32(0x80000000), np.float32(0.5)
 _VECTOR_WIDTH, _1, _2, _32 = (np.uint64(number) for number in (VECTOR_WIDTH, 1, 2, 32))
-_LINE_SHIFT = np.uint32(23 - _LINE_BITS)
-_FIRST_LINE = np.uint32(126 << _LINE_BITS)
+_LINE_SHIFT, _FIRST_LINE = np.uint32(LINE_SHIFT), np.uint32(FIRST_LINE)
 
 _POSITION_BITS = np.uint64(52 - (SEGMENTS.bit_length() - 1))
 _POSITION_MASK = np.uint64(2 ** (52 - (SEGMENTS.bit_length() - 1)) - 1)
@@ -91,26 +84,9 @@ def normal_quantiles() -> Quantiles:
 
 def build_quantiles(table: Float) -> Quantiles:
     """Derive the lines and their error from a table of quadratics, float64 ``[OCTAVES * SEGMENTS, 3]``."""
-    per_segment = LINES_PER_OCTAVE // SEGMENTS
-    rows = np.repeat(table, per_segment, axis=0)
-    t = np.arange(per_segment + 1) / LINES_PER_OCTAVE
-    at = np.tile(np.arange(per_segment), len(table))
-    low, high = t[at], t[at + 1]
-    z_low, z_high, z_middle = (rows[:, 0] + x * (rows[:, 1] + x * rows[:, 2]) for x in (low, high, (low + high) / 2))
-    octave = np.repeat(2.0 ** (np.arange(OCTAVES) - 1), LINES_PER_OCTAVE)
-    f_low = octave * (1 + np.tile(np.arange(LINES_PER_OCTAVE) / LINES_PER_OCTAVE, OCTAVES))
-    f_high = f_low + octave / LINES_PER_OCTAVE
-    slope = (z_high - z_low) / (f_high - f_low)
-    start = z_low - slope * f_low + (z_middle - (z_low + z_high) / 2) / 2
-    start32, slope32 = start.astype(np.float32), slope.astype(np.float32)
-    error = max(
-        float(np.abs(z - (start32.astype(np.float64) + slope32.astype(np.float64) * f)).max())
-        for z, f in ((z_low, f_low), (z_middle, (f_low + f_high) / 2), (z_high, f_high))
-    )
+    start, slope, error = quantile_lines(table)
     farthest = float(np.abs(table[:, 0]).max())
-    error += FLOAT32_ERROR * (farthest + float(np.abs(slope * f_high).max()))
-    lines = np.concatenate([pack_lines(start32, slope32), np.zeros(1, dtype=np.uint64)])
-    return Quantiles(lines, error, farthest, np.pad(table, ((0, 0), (0, 1))).ravel())
+    return Quantiles(pack_lines(start, slope), error, farthest, np.pad(table, ((0, 0), (0, 1))).ravel())
 
 
 def pack_lines(start: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArray[np.uint64]:

@@ -35,7 +35,12 @@ def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Philo
 def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
     """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
     rows = [
-        (plan.stream_key & 0xFFFFFFFF, plan.stream_key >> 32, plan.level << 12 | plan.draw, plan.frame)
+        (
+            plan.stream_key & 0xFFFFFFFF,
+            plan.stream_key >> 32,
+            plan.noise.level << 12 | plan.noise.draw,
+            plan.noise.frame,
+        )
         for plan in plans
     ]
     return np.array(rows, dtype=np.uint64)

@@ -6,8 +6,8 @@ Counts are those of `reference.poisson`, for rates up to 1e9. They are computed 
    rate 5: comparison of the word's rank with the distribution function, summed term by term. From rate 5 up: the first
    terms of the expansion, with an approximate normal.
 2. Exactly, float64, for sites of which the caller needs more: by the first terms again where they suffice, otherwise in
-   the reference's order of operations. That is the complete expansion from rate 64 up; below, a guess from a table that
-   is at most one too low, and one comparison with the distribution function.
+   the reference's order of operations. That is the complete expansion from rate 64 up; below, comparisons with the
+   distribution function next to an estimate.
 
 Timings and rejected alternatives: ``docs/design/kernels.md``.
 """
@@ -51,10 +51,7 @@ from unprocess_gen.simulation.kernels.simd import (
 )
 from unprocess_gen.simulation.kernels.strips import Workspace
 from unprocess_gen.simulation.reference.poisson import (
-    GUESS_UNIT,
-    LEAST_NORMAL,
     LIMIT,
-    NORMAL_CELLS,
     ORDER,
     RATE_CELLS,
     TAIL_CELLS,
@@ -79,7 +76,6 @@ _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
 _1, _8, _31, _32 = (np.uint64(number) for number in (1, 8, 31, 32))
 _POWERS = len(A)
 _COEFFICIENTS = np.array([(*series, *(0.0,) * (_POWERS - len(series))) for series in (A, B, C, D, E)])
-_GUESSES = 13 * NORMAL_CELLS
 
 
 class CountTables(NamedTuple):
@@ -91,7 +87,7 @@ class CountTables(NamedTuple):
         Approximate normals (`normal.Quantiles`).
     quadratics : ndarray of float64
         Exact normals.
-    tails, cdf, guess : ndarray
+    tails, cdf : ndarray
         Members of `reference.poisson.Tables`.
     cells : ndarray of float64, [81, 4]
         Its ``first``, ``least``, ``most`` and ``middle``.
@@ -102,7 +98,6 @@ class CountTables(NamedTuple):
     tails: Float
     cdf: Float
     cells: Float
-    guess: NDArray[np.int8]
 
 
 @functools.lru_cache(maxsize=1)
@@ -110,7 +105,7 @@ def count_tables() -> CountTables:
     """Return the tables, computed once per process."""
     normal, exact = normal_quantiles(), poisson_tables()
     cells = np.stack([exact.first, exact.least, exact.most, exact.middle], axis=1)
-    return CountTables(normal.lines, normal.quadratics, exact.tails, exact.cdf, cells, exact.guess)
+    return CountTables(normal.lines, normal.quadratics, exact.tails, exact.cdf, cells)
 
 
 # -------------------------------------------------------------------------------------------------- one rate everywhere
@@ -168,36 +163,34 @@ _0F, _HALF, _1F, _LOW = np.float32(0), np.float32(0.5), np.float32(1), np.float3
 
 @inner
 def fill_counts(
-    count: int,
-    words: Pointer,
-    rates: Pointer,
-    has_high: bool,
-    limit: np.float32,
-    tables: CountTables,
-    workspace: Workspace,
-    out: Pointer,
-    error: Pointer,
+    count: int, words: Pointer, rates: Pointer, tables: CountTables, workspace: Workspace, out: Pointer, error: Pointer
 ) -> None:
     """Fill ``out`` (float32) with the Poisson counts of ``words``; ``count`` is a multiple of `VECTOR_WIDTH`.
 
     ``error`` (float32) receives 0 where the count is certain, else a bound of its error, which may be infinite.
-    ``rates`` (float32) may differ from the true rates by `FLOAT32_RATE`. ``has_high`` states whether any of them is
-    `LOW_RATE` or more; if so, ``normals`` of the workspace receives the normals of all words. Blocks are not filled if
-    all of their rates are ``limit`` or more.
+    ``rates`` (float32) may differ from the true rates by `FLOAT32_RATE`.
     """
-    if has_high:
+    if _reaches_low_rate(rates, np.uint64(0), count // VECTOR_WIDTH):
         fill_values_by_lines(count, words, tables.lines, workspace.lines, workspace.normals)
     for start in range(0, count, BLOCK):
         first, vectors = np.uint64(start), min(BLOCK, count - start) // VECTOR_WIDTH
-        lowest = highest = load(rates, first)
+        lowest = load(rates, first)
         for n in range(1, vectors):
-            r = load(rates, first + np.uint64(n) * _8)
-            lowest, highest = minimum(r, lowest), maximum(r, highest)
+            lowest = minimum(load(rates, first + np.uint64(n) * _8), lowest)
         has_low = movemask(less_than(lowest, _LOW)) != 0
         if has_low:
             _count_low_rates(first, vectors, words, rates, workspace, out, error)
-        if movemask(less_than(highest, _LOW)) != _EVERY_LANE and movemask(less_than(lowest, limit)) != 0:
+        if _reaches_low_rate(rates, first, vectors):
             _count_high_rates(first, vectors, has_low, rates, workspace.normals, out, error)
+
+
+@inner
+def _reaches_low_rate(rates: Pointer, first: np.uint64, vectors: int) -> bool:
+    """Return whether any rate is `LOW_RATE` or more."""
+    highest = load(rates, first)
+    for n in range(1, vectors):
+        highest = maximum(load(rates, first + np.uint64(n) * _8), highest)
+    return bool(movemask(less_than(highest, _LOW)) != _EVERY_LANE)
 
 
 _EVERY_LANE = np.uint32(2**VECTOR_WIDTH - 1)
@@ -392,25 +385,18 @@ def _power_sum(which: int, s: float) -> float:
 
 @inner
 def _count_by_cdf(word: np.uint32, rate: float, z: float, tables: CountTables) -> float:
-    """Return the least k with P(K <= k) >= u: a guess that is at most one too low, then a comparison.
-
-    In the first cell, where counts are almost always 0, the guess is 0 and more comparisons may follow.
-    """
+    """Return the least k with P(K <= k) >= u, from an estimate by the normal of the word up or down."""
     root = np.sqrt(rate)
-    cell = np.int64(root * RATE_CELLS)
-    of_cell = pointer_to(tables.cells, 4 * cell)
-    first, least, most, middle = of_cell[0], of_cell[1], of_cell[2], of_cell[3]
-    at = np.uint64(cell * _GUESSES + np.int64((z - LEAST_NORMAL) * NORMAL_CELLS))
-    guess = np.floor(rate + root * z + tables.guess[at] * GUESS_UNIT + 0.5) - 1.0
-    k = np.int64(minimum(maximum(guess, least), most)) if cell > 0 else np.int64(0)
+    of_cell = pointer_to(tables.cells, 4 * np.int64(root * RATE_CELLS))
+    first, least, most, offset = np.int64(of_cell[0]), of_cell[1], of_cell[2], rate - of_cell[3]
     # rank of the word by its normal: invert the top bit, and the other bits too if it was 0
     bits = np.uint64(word)
     uniform = (np.float64(bits ^ (_SIGN | (((bits >> _31) - _1) & _LOW31))) + 0.5) * 2.0**-32
-    row, offset = np.int64(first) + k, rate - middle
-    if uniform > _cdf_at(tables.cdf, row, offset):
+    k = np.int64(minimum(maximum(np.floor(rate + root * z + (z * z - 1.0) / 6.0), least), most))
+    while k <= most and uniform > _cdf_at(tables.cdf, first + k, offset):
         k += 1
-        while cell == 0 and uniform > _cdf_at(tables.cdf, k, offset):
-            k += 1
+    while k > least and not uniform > _cdf_at(tables.cdf, first + k - 1, offset):
+        k -= 1
     return float(k)
 
 

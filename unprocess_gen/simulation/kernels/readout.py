@@ -1,8 +1,27 @@
 """Read out the frames of a strip: round to the sensor's integers or normalise, clip, count, and write.
 
-`Integers` rounds approximate DN and asks the noise for the exact value of sites whose error bound reaches a rounding
-boundary. `Normalised` needs the exact value of every site, because float32 frames are not rounded to DN. `FloatClean`
-reads the noisy frames as the former and the clean frame as the latter.
+The way of a strip through the read-out, once its noise is drawn (`draw_noise`)::
+
+    Integers, FloatClean: noisy frames of uint16        Normalised: noisy frames of float32
+      _approximate    noise_dn, error_dn (float32)        _fill_exact    exact_dn (float64)
+      _round_and_list                                     pinned sites get the level of white
+          rounded = rint(noise_dn)                        _normalise
+          noisy_dn = base + rounded                           clip, then (dn - black) / span
+          noisy = clip(noisy_dn) as uint16                _write (or in place, see `_is_direct`)
+          sites with |noise_dn - rounded| + error_dn > 1/2
+          are uncertain
+      _exact_site and _replace, for uncertain sites
+      pinned sites get the level of white
+      _write: to a mosaic, or to four planes
+
+The base is what the noise is added to, integers in DN: the rounded clean frame for one normal per site, black for its
+float32 form, and 0 for counts of electrons, whose ``noise_dn`` is the DN itself.
+
+The clean frame is read out once, after all noisy frames (`write_clean`): its values are rounded already, or normalised
+for `Normalised` and `FloatClean`; with fixed patterns they are rounded here, after `average_patterns`.
+
+Two records select the compiled code by their class (`jit.by_class`): the read-out, one of the three above, and the
+noise: `Gaussian`, `Gaussian32` or `Electrons`. Each function below that is made by `by_class` states its arguments.
 """
 
 from __future__ import annotations
@@ -19,20 +38,21 @@ from unprocess_gen.core.types import PACKED, Float, Plan
 from unprocess_gen.simulation.kernels.clean import FLOAT32_MARGIN
 from unprocess_gen.simulation.kernels.electrons import (
     Electrons,
-    add_electrons,
+    approximate_electrons,
     average_electrons,
+    count_defects,
     count_electrons,
-    exact_electrons_dn,
-    fill_exact_electrons,
+    exact_electrons,
+    exact_electrons_site,
 )
 from unprocess_gen.simulation.kernels.gaussian import (
     Gaussian,
     Gaussian32,
-    add_gaussian,
-    add_gaussian32,
+    approximate_gaussian,
+    approximate_gaussian32,
     draw_gaussian,
-    exact_gaussian_dn,
-    fill_exact_gaussian,
+    exact_gaussian,
+    exact_gaussian_site,
     variance_lines,
 )
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
@@ -86,13 +106,25 @@ class FloatClean(ReadOut):
     """Read out noisy frames of uint16 and a clean frame of float32."""
 
 
+class Limits(NamedTuple):
+    """Limits of a noisy frame, DN."""
+
+    low: float
+    high: float
+    pinned_dn: float  # noisy value of saturated sites
+    pinned_from: float  # unrounded clean value from which they are pinned; infinity if they keep their noise
+
+
 class Output(NamedTuple):
     """Locate what a strip of a frame fills."""
 
-    n: int  # number of the noisy frame
     sites: Pointer  # the strip in the frame
-    counts: Pointer  # of the frame
+    counts: Pointer  # of the frame, see `CLEAN_LOW`
     may_saturate: bool  # whether any site of the clean frame can be saturated
+
+
+CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE = range(6)
+"""Places of the members of `Counts` in the counts of a frame."""
 
 
 def readout_of(
@@ -101,19 +133,20 @@ def readout_of(
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
     limits_dn = [
-        noisy_limits(plan.bits, plan.black_level_dn, plan.sensor_clip) + _pinned_dn(plan, counts_from_black)
+        noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
+        + _pinned_dn(plan, counts_from_black)
         for plan in plans
     ]
-    packed = first.layout == PACKED
-    planes = _planes(first.pattern, origin[0] % 2, origin[1] % 2)
-    kind = Normalised if first.normalised else FloatClean if first.clean_normalised else Integers
+    packed = first.output.layout == PACKED
+    planes = _planes(first.sensor.pattern, origin[0] % 2, origin[1] % 2)
+    kind = Normalised if first.output.normalised else FloatClean if first.output.clean_normalised else Integers
     return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
         variance_lines=variance_lines(plans, np.float32 if counts_from_black else np.float64),
-        averaged=first.averaged,
-        black_dn=np.float32(0) if counts_from_black else float(first.black_level_dn),
-        span_dn=float(first.white_level_dn - first.black_level_dn),
-        white=1.0 if first.clean_normalised else float(first.white_level_dn),
+        averaged=first.noise.averaged,
+        black_dn=np.float32(0) if counts_from_black else float(first.sensor.black_level_dn),
+        span_dn=float(first.sensor.white_level_dn - first.sensor.black_level_dn),
+        white=1.0 if first.output.clean_normalised else float(first.sensor.white_level_dn),
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
@@ -128,59 +161,61 @@ def _planes(pattern: str, top: int, left: int) -> NDArray[np.int64]:
 
 def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:
     """Return the noisy DN of saturated sites, and the clean value from which they are; infinity if they keep noise."""
-    if plan.saturated != "pinned":
+    if plan.noise.saturated != "pinned":
         return np.inf, np.inf
     if counts_from_black:
-        above_black = np.float32((plan.brightest_dn - plan.black_level_dn) * (1 - FLOAT32_MARGIN))
+        above_black = np.float32((plan.brightest_dn - plan.sensor.black_level_dn) * (1 - FLOAT32_MARGIN))
         return plan.brightest_dn, float(above_black)
     return plan.brightest_dn, plan.brightest_dn
+
+
+@inner
+def load_limits(readout: Any, n: int) -> Limits:
+    """Return the limits of noisy frame ``n``."""
+    limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * n))
+    return Limits(limits_dn[0], limits_dn[1], limits_dn[2], limits_dn[3])
 
 
 # ------------------------------------------------------------------------------------------------------- noise by class
 
 
-@inner
-def _do_nothing(noise: Any, strip: Strip, workspace: Workspace) -> None:
-    """Do nothing: the noise has no fixed patterns."""
-
-
-@inner
-def _is_approximate(noise: Any) -> bool:
-    return True
-
-
-@inner
-def _is_final(noise: Any) -> bool:
-    return False
-
-
-@inner
-def _exact_gaussian32_dn(noise: Gaussian32, n: int, x: int, strip: Strip, workspace: Workspace) -> float:
-    """Return 0: this noise lists no site as uncertain."""
-    return 0.0
-
-
 draw_noise = by_class({Gaussian: draw_gaussian, Gaussian32: draw_gaussian, Electrons: count_electrons})
 """Fill the random words and counts of a strip of frame n; arguments: noise, n, key, strip, workspace."""
-sample_noise = by_class(
+_approximate = by_class(
+    {Gaussian: approximate_gaussian, Gaussian32: approximate_gaussian32, Electrons: approximate_electrons}
+)
+"""Fill ``noise_dn``, which the read-out adds to the base, and ``error_dn``; arguments: noise, n, strip, workspace."""
+_base_of = by_class(
     {
-        (Integers, Gaussian): add_gaussian,
-        (Integers, Gaussian32): add_gaussian32,
-        (Integers, Electrons): add_electrons,
-        (Normalised, Gaussian): fill_exact_gaussian,
-        (Normalised, Electrons): fill_exact_electrons,
-        (FloatClean, Gaussian): add_gaussian,
-        (FloatClean, Electrons): add_electrons,
+        Gaussian: lambda noise, workspace: workspace.rounded_dn,
+        Gaussian32: lambda noise, workspace: noise.black_dn,
+        Electrons: lambda noise, workspace: workspace.zeros,
     }
 )
-"""Compute the noise of a strip of frame n in DN, as its read-out needs it: approximately, or with the clean frame.
-
-Arguments: read-out, noise, n, strip, workspace. Return what `read_noisy` takes: values, or the base to which it adds
-noise, and how many sites are listed as uncertain.
-"""
-_needs_exact_sites = by_class({Gaussian: _is_approximate, Gaussian32: _is_final, Electrons: _is_approximate})
-_exact_dn = by_class({Gaussian: exact_gaussian_dn, Gaussian32: _exact_gaussian32_dn, Electrons: exact_electrons_dn})
-average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Electrons: average_electrons})
+"""Return the integers to which ``noise_dn`` is added, DN; arguments: noise, workspace."""
+_has_errors = by_class({Gaussian: lambda noise: True, Gaussian32: lambda noise: False, Electrons: lambda noise: True})
+"""Return whether ``error_dn`` has bounds, so that sites can be uncertain; argument: noise."""
+_count_listed = by_class(
+    {Gaussian: lambda noise, strip: 0, Gaussian32: lambda noise, strip: 0, Electrons: count_defects}
+)
+"""Return the number of sites that are listed as uncertain already; arguments: noise, strip."""
+_exact_site = by_class(
+    {
+        Gaussian: exact_gaussian_site,
+        Gaussian32: lambda noise, n, x, strip, workspace: 0.0,  # it lists no site
+        Electrons: exact_electrons_site,
+    }
+)
+"""Return the exact DN of a site; arguments: noise, n, x, strip, workspace."""
+_fill_exact = by_class({Gaussian: exact_gaussian, Electrons: exact_electrons})
+"""Fill ``exact_dn`` with the DN of all sites; arguments: noise, n, strip, workspace."""
+average_patterns = by_class(
+    {
+        Gaussian: lambda noise, strip, workspace: None,
+        Gaussian32: lambda noise, strip, workspace: None,
+        Electrons: average_electrons,
+    }
+)
 """Replace the unrounded clean frame of a strip with the average of many frames; arguments: noise, strip, workspace."""
 
 
@@ -188,37 +223,41 @@ average_patterns = by_class({Gaussian: _do_nothing, Gaussian32: _do_nothing, Ele
 
 
 @inner
-def _read_integers(
-    readout: Any, noise: Any, base: Pointer, listed: int, output: Output, strip: Strip, workspace: Workspace
-) -> None:
-    n, limits_dn = output.n, pointer_to(readout.limits_dn, np.uint64(4 * output.n))
-    low, high = np.float32(limits_dn[0]), np.float32(limits_dn[1])
-    found, has_clipped = _round_and_list(noise, base, listed, low, high, strip, workspace)
-    for m in range(found):
-        at = np.int64(workspace.uncertain[m])  # as below: Numba compiles a function for each type of index
-        dn = np.float32((_exact_dn(noise, n, at, strip, workspace) + ROUND) - ROUND)
-        has_clipped = _replace(at, dn, low, high, workspace) or has_clipped
-    if output.may_saturate and limits_dn[3] < np.inf:
-        dn = np.float32((limits_dn[2] + ROUND) - ROUND)
+def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Strip, workspace: Workspace) -> None:
+    limits = load_limits(readout, n)
+    low, high = np.float32(limits.low), np.float32(limits.high)
+    _approximate(noise, n, strip, workspace)
+    listed, has_clipped = _round_and_list(noise, low, high, strip, workspace)
+    for m in range(listed):
+        site = np.int64(workspace.uncertain[m])  # as below: Numba compiles a function for each type of index
+        dn = np.float32((_exact_site(noise, n, site, strip, workspace) + ROUND) - ROUND)
+        has_clipped = _replace(site, dn, low, high, workspace) or has_clipped
+    if output.may_saturate and limits.pinned_from < np.inf:
+        dn = np.float32((limits.pinned_dn + ROUND) - ROUND)
         for x in range(strip.first, strip.after):
-            if workspace.unrounded_dn[x] >= limits_dn[3]:
+            if workspace.unrounded_dn[x] >= limits.pinned_from:
                 has_clipped = _replace(x, dn, low, high, workspace) or has_clipped
     if has_clipped:
-        below, above = count_outside(strip, workspace.noisy_dn, low, high)
-        output.counts[2] += below
-        output.counts[3] += above
+        _count_clipped(output, strip, workspace.noisy_dn, low, high)
     _write(readout, strip, workspace.noisy, output.sites)
 
 
 @inner
+def _count_clipped(output: Output, strip: Strip, values_dn: Pointer, low: Any, high: Any) -> None:
+    below, above = count_outside(strip, values_dn, low, high)
+    output.counts[NOISY_LOW] += below
+    output.counts[NOISY_HIGH] += above
+
+
+@inner
 def _round_and_list(
-    noise: Any, base: Pointer, listed: int, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
+    noise: Any, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
 ) -> tuple[int, bool]:
     """Round half to even, clip and cast to uint16; list sites whose error bound reaches a rounding boundary.
 
     Return how many sites are listed then, and whether any was clipped.
     """
-    found = listed
+    base, listed = _base_of(noise, workspace), _count_listed(noise, strip)
     clipped_bits = uint32_zeros()
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
@@ -229,10 +268,10 @@ def _round_and_list(
         store(workspace.noisy_dn, x, dn)
         store(workspace.noisy, x, to_uint32(clipped))
         clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
-        if _needs_exact_sites(noise):
+        if _has_errors(noise):
             to_boundary = _HALF32 - absolute(noise_dn - rounded)
-            found = list_lanes(less_than(to_boundary, load(workspace.error_dn, x)), x, found, workspace)
-    return found, has_any_bit(clipped_bits)
+            listed = list_lanes(less_than(to_boundary, load(workspace.error_dn, x)), x, listed, workspace)
+    return listed, has_any_bit(clipped_bits)
 
 
 @inner
@@ -247,12 +286,12 @@ def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspac
 def _write_integers(readout: Integers, output: Output, strip: Strip, workspace: Workspace) -> None:
     clean = workspace.clean
     if readout.averaged:
-        low, high = readout.limits_dn[0], readout.limits_dn[1]
+        limits = load_limits(readout, np.int64(0))
         for x in range(strip.total):
             dn = (workspace.unrounded_dn[x] + ROUND) - ROUND
-            clean[x] = np.uint16(np.int32(minimum(maximum(dn, low), high)))
+            clean[x] = np.uint16(np.int32(minimum(maximum(dn, limits.low), limits.high)))
     if output.may_saturate:
-        output.counts[4] += _count_equal(strip, clean, np.uint16(readout.white))
+        output.counts[SATURATED] += _count_equal(strip, clean, np.uint16(readout.white))
     _write(readout, strip, clean, output.sites)
 
 
@@ -269,17 +308,16 @@ def _count_equal(strip: Strip, values: Pointer, value: Any) -> int:
 
 @inner
 def _read_normalised(
-    readout: Normalised, noise: Any, noisy_dn: Pointer, listed: int, output: Output, strip: Strip, workspace: Workspace
+    readout: Normalised, noise: Any, n: int, output: Output, strip: Strip, workspace: Workspace
 ) -> None:
-    limits_dn = pointer_to(readout.limits_dn, np.uint64(4 * output.n))
+    limits, noisy_dn = load_limits(readout, n), workspace.exact_dn
+    _fill_exact(noise, n, strip, workspace)
     noisy = output.sites if _is_direct(readout, strip) else workspace.normalised
-    if output.may_saturate and limits_dn[3] < np.inf:
+    if output.may_saturate and limits.pinned_from < np.inf:
         for x in range(strip.total):
-            noisy_dn[x] = limits_dn[2] if workspace.unrounded_dn[x] >= limits_dn[3] else noisy_dn[x]
-    if _normalise(readout, noisy_dn, limits_dn[0], limits_dn[1], strip, noisy):
-        below, above = count_outside(strip, noisy_dn, limits_dn[0], limits_dn[1])
-        output.counts[2] += below
-        output.counts[3] += above
+            noisy_dn[x] = limits.pinned_dn if workspace.unrounded_dn[x] >= limits.pinned_from else noisy_dn[x]
+    if _normalise(readout, noisy_dn, limits.low, limits.high, strip, noisy):
+        _count_clipped(output, strip, noisy_dn, limits.low, limits.high)
     if not _is_direct(readout, strip):
         _write(readout, strip, noisy, output.sites)
 
@@ -323,10 +361,11 @@ def _write_normalised(readout: Any, output: Output, strip: Strip, workspace: Wor
     clean = output.sites if _is_direct(readout, strip) else workspace.normalised
     low, high = readout.black_dn, readout.black_dn + readout.span_dn
     if readout.averaged:
-        low, high = readout.limits_dn[0], readout.limits_dn[1]
+        limits = load_limits(readout, np.int64(0))
+        low, high = limits.low, limits.high
     _normalise(readout, workspace.unrounded_dn, low, high, strip, clean)
     if output.may_saturate:
-        output.counts[4] += _count_equal(strip, clean, np.float32(readout.white))
+        output.counts[SATURATED] += _count_equal(strip, clean, np.float32(readout.white))
     if not _is_direct(readout, strip):
         _write(readout, strip, clean, output.sites)
 
@@ -349,20 +388,20 @@ def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
 
 
 @inner
-def count_zero_variance(readout: Any, n: int, strip: Strip, workspace: Workspace, counts: Pointer) -> None:
+def count_zero_variance(readout: Any, n: int, output: Output, strip: Strip, workspace: Workspace) -> None:
     """Count sites with a·(clean - black) + b <= 0."""
     a, b = readout.variance_lines[2 * n], readout.variance_lines[2 * n + 1]
     if minimum(a, b) <= 0.0:
         count = 0
         for x in range(strip.first, strip.after):
             count += a * (workspace.unrounded_dn[x] - readout.black_dn) + b <= 0.0
-        counts[5] += count
+        output.counts[ZERO_VARIANCE] += count
 
 
 read_noisy = by_class({Integers: _read_integers, Normalised: _read_normalised, FloatClean: _read_integers})
-"""Read out a strip of a noisy frame, and count its clipped sites.
+"""Read out a strip of noisy frame n, and count its clipped sites.
 
-Arguments: read-out, noise, the two values of `sample_noise`, output, strip, workspace.
+Arguments: read-out, noise, n, output, strip, workspace.
 """
 write_clean = by_class({Integers: _write_integers, Normalised: _write_normalised, FloatClean: _write_normalised})
 """Read out the clean frame of a strip; arguments: read-out, output, strip, workspace."""

@@ -1,12 +1,31 @@
 """Write SIMD code in kernels: vectors of eight numbers, and raw pointers.
 
-This module serves loops that LLVM does not vectorise by itself. Kernels load vectors, compute with them and store them.
-Vectors support ``+ - * / & | ^ >> <<`` per lane, also with a scalar operand, and the functions of this module. Every
-operation rounds as it does on single numbers: nothing is reordered, and no multiply-add is fused.
+LLVM does not vectorise loops that look up tables, convert between widths or list sites. Kernels write them with the
+functions of this module, eight sites at a time. One round of such a loop::
 
-Each function has two implementations, which tests compare. Uncompiled kernels use its body, on NumPy arrays of eight
-elements. Compiled kernels use the LLVM instructions in its decorator, on ``<8 x type>``, which LLVM maps to the
-registers of the processor. Bytes and bits are numbered from the low end, as on every platform that Numba supports.
+    memory of a strip   | x0 x1 x2 x3 x4 x5 x6 x7 | x8 ...          pointer: `pointer_to(array, index)`
+                          load(pointer, 0)
+    a vector            [ x0 x1 x2 x3 x4 x5 x6 x7 ]                 + - * / & | ^ >> <<, maximum, select ...
+    a mask              [ ~0  0  0 ~0  0  0  0  0 ]                 less_than(x, y): all bits of a lane, or none
+                          store(pointer, 0, vector)
+
+A scalar operand is copied into every lane. Every operation rounds as it does on single numbers: nothing is reordered,
+and no multiply-add is fused. Bytes and bits are numbered from the low end, as on every platform that Numba supports.
+
+Each function has two implementations, which tests compare. Its body is the definition: NumPy, on arrays of eight
+elements; uncompiled kernels use it. Its decorator is the compiled form: LLVM instructions on ``<8 x type>``, which LLVM
+maps to the registers of the processor.
+
+=============================  =====================================================================================
+part of this module            what it teaches Numba
+=============================  =====================================================================================
+types and compiler             the type of a vector, its operators, and decorators that compile a function as LLVM code
+pointers                       `pointers_of` a record, `pointer_to` an array, `buffers_at` constant places, load, store
+functions                      comparisons, bits, conversions, square root
+=============================  =====================================================================================
+
+A decorator takes a *typer* (types of the operands → type of the result) and a *builder*, which writes the instructions:
+``build(context, builder, call, arguments)``, where ``call`` is the signature and ``arguments`` are LLVM values.
 """
 
 from __future__ import annotations
@@ -103,7 +122,7 @@ def _lanewise(
 
 def _vector_type(operands: tuple[Any, ...]) -> Any:
     """Return the type of the last vector among operands, or None: then Numba tries other overloads."""
-    return next((each for each in operands[::-1] if isinstance(each, VectorType)), None)
+    return next((operand for operand in operands[::-1] if isinstance(operand, VectorType)), None)
 
 
 def _per_lane(code: Callable[..., Any]) -> Callable[..., Any]:
@@ -162,7 +181,7 @@ def _pointer_type(member: Any) -> Any:
     if isinstance(member, types.Array):
         return types.CPointer(member.dtype)
     if isinstance(member, types.NamedTuple | types.NamedUniTuple):
-        return types.NamedTuple([_pointer_type(each) for each in member.types], member.instance_class)
+        return types.NamedTuple([_pointer_type(inner) for inner in member.types], member.instance_class)
     return member
 
 
@@ -171,7 +190,7 @@ def _build_pointers(context: Any, builder: Any, of_type: Any, member: Any) -> An
         return context.make_array(of_type)(context, builder, member).data
     if isinstance(of_type, types.NamedTuple | types.NamedUniTuple):
         members = zip(of_type.types, cgutils.unpack_tuple(builder, member), strict=True)
-        converted = [_build_pointers(context, builder, each, value) for each, value in members]
+        converted = [_build_pointers(context, builder, kind, value) for kind, value in members]
         return context.make_tuple(builder, _pointer_type(of_type), converted)
     return member
 

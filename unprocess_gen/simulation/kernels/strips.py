@@ -40,7 +40,8 @@ Indices = NDArray[np.uint32]
 Lines = NDArray[np.uint64]
 
 ONES = np.ones(SIZE, dtype=np.float32)
-"""Relative gain of the pixels without PRNU."""
+ZEROS = np.zeros(SIZE, dtype=np.float32)
+"""Factors and offsets of pixels without fixed patterns."""
 
 _8 = np.uint64(8)
 _MASK_BITS = np.arange(2**VECTOR_WIDTH)[:, None] >> np.arange(VECTOR_WIDTH) & 1
@@ -83,7 +84,7 @@ class Workspace(NamedTuple):
     """Point to the scratch memory of one strip. The first four are float64, or float32 for the tier ``fast``."""
 
     signal: Any  # before white balance and highlights
-    defects: Any  # electrons of hot pixels; negative at dead pixels, 0 at others
+    defects_e: Any  # additional electrons of bright defects; negative at dead pixels, 0 at others
     bright_light: Any  # normalised light in bright blocks, 0 elsewhere
     unrounded_dn: Any  # clean frame
     exact_dn: Float  # noisy frame before rounding
@@ -95,20 +96,18 @@ class Workspace(NamedTuple):
     noisy_dn: Float32  # rounded, not clipped
     normalised: Float32
     depths: Float32  # see `normal.fill_depths`
-    normals: Float32  # of shot noise
+    normals: Float32  # of the counts of light
     errors: Float32
     rates: Float32  # mean electrons
-    electrons: Float32  # shot noise
-    error_e: Float32  # bound of the error of electrons; 0 where the count is certain
-    dark: Float32  # counts of the dark signal
+    light_e: Float32  # counts of light
+    light_error_e: Float32  # bound of their error; 0 where the count is certain
+    dark_e: Float32  # counts of one rate
     dark_error_e: Float32
-    total_e: Float32
-    total_error_e: Float32
     zeros: Float32
     words: Indices
-    read_words: Indices
+    site_words: Indices
     dark_words: Indices
-    hot_words: Indices
+    defect_words: Indices
     scratch: Indices
     uncertain: Indices  # [2 SIZE]: sites to recompute exactly
     lines: Lines  # scratch of look-ups

@@ -40,14 +40,17 @@ def process(camera_light: Float, plan: Plan) -> Float:
     ndarray of float64, [H, W, 3]
         Values in [0, 1]. Colours outside [0, 1] are clipped before the gamma, as cameras do.
     """
-    return render(apply_gains(camera_light, plan.inverse_gains, plan.highlight, plan.highlight_threshold), plan)
+    return render(
+        apply_gains(camera_light, plan.camera.inverse_gains, plan.camera.highlight, plan.camera.highlight_threshold),
+        plan,
+    )
 
 
 def render(camera_rgb: Float, plan: Plan) -> Float:
     """Apply matrix, gamma and tone curve to white-balanced camera RGB, [H, W, 3]; returns values in [0, 1]."""
-    image = camera_rgb @ np.array(invert(plan.rgb2cam)).reshape(3, 3).T
-    image = compress_gamma(np.clip(image, 0, 1), plan.gamma)
-    return TONES[plan.tone](image)
+    image = camera_rgb @ np.array(invert(plan.camera.rgb2cam)).reshape(3, 3).T
+    image = compress_gamma(np.clip(image, 0, 1), plan.isp.gamma)
+    return TONES[plan.isp.tone](image)
 
 
 def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) -> Float:
@@ -79,12 +82,12 @@ def develop(raw: Frame | Float, plan: Plan, origin: tuple[int, int] = (0, 0)) ->
     ``highlight="gray_mean"`` the gains depend on all three channels, so there demosaicking follows the plain gains.
     """
     light = to_light(raw, plan)
-    k = np.broadcast_to(plan.inverse_gains, (*light.shape, 3))
-    site_k = mosaic(k, plan.pattern, origin)
-    if plan.highlight == "gray_mean":
-        return process(demosaic(light / site_k, plan.pattern, origin) * k, plan)
-    balanced = HIGHLIGHTS[plan.highlight](light, site_k, plan.highlight_threshold)
-    return render(demosaic(balanced, plan.pattern, origin), plan)
+    k = np.broadcast_to(plan.camera.inverse_gains, (*light.shape, 3))
+    site_k = mosaic(k, plan.sensor.pattern, origin)
+    if plan.camera.highlight == "gray_mean":
+        return process(demosaic(light / site_k, plan.sensor.pattern, origin) * k, plan)
+    balanced = HIGHLIGHTS[plan.camera.highlight](light, site_k, plan.camera.highlight_threshold)
+    return render(demosaic(balanced, plan.sensor.pattern, origin), plan)
 
 
 def to_light(dn: Frame | Float, plan: Plan) -> Float:
@@ -102,8 +105,8 @@ def to_light(dn: Frame | Float, plan: Plan) -> Float:
     ndarray of float64
         Light, 0 at black and 1 at the white of the source image; same shape.
     """
-    span_dn = float(plan.white_level_dn - plan.black_level_dn)
-    return np.asarray((dn - float(plan.black_level_dn)) / span_dn * plan.exposure_ratio)
+    span_dn = float(plan.sensor.white_level_dn - plan.sensor.black_level_dn)
+    return np.asarray((dn - float(plan.sensor.black_level_dn)) / span_dn * plan.scene.exposure_ratio)
 
 
 def to_codes(srgb: Float, codes: int = 256) -> Float:

@@ -19,7 +19,6 @@ error is at most 6e-12. Tables are computed with `decimal` and single operations
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from decimal import Decimal, localcontext
 from typing import NamedTuple
@@ -28,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import MachineError
-from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density, tukey_core_std
+from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_density
 from unprocess_gen.core.lookup_tables import SEGMENTS, normal_table, sha256
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.types import Float
@@ -37,11 +36,11 @@ LIMIT = 64.0
 """Smallest rate for which counts are computed by the expansion."""
 
 
-TABLES_SHA256 = "25207712ad68964496f19a7d00d298dfbc6c164937338e04b57489c670bacbd6"
+TABLES_SHA256 = "c928d1d632cfd8f69d4ed02bca71681d1ef1124be3140089f2529a881334b0b2"
 """SHA-256 of all tables (`digest`)."""
 
 
-# Coefficients of the expansion, lowest power of s first; a test derives them independently.
+# Coefficients of the expansion, lowest power of s first. A wrong one breaks the distribution, which tests compare.
 A = (
     *(1 / 6, -1 / 72, 1 / 270, -23 / 17280, 19 / 34020, -11237 / 43545600, 13 / 102060, -2482411 / 37623398400),
     *(53741 / 1515591000, -272785979 / 13905608048640, 51173 / 4605822000),
@@ -81,10 +80,6 @@ CELLS = int(8 * RATE_CELLS) + 1
 MOST = 128
 """Upper bound of all counts for rates below `LIMIT`."""
 
-NORMAL_CELLS, LEAST_NORMAL = 8, -6.5
-
-GUESS_UNIT = 0.125
-
 
 class Tables(NamedTuple):
     """Tables for Poisson counts, read-only.
@@ -100,8 +95,6 @@ class Tables(NamedTuple):
         Row offset, smallest k and largest k of each cell.
     middle : ndarray of float64, [81]
         Rate at the centre of each cell.
-    guess : ndarray of int8, [81, 104]
-        Estimate of x - (rate + √rate·z) in eighths, by cell c and cell floor(8 (z + 6.5)) of the normal deviate z.
     """
 
     tails: Float
@@ -110,7 +103,6 @@ class Tables(NamedTuple):
     least: NDArray[np.int64]
     most: NDArray[np.int64]
     middle: Float
-    guess: NDArray[np.int8]
 
 
 @functools.lru_cache(maxsize=1)
@@ -135,8 +127,7 @@ def poisson_tables() -> Tables:
     kept = (counts >= least[:, None]) & (counts <= most[:, None])
     ends = np.cumsum(most - least + 1)
     first = ends - most - 1
-    guess = np.array([_guesses(*cell) for cell in zip(middle, polynomials[..., 0], least, most, strict=True)])
-    tables = Tables(_tails(), polynomials[kept], first, least, most, middle, guess)
+    tables = Tables(_tails(), polynomials[kept], first, least, most, middle)
     if (found := digest(tables)) != TABLES_SHA256:
         raise MachineError(f"the Poisson tables have SHA-256 {found}; expected {TABLES_SHA256}; use another Python")
     for table in tables:
@@ -193,18 +184,6 @@ def _range(middle: Float, polynomials: Float) -> tuple[NDArray[np.int64], NDArra
     least = np.maximum((at_lowest < 2.0**-34).sum(axis=1) - 1, 0)
     most = (1 - at_highest > 2.0**-34).sum(axis=1)
     return least, most
-
-
-def _guesses(rate: float, cdf: Float, least: int, most: int) -> NDArray[np.int8]:
-    """Return a row of `Tables.guess`: linear interpolation between normal deviates at which the count changes."""
-    tail = np.minimum(cdf, 1 - cdf)
-    edges = np.flatnonzero(tail > 2.0**-33)
-    edges = edges[(edges >= least) & (edges <= most)]
-    z_edges = np.where(cdf[edges] < 0.5, -1, 1) * _quantile(np.minimum(tail[edges], 0.5 - 2.0**-33))
-    z = (np.arange(104) + 0.5) / NORMAL_CELLS + LEAST_NORMAL
-    at = np.clip(np.searchsorted(z_edges, z) - 1, 0, len(edges) - 2)
-    x = edges[at] + 1 + (z - z_edges[at]) / (z_edges[at + 1] - z_edges[at])
-    return np.asarray(np.rint((np.maximum(x, 1) - rate - np.sqrt(rate) * z) / GUESS_UNIT), dtype=np.int8)
 
 
 def poisson(words: Words, rate: Float) -> Float:
@@ -306,101 +285,3 @@ def _by_cdf(uniform: Float, rate: Float) -> Float:
         above = uniform > _horner(tables.cdf[tables.first[cell] + k], rate - tables.middle[cell])
         low, high = np.where(above & (low < high), k + 1, low), np.where(above, high, np.minimum(high, k))
     return np.asarray(low, dtype=np.float64)
-
-
-def gaussian_distance(rate_e: float, read_std_e: float) -> float:
-    """Return the CDF distance between shot plus read noise and a normal distribution of the same variance.
-
-    The first Edgeworth term gives 0.0665 · rate / (rate + read_std²)^1.5: skewness / 6 times the maximum of
-    |(z² - 1) φ(z)|, which is at 0. It ignores that electrons are integers; read noise below half an electron shows the
-    steps, and `kernels.electrons` always draws counts there.
-
-    Parameters
-    ----------
-    rate_e : float
-        Mean of the Poisson counts, electrons.
-    read_std_e : float
-        Standard deviation of the read noise, electrons.
-
-    Returns
-    -------
-    float
-        Largest difference of the two distribution functions; 0 without noise.
-    """
-    variance = rate_e + read_std_e * read_std_e
-    return 0.0665 * (rate_e / variance) / math.sqrt(variance) if variance else 0.0
-
-
-def gaussian_from(read_std_e: float, law_distance: float) -> tuple[float, float]:
-    """Return the means for which a normal distribution is accurate enough for shot plus read noise.
-
-    `gaussian_distance` increases up to a mean of twice the variance of the read noise, and decreases after it.
-
-    Parameters
-    ----------
-    read_std_e : float
-        Standard deviation of the read noise, electrons.
-    law_distance : float
-        Largest accepted `gaussian_distance`.
-
-    Returns
-    -------
-    (float, float)
-        (r0, r1): the distance is accepted for means up to r0 and from r1, in electrons. r0 = r1 if it is accepted
-        everywhere; (0, infinity) for ``law_distance`` of 0.
-    """
-    if law_distance <= 0:
-        return 0.0, math.inf
-    peak = 2 * read_std_e * read_std_e
-    if gaussian_distance(peak, read_std_e) <= law_distance and peak:
-        return peak, peak
-    far = max(peak, 1.0)
-    while gaussian_distance(far, read_std_e) > law_distance:
-        far *= 2
-    below = _last_accepted(0.0, peak, read_std_e, law_distance) if peak else 0.0
-    return below, _last_accepted(far, peak, read_std_e, law_distance)
-
-
-CORE_MARGIN = 1.05
-"""Factor by which law distances with read noise of the law ``tukey_lambda`` may exceed those of `gaussian_distance`.
-
-It covers the steps of single electrons, of which a peaked density shows more."""
-
-MAX_CORE_SHAPE = 0.3
-"""Largest shape of Tukey's lambda distribution with which normals replace counts. The ends of the supports of larger
-shapes show the skewness of the counts; no calibration has such shapes."""
-
-
-@functools.lru_cache(maxsize=64)
-def core_share(shape: float) -> float:
-    """Return how much less than normal read noise Tukey's lambda distribution smooths the steps and skewness of counts.
-
-    The first Edgeworth term is the curvature of the density of normal shot noise plus read noise. A mixture of normal
-    densities has, by Jensen's inequality, at most that of the normal one with its curvature at 0
-    (`exact_distributions.tukey_core_std`). Tests compare the bound with integrated distances for shapes from -0.45.
-
-    Parameters
-    ----------
-    shape : float
-        The distribution's λ, in (-½, 10).
-
-    Returns
-    -------
-    float
-        Factor of the standard deviation, at most 1, for `gaussian_from`; 0 for shapes above `MAX_CORE_SHAPE`.
-    """
-    if shape > MAX_CORE_SHAPE:
-        return 0.0
-    with localcontext(prec=DIGITS):
-        return min(float(tukey_core_std(shape)), 1.0)
-
-
-def _last_accepted(inside: float, outside: float, read_std_e: float, law_distance: float) -> float:
-    """Return by bisection the accepted mean nearest to the boundary between ``inside`` and ``outside``."""
-    for _ in range(60):
-        middle = (inside + outside) / 2
-        if gaussian_distance(middle, read_std_e) <= law_distance:
-            inside = middle
-        else:
-            outside = middle
-    return inside

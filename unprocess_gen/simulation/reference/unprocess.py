@@ -1,7 +1,7 @@
 """Algorithm 1 of the article, step by step: from a display-referred image to the light at the sensor.
 
 This is the reference (NumPy, float64, one function per step, in the article's order). It defines the clean frame; the
-kernels compute the same DN. It takes about 200 ns per pixel, 50 times as long as the kernels.
+kernels compute the same DN, much faster (``docs/performance.md``).
 
 The formulas of the tone curves use libm, whose last bit differs between machines. Datasets never depend on it: kernels,
 and ``accuracy=reference``, read exact tables (`core.tone_curves`). With 8-bit sources and all five sensors, table
@@ -36,7 +36,7 @@ def unprocess(srgb: Srgb, plan: Plan, origin: tuple[int, int] = (0, 0), curve: F
     ndarray of float64, [H, W]
         Normalised light, 0 at black and 1 at white.
     """
-    return mosaic(camera_light(srgb, plan, curve), plan.pattern, origin)
+    return mosaic(camera_light(srgb, plan, curve), plan.sensor.pattern, origin)
 
 
 def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (0, 0)) -> Srgb:
@@ -66,11 +66,11 @@ def dequantise(srgb: Srgb, plan: Plan, curve: Float, origin: tuple[int, int] = (
     size = (srgb.shape[0], srgb.shape[1])
     channels = [words(plan.stream_key, "dequantize", size, origin=origin, draw=channel) for channel in range(3)]
     kept = (srgb == 0) | (srgb == 255)
-    if plan.dequantize == "dither_all":
+    if plan.source.dequantize == "dither_all":
         steps = np.where(srgb == 254, np.uint64(385), np.uint64(257))  # 254 · 257 + 256 is one less than white
     else:
         steps = np.broadcast_to(np.uint64(257), srgb.shape)
-        kept |= curve[srgb] > plan.highlight_threshold
+        kept |= curve[srgb] > plan.camera.highlight_threshold
     offsets = (np.stack(channels, axis=-1).astype(np.uint64) * steps >> np.uint64(32)).astype(np.int32) - 128
     return (srgb.astype(np.int32) * 257 + np.where(kept, 0, offsets)).astype(np.uint16)
 
@@ -92,9 +92,9 @@ def camera_light(srgb: Srgb, plan: Plan, curve: Float | None = None) -> Float:
     ndarray of float64, [H, W, 3]
         Camera RGB, 0 at black and 1 at white.
     """
-    image = linear_light(srgb, plan.tone, plan.gamma) if curve is None else curve[srgb]
-    image = apply_ccm(image, plan.rgb2cam)
-    return invert_gains(image, plan.inverse_gains, plan.highlight, plan.highlight_threshold)
+    image = linear_light(srgb, plan.isp.tone, plan.isp.gamma) if curve is None else curve[srgb]
+    image = apply_ccm(image, plan.camera.rgb2cam)
+    return invert_gains(image, plan.camera.inverse_gains, plan.camera.highlight, plan.camera.highlight_threshold)
 
 
 def linear_light(srgb: Srgb, tone: str, gamma: float | str) -> Float:

@@ -1,7 +1,7 @@
 """Read the headers of JPEG, PNG, TIFF, WebP and BMP files without decoding pixels.
 
-A header takes 5 to 60 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
-shape of the decoded array is compared with the header later (`decode`). Why Pillow is not used:
+A header takes 5 to 200 µs, whatever size it declares, plus the search for a JPEG's last marker at about 1 GB/s. The
+shape of the decoded array is compared with the header later (`decode`). Why no library reads them:
 ``docs/design/decoding.md``.
 
 A file is complete if it contains its end-of-image marker, IEND, or its last strip; bytes after the end (motion photos)
@@ -72,22 +72,9 @@ class Header:
 
 
 def probe(data: bytes) -> Header:
-    """Read the header of an image file; its first bytes decide the format.
+    """Read the header of a complete image file; its first bytes decide the format; no pixel is decoded.
 
-    Parameters
-    ----------
-    data : bytes
-        The complete file.
-
-    Returns
-    -------
-    Header
-        Declared properties; no pixel is decoded.
-
-    Raises
-    ------
-    SourceError
-        ``empty``, ``unsupported``, ``truncated`` (within the header itself) or ``corrupt``.
+    Raises SourceError: ``empty``, ``unsupported``, ``truncated`` (within the header itself) or ``corrupt``.
     """
     header = _header(data)
     if header.width < 1 or header.height < 1:
@@ -183,26 +170,27 @@ _PNG_MODES = {
 _PNG_HEAD = 8
 
 
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield (kind, start, end) of each complete chunk up to IEND."""
-    return _bounded(_png_walk(data))
+def _png_walk(data: bytes) -> Iterator[tuple[bytes, slice]]:
+    """Yield the kind and the place of each complete chunk up to IEND."""
+    offset, kind = _PNG_HEAD, b""
+    while kind != b"IEND" and offset + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, offset)
+        start, offset = offset + 8, offset + 12 + length
+        if offset <= len(data):
+            yield kind, slice(start, offset - 4)
 
 
-def _png_walk(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    at, kind = _PNG_HEAD, b""
-    while kind != b"IEND" and at + 12 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        start, at = at + 8, at + 12 + length
-        if at <= len(data):
-            yield kind, start, at - 4
-
-
-def _png_chunk(data: bytes, wanted: bytes) -> bytes | None:
-    return next((data[start:end] for kind, start, end in _png_chunks(data) if kind == wanted), None)
+def _png_chunks(data: bytes) -> dict[bytes, slice]:
+    """Return the place of the first chunk of each kind."""
+    chunks: dict[bytes, slice] = {}
+    for kind, place in _bounded(_png_walk(data)):
+        chunks.setdefault(kind, place)
+    return chunks
 
 
 def _png(data: bytes) -> Header:
-    kinds = {kind for kind, _, _ in _png_chunks(data)}
+    chunks = _png_chunks(data)
+    exif, profile, cicp = (data[chunks[kind]] if kind in chunks else None for kind in (b"eXIf", b"iCCP", b"cICP"))
     first, width, height, bits, colour = struct.unpack_from(">4sIIBB", data, _PNG_HEAD + 4)
     if first != b"IHDR" or colour not in _PNG_MODES:
         raise SourceError("corrupt", f"the PNG file begins with {first!r} and has colour type {colour}")
@@ -212,12 +200,12 @@ def _png(data: bytes) -> Header:
         height,
         _PNG_MODES[colour],
         16 if bits == 16 else 8,
-        has_alpha=colour in (_PNG_GRAY_ALPHA, _PNG_RGB_ALPHA) or b"tRNS" in kinds,
-        orientation=_exif_orientation(_png_chunk(data, b"eXIf") or b""),
-        frames=2 if b"acTL" in kinds else 1,
-        icc=_png_profile(_png_chunk(data, b"iCCP")),
-        cicp=_png_cicp(_png_chunk(data, b"cICP")),
-        missing="" if b"IEND" in kinds else "its IEND chunk",
+        has_alpha=colour in (_PNG_GRAY_ALPHA, _PNG_RGB_ALPHA) or b"tRNS" in chunks,
+        orientation=_exif_orientation(exif or b""),
+        frames=2 if b"acTL" in chunks else 1,
+        icc=_png_profile(profile),
+        cicp=_png_cicp(cicp),
+        missing="" if b"IEND" in chunks else "its IEND chunk",
     )
 
 
@@ -243,7 +231,7 @@ def _png_cicp(chunk: bytes | None) -> tuple[int, int, int, int] | None:
 def png_transparent_gray(data: bytes) -> int:
     """Return the gray value that tRNS declares transparent, as it appears in the decoded array."""
     bits = data[_PNG_HEAD + 16]
-    key = int.from_bytes((_png_chunk(data, b"tRNS") or b"")[:2], "big")
+    key = int.from_bytes(data[_png_chunks(data).get(b"tRNS", slice(0))][:2], "big")
     return key if bits == 16 else (key & (2**bits - 1)) * (255 // (2**bits - 1))
 
 
@@ -276,6 +264,9 @@ _TIFF_KINDS = {
     (3, 8, 1): "palette",
     (6, 8, 3): "rgb",
 }
+_STRIP_PLACES = (_STRIP_OFFSETS, _STRIP_BYTES)
+_TILE_PLACES = (_TILE_OFFSETS, _TILE_BYTES)
+_PLACES = _STRIP_PLACES + _TILE_PLACES
 _MOST_ENTRIES = 4096
 """Tags of a directory that libtiff accepts, in each of up to `_MAX_PAGES` directories, which may overlap."""
 _MOST_PLACES, _MOST_VALUES = 2**22, 2**16
@@ -289,106 +280,99 @@ _MAX_PAGES = 64
 
 
 class _Entry(NamedTuple):
-    """Hold one tag of a TIFF directory: offsets of the entry (``at``) and of its first value (``value_at``)."""
+    """Tag of a TIFF directory: offset of the entry, type and number of its values, offset of the first value."""
 
-    at: int
+    offset: int
     kind: int
     values: int
-    value_at: int
+    values_offset: int
 
 
-class _Tiff(NamedTuple):
-    """Hold the byte order of a TIFF file, whether it is a BigTIFF, and the offset of its first directory."""
+class _Directory:
+    """Read the tags of one directory, a page, of a TIFF file; struct.error if it lies outside the file."""
 
-    order: str
-    big: bool
-    first: int
+    def __init__(self, data: bytes, order: str, is_big: bool, offset: int) -> None:
+        counter, entry, link = ("Q", "HHQ", "Q") if is_big else ("H", "HHI", "I")
+        step, inline_bytes = (20, 8) if is_big else (12, 4)
+        self.data, self.order, self.is_big = data, order, is_big
+        (count,) = struct.unpack_from(order + counter, data, offset)
+        if count > _MOST_ENTRIES:
+            raise SourceError("corrupt", f"the TIFF directory has {count} entries, more than {_MOST_ENTRIES}")
+        first = offset + struct.calcsize("<" + counter)
+        (self.next_offset,) = struct.unpack_from(order + link, data, first + count * step)
+        self.entries: dict[int, _Entry] = {}
+        for place in range(first, first + count * step, step):
+            tag, kind, values = struct.unpack_from(order + entry, data, place)
+            values_offset = place + step - inline_bytes
+            if values * _TIFF_SIZES.get(kind, 1) > inline_bytes:
+                (values_offset,) = struct.unpack_from(order + link, data, values_offset)
+            self.entries.setdefault(tag, _Entry(place, kind, values, values_offset))
+
+    def values(self, tag: int, default: int) -> tuple[int, ...]:
+        """Return the values of a tag, at least one."""
+        entry = self.entries.get(tag)
+        if entry is None or entry.kind not in _TIFF_VALUES:
+            return (default,)
+        most = _MOST_PLACES if tag in _PLACES else _MOST_VALUES
+        if entry.values > most:
+            raise SourceError("corrupt", f"a TIFF tag has {entry.values} values, more than {most}")
+        form = f"{self.order}{entry.values}{_TIFF_VALUES[entry.kind]}"
+        return struct.unpack_from(form, self.data, entry.values_offset) or (default,)
+
+    def value(self, tag: int, default: int) -> int:
+        """Return the first value of a tag."""
+        return self.values(tag, default)[0]
+
+    @property
+    def is_thumbnail(self) -> bool:
+        """True for a smaller form of another page."""
+        return bool(self.value(_SUBFILE, 0) & _REDUCED_PAGE)
+
+    @property
+    def orientation(self) -> int:
+        """EXIF orientation, 1 if it is missing or unknown."""
+        orientation = self.value(_ORIENTATION, 1)
+        return orientation if orientation in ORIENTATIONS else 1
 
 
-_Page = dict[int, _Entry]
-
-
-def _tiff_start(data: bytes) -> _Tiff:
+def _directories(data: bytes) -> Iterator[_Directory]:
+    """Yield the directories of the chain of a TIFF file."""
     order = ">" if data[:2] == b"MM" else "<"
-    big = struct.unpack_from(order + "H", data, 2)[0] == 43
-    (first,) = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)
-    return _Tiff(order, big, first)
-
-
-def _tiff_pages(data: bytes, tiff: _Tiff) -> Iterator[_Page]:
-    """Yield the directories of the chain; struct.error if one lies outside the file."""
-    at, seen = tiff.first, {0}
-    while at not in seen:
-        seen.add(at)
-        page, at = _tiff_page(data, at, tiff.order, tiff.big)
-        yield page
-
-
-def _tiff_page(data: bytes, at: int, order: str, big: bool) -> tuple[_Page, int]:
-    counter, entry, link = ("Q", "HHQ", "Q") if big else ("H", "HHI", "I")
-    step, inline = (20, 8) if big else (12, 4)
-    (count,) = struct.unpack_from(order + counter, data, at)
-    if count > _MOST_ENTRIES:
-        raise SourceError("corrupt", f"the TIFF directory has {count} entries, more than {_MOST_ENTRIES}")
-    first = at + struct.calcsize("<" + counter)
-    (following,) = struct.unpack_from(order + link, data, first + count * step)
-    page: _Page = {}
-    for place in range(first, first + count * step, step):
-        tag, kind, values = struct.unpack_from(order + entry, data, place)
-        value_at = place + step - inline
-        if values * _TIFF_SIZES.get(kind, 1) > inline:
-            (value_at,) = struct.unpack_from(order + link, data, value_at)
-        page.setdefault(tag, _Entry(place, kind, values, value_at))
-    return page, following
-
-
-def _values(data: bytes, order: str, entry: _Entry | None, most: int = _MOST_VALUES) -> tuple[int, ...]:
-    if entry is None or entry.kind not in _TIFF_VALUES:
-        return ()
-    if entry.values > most:
-        raise SourceError("corrupt", f"a TIFF tag has {entry.values} values, more than {most}")
-    return struct.unpack_from(f"{order}{entry.values}{_TIFF_VALUES[entry.kind]}", data, entry.value_at)
+    is_big = struct.unpack_from(order + "H", data, 2)[0] == 43
+    (offset,) = struct.unpack_from(order + ("Q" if is_big else "I"), data, 8 if is_big else 4)
+    seen = {0}
+    while offset not in seen:
+        seen.add(offset)
+        directory = _Directory(data, order, is_big, offset)
+        yield directory
+        offset = directory.next_offset
 
 
 def _tiff(data: bytes) -> Header:
-    tiff = _tiff_start(data)
-    pages = list(islice(_tiff_pages(data, tiff), _MAX_PAGES))
+    pages = list(islice(_directories(data), _MAX_PAGES))
     if not pages:
         raise SourceError("corrupt", "the TIFF file has no page")
-    read = _reader(data, tiff.order, pages[0])
-    mode = _tiff_mode(read)
-    width, height, bits = read(_WIDTH, 0)[0], read(_HEIGHT, 0)[0], read(_BITS, 1)[0]
-    profile = pages[0].get(_PROFILE)
+    page = pages[0]
+    mode = _tiff_mode(page)
+    profile = page.entries.get(_PROFILE)
     return Header(
         "tiff",
-        width,
-        height,
+        page.value(_WIDTH, 0),
+        page.value(_HEIGHT, 0),
         mode,
-        16 if bits == 16 else 8,
-        has_alpha=mode == "rgb" and read(_SAMPLES, 1)[0] == 4,
-        orientation=_known_orientation(read(_ORIENTATION, 1)),
-        frames=sum(not _reader(data, tiff.order, each)(_SUBFILE, 0)[0] & _REDUCED_PAGE for each in pages),
-        icc=data[profile.value_at : profile.value_at + profile.values] if profile else None,
-        missing=_tiff_missing(read, len(data)),
+        16 if page.value(_BITS, 1) == 16 else 8,
+        has_alpha=mode == "rgb" and page.value(_SAMPLES, 1) == 4,
+        orientation=page.orientation,
+        frames=sum(not other.is_thumbnail for other in pages),
+        icc=data[profile.values_offset : profile.values_offset + profile.values] if profile else None,
+        missing=_tiff_missing(page),
     )
 
 
-_Read = Callable[[int, int], tuple[int, ...]]
-
-
-def _reader(data: bytes, order: str, page: _Page) -> _Read:
-    """Return a function ``read(tag, default)`` that returns a tuple of at least one value."""
-
-    def read(tag: int, default: int) -> tuple[int, ...]:
-        most = _MOST_PLACES if tag in _STRIP_TAGS + _TILE_TAGS else _MOST_VALUES
-        return _values(data, order, page.get(tag), most) or (default,)
-
-    return read
-
-
-def _tiff_mode(read: _Read) -> str:
-    photometric, samples, depths = read(_PHOTOMETRIC, 1)[0], read(_SAMPLES, 1)[0], read(_BITS, 1)
-    if read(_SUBFILE, 0)[0] & _REDUCED_PAGE:
+def _tiff_mode(page: _Directory) -> str:
+    """Return the mode; raise SourceError for pixels and layouts that OpenCV cannot read or reads wrongly."""
+    photometric, samples, depths = page.value(_PHOTOMETRIC, 1), page.value(_SAMPLES, 1), page.values(_BITS, 1)
+    if page.is_thumbnail:
         raise _unsupported("a TIFF whose first page is a thumbnail, as in camera raw files")
     if photometric == _TIFF_CMYK:
         return "cmyk"
@@ -396,76 +380,69 @@ def _tiff_mode(read: _Read) -> str:
     described = f"a TIFF of photometric {photometric} with {samples} samples of {depths} bits"
     if photometric in (0, 1) and samples == 2:
         raise SourceError("alpha", f"{described}: its alpha cannot be checked; save the picture without alpha")
-    if kind not in _TIFF_KINDS or len(set(depths)) > 1 or set(read(_SAMPLE_FORMAT, 1)) != {1}:
-        raise _unsupported(f"{described} and sample format {read(_SAMPLE_FORMAT, 1)[0]}")
-    _check_tiff_layout(read, depths[0], samples)
+    sample_formats = page.values(_SAMPLE_FORMAT, 1)
+    if kind not in _TIFF_KINDS or len(set(depths)) > 1 or set(sample_formats) != {1}:
+        raise _unsupported(f"{described} and sample format {sample_formats[0]}")
+    if (compression := page.value(_COMPRESSION, _UNCOMPRESSED)) not in _TIFF_COMPRESSIONS:
+        raise _unsupported(f"a TIFF of compression {compression}")
+    if depths[0] == 16 and samples > 1 and page.value(_PLANES, _CHUNKY) == _SEPARATE:
+        raise _unsupported("a 16-bit TIFF with separate colour planes")
+    sides = [*page.values(_TILE_WIDTH, _SMALLEST_TILE), *page.values(_TILE_HEIGHT, _SMALLEST_TILE)]
+    if depths[0] != 16 and min(sides) < _SMALLEST_TILE:
+        raise _unsupported(f"an 8-bit TIFF with tiles narrower than {_SMALLEST_TILE} pixels")
+    if page.value(_TILE_WIDTH, 1) * page.value(_TILE_HEIGHT, 1) > _LARGEST_TILE:
+        raise _unsupported(f"a TIFF with tiles of more than {_LARGEST_TILE} pixels")
     return _TIFF_KINDS[kind]
 
 
-def _check_tiff_layout(read: _Read, bits: int, samples: int) -> None:
-    """Raise SourceError for layouts that OpenCV cannot read or reads wrongly."""
-    compression = read(_COMPRESSION, _UNCOMPRESSED)[0]
-    if compression not in _TIFF_COMPRESSIONS:
-        raise _unsupported(f"a TIFF of compression {compression}")
-    if bits == 16 and samples > 1 and read(_PLANES, _CHUNKY)[0] == _SEPARATE:
-        raise _unsupported("a 16-bit TIFF with separate colour planes")
-    if bits != 16 and min(*read(_TILE_WIDTH, _SMALLEST_TILE), *read(_TILE_HEIGHT, _SMALLEST_TILE)) < _SMALLEST_TILE:
-        raise _unsupported(f"an 8-bit TIFF with tiles narrower than {_SMALLEST_TILE} pixels")
-    if read(_TILE_WIDTH, 1)[0] * read(_TILE_HEIGHT, 1)[0] > _LARGEST_TILE:
-        raise _unsupported(f"a TIFF with tiles of more than {_LARGEST_TILE} pixels")
-
-
-_STRIP_TAGS = (_STRIP_OFFSETS, _STRIP_BYTES)
-_TILE_TAGS = (_TILE_OFFSETS, _TILE_BYTES)
-
-
-def _tiff_missing(read: _Read, size_bytes: int) -> str:
+def _tiff_missing(page: _Directory) -> str:
     """Return what the file lacks of the strips or tiles that its first page lists; empty if it is complete."""
-    offsets, lengths = (read(tag, 0) for tag in (_TILE_TAGS if _is_tiled(read) else _STRIP_TAGS))
+    is_tiled = page.values(_TILE_OFFSETS, 0) != (0,)
+    offsets, lengths = (page.values(tag, 0) for tag in (_TILE_PLACES if is_tiled else _STRIP_PLACES))
     if 0 in offsets or 0 in lengths or len(offsets) != len(lengths):
         raise SourceError("corrupt", "the TIFF page does not list its strips")
-    if len(offsets) < _tiff_pieces(read):
-        raise SourceError("corrupt", f"the TIFF page lists {len(offsets)} pieces of {_tiff_pieces(read)}")
-    if sum(lengths) < _tiff_smallest(read):
-        raise SourceError("corrupt", f"the TIFF page lists {sum(lengths)} bytes, expected {_tiff_smallest(read)}")
+    pieces, smallest_bytes = _tiff_pieces(page, is_tiled), _tiff_smallest(page)
+    listed_bytes, file_bytes = sum(lengths), len(page.data)
+    if len(offsets) < pieces:
+        raise SourceError("corrupt", f"the TIFF page lists {len(offsets)} pieces of {pieces}")
+    if listed_bytes < smallest_bytes:
+        raise SourceError("corrupt", f"the TIFF page lists {listed_bytes} bytes, expected {smallest_bytes}")
     end = max(offset + length for offset, length in zip(offsets, lengths, strict=True))
-    if end > size_bytes:
-        return f"{end - size_bytes} bytes of its strips"
-    if read(_COMPRESSION, _UNCOMPRESSED)[0] != _UNCOMPRESSED and sum(lengths) > _MOST_READ * size_bytes:
-        raise SourceError("corrupt", f"the TIFF page lists {sum(lengths)} bytes of strips, the file has {size_bytes}")
+    if end > file_bytes:
+        return f"{end - file_bytes} bytes of its strips"
+    if page.value(_COMPRESSION, _UNCOMPRESSED) != _UNCOMPRESSED and listed_bytes > _MOST_READ * file_bytes:
+        raise SourceError("corrupt", f"the TIFF page lists {listed_bytes} bytes of strips, the file has {file_bytes}")
     return ""
 
 
-def _is_tiled(read: _Read) -> bool:
-    return read(_TILE_OFFSETS, 0) != (0,)
-
-
-def _tiff_pieces(read: _Read) -> int:
-    """Return the number of strips or tiles that the first page needs."""
-    width, height = read(_WIDTH, 0)[0], read(_HEIGHT, 0)[0]
-    across = read(_TILE_WIDTH, 0)[0] if _is_tiled(read) else width
-    down = read(_TILE_HEIGHT, 0)[0] if _is_tiled(read) else read(_STRIP_ROWS, height)[0]
+def _tiff_pieces(page: _Directory, is_tiled: bool) -> int:
+    """Number of strips or tiles that a page needs."""
+    width, height = page.value(_WIDTH, 0), page.value(_HEIGHT, 0)
+    across = page.value(_TILE_WIDTH, 0) if is_tiled else width
+    down = page.value(_TILE_HEIGHT, 0) if is_tiled else page.value(_STRIP_ROWS, height)
     if not across or not down:
         raise SourceError("corrupt", "the TIFF page has strips or tiles of size 0")
-    planes = read(_SAMPLES, 1)[0] if read(_PLANES, _CHUNKY)[0] == _SEPARATE else 1
+    planes = page.value(_SAMPLES, 1) if page.value(_PLANES, _CHUNKY) == _SEPARATE else 1
     return -(-width // across) * -(-height // down) * planes
 
 
-def _tiff_smallest(read: _Read) -> int:
-    """Return the least number of bytes of the pixels; 1 for compressed or subsampled ones, which give no bound."""
-    if read(_COMPRESSION, _UNCOMPRESSED)[0] != _UNCOMPRESSED or read(_PHOTOMETRIC, 1)[0] == _TIFF_SUBSAMPLED:
+def _tiff_smallest(page: _Directory) -> int:
+    """Least number of bytes of the pixels; 1 for compressed or subsampled ones, which give no bound."""
+    if page.value(_COMPRESSION, _UNCOMPRESSED) != _UNCOMPRESSED or page.value(_PHOTOMETRIC, 1) == _TIFF_SUBSAMPLED:
         return 1
-    return (read(_WIDTH, 0)[0] * read(_BITS, 1)[0] * read(_SAMPLES, 1)[0] + 7) // 8 * read(_HEIGHT, 0)[0]
+    row_bits = page.value(_WIDTH, 0) * page.value(_BITS, 1) * page.value(_SAMPLES, 1)
+    return (row_bits + 7) // 8 * page.value(_HEIGHT, 0)
 
 
 def tiff_without_orientation(data: bytes) -> bytes | bytearray:
     """Return the TIFF file with tag 274 set to 1, so that no decoder rotates it; the same bytes if it is 1 already."""
-    tiff = _tiff_start(data)
-    entry = next(_tiff_pages(data, tiff)).get(_ORIENTATION)
-    if entry is None or _values(data, tiff.order, entry) == (1,):
+    page = next(_directories(data))
+    entry = page.entries.get(_ORIENTATION)
+    if entry is None or page.values(_ORIENTATION, 0) == (1,):
         return data
     edited = bytearray(data)
-    struct.pack_into(tiff.order + ("HHQH6x" if tiff.big else "HHIH2x"), edited, entry.at, _ORIENTATION, 3, 1, 1)
+    form = page.order + ("HHQH6x" if page.is_big else "HHIH2x")
+    struct.pack_into(form, edited, entry.offset, _ORIENTATION, 3, 1, 1)
     return edited
 
 
@@ -475,16 +452,10 @@ def _exif_orientation(block: bytes) -> int:
     if not _FORMATS["tiff"].magic.match(tiff):
         return 1
     try:
-        start = _tiff_start(tiff)
         # Only the first directory: the second, of the thumbnail, is often broken by editors.
-        page = next(_tiff_pages(tiff, start), {})
-        return _known_orientation(_values(tiff, start.order, page.get(_ORIENTATION)))
+        return next((page.orientation for page in _directories(tiff)), 1)
     except (*_PAST_THE_END, SourceError):
         return 1
-
-
-def _known_orientation(values: tuple[int, ...]) -> int:
-    return values[0] if values and values[0] in ORIENTATIONS else 1
 
 
 # WebP -----------------------------------------------------------------------------------------------------------------
@@ -503,14 +474,14 @@ def _webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _webp(data: bytes) -> Header:
-    chunks: dict[bytes, tuple[int, int]] = {}
-    for kind, *place in _bounded(_webp_chunks(data)):
-        chunks.setdefault(kind, (place[0], place[1]))
-    sizes = [read(data, chunks[kind][0]) for kind, read in _WEBP_SIZES.items() if kind in chunks]
+    chunks: dict[bytes, slice] = {}
+    for kind, start, end in _bounded(_webp_chunks(data)):
+        chunks.setdefault(kind, slice(start, end))
+    sizes = [read(data, chunks[kind].start) for kind, read in _WEBP_SIZES.items() if kind in chunks]
     lacking = 8 + struct.unpack_from("<I", data, 4)[0] - len(data)
     if not sizes:
         raise SourceError("truncated" if lacking > 0 else "corrupt", "the WebP file has no picture")
-    exif, icc = (data[slice(*chunks[kind])] if kind in chunks else None for kind in (b"EXIF", b"ICCP"))
+    exif, icc = (data[chunks[kind]] if kind in chunks else None for kind in (b"EXIF", b"ICCP"))
     flags = [flag for _, _, flag in sizes]
     return Header(
         "webp",
@@ -609,7 +580,7 @@ _HEIF = re.compile(rb"....ftyp(?:hei[cmsx]|hev[cx]|mif1|msf1|(?P<avif>avi[fs]))"
 def _header(data: bytes) -> Header:
     if not data:
         raise SourceError("empty", "the file has 0 bytes")
-    name = next((name for name, each in _FORMATS.items() if each.magic.match(data)), None)
+    name = next((name for name, form in _FORMATS.items() if form.magic.match(data)), None)
     if name is None and (heif := _HEIF.match(data)):
         raise SourceError("unsupported", f"{'AVIF' if heif['avif'] else 'HEIC'}; convert it to JPEG, PNG or TIFF")
     if name is None:

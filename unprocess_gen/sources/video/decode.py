@@ -69,13 +69,7 @@ _ORIENTATIONS = {
 
 
 def is_installed() -> bool:
-    """Return whether PyAV is installed.
-
-    Returns
-    -------
-    bool
-        Found without importing it.
-    """
+    """Return whether PyAV is installed."""
     return find_spec("av") is not None
 
 
@@ -95,15 +89,7 @@ class _PacketInfo:
 class Video:
     """Give access to the frames of a video file in any order; in sequence is fastest.
 
-    Parameters
-    ----------
-    file : BinaryIO
-        The open file, which is closed when the object is deleted.
-
-    Raises
-    ------
-    SourceError
-        ``unsupported``, ``truncated``, ``empty`` (no frame), ``alpha`` or ``corrupt``.
+    ``file``: The open file, which is closed when the object is deleted. Raises SourceError.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -162,36 +148,17 @@ class Video:
     def frame(self, number: int, max_pixels: int, icc: str) -> tuple[Srgb, int]:
         """Decode one frame.
 
-        Parameters
-        ----------
-        number : int
-            Number of the frame in presentation order, from 0.
-        max_pixels : int
-            Largest number of pixels.
-        icc : {"ignore", "refuse"}
-            Whether to refuse primaries other than those of sRGB.
-
-        Returns
-        -------
-        srgb : ndarray of uint8 or uint16, [H, W, 3]
-            Pixels as stored.
-        orientation : int
-            EXIF orientation that shows them upright.
-
-        Raises
-        ------
-        SourceError
-            If the frame cannot be decoded or its pixels cannot be read.
+        The result is uint8 or uint16, [H, W, 3]. Raises SourceError.
         """
         if number >= len(self):
             raise SourceError("corrupt", f"frame {number} was requested, the video has {len(self)}")
         self.refuse(max_pixels, icc)
         with _as_source_errors(f"frame {number} cannot be decoded"):
-            found = self._decoded(number)
-        if found.is_corrupt:
+            decoded = self._decoded(number)
+        if decoded.is_corrupt:
             raise SourceError("corrupt", f"the decoder reports that frame {number} is damaged")
-        refuse(PixelTags.of(found, found.format.name), max_pixels, icc)
-        return rgb(found), _orientation(found)
+        refuse(PixelTags.of(decoded, decoded.format.name), max_pixels, icc)
+        return rgb(decoded), _orientation(decoded)
 
     def _decoded(self, number: int) -> VideoFrame:
         start = self._starts[self._order[number]]

@@ -1,0 +1,97 @@
+"""Frames are prepared for training as the guide on loading says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unprocess_gen as ug
+from unprocess_gen.simulation.reference.cfa import PATTERNS, unpack
+
+ROW = {"pattern": "RGGB", "black_level_dn": 240, "white_level_dn": 4095, "a_dn": 5.0, "b_dn2": 30.0}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_packing_is_undone_by_unpacking(pattern: str) -> None:
+    mosaic = np.arange(48, dtype=np.uint16).reshape(6, 8)
+
+    planes = ug.pack(mosaic, pattern)
+
+    assert planes.shape == (4, 3, 4)
+    assert planes[0, 0, 0] == mosaic[divmod(pattern.index("R"), 2)]
+    assert np.array_equal(unpack(planes, pattern), mosaic)
+
+
+def test_light_keeps_noise_below_black() -> None:
+    light = ug.to_light(np.array([0, 240, 4095, 4200], np.uint16), ROW)
+
+    assert light.dtype == np.float32
+    assert light.tolist() == pytest.approx([-240 / 3855, 0, 1, 3960 / 3855], rel=1e-6)
+
+
+def test_noise_map_is_the_std_of_simulated_noise() -> None:
+    pair = ug.make_pair(np.full((256, 256, 3), 150, np.uint8), ug.load_config(["noise=imx385_iso12800"]))
+    measured = np.std((pair.noisy.astype(np.float64) - pair.clean)[::2, ::2])
+
+    expected = ug.noise_std(pair.clean[::2, ::2], pair.row).mean()
+
+    assert measured == pytest.approx(expected, rel=5 / np.sqrt(2 * 128 * 128))  # five standard errors
+
+
+def test_noise_map_prefers_the_variance_of_all_effects_at_black() -> None:
+    assert ug.noise_std([240], ROW) == pytest.approx(np.sqrt(30))
+    assert ug.noise_std([240], ROW | {"dark_variance_dn2": 238.0}) == pytest.approx(np.sqrt(238))
+    assert ug.noise_std([240], ROW | {"dark_variance_dn2": None}) == pytest.approx(np.sqrt(30))
+
+
+def test_noise_map_is_zero_where_a_fitted_variance_is_negative() -> None:
+    assert ug.noise_std([240, 250], ROW | {"b_dn2": -30.0}).tolist() == pytest.approx([0, np.sqrt(20)])
+
+
+def test_crops_begin_at_even_sites_and_reach_both_ends() -> None:
+    frame = np.arange(10 * 14).reshape(10, 14)
+    corners = {
+        int(ug.random_crop([frame], 4, lambda count, pick=pick: min(pick, count - 1))[0][0, 0]) for pick in range(6)
+    }
+
+    rows, columns = zip(*(divmod(corner, 14) for corner in corners), strict=True)
+    assert set(rows) == {0, 2, 4, 6}
+    assert set(columns) == {0, 2, 4, 6, 8, 10}
+
+
+@pytest.mark.parametrize("side", [0, 3, 12])
+def test_impossible_crop_is_refused(side: int) -> None:
+    with pytest.raises(ValueError, match=f"side={side}: expected an even number of at most 10"):
+        ug.random_crop([np.zeros((10, 14))], side, np.random.default_rng(0).integers)
+
+
+def test_arrays_only_gives_the_frames_without_the_row(dataset: Path) -> None:
+    clean, noisy = ug.RawPairs(dataset, arrays_only=True)[1:][0]
+
+    expected = ug.RawPairs(dataset)[1]
+    assert np.array_equal(clean, expected.clean)
+    assert np.array_equal(noisy, expected.noisy)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["noise=nikon_d850", "scene=long_exposure", "effects.hot_pixels=off"],
+        ["noise=sony_a7s2", "scene=night", "effects.hot_pixels=off"],
+        ["noise=canon_5d4", "scene=night", "effects.all=on", "effects.hot_pixels=off", "effects.dead_pixels=off"],
+    ],
+)
+def test_dark_variance_is_that_of_black_frames(overrides: list[str]) -> None:
+    """Offsets of rows add a term of their own to the variance of a frame, so the bound has their share."""
+    config = ug.load_config([*overrides, "sensor=generic_14bit", "effects.dead_pixels=off", "effects.black_error=off"])
+    pair = ug.make_pair(np.zeros((256, 384, 3), np.uint8), config)
+
+    measured = np.var(pair.noisy.astype(float) - pair.clean)
+    expected = pair.row["dark_variance_dn2"] + 1 / 12  # black is an integer, so only the noisy frame is rounded
+    rows = pair.row["row_std_dn"] ** 2
+    error = np.hypot(expected * np.sqrt(2 / pair.noisy.size), rows * np.sqrt(2 / 256))
+
+    assert abs(measured - expected) < 5 * error + 0.02 * expected * (pair.row["read_law"] != "gaussian")
+    assert pair.row["dark_variance_dn2"] > 1.01 * pair.row["b_dn2"]

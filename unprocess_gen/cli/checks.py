@@ -1,0 +1,177 @@
+"""Run the verbs that compare a dataset with what it records: verify and replay."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.messages import print_result, report, report_error
+from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
+from unprocess_gen.cli.sweep import worst
+from unprocess_gen.core.errors import ConfigError, DamageError, UnprocessGenError
+from unprocess_gen.core.paths import AnyPath, local_path
+from unprocess_gen.core.types import Row
+from unprocess_gen.dataset.selection import select_rows
+from unprocess_gen.pipeline.repair import repair
+from unprocess_gen.pipeline.replay import ReplayResult, evenly_spaced_rows, source_root
+from unprocess_gen.pipeline.replay import replay as replay_rows
+from unprocess_gen.pipeline.verify import Damage, is_sweep, verify_sweep
+from unprocess_gen.pipeline.verify import verify as verify_dataset
+from unprocess_gen.reports.formatting import counted
+
+
+def verify(call: Call) -> int:
+    """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
+    folder = dataset_folder("verify", call, sweeps=True)
+    given_root(call)
+    if "to" in call.values:
+        if "noise" not in call.values:
+            raise ConfigError(f"verify: --to {call.values['to']}: draws the fits of --noise; add --noise")
+        from unprocess_gen.reports.photon_transfer import check_figure_file
+
+        check_figure_file(Path(call.values["to"]))
+    if not is_sweep(folder):
+        return _finish(folder, verify_dataset(folder), call)
+    codes = []
+    for result in verify_sweep(folder):
+        try:
+            codes.append(_finish(folder / result.folder, result.damages, call))
+        except UnprocessGenError as error:  # the other datasets are verified nevertheless
+            codes.append(report_error(error))
+    print_result(f"{folder}: {codes.count(0)} of {len(codes)} datasets are intact")
+    return worst(codes)
+
+
+def _finish(folder: AnyPath, damages: Iterable[Damage], call: Call) -> int:
+    """Report the damage of a dataset; repair, regenerate and check the noise as the flags ask; return the exit code."""
+    texts, codes, done = _reported(folder, damages), [], ""
+    is_finished = any((folder / name).exists() for name in ("dataset.json", "manifest.csv"))  # not so in a sweep
+    if texts and is_finished and "repair" in call.values:
+        codes = _repair(folder, call)
+        texts = _reported(folder, verify_dataset(folder))
+    elif texts and is_finished and isinstance(folder, Path):
+        report(f"{folder}: to restore damaged files, run gen-dataset verify {shlex.quote(str(folder))} --repair")
+    if not texts and call.values.get("regenerate"):
+        results = _regenerated(folder, call)
+        codes, done = (
+            [result.exit_code for result in results],
+            f"; {counted(len(results), 'pair')} regenerated, bit for bit",
+        )
+        texts = _reported(folder, (_complaint(result) for result in results if result.complaint))
+    if not texts and "noise" in call.values:
+        texts = _check_noise(folder, call)
+    if texts:
+        return worst(codes) or DamageError.exit_code
+    print_result(f"{folder} is intact{done}")
+    return 0
+
+
+def _repair(folder: AnyPath, call: Call) -> list[int]:
+    """Restore damaged files, report each step, and return the exit codes of the steps."""
+    refusal = f"verify: --repair: {folder} is in an object store; expected a local copy of the dataset"
+    manifest, codes = folder / "manifest.csv", []
+    root, dark = source_root(manifest, call.values.get("source")), dark_frames_of(manifest, call)
+    for step in repair(local_path(folder, refusal), root, dark):
+        if step.repaired:
+            print_result(step)
+        else:
+            report(str(step), logging.ERROR)
+        codes.append(step.exit_code)
+    return codes
+
+
+def _regenerated(folder: AnyPath, call: Call) -> list[ReplayResult]:
+    """Regenerate rows that are spread evenly over the dataset, and compare them."""
+    manifest = folder / "manifest.csv"
+    rows = evenly_spaced_rows(manifest, call.values["regenerate"])
+    dark = dark_frames_of(manifest, call)
+    return list(replay_rows(rows, source_root(manifest, call.values.get("source")), dark=dark))
+
+
+def _complaint(result: ReplayResult) -> str:
+    return f"{result.key} ({result.source}): {result.complaint}"
+
+
+def _check_noise(folder: AnyPath, call: Call) -> list[str]:
+    """Compare the noise in the arrays with the manifest's numbers; return what does not fit."""
+    from unprocess_gen.reports import photon_transfer
+
+    to, access = call.values.get("to"), None
+    try:
+        access = dark_frames_of(folder / "manifest.csv", call).open()
+    except ConfigError:  # without the recorded files, the pairs are counted as not checked
+        if {"dark_frames", "dark_shading"} & call.values.keys():
+            raise
+    found = photon_transfer.examine_dataset(folder, access)
+    checks = found.checks
+    if not checks.count:
+        print_result(
+            f"{folder}: no pair can be checked: too few usable sites, or dark frames that are not available; "
+            "noise.dark_frames=FOLDER names their folder, noise.dark_shading=PATH their map"
+        )
+        return []
+    if found.worst is not None:
+        print_result(
+            f"noise of {counted(found.count, 'pair')} fitted (a, b with 95 % intervals); "
+            f"the farthest from its row: {found.worst}"
+        )
+    unchecked = f"; {checks.unchecked} not checked: too few usable sites, or a dark frame that is not available"
+    print_result(
+        f"noise of {counted(checks.count, 'pair')} checked, {checks.wrong_pairs} wrong"
+        + (unchecked if checks.unchecked else "")
+    )
+    if to is not None:
+        photon_transfer.draw_fits(found.first, Path(to))
+        print_result(f"drawn in {to}")
+    unlisted = checks.wrong_pairs - sum(bool(alarm.key) for alarm in checks.alarms)
+    more = [f"noise of {counted(unlisted, 'other pair')}: wrong too"] if unlisted else []
+    return _reported(folder, [*map(str, checks.alarms), *more])
+
+
+def _reported(folder: AnyPath, damages: Iterable[object]) -> list[str]:
+    """Report damages on stderr; return them as text."""
+    texts = [str(damage) for damage in damages]
+    for text in texts:
+        report(f"{folder}: {text}", logging.ERROR)
+    return texts
+
+
+def replay(call: Call) -> int:
+    """Regenerate rows of a manifest, and compare or write their arrays."""
+    if {"rows", "keys"} <= call.values.keys():
+        raise ConfigError("replay: --rows and --keys exclude each other; expected one of them")
+    manifest = dataset_folder("replay", call, files=True)
+    manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
+    to = Path(call.values["to"]) if "to" in call.values else None
+    failed: list[Row] = []
+    rows = _ok_rows(select_rows(manifest, call.values.get("rows"), call.values.get("keys"), failed), failed)
+    codes, written = [], False
+    for result in replay_rows(rows, source_root(manifest, given_root(call)), to, dark_frames_of(manifest, call)):
+        codes.append(result.exit_code)
+        written |= result.written
+        if result.complaint:
+            report(_complaint(result), logging.ERROR)
+    same = codes.count(0)
+    others = len(codes) - same
+    print_result(
+        f"{counted(same, 'pair')} {_are(same)} the same, bit for bit; {others} {_are(others)} not"
+        + (f"; arrays in {to}" if written else "")
+        + (f"; {counted(len(failed), 'failed row')} skipped" if failed else "")
+    )
+    return worst(codes)
+
+
+def _ok_rows(rows: Iterable[Row], failed: list[Row]) -> Iterator[Row]:
+    """Yield the rows of pairs; append failed rows to a list."""
+    for row in rows:
+        if row["status"] == "ok":
+            yield row
+        else:
+            failed.append(row)
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"

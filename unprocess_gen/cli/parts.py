@@ -1,0 +1,102 @@
+"""Run the verbs of a run in parts: prepare, part, status and merge."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+from functools import partial
+from typing import TYPE_CHECKING
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
+from unprocess_gen.cli.hydra_app import compose
+from unprocess_gen.cli.messages import print_result, report
+from unprocess_gen.cli.places import given_root
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.reports.formatting import counted
+
+if TYPE_CHECKING:
+    from unprocess_gen.config.schema import Config
+
+PART_VARIABLES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDEX")
+"""Variables in which SLURM, PBS and Kubernetes give a job of an array its number."""
+
+
+def prepare(call: Call) -> int:
+    """List the sources of a run and split it into parts."""
+    if "parts" not in call.values:
+        raise ConfigError("prepare: parts is missing; expected the number of parts; give parts=…")
+    return compose(call, partial(_prepare, parts=call.values["parts"]))
+
+
+def _prepare(config: Config, label: str = "", *, parts: int) -> tuple[int, None, list[str]]:
+    from unprocess_gen.pipeline.parts import prepare
+
+    prepared = prepare(config, parts)
+    for warning in prepared.warnings:
+        report(warning, logging.WARNING)
+    if prepared.complete:
+        return DONE, None, [f"{config.out} is complete; nothing to do"]
+    out = shlex.quote(config.out)
+    counts = f"{counted(prepared.sources, 'source')}, {counted(prepared.shards, 'shard')}, {counted(parts, 'part')}"
+    how = f"run gen-dataset part {out} K for K = 0 to {parts - 1}, then gen-dataset merge {out}"
+    return DONE, None, [f"{config.out}: {counts}; {how}"]
+
+
+def part(call: Call) -> int:
+    """Generate one part of a prepared run."""
+    from unprocess_gen.pipeline.parts import make_part
+
+    out, number = str(call.path), call.values.get("part", _part_of_environment())
+    if number is None:
+        raise ConfigError(
+            f"part: its number is missing; expected it after {out}, or in one of {', '.join(PART_VARIABLES)}"
+        )
+    made = make_part(out, number, call.values.get("n_jobs"), given_root(call))
+    if made is None:
+        print_result(f"{out} is complete; nothing to do")
+        return DONE
+    print_result(
+        f"{out}: part {number} of {made.parts}: {counted(made.shards, 'shard')} committed, {made.made} of them "
+        f"({counted(made.rows, 'row')}) in this run, {made.seconds:.1f} s"
+    )
+    return DONE
+
+
+def _part_of_environment() -> int | None:
+    """Return the number of the part that a batch system gives, None without one."""
+    for variable in PART_VARIABLES:
+        if (text := os.environ.get(variable)) is not None:
+            try:
+                return int(text)
+            except ValueError:
+                raise ConfigError(f"part: {variable}={text}: expected an integer") from None
+    return None
+
+
+def status(call: Call) -> int:
+    """Print which parts of a prepared run are left."""
+    from unprocess_gen.pipeline.parts import left_text, parts_status
+
+    out = str(call.path)
+    found = parts_status(out)
+    if "left" in call.values:
+        print_result(left_text(found.left))
+    elif found.complete:
+        print_result(f"{out} is complete")
+    else:
+        done = f"{found.parts - len(found.left)} of {counted(found.parts, 'part')}"
+        shards = f"{found.committed} of {counted(found.shards, 'shard')} committed"
+        next_step = f"left: {left_text(found.left)}" if found.left else f"run gen-dataset merge {shlex.quote(out)}"
+        print_result(f"{out}: {done} done, {shards}; {next_step}")
+    return DONE
+
+
+def merge(call: Call) -> int:
+    """Write manifest and ``dataset.json`` of a run whose parts are done."""
+    from unprocess_gen.pipeline.parts import merge
+
+    summary, max_failed = merge(str(call.path))
+    print_result(summary.sentence(max_failed))
+    return TOO_MANY_FAILED if summary.made and sum(summary.failed.values()) > max_failed else DONE

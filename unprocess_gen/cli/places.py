@@ -1,0 +1,65 @@
+"""Find the datasets and folders that a command line names, and refuse others in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.verbs import VERBS
+from unprocess_gen.core.errors import ConfigError, DamageError
+from unprocess_gen.core.output_paths import DATASET_ENTRIES
+from unprocess_gen.core.paths import AnyPath, any_path
+
+if TYPE_CHECKING:
+    from unprocess_gen.sources.dark_frames import DarkPlaces
+
+
+def dataset_folder(verb: str, call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
+    """Return the verb's dataset; refuse anything else, and for a sweep name one of its datasets.
+
+    ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
+    """
+    path, place = call.path, VERBS[verb].place
+    assert path is not None and place is not None
+    if not any_path(path).is_listed():
+        kind = "file or folder" if files else "folder"
+        raise ConfigError(f"{verb}: {path}: no such {kind}; expected {place.expected}")
+    if not path.is_dir():
+        if files:
+            return path
+        raise ConfigError(f"{verb}: {path}: is a file; expected {place.expected}")
+    is_sweep = (path / "sweep.csv").is_file()
+    if not is_sweep and not any((path / name).exists() for name in DATASET_ENTRIES):
+        # a dataset without any of its files is damaged; only again, which reads settings, calls it wrong usage
+        error = ConfigError if verb == "again" else DamageError
+        raise error(f"{verb}: {path}: not a dataset; expected {place.expected}")
+    if is_sweep and not sweeps and not (path / "dataset.json").exists():
+        datasets = sorted(str(folder) for folder in path.iterdir() if (folder / "dataset.json").is_file())
+        example = f", such as {datasets[0]}" if datasets else ""
+        raise ConfigError(f"{verb}: {path}: is the folder of a sweep; expected one of its datasets{example}")
+    return path
+
+
+def given_root(call: Call) -> str | None:
+    """Return the root that the user gives; ConfigError if it is no folder or photograph, None if none is given."""
+    from unprocess_gen.sources.listing import check_root
+
+    root: str | None = call.values.get("source")
+    if root is not None:
+        check_root(root)
+    return root
+
+
+def dark_frames_of(manifest: AnyPath, call: Call) -> DarkPlaces:
+    """Return where the dark frames of a dataset and their map are, by the call or by ``dataset.json``."""
+    from unprocess_gen.pipeline.replay import dark_places
+
+    return dark_places(manifest, call.values.get("dark_frames"), call.values.get("dark_shading"))
+
+
+def folder_to(verb: str, call: Call) -> Path:
+    """Return the folder of ``--to``, which the verb requires."""
+    if "to" not in call.values:
+        raise ConfigError(f"{verb}: --to is missing; expected the folder to write to; give --to FOLDER")
+    return Path(call.values["to"])

@@ -1,0 +1,212 @@
+"""Run the verbs that report on settings or on a dataset: plan, accuracy, figures, report, preview and dng."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.hydra_app import compose
+from unprocess_gen.cli.messages import print_result
+from unprocess_gen.cli.messages import report as report_message
+from unprocess_gen.cli.places import dark_frames_of, dataset_folder, folder_to, given_root
+from unprocess_gen.cli.sweep import plan_totals
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
+from unprocess_gen.core.paths import any_path, local_path
+from unprocess_gen.reports.formatting import counted
+
+if TYPE_CHECKING:
+    from unprocess_gen.config.schema import AccuracyConfig, Config
+    from unprocess_gen.reports.estimate import RunEstimate
+
+Option = TypeVar("Option")
+
+
+def plan(call: Call) -> int:
+    """Estimate pairs, bytes and time of a run, and explain which effects it simulates."""
+    return compose(call, partial(_plan, read_all="all" in call.values), totals=plan_totals)
+
+
+def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate, list[str]]:
+    from unprocess_gen.pipeline.executors.local import effective_jobs
+    from unprocess_gen.reports.estimate import estimate_run, format_estimate
+
+    estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
+    blank = [""] if label and not label.startswith("1/") else []
+    return 0, estimate, [*blank, f"out       {config.out}", format_estimate(config, estimate)]
+
+
+def accuracy(call: Call) -> int:
+    """Measure error and time of every method and tier, and write a report."""
+    call = _with_out(call, "accuracy")
+    return compose(call, partial(_accuracy, command=_command("accuracy", call)))
+
+
+def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
+    from unprocess_gen.config.interpretation import uses_dark_frames
+    from unprocess_gen.config.schema import NoiseConfig, SceneConfig, SensorConfig
+    from unprocess_gen.reports import report_files
+    from unprocess_gen.reports.benchmark import measure
+    from unprocess_gen.reports.benchmark import report as benchmark_report
+
+    if uses_dark_frames(config.noise):
+        raise ConfigError(
+            f"accuracy: noise.dark_frames={config.noise.dark_frames}: tiers are measured with the noise of a profile; "
+            "expected null; leave it out"
+        )
+    out = _local_out(config)
+    report_files.check_report_folder(out, "accuracy")
+    profiles = measure.BenchmarkProfiles(
+        _tiers(),
+        _option("noise", "imx385_iso3200", NoiseConfig),
+        _option("noise", "sony_a7s2", NoiseConfig),
+        _option("sensor", "generic_14bit", SensorConfig),
+        {name: _option("scene", name, SceneConfig) for name in ("daylight", "night")},
+    )
+    benchmark = measure.measure_accuracy(config, profiles, command=command)
+    benchmark_report.write_benchmark(benchmark, out)
+    return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.FILES)}"]
+
+
+def _option(group: str, name: str, kind: type[Option]) -> Option:
+    """Return one option of ``conf/``."""
+    from unprocess_gen.config.serialization import read_option
+
+    return read_option(conf_dir() / group / f"{name}.yaml", kind)
+
+
+def _tiers() -> dict[str, AccuracyConfig]:
+    """Return every tier of ``conf/accuracy``, the reference first."""
+    from unprocess_gen.config.schema import AccuracyConfig
+
+    names = sorted(group_options("accuracy"), key=lambda name: name != "reference")
+    return {name: _option("accuracy", name, AccuracyConfig) for name in names}
+
+
+FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
+"""Settings that ``figures`` accepts; the article determines the others."""
+
+
+def figures(call: Call) -> int:
+    """Draw the article's figures for one photograph."""
+    for override in call.overrides:
+        if re.split(r"[.=]", override)[0] not in FIGURE_KEYS:
+            raise ConfigError(f"figures: {override}: the article sets it; expected {', '.join(FIGURE_KEYS)}")
+    call = _with_out(call, "figures")
+    return compose(call, partial(_figures, command=_command("figures", call)))
+
+
+def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
+    from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+    from unprocess_gen.reports import report_files
+    from unprocess_gen.reports.paper import figures as paper_figures
+
+    out = _local_out(config)
+    report_files.check_report_folder(out, "figures")
+    gains = {name: _option("gains", name, GainsConfig) for name in paper_figures.GAINS}
+    authors = _option("noise", paper_figures.AUTHORS_NOISE, NoiseConfig)
+    drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
+    return 0, None, [f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}"]
+
+
+def _local_out(config: Config) -> Path:
+    return local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
+
+
+def _with_out(call: Call, out: str) -> Call:
+    """Add a verb's own default of ``out``, so that a report never goes into a dataset's folder."""
+    if any(override.startswith("out=") for override in call.overrides):
+        return call
+    return replace(call, overrides=[*call.overrides, f"out={out}"])
+
+
+def _command(verb: str, call: Call) -> str:
+    """Return the command line of a call, for its report."""
+    return shlex.join(["gen-dataset", verb, *call.hydra_arguments, *call.overrides])
+
+
+def report(call: Call) -> int:
+    """Write the HTML page of a dataset."""
+    from unprocess_gen.reports.dataset_page.page import write_dataset_report
+
+    folder = dataset_folder("report", call)
+    to, root = call.values.get("to"), given_root(call)
+    dark = dark_frames_of(folder / "manifest.csv", call)
+    if {"dark_frames", "dark_shading"} & call.values.keys():
+        dark.open()  # refuses places that the user names and that do not exist
+    page, photographs = None if to is None else Path(to), None if root is None else any_path(root)
+    try:
+        print_result(write_dataset_report(folder, page, photographs, dark))
+    except (PermissionError, MachineError) as error:
+        if to is None and isinstance(folder, Path) and not os.access(folder, os.W_OK):
+            raise MachineError(f"{folder}: the page cannot be written to the dataset; give --to FILE") from error
+        raise
+    return 0
+
+
+def preview(call: Call) -> int:
+    """Draw contact sheets of pairs."""
+    from unprocess_gen.dataset.selection import select_pairs
+    from unprocess_gen.pipeline.replay import source_root
+    from unprocess_gen.reports.sheets.contact_sheet import write_sheets
+
+    folder = dataset_folder("preview", call)
+    to, root, with_stages = folder_to("preview", call), given_root(call), "stages" in call.values
+    keys: Sequence[str] = []
+    failed = files = code = 0
+    if "keys" in call.values:
+        selected = select_pairs(folder / "manifest.csv", call.values["keys"])
+        keys, failed = [str(row["key"]) for row in selected.rows.values()], selected.failed
+    photographs = source_root(folder / "manifest.csv", root)
+    _check_not_among_photographs(to, photographs)
+    for sheet in write_sheets(folder, to, keys, None if root is None else any_path(root), with_stages):
+        files += len(sheet.files)
+        if sheet.missing_source:
+            code = SourceChangedError.exit_code if photographs is not None else code
+            omitted = "the source's panel and the stages are" if with_stages else "the source's panel is"
+            report_message(f"{sheet.key} ({sheet.source}): {omitted} omitted: {sheet.missing_source}")
+    skipped = f"; {counted(failed, 'failed row')} skipped" if failed else ""
+    print_result(f"{counted(files, 'picture')} in {to}{skipped}")
+    return code
+
+
+def _check_not_among_photographs(to: Path, root: str | None) -> None:
+    """Refuse a folder for pictures inside the folder of the sources, of which the next run would make pairs."""
+    place = None if root is None else any_path(root).resolve()
+    if not isinstance(place, Path) or not place.is_dir():
+        return
+    if place in (resolved := Path(os.path.realpath(to)), *resolved.parents):
+        raise ConfigError(
+            f"--to {to}: is inside the folder of the photographs, {root}; expected a folder outside of it, because "
+            "runs would read the pictures; choose another folder"
+        )
+
+
+def dng(call: Call) -> int:
+    """Write frames as DNG files."""
+    from unprocess_gen.dataset.dng import FRAMES, export
+    from unprocess_gen.dataset.selection import select_pairs
+
+    folder = dataset_folder("dng", call)
+    if "keys" not in call.values:
+        raise ConfigError("dng: --keys is missing; expected the keys of the rows to write; give --keys K,…")
+    to = folder_to("dng", call)
+    frames = [frame for frame in FRAMES if frame in call.values] or FRAMES
+    exported = export(folder, call.values["keys"], frames, to)
+    failed = select_pairs(folder / "manifest.csv", call.values["keys"]).failed
+    undescribed = counted(exported.without_profile, "noisy frame")
+    counts = (
+        (exported.written, f"{counted(exported.written, 'DNG file')} written"),
+        (exported.present, f"{exported.present} existed with the same bytes"),
+        (exported.without_profile, f"{undescribed} without NoiseProfile, which cannot describe the noise"),
+        (failed, f"{counted(failed, 'failed row')} skipped"),
+    )
+    print_result(f"{to}: " + "; ".join(text for count, text in counts if count))
+    return 0

@@ -1,0 +1,70 @@
+"""Run the verbs that generate a dataset: generate and again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from unprocess_gen.cli.arguments import Call
+from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
+from unprocess_gen.cli.hydra_app import compose
+from unprocess_gen.cli.messages import print_result, print_results
+from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
+from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.paths import any_path
+
+if TYPE_CHECKING:
+    from unprocess_gen.config.schema import Config, ExecutorConfig
+    from unprocess_gen.pipeline.generate import Summary
+
+
+def generate(call: Call) -> int:
+    """Generate a dataset, or one for each combination of a sweep."""
+    return compose(call, generate_dataset, sweep_csv=True)
+
+
+def generate_dataset(config: Config, label: str = "") -> tuple[int, Summary, list[str]]:
+    """Generate one dataset; return the exit code, what was generated, and the lines to print."""
+    from unprocess_gen.pipeline.generate import generate
+    from unprocess_gen.sources.listing import unmatched_sentence
+
+    summary = generate(config, label)
+    lines = [summary.sentence(config.source.max_failed)]
+    if summary.unmatched:
+        lines.append(unmatched_sentence(summary.unmatched))
+    too_many = sum(summary.failed.values()) > config.source.max_failed
+    return TOO_MANY_FAILED if too_many else DONE, summary, lines
+
+
+def again(call: Call) -> int:
+    """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
+    from unprocess_gen.pipeline.again import check_sources, compare, recorded_config
+
+    folder = dataset_folder("again", call)
+    if "out" not in call.values:
+        raise ConfigError("again: out is missing; expected the folder of the new dataset; give out=…")
+    changes = {"out": call.values["out"], "executor": _executor(call)}
+    changes |= {"n_jobs": call.values["n_jobs"]} if "n_jobs" in call.values else {}
+    changes |= {"source.max_failed": call.values["max_failed"]} if "max_failed" in call.values else {}
+    given = {name for name in ("dark_frames", "dark_shading") if name in call.values}
+    dark = dark_frames_of(folder / "manifest.csv", call)
+    config = recorded_config(folder, given_root(call), dark, given, changes)
+    check_sources(folder, config)
+    code, _, lines = generate_dataset(config)
+    print_results(lines)
+    print_result(compare(folder, any_path(config.out)))
+    return code
+
+
+def _executor(call: Call) -> ExecutorConfig:
+    """Return the settings of the executor that a call names, those of ``executor=local`` without one."""
+    from dataclasses import replace
+
+    from unprocess_gen.config.schema import ExecutorConfig
+    from unprocess_gen.config.serialization import read_option
+    from unprocess_gen.config.values import one_of
+
+    name = call.values.get("executor", "local")
+    one_of("executor", name, tuple(group_options("executor")))
+    executor = read_option(conf_dir() / "executor" / f"{name}.yaml", ExecutorConfig)
+    return replace(executor, address=call.values.get("address"))

@@ -1,0 +1,138 @@
+"""Prepare frames for training: packed planes, light, noise maps and crops. Needs NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from unprocess_gen.core.types import Frame, Row
+from unprocess_gen.simulation.reference import cfa
+
+
+def pack(mosaic: Frame, pattern: str) -> Frame:
+    """Convert a mosaic to packed planes.
+
+    Parameters
+    ----------
+    mosaic : ndarray, [H, W]
+        Frame or crop that begins at an even row and column; even height and width.
+    pattern : str
+        CFA pattern of its first four sites: RGGB, BGGR, GRBG or GBRG; in a row, ``pattern``.
+
+    Returns
+    -------
+    ndarray, [4, H / 2, W / 2]
+        R, G of the red rows, G of the blue rows, B; a copy of the same dtype.
+
+    Raises
+    ------
+    ValueError
+        If a side is odd or the pattern is unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import unprocess_gen as ug
+    >>> ug.pack(np.array([[1, 2], [3, 4]], np.uint16), "BGGR").ravel().tolist()
+    [4, 3, 2, 1]
+    """
+    return cfa.pack(mosaic, pattern)
+
+
+def to_light(dn: ArrayLike, row: Row) -> NDArray[np.float32]:
+    """Scale DN to 0 at the black level and 1 at the white level.
+
+    Parameters
+    ----------
+    dn : array_like
+        Frame, crop or planes in DN.
+    row : mapping
+        Manifest row: ``black_level_dn``, ``white_level_dn``.
+
+    Returns
+    -------
+    ndarray of float32, same shape
+        (DN - black) / (white - black). Not clipped, because clipping at 0 raises the mean of dark areas.
+
+    Examples
+    --------
+    >>> import unprocess_gen as ug
+    >>> ug.to_light([240, 4095], {"black_level_dn": 240, "white_level_dn": 4095}).tolist()
+    [0.0, 1.0]
+    """
+    black, span = _levels(row)
+    return (np.asarray(dn).astype(np.float32) - np.float32(black)) / np.float32(span)
+
+
+def noise_std(noisy: ArrayLike, row: Row) -> NDArray[np.float32]:
+    """Estimate the standard deviation of the noise at each site of a noisy frame.
+
+    Parameters
+    ----------
+    noisy : array_like
+        Noisy frame, crop or planes in DN.
+    row : mapping
+        Manifest row: ``black_level_dn``, ``a_dn`` and ``dark_variance_dn2``, or ``b_dn2`` in rows without that column.
+
+    Returns
+    -------
+    ndarray of float32, same shape
+        √max(0, a_dn · (noisy - black) + dark_variance_dn2), DN. Divide by white - black for the scale of `to_light`.
+
+    Examples
+    --------
+    >>> import unprocess_gen as ug
+    >>> ug.noise_std([240, 340], {"black_level_dn": 240, "white_level_dn": 4095, "a_dn": 2.0, "b_dn2": 25.0}).tolist()
+    [5.0, 15.0]
+    """
+    dark_variance = row.get("dark_variance_dn2")
+    intercept = row["b_dn2"] if dark_variance is None else dark_variance
+    black, _ = _levels(row)
+    signal = np.asarray(noisy).astype(np.float32) - np.float32(black)
+    variance = np.float32(row["a_dn"] or 0) * signal + np.float32(intercept or 0)
+    return np.asarray(np.sqrt(np.maximum(variance, 0)), dtype=np.float32)
+
+
+def random_crop(frames: Sequence[Frame], side: int, integer: Callable[[int], int]) -> tuple[Frame, ...]:
+    """Cut the same square from each mosaic, at an even row and column, so that the CFA pattern stays that of the row.
+
+    Parameters
+    ----------
+    frames : sequence of ndarray, [H, W]
+        Mosaics of one size, for example clean and noisy.
+    side : int
+        Side of the square, pixels; even.
+    integer : callable
+        Random integer from 0 to below its argument: ``rng.integers``, or ``lambda n: int(torch.randint(n, ()))``.
+
+    Returns
+    -------
+    tuple of ndarray, [side, side]
+        Views of the frames.
+
+    Raises
+    ------
+    ValueError
+        If the side is odd or does not fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import unprocess_gen as ug
+    >>> (crop,) = ug.random_crop([np.zeros((8, 6))], 4, np.random.default_rng(0).integers)
+    >>> crop.shape
+    (4, 4)
+    """
+    height, width = frames[0].shape
+    if side % 2 or not 0 < side <= min(height, width):
+        raise ValueError(f"side={side}: expected an even number of at most {min(height, width)}, the shorter side")
+    y, x = (2 * int(integer((length - side) // 2 + 1)) for length in (height, width))
+    return tuple(frame[y : y + side, x : x + side] for frame in frames)
+
+
+def _levels(row: Row) -> tuple[int, int]:
+    """Black level and range from black to white, DN."""
+    black, white = int(row["black_level_dn"] or 0), int(row["white_level_dn"] or 0)
+    return black, white - black

@@ -1,0 +1,84 @@
+"""Make the pairs of an image: examine, plan, cut and simulate it, the one sequence that decides what a pair is.
+
+Runs, estimates, replays, the Python functions and benchmarks use it; they differ in where pixels and plans come from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from unprocess_gen.config.interpretation import patch_rule
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.types import DarkFrames, Facts, Pair, Patch, Plan, Source, Srgb
+from unprocess_gen.planning.effect_selection import facts_for
+from unprocess_gen.planning.plan import plan_pairs
+from unprocess_gen.simulation.pair import make_pairs
+from unprocess_gen.sources.dark_frames import DarkFolder, open_dark_frames
+from unprocess_gen.sources.patches import crop_patch, list_patches
+
+
+@dataclass(frozen=True, slots=True)
+class PairSettings:
+    """Hold what all pairs of a run follow from: the config, and its dark frames if it names any.
+
+    Attributes
+    ----------
+    config : Config
+        The config, with the digests of the dark frames.
+    dark_frames : DarkFrames or None
+        What plans need of the dark frames.
+    dark_folder : DarkFolder or None
+        Access to their pixels.
+    """
+
+    config: Config
+    dark_frames: DarkFrames | None = None
+    dark_folder: DarkFolder | None = None
+
+    @classmethod
+    def read(cls, config: Config) -> PairSettings:
+        """Open the dark frames of a config; errors are those of `open_dark_frames`."""
+        return cls(*open_dark_frames(config))
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedImage:
+    """Hold the pixels of an image and all that decides its pairs.
+
+    Attributes
+    ----------
+    srgb : ndarray of uint8 or uint16, [H, W, 3]
+        The decoded image.
+    plans : tuple of Plan
+        A plan for each draw of each noise level.
+    patches : tuple of Patch
+        The parts of the image that become samples.
+    facts : Facts or None
+        Facts about the pixels, for physical noise profiles.
+    dark_folder : DarkFolder or None
+        Access to the dark frames that the plans name.
+    """
+
+    srgb: Srgb
+    plans: tuple[Plan, ...]
+    patches: tuple[Patch, ...]
+    facts: Facts | None = None
+    dark_folder: DarkFolder | None = None
+
+    def pairs(self) -> Iterator[tuple[Patch, Plan, Pair]]:
+        """Simulate the pairs of every patch, in the order of the manifest; pairs of a patch share their clean frame."""
+        for patch in self.patches:
+            pairs = make_pairs(crop_patch(self.srgb, patch), self.plans, patch.origin, self.dark_folder)
+            for plan, pair in zip(self.plans, pairs, strict=True):
+                yield patch, plan, pair
+
+
+def plan_pixels(settings: PairSettings, srgb: Srgb, source: Source, sha256: str) -> PlannedImage:
+    """Plan the pairs of decoded pixels; ``sha256`` is the digest of the source's bytes."""
+    config = settings.config
+    facts = facts_for(config, srgb, source.frames)
+    plans = plan_pairs(config, *source.stream_identity(sha256), facts, source.frame, settings.dark_frames)
+    height, width = srgb.shape[:2]
+    patches = list_patches(patch_rule(config.source), plans[0].stream_key, height, width, config.output.layout)
+    return PlannedImage(srgb, plans, patches, facts, settings.dark_folder)

@@ -1,0 +1,65 @@
+"""Resolve a config to a run: list its sources, open its dark frames, and divide it into shards.
+
+A config is complete after `resolve`; no later step changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from unprocess_gen.config.schema import Config
+from unprocess_gen.core.types import Source
+from unprocess_gen.pipeline.pairs import PairSettings
+from unprocess_gen.pipeline.sizes import resolve_pairs_per_shard, shards_warning
+from unprocess_gen.pipeline.tasks import ShardTask
+from unprocess_gen.planning.dark_scene import dark_scene_warning
+from unprocess_gen.planning.sensor_levels import sensor_warning
+from unprocess_gen.sources.listing import Listing
+from unprocess_gen.sources.loader import list_photographs
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Hold the settings of a run and its sources."""
+
+    settings: PairSettings
+    listing: Listing
+
+    @property
+    def config(self) -> Config:
+        """The complete config."""
+        return self.settings.config
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """All sources, in the order of the manifest."""
+        return self.listing.sources
+
+    def tasks(self) -> list[ShardTask]:
+        """Divide the sources into shards."""
+        return shard_tasks(self.sources, self.config.output.pairs_per_shard)
+
+    def warnings(self) -> tuple[str, ...]:
+        """Collect what the user should know before the run begins, a sentence each."""
+        config = self.config
+        about_noise = dark_scene_warning(config), sensor_warning(config)
+        warnings = *self.listing.warnings, shards_warning(config, self.sources), *about_noise
+        return tuple(filter(None, warnings))
+
+
+def resolve(config: Config) -> Run:
+    """List the sources of a validated config and complete it: dark frames' digests, a number of pairs per shard.
+
+    Raises ConfigError if sources or dark frames cannot be used, SourceChangedError if recorded dark frames changed.
+    """
+    listing = list_photographs(config.source)
+    settings = PairSettings.read(config)
+    complete = resolve_pairs_per_shard(settings.config, listing.sources)
+    return Run(replace(settings, config=complete), listing)
+
+
+def shard_tasks(sources: Sequence[Source], pairs_per_shard: int) -> list[ShardTask]:
+    """Split the listing into tasks: shard s holds source indices [s·N, (s+1)·N), N = ``pairs_per_shard``."""
+    starts = range(0, len(sources), pairs_per_shard)
+    return [ShardTask(shard, tuple(sources[first : first + pairs_per_shard])) for shard, first in enumerate(starts)]

@@ -1,0 +1,190 @@
+"""Hold the place that ``out`` names for a run: check and lock it, and write its files and the records of the run.
+
+Unfinished files of a folder are below ``.work/tmp``, those of an object store in the local temporary folder. Object
+stores have no rename and no locks, and need neither. An object appears under its key complete or not at all,
+``config.yaml`` and the record of the sources are created only if they do not exist, and any number of writers may put
+the same shard, because all of them make the same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import platform
+import re
+import shutil
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from unprocess_gen.core.errors import RESUME, ConfigError, LockedError, UnprocessGenError
+from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.locks import LockFile, has_ended, is_held
+from unprocess_gen.core.object_store import Item, ObjectPath, Result, StoreAccessError
+from unprocess_gen.core.output_paths import is_dataset
+from unprocess_gen.core.paths import LocalPath, any_path
+
+WORK = ".work"
+"""Folder below ``out`` for what a run needs until the dataset is finished."""
+
+TMP = f"{WORK}/tmp"
+"""Folder of unfinished files: one folder for each writer."""
+
+OWNER = "owner"
+"""Lock file in the folder of a writer, by which others see whether the writer still runs."""
+
+LOCK = "lock"
+
+
+class Storage:
+    """Read and write files by their names below ``out``, joined by ``/``.
+
+    A file appears under its name complete or not at all. Errors of the system are OSError. Nothing is created before
+    the storage is opened or written to.
+
+    Parameters
+    ----------
+    out : str or path
+        Folder or URL of the dataset.
+    """
+
+    def __init__(self, out: str | os.PathLike[str] | ObjectPath) -> None:
+        self._out = any_path(out)
+        self._lock = None if isinstance(self._out, ObjectPath) else LockFile(self._out / WORK / LOCK)
+        self._owner: LockFile | None = None
+
+    def open(self) -> None:
+        """Create the place; raise ConfigError if it is inside a dataset or cannot be created."""
+        try:
+            dataset = next((folder for folder in self._out.resolve().parents if is_dataset(folder)), None)
+            if dataset is not None:
+                raise ConfigError(
+                    f"out={self._out}: is inside the dataset {dataset}; expected a folder outside of it; choose "
+                    "another out"
+                )
+            self._out.mkdir(parents=True, exist_ok=True)
+        except StoreAccessError as error:
+            raise ConfigError(f"out={error}") from None
+        except OSError as error:
+            raise cannot_write(error, str(self._out)) from error
+
+    def hold(self) -> None:
+        """Lock a folder; raise LockedError if another process holds it, ConfigError if it cannot be written."""
+        if self._lock is None:
+            return
+        try:
+            self._lock.path.parent.mkdir(exist_ok=True)
+            self._lock.acquire(wait=False)
+        except BlockingIOError:
+            raise LockedError(
+                f"out={self._out}: another run is writing to it; wait for that run, or choose another out"
+            ) from None
+        except OSError as error:
+            raise cannot_write(error, str(self._out)) from error
+
+    def close(self) -> None:
+        """Delete the unfinished files of this process, and release the lock."""
+        self._delete_scratch()
+        if self._lock is not None:
+            self._lock.release()
+            for folder in (self._lock.path.parent / "tmp", self._lock.path.parent):
+                with contextlib.suppress(OSError):  # contains files of an unfinished run, or was deleted
+                    folder.rmdir()
+
+    def names(self, folder: str) -> dict[str, int]:
+        """Entries of a folder: bytes of files, -1 for others; empty if the folder does not exist."""
+        return self._path(folder).entries()
+
+    def size(self, name: str) -> int | None:
+        """Size of a file in bytes, None if there is no such file."""
+        return self._path(name).size()
+
+    def read(self, name: str) -> str:
+        """Return the text of a file; raise FileNotFoundError if there is none."""
+        return self.read_bytes(name).decode()
+
+    def read_bytes(self, name: str) -> bytes:
+        """Return the content of a file; raise FileNotFoundError if there is none."""
+        return self._path(name).read_bytes()
+
+    def write(self, name: str, text: str) -> None:
+        """Write a file durably, or replace it."""
+        self._path(name).write(text.encode(), f"{self._out}/{WORK}")
+
+    def create(self, name: str, text: str) -> bool:
+        """Write a file durably unless it exists; return whether it was written."""
+        return self._path(name).create(text.encode(), f"{self._out}/{WORK}")
+
+    def commit(self, file: Path, name: str) -> None:
+        """Move a finished file of `scratch` to a name, durably; replace a file of that name."""
+        self._path(name).commit(file)
+
+    def remove(self, name: str) -> None:
+        """Remove a file; ignore one that does not exist."""
+        self._path(name).delete()
+
+    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Apply a function that reads files to items, in threads if a store is slow; yield the results in order."""
+        return self._out.each(function, items)
+
+    @property
+    def scratch(self) -> Path:
+        """Local folder for unfinished files of this process and its workers, named after host and process."""
+        if self._owner is None:
+            place, prefix = self._out.scratch_place(TMP)
+            host = re.sub(r"[^A-Za-z0-9.]", "", platform.node())[:40]
+            folder = place / f"{prefix}{host}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
+            folder.mkdir(mode=0o700, parents=True)
+            owner = LockFile(folder / OWNER)
+            owner.acquire(wait=False)
+            self._owner = owner
+        return self._owner.path.parent
+
+    def _delete_scratch(self) -> None:
+        if self._owner is not None:
+            self._owner.release()
+            shutil.rmtree(self._owner.path.parent, ignore_errors=True)
+            self._owner = None
+
+    def begin(self) -> None:
+        """Create the folder of shards; remove unfinished files of processes of this host that have ended."""
+        self._path("shards").mkdir(exist_ok=True)
+        for name, size in self.names(TMP).items():
+            if size >= 0:  # version 0.1 had no folders of writers
+                self.remove(f"{TMP}/{name}")
+        for folder in self._scratch_folders():
+            if has_ended(folder / OWNER):
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def remove_work(self, keep_records: bool) -> None:
+        """Remove the unfinished files of writers that have ended and, unless they are kept, the records of the run."""
+        self._delete_scratch()
+        for folder in self._scratch_folders() if self._lock is not None else ():  # also those of other hosts
+            if not is_held(folder / OWNER):
+                shutil.rmtree(folder, ignore_errors=True)
+        for name in self.names(WORK) if not keep_records else ():
+            if name not in (Path(TMP).name, LOCK):
+                self._path(f"{WORK}/{name}").delete_all()
+
+    def _scratch_folders(self) -> list[Path]:
+        """List the folders of unfinished files of all writers that this process can see."""
+        place, prefix = self._out.scratch_place(TMP)
+        return [folder for folder in place.glob(f"{prefix}*") if folder.is_dir()]
+
+    def _path(self, name: str) -> LocalPath | ObjectPath:
+        return self._out / name if name else self._out
+
+
+def open_storage(out: str) -> Storage:
+    """Return the storage of a value of ``out``."""
+    return Storage(out)
+
+
+def cannot_write(error: OSError, out: str) -> UnprocessGenError:
+    """Return the error of a place that cannot be begun: MachineError for a full disk, else ConfigError."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return machine_error(error, any_path(out), RESUME)
+    if error.errno == errno.EEXIST:
+        return ConfigError(f"out={out}: is a file; expected a folder; choose another out")
+    return ConfigError(f"out={out}: cannot be written ({error.strerror}); choose another out")

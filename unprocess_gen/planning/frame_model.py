@@ -1,0 +1,172 @@
+"""Model a frame for the planner: the range of its signal, what effects contribute to it, and the noise that masks it.
+
+All arithmetic is + - × ÷ √ and `decimal`, and the pixels enter as integer facts only (`core.types.Facts`): predictions
+are the same on every machine and in every tier. Derivations: ``docs/design/effect_selection.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from operator import add, mul
+from typing import NamedTuple
+
+from unprocess_gen.core.tone_curves import linear_table
+from unprocess_gen.core.types import CameraPlan, Facts, IspPlan
+from unprocess_gen.simulation.effects import BY_NAME, EFFECTS, Physics
+from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, PerStatistic
+from unprocess_gen.simulation.effects.quantise import VARIANCE_DN2
+
+MASKING = tuple(effect for effect in EFFECTS if effect.masks)
+"""Random effects of single pixels, which mask others."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignalRange:
+    """The lowest and highest signal that a site of an image can have, DN above black."""
+
+    dark_dn: float
+    bright_dn: float
+
+
+def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float, span_dn: float) -> SignalRange:
+    """Return the signal range of an image with any colours between its lowest and highest code, DN above black.
+
+    Every treatment of highlights maps light i to at least k·i and at most i·max(1, k), where k is the inverse gain.
+    """
+    curve = linear_table(isp.tone, isp.gamma, facts.codes)
+    low, high = float(curve[facts.dark_code]), float(curve[facts.bright_code])
+    lowest, highest = math.inf, -math.inf
+    for channel, k in enumerate(camera.inverse_gains):
+        r, g, b = camera.rgb2cam[3 * channel : 3 * channel + 3]
+        least = r * (low if r > 0 else high) + g * (low if g > 0 else high) + b * (low if b > 0 else high)
+        most = r * (high if r > 0 else low) + g * (high if g > 0 else low) + b * (high if b > 0 else low)
+        lowest, highest = min(lowest, least * k), max(highest, most * max(k, 1.0))
+    return SignalRange(max(min(lowest * exposure, 1.0), 0.0) * span_dn, min(highest * exposure, 1.0) * span_dn)
+
+
+class FrameModel(FrameFacts):
+    """Predictions for a frame, and results that several predictions share; effects are given by their names."""
+
+    def __init__(self, physics: Physics, facts: Facts, signals: SignalRange, black_level_dn: float) -> None:
+        super().__init__(physics, facts, black_level_dn)
+        self._roots = tuple(map(math.sqrt, self.counts))
+        full_dn = physics.full_well_e * physics.dn_per_e
+        self._levels = signals.dark_dn, signals.bright_dn
+        self._levels_in_well = min(signals.dark_dn, full_dn), min(signals.bright_dn, full_dn)
+        self._known_ratios: dict[tuple[str, float, float], _Ratios] = {}
+        self._known_variances: dict[float, list[tuple[str, float]]] = {}
+
+    def levels(self, on: frozenset[str]) -> tuple[float, float]:
+        """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
+        return self._levels_in_well if "full_well" in on else self._levels
+
+    def masking_variance(self, effect: str, level_dn: float, on: frozenset[str]) -> float:
+        """Return the variance of a pixel at a signal due to all random effects in ``on`` except ``effect``, DN²."""
+        rounding = VARIANCE_DN2 if "quantise" in on and effect != "quantise" else 0.0
+        if BY_NAME[effect].is_fixed and self.physics.fixed_pattern_in_clean:
+            return rounding
+        variance = 0.0
+        for name, effect_dn2 in self._variances(level_dn):
+            if name in on and name != effect:
+                variance += effect_dn2
+        return rounding + variance
+
+    def _variances(self, level_dn: float) -> list[tuple[str, float]]:
+        """Return the variance of a pixel due to each of `MASKING` at a signal, DN²."""
+        known = self._known_variances.get(level_dn)
+        if known is None:
+            known = [(effect.name, effect.variance(self.physics, level_dn)) for effect in MASKING]
+            self._known_variances[level_dn] = known
+        return known
+
+    def _ratios(self, effect: str, level_dn: float, masking: float) -> _Ratios:
+        """Return the ratios of one effect to a masking noise at a signal."""
+        known = self._known_ratios.get((effect, level_dn, masking))
+        if known is None:
+            contribution = BY_NAME[effect].contribution(self, level_dn, masking)
+            squares = ratios_to_noise(map(mul, contribution.variances, self.counts), masking)
+            offset_dn, offsets = abs(contribution.offset_dn), None
+            if offset_dn:
+                offsets = ratios_to_noise([offset_dn * root for root in self._roots], math.sqrt(masking))
+            known = self._known_ratios[effect, level_dn, masking] = _Ratios(contribution, squares, offsets)
+        return known
+
+    def contribution(self, effect: str, level_dn: float, masking: float) -> Contribution:
+        """Return the contribution of an effect at a signal, where the other noise has the variance ``masking``, DN²."""
+        return self._ratios(effect, level_dn, masking).contribution
+
+    def ratios(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> PerStatistic:
+        """Return the ratio of several effects together to the masking noise, in each statistic.
+
+        Variances add; offsets add linearly.
+        """
+        return tuple(map(math.sqrt, self._squares(effects, level_dn, on)))
+
+    def _squares(self, effects: Iterable[str], level_dn: float, on: frozenset[str]) -> list[float]:
+        """Return the square of each of `ratios`."""
+        squares: list[float] = []
+        offsets: list[float] | None = None
+        before_well = 0.0
+        for effect in effects:
+            ratios = self._ratios(effect, level_dn, self.masking_variance(effect, level_dn, on))
+            squares = list(map(add, squares, ratios.squares)) if squares else ratios.squares
+            if ratios.offsets is not None:
+                offsets = ratios.offsets if offsets is None else list(map(add, offsets, ratios.offsets))
+            if BY_NAME[effect].is_before_well:
+                before_well += ratios.contribution.variances[0]
+        if before_well and "full_well" in on:
+            masking = self.masking_variance("full_well", level_dn, on)
+            lost_dn = self.lost_in_well(before_well, level_dn, on)
+            if lost_dn:
+                lost = [lost_dn * math.sqrt(ratio_to_noise(count, masking)) for count in self.counts]
+                offsets = lost if offsets is None else list(map(add, offsets, lost))
+        if offsets is None:
+            return squares
+        return [square + offset * offset for square, offset in zip(squares, offsets, strict=True)]
+
+    def lost_in_well(self, variance: float, level_dn: float, on: frozenset[str]) -> float:
+        """Return the drop of the mean signal due to clipping ``variance`` at the full well, DN.
+
+        At a signal that fills the well the upper half of the distribution is cut, which lowers the mean of a normal
+        distribution by σ/√(2π).
+        """
+        if self.contribution("full_well", level_dn, 0.0).offset_dn == 0:
+            return 0.0
+        other = 0.0
+        for name, effect_dn2 in self._variances(level_dn):
+            if name in on and BY_NAME[name].is_before_well:
+                other += effect_dn2
+        return MEAN_ABS_NORMAL / 2 * (math.sqrt(other + variance) - math.sqrt(other))
+
+    def ratio(self, effects: Sequence[str], on: frozenset[str]) -> float:
+        """Return the largest ratio of several effects together, over all statistics and both signals."""
+        dark_dn, bright_dn = self.levels(on)
+        return math.sqrt(max(*self._squares(effects, dark_dn, on), *self._squares(effects, bright_dn, on)))
+
+    def outliers(self, effect: str, on: frozenset[str]) -> float:
+        """Return the expected number of pixels per frame that an effect moves by more than one standard deviation."""
+        if not BY_NAME[effect].has_outliers:
+            return 0.0
+        levels = ((level_dn, self.masking_variance(effect, level_dn, on)) for level_dn in self.levels(on))
+        shares = [BY_NAME[effect].outliers(self, level_dn, masking) for level_dn, masking in levels]
+        return self.facts.width * self.facts.height * max(shares)
+
+
+class _Ratios(NamedTuple):
+    """A contribution, and the ratios of its variances (``squares``) and of its offset, if any, to the masking noise."""
+
+    contribution: Contribution
+    squares: list[float]
+    offsets: list[float] | None
+
+
+def ratio_to_noise(size: float, noise: float) -> float:
+    """Return ``size / noise``; without noise, 0 for no size and infinity otherwise."""
+    return size / noise if noise else math.inf if size else 0.0
+
+
+def ratios_to_noise(sizes: Iterable[float], noise: float) -> list[float]:
+    """Return `ratio_to_noise` of each size."""
+    return [size / noise for size in sizes] if noise else [ratio_to_noise(size, noise) for size in sizes]

@@ -1,0 +1,41 @@
+"""Measure times in turns, so that other programs disturb everything that is compared alike.
+
+Used by ``gen-dataset accuracy`` and by the benchmarks of ``tests/benchmarks``.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import TypeVar
+
+_Key = TypeVar("_Key", bound=Hashable)
+_Time = TypeVar("_Time")
+
+
+def thread_ns(call: Callable[[], object], pixels: int) -> float:
+    """Processor time of a call in this thread, ns per pixel, more than 0."""
+    started = time.thread_time_ns()
+    call()
+    return max(time.thread_time_ns() - started, 1) / pixels
+
+
+def measure_in_turns(
+    measurements: Mapping[_Key, Callable[[int], _Time]], rounds: int, advance: Callable[[], None] = lambda: None
+) -> dict[_Key, list[_Time]]:
+    """Run every measurement once in each round, in reversed order in every second round; results by round.
+
+    A measurement gets the number of the round. ``advance`` is called after each.
+    """
+    results: dict[_Key, list[_Time]] = {key: [] for key in measurements}
+    for number in range(rounds):
+        for key in list(measurements)[:: -1 if number % 2 else 1]:
+            results[key].append(measurements[key](number))
+            advance()
+    return results
+
+
+def median_ratio(times: Sequence[float], reference: Sequence[float]) -> float:
+    """Median of the ratios within rounds."""
+    return statistics.median(time / other for time, other in zip(times, reference, strict=True))

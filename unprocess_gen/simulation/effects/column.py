@@ -1,0 +1,60 @@
+"""Column offsets of the columns' amplifiers: a fixed pattern of the camera body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
+from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
+from unprocess_gen.simulation.reference.noise import normals
+from unprocess_gen.simulation.slots import LineOffsets, Slots, Words
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnNumbers:
+    """Standard deviation of column offsets, DN."""
+
+    column_std_dn: float = number(
+        0.0,
+        "standard deviation of column offsets",
+        unit="DN",
+        kind=DN,
+        forms=("root", "line", "by_iso"),
+        counter=17,
+        scatter=3,
+    )
+
+
+class Column(Effect):
+    """Offset of each column."""
+
+    name = "column"
+    meaning = "an offset of each column; fixed pattern"
+    cost_ns = 0.1
+    numbers = ColumnNumbers
+    is_fixed = is_in_dark_frames = True
+
+    def column_offset_dn(self, part: Part) -> Float:
+        """Return the offset of each column, [1, W] DN."""
+        words = part.body_words("column", (1, part.shape[1]), (0, part.origin[1]))
+        return np.asarray(part.physics.column_std_dn * normals(words))
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict independent offsets of columns, the same in all frames."""
+        return fixed_in_clip(frame, offsets_of_columns(frame, frame.physics.column_std_dn))
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the offsets of columns of the body."""
+        physics = plan.physics
+        return slots._replace(fixed_columns=LineOffsets(Words(physics.body_key, "column"), physics.column_std_dn))
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Offset of each column of the body, which the row determines."""
+        part = Part(site.plan, site.physics, (1, site.patch.width // 2 * 2), (0, site.patch.x))
+        offset_dn = self.column_offset_dn(part)[0, site.place[1] :: 2]
+        return known_offset(site, offset_dn)

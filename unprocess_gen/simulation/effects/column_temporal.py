@@ -1,0 +1,62 @@
+"""Temporal column noise: the part of each column's offset that is new in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part, slot_words
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
+from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
+from unprocess_gen.simulation.reference.noise import normals
+from unprocess_gen.simulation.slots import LineOffsets, Slots
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnTemporalNumbers:
+    """Standard deviation of the temporal column offsets, DN."""
+
+    column_temporal_std_dn: float = number(
+        0.0,
+        "standard deviation of the part of column offsets that is new in every frame",
+        unit="DN",
+        kind=DN,
+        forms=("root", "line"),
+        counter=19,
+        scatter=4,
+        since="0.2",
+    )
+
+
+class ColumnTemporal(Effect):
+    """Offset of each column in one frame."""
+
+    name = "column_temporal"
+    meaning = "an offset of each column, new in every frame"
+    cost_ns = 0.6
+    numbers = ColumnTemporalNumbers
+    since = "0.2"
+    is_in_dark_frames = True
+
+    def column_offset_dn(self, part: Part) -> Float:
+        """Draw the offset of each column, [1, W] DN."""
+        words = part.frame_words("column_temporal", (1, part.shape[1]), (0, part.origin[1]))
+        return np.asarray(part.physics.column_temporal_std_dn * normals(words))
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict independent offsets of columns, new in every frame."""
+        return new_in_every_frame(frame, offsets_of_columns(frame, frame.physics.column_temporal_std_dn))
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the offsets of columns of the frame."""
+        columns = LineOffsets(slot_words(plan, "column_temporal"), plan.physics.column_temporal_std_dn)
+        return slots._replace(columns=columns)
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Offset of each column of the frame, which the row determines."""
+        part = Part(site.plan, site.physics, (1, site.patch.width // 2 * 2), (0, site.patch.x))
+        offset_dn = self.column_offset_dn(part)[0, site.place[1] :: 2]
+        return EffectNoise(offset_dn=offset_dn)

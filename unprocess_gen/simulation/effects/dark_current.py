@@ -1,0 +1,105 @@
+"""Dark current: Poisson counts of thermal electrons, whose rate doubles every few degrees (EMVA 1288)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import (
+    ALWAYS_COUNTED,
+    EffectNoise,
+    Site,
+    constant,
+    known_offset,
+    poisson_noise,
+)
+from unprocess_gen.simulation.effects.numbers import RATE, Number, number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.reference.poisson import poisson
+from unprocess_gen.simulation.slots import Slots, UniformCounts
+
+if TYPE_CHECKING:
+    from unprocess_gen.simulation.effects import Physics
+
+HEAT = {
+    "dark_reference_c": Number(
+        "temperature at which the dark currents were measured",
+        unit="degrees Celsius",
+        low=-273.0,
+        high=200.0,
+        key_default=25.0,
+    ),
+    "dark_doubling_c": Number(
+        "rise of the temperature that doubles the dark currents",
+        unit="degrees Celsius",
+        low=0.1,
+        high=100.0,
+        key_default=7.0,
+    ),
+}
+"""Keys of the profile from which the warmth of the sensor follows."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DarkCurrentNumbers:
+    """Mean dark signal of the exposure, electrons."""
+
+    dark_e: float = number(
+        0.0,
+        "mean dark current of the exposure",
+        unit="electrons",
+        kind=RATE,
+        key="dark_e_per_s",
+        key_meaning="mean dark current at dark_reference_c",
+        key_unit="electrons per second",
+        high=1e6,
+        highest=1e9,
+    )
+
+
+class DarkCurrent(Effect):
+    """Dark signal; the camera subtracts its mean with optical-black pixels, unless ``dark_offset`` is ``"kept"``."""
+
+    name = "dark_current"
+    meaning = "Poisson counts of thermal electrons"
+    cost_ns = 15.5
+    numbers = DarkCurrentNumbers
+    keys = HEAT
+    heat = is_before_well = is_in_dark_frames = masks = True
+
+    def electrons(self, electrons: Float, part: Part) -> Float:
+        """Add a count to each pixel."""
+        physics = part.physics
+        count = poisson(part.frame_words("dark_current"), np.full(part.shape, physics.dark_e))
+        return electrons + (count - (physics.dark_e if physics.dark_offset == "removed" else 0.0))
+
+    def mean_electrons(self, part: Part) -> float | None:
+        """Return the mean if the camera keeps it."""
+        return part.physics.dark_e if part.physics.dark_offset == "kept" else None
+
+    def variance(self, physics: Physics, level_dn: float) -> float:
+        """Return K² times the mean, DN²."""
+        return physics.dn_per_e * physics.dn_per_e * physics.dark_e
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict the variance, and the mean if the camera keeps it."""
+        physics = frame.physics
+        offset_dn = physics.dn_per_e * physics.dark_e if physics.dark_offset == "kept" else 0.0
+        return independent(frame, self.variance(physics, level_dn), offset_dn)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the counts of one rate."""
+        physics = plan.physics
+        removed_e = physics.dark_e if physics.dark_offset == "removed" else 0.0
+        return slots._replace(uniform=UniformCounts("dark_current", physics.dark_e, removed_e))
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Poisson counts with a constant mean, which the camera subtracts or keeps."""
+        physics = site.physics
+        kept_dn = physics.dark_e * site.gain_dn if physics.dark_offset == "kept" else 0.0
+        noise = poisson_noise(site.gain_dn, constant(physics.dark_e), ALWAYS_COUNTED)
+        return known_offset(site, kept_dn)._replace(variance=noise.variance, factor=noise.factor)

@@ -1,0 +1,120 @@
+"""Dark frames: the noise of the read-out is sampled from frames of the camera (SFRN, Zhang et al. 2021)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.lookup_tables import quantile_table
+from unprocess_gen.core.types import DarkPixels, Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
+from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, EffectNoise, Site, uniform
+from unprocess_gen.simulation.reference.noise import by_inverse_cdf
+from unprocess_gen.simulation.slots import SiteNoise, Slots
+
+DITHER_LAW, DITHER_SHAPE = "tukey_lambda", 1.0
+"""Uniform distribution, as Tukey's lambda distribution of shape 1."""
+
+
+def dither_std_dn(plan: Plan) -> float:
+    """Return the standard deviation of the dither of a dark frame, DN: uniform in ±½ DN of the dark frame."""
+    return plan.noise.dark.scale / math.sqrt(12)
+
+
+def dark_frame_offsets(
+    plan: Plan,
+    dark_pixels: DarkPixels | None,
+    shape: Shape,
+    origin: Shape = (0, 0),
+    out: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """Return the dark frame's contribution, (frame - black level - dark-shading map) · scale.
+
+    Frames smaller than the image are repeated: rows and columns count modulo the size of the frame, which is even.
+
+    Parameters
+    ----------
+    plan : Plan
+        Parameters of a pair with a dark frame.
+    dark_pixels : DarkPixels or None
+        Access to the pixels of the frame.
+    shape : (int, int)
+        Height and width.
+    origin : (int, int)
+        Row and column of the first pixel in the full frame.
+    out : ndarray of float32, [H, W], optional
+        Where the result is written.
+
+    Returns
+    -------
+    ndarray of float32, [H, W]
+        DN of the sensor.
+
+    Raises
+    ------
+    ValueError
+        If ``dark_pixels`` is None.
+    """
+    dark = plan.noise.dark
+    if dark_pixels is None:
+        raise ValueError(f"dark_pixels=None: the plan needs the dark frame {dark.sha256}; expected access to it")
+    out = np.empty((shape[0], shape[1]), dtype=np.float32) if out is None else out
+    frame, black, scale = dark_pixels.frame(dark.sha256), np.float32(dark.black_dn), np.float32(dark.scale)
+    shading = dark_pixels.shading(dark.shading) if dark.shading else None
+    for y, from_y, rows in _runs(origin[0] + dark.shift[0], shape[0], frame.shape[0]):
+        for x, from_x, columns in _runs(origin[1] + dark.shift[1], shape[1], frame.shape[1]):
+            part, source = out[y : y + rows, x : x + columns], np.s_[from_y : from_y + rows, from_x : from_x + columns]
+            np.subtract(frame[source], black if shading is None else shading[source], out=part, dtype=np.float32)
+            if shading is not None and black != 0:
+                part -= black
+            if scale != 1:
+                part *= scale
+    return out
+
+
+def _runs(start: int, count: int, period: int) -> Iterator[tuple[int, int, int]]:
+    """Yield runs of a periodic sequence: first index in the result, first index in the period, and length."""
+    done = 0
+    while done < count:
+        place = (start + done) % period
+        length = min(period - place, count - done)
+        yield done, place, length
+        done += length
+
+
+class DarkFrame(Effect):
+    """Dark frame in place of the read noise, with dither.
+
+    A dark frame has integer values. Without dither, the sum of a constant signal and the frame is rounded at every site
+    alike, so fractions of a DN are lost from the mean. SFRN samples within the bins too.
+    """
+
+    name = "dark_frame"
+    meaning = "noise of the read-out, sampled from dark frames"
+    cost_ns = 4.0
+    has_switch = False
+
+    def noise_dn(self, part: Part) -> Float:
+        """Draw the dither, uniform in ±½ DN of the dark frame."""
+        uniform = by_inverse_cdf(part.frame_words("dark_dither"), quantile_table(DITHER_LAW, DITHER_SHAPE))
+        return dither_std_dn(part.plan) * uniform
+
+    def site_offset_dn(self, part: Part) -> NDArray[np.float32]:
+        """Return the dark frame."""
+        return dark_frame_offsets(part.plan, part.dark_pixels, part.shape, part.origin)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the noise of a site with the dither, and the offsets by site."""
+        dither = SiteNoise("dark_dither", dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
+        return slots._replace(noise=dither, has_site_offsets=True)
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Known pixels with a uniform dither; sites far from black, such as hot pixels, cannot be checked."""
+        plan, (y, x) = site.plan, site.place
+        shape = site.patch.height // 2 * 2, site.patch.width // 2 * 2
+        offset_dn = dark_frame_offsets(plan, site.dark_pixels, shape, site.patch.origin)[y::2, x::2].copy()
+        offset_dn[np.abs(offset_dn) > NORMAL_DISTANCE * math.sqrt(max(plan.noise.b_dn2, 0.0))] = np.nan
+        return uniform(plan.noise.dark.scale)._replace(offset_dn=offset_dn)

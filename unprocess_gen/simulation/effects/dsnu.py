@@ -1,0 +1,64 @@
+"""Dark-signal non-uniformity (DSNU, EMVA 1288): unequal offsets of pixels, a fixed pattern of the camera body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
+from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.reference.noise import normals
+from unprocess_gen.simulation.slots import NormalPattern, Slots
+
+
+@dataclass(frozen=True, kw_only=True)
+class DsnuNumbers:
+    """Standard deviation of the pixels' offsets, electrons."""
+
+    dsnu_std_e: float = number(
+        0.0,
+        "standard deviation of the dark-signal non-uniformity (DSNU), whose mean is 0",
+        unit="electrons",
+        high=1e6,
+        highest=1e9,
+        since="0.3",
+    )
+
+
+class Dsnu(Effect):
+    """Normal offset of each pixel with mean 0, added behind the gain."""
+
+    name = "dsnu"
+    meaning = "unequal offsets of pixels; fixed pattern"
+    cost_ns = 0.3
+    numbers = DsnuNumbers
+    since = "0.3"
+    is_fixed = is_in_dark_frames = True
+
+    def site_offset_dn(self, part: Part) -> Float:
+        """Return the offset of each pixel, [H, W] DN; values of float32, in which kernels store the pattern."""
+        std_dn = part.physics.dsnu_std_e * part.physics.dn_per_e
+        offset_dn = std_dn * normals(part.body_words("dsnu"))
+        return offset_dn.astype(np.float32).astype(np.float64)
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict independent offsets of pixels, the same in all frames."""
+        std_dn = frame.physics.dsnu_std_e * frame.physics.dn_per_e
+        return independent(frame, 0.0, fixed_variance=std_dn * std_dn)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the offsets by site of the body."""
+        physics = plan.physics
+        offsets = NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)
+        return slots._replace(patterns=slots.patterns._replace(sites_dn=offsets))
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Normal offsets; no site is checked if the clean frame contains them, as it does not state the light then."""
+        if site.plan.noise.averaged:
+            return EffectNoise(largest_dn=0.0)
+        std_dn = site.physics.dsnu_std_e * site.physics.dn_per_e
+        return gaussian(constant(std_dn * std_dn))._replace(is_fixed=True)

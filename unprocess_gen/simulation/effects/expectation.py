@@ -1,0 +1,168 @@
+"""Describe the noise that an effect adds to the sites of a plane, which ``verify --noise`` expects.
+
+A site's noise is the sum of the noise of its effects, which are independent, and of known offsets. Signals are in DN
+above black, frequencies τ in radians per DN.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.exact_distributions import LOGISTIC, tukey_std
+from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
+
+if TYPE_CHECKING:
+    from unprocess_gen.simulation.effects import Physics
+
+Complex = NDArray[np.inexact[Any]]
+"""Values of a characteristic function; float64 if it is real."""
+
+NORMAL_DISTANCE = 6.0
+"""Distance that sites keep from the limits of the sensor, in standard deviations of the noise."""
+RARE = 1e-5
+"""Probability of a read-noise value beyond this distance."""
+
+
+class Site(NamedTuple):
+    """The sites of a pair at one ``place`` (row, column) of the 2x2 tile."""
+
+    plan: Plan
+    patch: Patch
+    place: tuple[int, int]
+    dark_pixels: DarkPixels | None = None
+
+    @property
+    def physics(self) -> Physics:
+        """Numbers of the physical profile."""
+        return self.plan.physics
+
+    @property
+    def gain_dn(self) -> float:
+        """DN of one electron; 0 if electrons are not counted."""
+        plan, (y, x) = self.plan, self.place
+        if plan.noise.physics is None:
+            return plan.noise.a_dn if plan.noise.counts_electrons else 0.0
+        relative = plan.noise.physics.gain_by_colour if "gain_by_colour" in plan.noise.effects else (1.0, 1.0, 1.0)
+        return plan.noise.physics.dn_per_e * relative["RGB".index(plan.sensor.pattern[2 * y + x])]
+
+
+class EffectNoise(NamedTuple):
+    """Noise that one effect adds to a site.
+
+    Attributes
+    ----------
+    variance : callable
+        Variance in DN² for an array of signals.
+    factor : callable
+        Factor of the characteristic function E[exp(iτ·noise)] for arrays of signals and frequencies.
+    is_fixed : bool
+        Whether the frames of one body share the values.
+    tail_dn : float
+        Distance beyond `NORMAL_DISTANCE` standard deviations that a fraction `RARE` of the values exceeds.
+    row_variance, row_correlation : float
+        Variance of the common offset of a row (DN²), and its correlation with that of the next row.
+    offset_dn : float or ndarray, broadcast to [H/2, W/2]
+        Known offset of the noisy frame; NaN for sites that cannot be checked.
+    clean_offset_dn : float
+        Offset of the clean frame that is no light.
+    largest_dn : float
+        Signal at which the pixel is full.
+    defects : float
+        Fraction of sites with another value.
+    defect_mean : callable
+        Mean that these add to all sites, for signals and for the bound of the noise (DN).
+    replacement : callable or None
+        Characteristic function at defects whose value replaces all noise, for signals and frequencies.
+    """
+
+    variance: Callable[[Float], Float] = np.zeros_like
+    factor: Callable[[Float, Float], Complex] = lambda signal, tau: np.ones_like(signal)
+    is_fixed: bool = False
+    tail_dn: float = 0.0
+    row_variance: float = 0.0
+    row_correlation: float = 0.0
+    offset_dn: float | Float | NDArray[np.float32] = 0.0
+    clean_offset_dn: float = 0.0
+    largest_dn: float = math.inf
+    defects: float = 0.0
+    defect_mean: Callable[[Float, Float], Float] = lambda signal, bound: np.zeros_like(signal)
+    replacement: Callable[[Float, Float], Complex] | None = None
+
+
+def gaussian(variance: Callable[[Float], Float]) -> EffectNoise:
+    """Normal noise."""
+    return EffectNoise(variance, lambda signal, tau: np.exp(-0.5 * tau * tau * variance(signal)))
+
+
+def constant(value: float) -> Callable[[Float], Float]:
+    """Function of the signal that does not depend on it."""
+    return lambda signal: np.full_like(signal, value)
+
+
+def uniform(width_dn: float) -> EffectNoise:
+    """Noise with a uniform distribution of this width."""
+    variance = constant(width_dn * width_dn / 12)
+    return EffectNoise(variance, lambda signal, tau: np.sinc(width_dn * tau / (2 * np.pi)))
+
+
+def poisson_noise(gain_dn: float, rate_e: Callable[[Float], Float], normal: tuple[float, float]) -> EffectNoise:
+    """Poisson counts minus their mean, times a gain; normal deviates up to and from the rates ``normal``."""
+
+    def factor(signal: Float, tau: Float) -> Complex:
+        rate, phase = rate_e(signal), gain_dn * tau
+        half_sine = np.sin(0.5 * phase)  # cos - 1 loses digits of small phases
+        exponent = rate * (-2 * half_sine * half_sine + 1j * (np.sin(phase) - phase))
+        is_normal = (rate <= normal[0]) | (rate >= normal[1])
+        return np.asarray(np.exp(np.where(is_normal, -0.5 * rate * phase * phase, exponent)))
+
+    return EffectNoise(lambda signal: gain_dn * gain_dn * rate_e(signal), factor)
+
+
+ALWAYS_COUNTED = (0.0, math.inf)
+
+
+def known_offset(site: Site, offset_dn: float | Float) -> EffectNoise:
+    """Offset of the noisy frame, or of the clean one if that contains the fixed patterns."""
+    if site.plan.noise.averaged:
+        return EffectNoise(clean_offset_dn=float(np.mean(offset_dn)))
+    return EffectNoise(offset_dn=offset_dn)
+
+
+def tukey_noise(std_dn: float, law: str, shape: float) -> EffectNoise:
+    """Read noise of Tukey's lambda distribution."""
+    values, largest = tukey_distribution(law, shape)
+    return EffectNoise(
+        constant(std_dn * std_dn),
+        lambda signal, tau: np.interp(np.abs(std_dn * tau), _FREQUENCIES, values),
+        tail_dn=std_dn * max(largest - NORMAL_DISTANCE, 0.0),
+    )
+
+
+LEAST_TAIL = 2.0**-33
+"""Least tail probability of a random word."""
+_FREQUENCIES = np.linspace(0.0, 2.0, 201)
+"""Radians per standard deviation; those of cos 2z, the highest that is computed, are at most 2."""
+
+
+@functools.lru_cache(maxsize=256)
+def tukey_distribution(law: str, shape: float) -> tuple[Float, float]:
+    """Characteristic function of Tukey's lambda distribution at `_FREQUENCIES`, and the quantile that `RARE` exceeds.
+
+    Both are for standard deviation 1, as read noise is drawn. The draws of ``"tukey_lambda"`` have this standard
+    deviation; for ``"tukey"`` (version 0.1) the distribution has, and its draws have less. The trapezoidal rule in the
+    logit of the probability p converges quickly: its error is below 3e-6 for shapes from -0.4.
+    """
+    logit, step = np.linspace(-40.0, 0.0, 1001, retstep=True)
+    p = 1 / (1 + np.exp(-logit))
+    weights = 2 * step * p * (1 - p)  # both halves: the distribution is symmetric
+    weights[-1] /= 2
+    tail = np.maximum(p, LEAST_TAIL)
+    quantiles = np.log(tail / (1 - tail)) if abs(shape) < LOGISTIC else (tail**shape - (1 - tail) ** shape) / shape
+    std = float(tukey_std(shape)) if law == "tukey" else math.sqrt(float(quantiles**2 @ weights))
+    return np.cos(np.outer(_FREQUENCIES, quantiles / std)) @ weights, -float(np.interp(RARE, p, quantiles)) / std

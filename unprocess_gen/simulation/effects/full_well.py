@@ -1,0 +1,60 @@
+"""Full well: the saturation capacity of a pixel, at which the clean and the noisy frame are clipped (EMVA 1288)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
+from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.slots import Slots
+
+FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
+"""Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FullWellNumbers:
+    """Saturation capacity, electrons."""
+
+    full_well_e: float = number(0.0, "saturation capacity", unit="electrons", low=1.0, high=1e9, highest=1e9)
+
+
+class FullWell(Effect):
+    """Limit of the electrons of a pixel."""
+
+    name = "full_well"
+    meaning = "saturation capacity, at which the clean and the noisy frame are clipped"
+    cost_ns = 0.1
+    numbers = FullWellNumbers
+
+    def electrons(self, electrons: Float, part: Part) -> Float:
+        """Limit the electrons."""
+        return np.minimum(electrons, part.physics.full_well_e / part.relative_gain)
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict the most that any pixel can lose."""
+        physics = frame.physics
+        if physics.full_well_e == 0:
+            return independent(frame, 0.0)
+        signal_e = level_dn / physics.dn_per_e * (1 + FARTHEST_NORMAL * physics.prnu_std)
+        reach_e = _reach(signal_e) + _reach(physics.dark_e) + _reach(FARTHEST_HOT * physics.hot_pixel_e)
+        return independent(frame, 0.0, max(reach_e - physics.full_well_e, 0.0) * physics.dn_per_e)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the limit of the well."""
+        return slots._replace(full_well_e=plan.physics.full_well_e)
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Saturation of the pixel, which sites must not reach."""
+        return EffectNoise(largest_dn=site.physics.full_well_e * site.physics.dn_per_e)
+
+
+def _reach(mean_e: float) -> float:
+    """Return an upper limit of the Poisson counts of 2**32 uniforms, electrons."""
+    return mean_e + 7 * math.sqrt(mean_e) + 12 if mean_e else 0.0

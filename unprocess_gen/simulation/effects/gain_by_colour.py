@@ -1,0 +1,56 @@
+"""Gains by colour: a system gain of its own for red, green and blue."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from unprocess_gen.core.types import Plan
+from unprocess_gen.simulation.effects.effect import Effect
+from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.slots import Slots
+
+COLOURS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainByColourNumbers:
+    """System gain of red, green and blue, relative to ``dn_per_e``."""
+
+    gain_by_colour: tuple[float, float, float] = number(
+        (1.0, 1.0, 1.0),
+        "system gain of red, green and blue, relative to dn_per_e",
+        low=0.1,
+        high=10.0,
+        count=3,
+        columns={f"gain_{colour[0]}": f"system gain of {colour}, relative to dn_per_e" for colour in COLOURS},
+        lowest=0.1,
+        highest=10.0,
+        empty_if="all are 1",
+        since="0.2",
+    )
+
+
+class GainByColour(Effect):
+    """Factor on the system gain, by the colour of a site."""
+
+    name = "gain_by_colour"
+    meaning = "a system gain of its own for each colour"
+    cost_ns = 0.3
+    numbers = GainByColourNumbers
+    since = "0.2"
+
+    def plane_gains(self, plan: Plan) -> tuple[float, ...]:
+        """Return the gain of the colour of each site of the tile."""
+        return tuple(plan.physics.gain_by_colour["RGB".index(colour)] for colour in plan.sensor.pattern)
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict a change of the shot noise: its standard deviation differs by a factor √gain."""
+        shot_dn = math.sqrt(frame.physics.dn_per_e * level_dn)
+        most_dn = shot_dn * max(abs(math.sqrt(gain) - 1) for gain in frame.physics.gain_by_colour)
+        return independent(frame, most_dn * most_dn)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the gains by plane."""
+        return slots._replace(plane_gains=self.plane_gains(plan))

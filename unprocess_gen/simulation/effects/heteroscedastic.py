@@ -1,0 +1,81 @@
+"""Noise of a two-parameter profile: shot and read noise with a variance linear in the signal.
+
+Foi et al. 2008 and the article, section 2; in Poisson form CRVD (Yue et al. 2020).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Shape, frame_words
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
+from unprocess_gen.simulation.effects.shot import counts, expected_counts
+from unprocess_gen.simulation.reference.noise import normals
+
+
+class Heteroscedastic(Effect):
+    """Noise with the variance max(0, a·(x - black) + b); the only effect of a two-parameter profile."""
+
+    name = "heteroscedastic"
+    meaning = "noise of a two-parameter profile, its only effect"
+    cost_ns = 1.8
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Variance a·signal + b; normal, or Poisson counts with the gain a and normal read noise."""
+        a, b = site.plan.noise.variance_line
+        if site.plan.noise.law == "gaussian" or a == 0:
+            return gaussian(lambda signal: np.maximum(a * signal + b, 0.0))
+        read_dn2 = max(b, 0.0)
+        shot, read = expected_counts(site), gaussian(constant(read_dn2))
+        return EffectNoise(
+            lambda signal: shot.variance(signal) + read_dn2,
+            lambda signal, tau: shot.factor(signal, tau) * read.factor(signal, tau),
+        )
+
+
+def noise_variance(clean_dn: Float, plan: Plan) -> Float:
+    """Return the variance of shot and read noise, max(0, a·(x - black) + b).
+
+    Parameters
+    ----------
+    clean_dn : ndarray of float64, [H, W]
+        Unrounded clean frame x, DN.
+    plan : Plan
+        Parameters of the pair.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        Variance, DN².
+    """
+    a_dn, b_dn2 = plan.noise.variance_line
+    return np.asarray(np.maximum(a_dn * (clean_dn - plan.sensor.black_level_dn) + b_dn2, 0))
+
+
+def heteroscedastic(clean_dn: Float, plan: Plan, origin: Shape = (0, 0)) -> Float:
+    """Add shot and read noise of a two-parameter profile.
+
+    For ``law="gaussian"``, the noise is one normal deviate of variance `noise_variance`. For ``"poisson"``, it is a
+    times a Poisson count of mean (x - black) / a, plus a normal deviate of variance b.
+
+    Parameters
+    ----------
+    clean_dn : ndarray of float64, [H, W]
+        Unrounded clean frame x, DN.
+    plan : Plan
+        Parameters of the pair.
+    origin : (int, int)
+        Row and column of ``clean_dn[0, 0]`` in the full frame.
+
+    Returns
+    -------
+    ndarray of float64, [H, W]
+        Noisy frame, DN, not clipped.
+    """
+    noise, black_dn = plan.noise, plan.sensor.black_level_dn
+    n = normals(frame_words(plan, "heteroscedastic", clean_dn.shape, origin))
+    if noise.law == "gaussian" or noise.a_dn == 0:  # a = 0: no shot noise
+        return clean_dn + np.sqrt(noise_variance(clean_dn, plan)) * n
+    electrons = counts(plan, (clean_dn - black_dn) / noise.a_dn, origin)
+    return np.asarray((electrons * noise.a_dn + black_dn) + np.sqrt(noise.b_dn2) * n)

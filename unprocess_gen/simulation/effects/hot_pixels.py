@@ -1,0 +1,104 @@
+"""Hot pixels: few pixels with a far larger dark current, a fixed pattern of the camera body."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+
+import numpy as np
+
+from unprocess_gen.core.lookup_tables import exponential_levels
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
+from unprocess_gen.simulation.effects.numbers import RATE, number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
+from unprocess_gen.simulation.reference.noise import is_among
+from unprocess_gen.simulation.reference.poisson import poisson
+from unprocess_gen.simulation.slots import BrightPixels, Slots
+
+
+@dataclass(frozen=True, kw_only=True)
+class HotPixelNumbers:
+    """Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure."""
+
+    hot_pixel_share: float = number(0.0, "fraction of hot pixels", high=1.0, highest=1.0)
+    hot_pixel_e: float = number(
+        0.0,
+        "mean excess of a hot pixel in the exposure",
+        unit="electrons",
+        kind=RATE,
+        key="hot_pixel_e_per_s",
+        key_meaning="mean of the exponentially distributed current of hot pixels at dark_reference_c",
+        key_unit="electrons per second",
+        high=1e6,
+        highest=1e9,
+    )
+
+
+class HotPixels(Effect):
+    """Excess of hot pixels, whose means are exponentially distributed in 1024 equally likely steps."""
+
+    name = "hot_pixels"
+    meaning = "few pixels with a far larger dark current; fixed pattern"
+    cost_ns = 1.0
+    numbers = HotPixelNumbers
+    heat = is_fixed = is_before_well = is_in_dark_frames = has_outliers = True
+
+    def electrons(self, electrons: Float, part: Part) -> Float:
+        """Add a Poisson count of its mean to each hot pixel."""
+        return electrons + poisson(part.frame_words("hot_pixels"), self.mean_electrons(part))
+
+    def mean_electrons(self, part: Part) -> Float:
+        """Return the mean excess of each pixel, [H, W] electrons; 0 except for hot pixels."""
+        physics = part.physics
+        hot = is_among(part.body_words("hot_pixels"), physics.hot_pixel_share)
+        step = part.body_words("hot_pixels", draw=1) >> np.uint32(22)
+        return np.where(hot, physics.hot_pixel_e * exponential_levels()[step], 0.0)
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict Poisson counts with exponentially distributed mean m, whose mean square is m + 2m²."""
+        physics = frame.physics
+        mean_dn = physics.dn_per_e * physics.hot_pixel_e
+        mean_square = (physics.dn_per_e + 2 * mean_dn) * mean_dn
+        return rare_pixels(frame, physics.hot_pixel_share, mean_dn, mean_square, masking)
+
+    def outliers(self, frame: FrameFacts, level_dn: float, masking: float) -> float:
+        """Predict the fraction of pixels that are hot and exceed one standard deviation."""
+        physics = frame.physics
+        least = math.floor(math.sqrt(masking) / physics.dn_per_e) + 1
+        return _share_of_counts(physics.hot_pixel_share, physics.hot_pixel_e, least)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the bright defects."""
+        physics = plan.physics
+        bright = BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)
+        return slots._replace(patterns=slots.patterns._replace(bright=bright))
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Few sites with additional electrons, whose means are exponentially distributed."""
+        physics, gain = site.physics, site.gain_dn
+        share, mean_e = physics.hot_pixel_share, physics.hot_pixel_e
+        if site.plan.noise.averaged or not mean_e:
+            return EffectNoise()
+        mean_dn = mean_e * gain
+        return EffectNoise(
+            factor=lambda signal, tau: 1 - share + share / (1 - mean_e * np.expm1(1j * gain * tau)),
+            defects=share,
+            defect_mean=lambda signal, bound: share * mean_dn * -np.expm1(-bound / mean_dn),
+        )
+
+
+@functools.lru_cache(maxsize=256)
+def _share_of_counts(share: float, mean_e: float, least: int) -> float:
+    """Return the fraction of pixels that are hot and have at least so many electrons.
+
+    Counts with exponentially distributed mean m are geometrically distributed: P(N >= k) = (m / (1 + m))**k.
+    """
+    with localcontext(prec=20):
+        mean = Decimal(mean_e)
+        if not mean:
+            return 0.0
+        return float(Decimal(share) * (least * (mean / (1 + mean)).ln()).exp())

@@ -1,0 +1,119 @@
+"""Lens shading: less light towards the corners, in the clean and the noisy frame.
+
+A polynomial in r², as in the opcode FixVignetteRadial of DNG 1.4 and in Lensfun's model "pa"; those correct the shading
+or describe it with the centre at 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
+from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
+from unprocess_gen.simulation.slots import RadialFactor, Slots
+
+PLACES = 64
+"""Squares of the distance from the centre at which lens shading is predicted."""
+
+Coefficients = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensShadingNumbers:
+    """Coefficients of r², r⁴ and r⁶ in the relative illumination; r is 1 in the corners."""
+
+    lens_shading: tuple[float, float, float] = number(
+        (0.0, 0.0, 0.0),
+        "relative illumination 1 + k1 r² + k2 r⁴ + k3 r⁶ as [k1, k2, k3]; r is the distance from the centre of the "
+        "full frame, 1 in the corners",
+        low=-10.0,
+        high=10.0,
+        count=3,
+        columns={
+            f"lens_shading_{power}": f"coefficient of r^{power} in the relative illumination" for power in (2, 4, 6)
+        },
+        lowest=-10.0,
+        highest=10.0,
+        empty_if="all are 0",
+        since="0.2",
+    )
+
+
+def illumination_at(square: Float, coefficients: Coefficients) -> Float:
+    """Return the relative illumination at a squared distance from the centre, in units of the corner's.
+
+    Parameters
+    ----------
+    square : ndarray of float64
+        r², 0 in the centre and 1 in the corners.
+    coefficients : tuple of three floats
+        Coefficients of r², r⁴ and r⁶.
+
+    Returns
+    -------
+    ndarray of float64
+        1 in the centre, same shape.
+    """
+    first, second, third = coefficients
+    return 1 + square * (first + square * (second + square * third))
+
+
+def illumination(
+    coefficients: Coefficients, frame_size: Shape, shape: Shape, origin: Shape = (0, 0)
+) -> NDArray[np.float32]:
+    """Return the relative illumination of each pixel.
+
+    Parameters
+    ----------
+    coefficients : tuple of three floats
+        As in `illumination_at`.
+    frame_size, shape : (int, int)
+        Height and width of the full frame and of the crop.
+    origin : (int, int)
+        Row and column of the crop's first pixel in the full frame.
+
+    Returns
+    -------
+    ndarray of float32, [H, W]
+        At most 1.
+    """
+    # Twice the distance from the centre is an integer, so that its square is exact.
+    rows, columns = (
+        2 * (np.arange(start, start + count) - 0.0) - (full - 1)
+        for start, count, full in zip(origin, shape, frame_size, strict=True)
+    )
+    corner = float(sum((full - 1) ** 2 for full in frame_size)) or 1.0
+    square = (rows * rows)[:, None] + (columns * columns)[None, :]
+    return np.asarray(illumination_at(square / corner, coefficients)).astype(np.float32)
+
+
+class LensShading(Effect):
+    """Relative illumination of each pixel."""
+
+    name = "lens_shading"
+    meaning = "less light towards the corners, in the clean and the noisy frame"
+    cost_ns = 15.1
+    numbers = LensShadingNumbers
+    since = "0.2"
+    in_both_frames = True
+
+    def light_factor(self, part: Part) -> Float:
+        """Return the relative illumination, [H, W]; values of float32, in which kernels store the pattern."""
+        physics = part.physics
+        return illumination(physics.lens_shading, physics.frame_size, part.shape, part.origin).astype(np.float64)
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict the light that the darkest place loses."""
+        places = illumination_at(np.arange(PLACES + 1) / PLACES, frame.physics.lens_shading)
+        return independent(frame, 0.0, level_dn * float(1 - places.min()))
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the factor on the light."""
+        physics = plan.physics
+        light = RadialFactor(physics.lens_shading, physics.frame_size)
+        return slots._replace(patterns=slots.patterns._replace(light=light))

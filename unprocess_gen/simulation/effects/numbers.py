@@ -1,0 +1,120 @@
+"""Declare the numbers of physical noise profiles.
+
+A number is declared once, as a field of the record of its effect. Keys of the settings with their checks, the fields of
+`simulation.effects.Physics`, manifest columns and reference pages follow from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+METADATA = "number"
+"""Key of a field's metadata that holds its `Number`."""
+
+PLAIN, DN, RATE, SHAPE, SITES = "plain", "dn", "rate", "shape", "sites"
+"""How a field follows from its key: unchanged, converted to DN of the sensor, times exposure and warmth, as a shape of
+Tukey's lambda, and as DN of the four sites of the 2x2 tile."""
+
+LARGEST = 1.7976931348623157e308
+
+
+@dataclass(frozen=True)
+class Number:
+    """Declare a number: a key of the profile, a field of `Physics`, and columns of the manifest.
+
+    Attributes
+    ----------
+    meaning : str
+        One phrase for users.
+    unit : str
+        Unit of the field. ``"DN"`` means DN of the profile for the key, and DN of the sensor for the field.
+    low, high : float
+        Allowed values of the key.
+    kind : str
+        `PLAIN`, `DN`, `RATE`, `SHAPE` or `SITES`.
+    key : str
+        Key of the profile; empty if it has the name of the field.
+    key_meaning, key_unit : str
+        Meaning and unit of the key, if they differ from those of the field.
+    key_default : Any
+        Value of a key that a profile does not name; None if the number is not known then.
+    optional : str
+        What null means if the effect is simulated without the number; empty if it needs the number.
+    required : bool
+        Whether null is refused.
+    forms, words : tuple of str
+        Forms of `config.forms`, and words, that the key allows; a key with any belongs to the branches of a profile.
+    count : int
+        Numbers in the value; a list if more than 1.
+    counter, scatter : int
+        Counters of the draw in the streams ``parameters`` and ``scatter``; -1 without a draw. Datasets depend on them.
+    columns : mapping of str to str
+        Name and meaning of each column; empty for one column with the name and meaning of the field.
+    lowest, highest : float
+        Values that rows allow.
+    empty_if : str
+        Condition under which columns that version 0.1 did not have are empty.
+    since : str
+        First version with the number; empty for 0.1.
+    """
+
+    meaning: str
+    unit: str = ""
+    low: float = 0.0
+    high: float = math.inf
+    kind: str = PLAIN
+    key: str = ""
+    key_meaning: str = ""
+    key_unit: str = ""
+    key_default: Any = None
+    optional: str = ""
+    required: bool = False
+    forms: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+    count: int = 1
+    counter: int = -1
+    scatter: int = -1
+    columns: Mapping[str, str] = field(default_factory=dict)
+    lowest: float = 0.0
+    highest: float = LARGEST
+    empty_if: str = "it is 0"
+    since: str = ""
+
+    @property
+    def may_be_unknown(self) -> bool:
+        """True if null means that the number is not known, or not needed."""
+        return self.key_default is None and not self.required
+
+    @property
+    def in_branch(self) -> bool:
+        """True for a key of the branches, false for a key of the profile."""
+        return bool(self.forms or self.words)
+
+
+def number(default: Any, meaning: str, **details: Any) -> Any:
+    """Declare a field of `Physics`.
+
+    Parameters
+    ----------
+    default : Any
+        Value without the effect.
+    meaning : str
+        One phrase for users.
+    **details : Any
+        Other attributes of `Number`.
+
+    Returns
+    -------
+    dataclasses.Field
+        For the body of a dataclass.
+    """
+    return field(default=default, metadata={METADATA: Number(meaning, **details)})
+
+
+def numbers_of(record: type[Any]) -> dict[str, Number]:
+    """Return the declared numbers of a dataclass by the names of its fields."""
+    return {one.name: one.metadata[METADATA] for one in dataclasses.fields(record) if METADATA in one.metadata}

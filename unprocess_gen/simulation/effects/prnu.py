@@ -1,0 +1,75 @@
+"""Photo response non-uniformity (PRNU, EMVA 1288): unequal response of pixels, a fixed pattern of the camera body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, gaussian
+from unprocess_gen.simulation.effects.numbers import number
+from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
+from unprocess_gen.simulation.reference.noise import normals
+from unprocess_gen.simulation.slots import NormalPattern, Slots
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrnuNumbers:
+    """Standard deviation of the pixels' relative gain."""
+
+    prnu_std: float = number(
+        0.0,
+        "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1",
+        high=0.5,
+        highest=1.0,
+    )
+
+
+class Prnu(Effect):
+    """Relative gain of each pixel with mean 1; if the clean frame contains the fixed patterns, on its light instead."""
+
+    name = "prnu"
+    meaning = "unequal response of pixels; fixed pattern"
+    cost_ns = 3.3
+    numbers = PrnuNumbers
+    is_fixed = is_before_well = True
+
+    def response(self, part: Part) -> Float:
+        """Return the relative gain of each pixel, [H, W]; not negative.
+
+        It is rounded to float32, the dtype in which kernels store the pattern for many frames.
+        """
+        n = normals(part.body_words("prnu"))
+        return np.maximum(1 + part.physics.prnu_std * n, 0).astype(np.float32).astype(np.float64)
+
+    def light_factor(self, part: Part) -> Float | None:
+        """Return the response if the clean frame contains the fixed patterns."""
+        return self.response(part) if part.physics.fixed_pattern_in_clean else None
+
+    def electrons(self, electrons: Float, part: Part) -> Float:
+        """Multiply the electrons of light by the response."""
+        return electrons if part.physics.fixed_pattern_in_clean else electrons * self.response(part)
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict a change of the mean of the shot noise.
+
+        Poisson counts of nearby means differ by √(|Δλ| + Δλ²) even for equal uniforms.
+        """
+        physics = frame.physics
+        change_e = physics.prnu_std * level_dn / physics.dn_per_e
+        squared = physics.dn_per_e * physics.dn_per_e
+        return independent(frame, squared * MEAN_ABS_NORMAL * change_e, fixed_variance=squared * change_e * change_e)
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the factor on the electrons."""
+        physics = plan.physics
+        factor = NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)
+        return slots._replace(patterns=slots.patterns._replace(electrons=factor))
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Relative gain of each pixel with standard deviation p: variance (p·signal)²."""
+        if site.plan.noise.averaged:
+            return EffectNoise()
+        return gaussian(lambda signal: (site.physics.prnu_std * signal) ** 2)._replace(is_fixed=True)

@@ -1,0 +1,85 @@
+"""Read noise of the amplifier and the converter: Gaussian, or Tukey's lambda distribution (ELD, Wei et al. 2020)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from unprocess_gen.core.lookup_tables import quantile_table
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian, tukey_noise
+from unprocess_gen.simulation.effects.numbers import DN, SHAPE, number
+from unprocess_gen.simulation.reference.noise import by_inverse_cdf
+from unprocess_gen.simulation.slots import SiteNoise, Slots
+
+if TYPE_CHECKING:
+    from unprocess_gen.simulation.effects import Physics
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadNumbers:
+    """Distribution of the read noise, shape of Tukey's lambda, and standard deviation, DN."""
+
+    read_law: str = number(
+        "gaussian",
+        "distribution of the read noise: gaussian, or tukey_lambda for Tukey's lambda with a shape from -0.45; tukey "
+        "is that of version 0.1, whose variance is low for shapes below -0.3",
+        words=("gaussian", "tukey", "tukey_lambda"),
+        key_default="gaussian",
+    )
+    read_shape: float = number(
+        0.0,
+        "shape of Tukey's lambda distribution",
+        kind=SHAPE,
+        forms=("choice", "by_stop", "by_iso"),
+        key_default=0.0,
+        counter=14,
+        scatter=0,
+        lowest=-0.5,
+        highest=10.0,
+    )
+    read_std_dn: float = number(
+        0.0,
+        "standard deviation of the read noise",
+        unit="DN",
+        kind=DN,
+        forms=("root", "line", "scale_line", "by_iso"),
+        required=True,
+        counter=15,
+        scatter=1,
+    )
+
+
+class Read(Effect):
+    """Independent noise of each site, behind the gain."""
+
+    name = "read"
+    meaning = "noise of the amplifier and the converter"
+    cost_ns = 1.8
+    numbers = ReadNumbers
+    masks = True
+
+    def noise_dn(self, part: Part) -> Float:
+        """Draw the noise by the inverse distribution function."""
+        physics = part.physics
+        table = quantile_table(physics.read_law, physics.read_shape)
+        return physics.read_std_dn * by_inverse_cdf(part.frame_words("read"), table)
+
+    def variance(self, physics: Physics, level_dn: float) -> float:
+        """Return the square of the standard deviation, DN²."""
+        return physics.read_std_dn * physics.read_std_dn
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the noise of a site."""
+        physics = plan.physics
+        noise = SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)
+        return slots._replace(noise=noise)
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Normal noise, or Tukey's lambda distribution."""
+        physics = site.physics
+        std = physics.read_std_dn
+        if physics.read_law == "gaussian":
+            return gaussian(constant(std * std))
+        return tukey_noise(std, physics.read_law, physics.read_shape)

@@ -1,0 +1,84 @@
+"""Row noise (banding): an offset of each row, new in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unprocess_gen.core.types import Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part, slot_words
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
+from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
+from unprocess_gen.simulation.reference.noise import autoregressive, normals
+from unprocess_gen.simulation.slots import LineOffsets, Slots
+
+
+@dataclass(frozen=True, kw_only=True)
+class RowNumbers:
+    """Standard deviation of row offsets, DN, and correlation of the offsets of neighbouring rows."""
+
+    row_std_dn: float = number(
+        0.0,
+        "standard deviation of row offsets",
+        unit="DN",
+        kind=DN,
+        forms=("root", "line", "by_iso"),
+        counter=16,
+        scatter=2,
+    )
+    row_correlation: float = number(
+        0.0,
+        "correlation of the offsets of neighbouring rows, an autoregressive process of order 1; part of the effect row",
+        low=-0.999,
+        high=0.999,
+        optional="independent rows",
+        lowest=-0.999,
+        highest=0.999,
+        since="0.2",
+    )
+
+
+class Row(Effect):
+    """Offset of each row.
+
+    With a correlation r, z(y) = r·z(y - 1) + √(1 - r²)·n(y) for normal deviates n, an autoregressive process of order 1
+    (Box and Jenkins 1970) with the standard deviation of n. It begins at row 0 of the full frame, so that a crop has
+    the offsets of its rows.
+    """
+
+    name = "row"
+    meaning = "an offset of each row, new in every frame"
+    cost_ns = 0.1
+    numbers = RowNumbers
+    is_in_dark_frames = True
+
+    def row_offset_dn(self, part: Part) -> Float:
+        """Draw the offset of each row, [H, 1] DN."""
+        physics, (height, _), (top, _) = part.physics, part.shape, part.origin
+        if physics.row_correlation == 0:
+            return np.asarray(physics.row_std_dn * normals(part.frame_words("row", (height, 1), (top, 0))))
+        independent = normals(part.frame_words("row", (top + height, 1), (0, 0)))[:, 0]
+        return (physics.row_std_dn * autoregressive(independent, physics.row_correlation)[top:])[:, None]
+
+    def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
+        """Predict row offsets; correlation r divides the number of independent rows by (1 + r) / (1 - r)."""
+        physics, height = frame.physics, frame.facts.height
+        variance = physics.row_std_dn * physics.row_std_dn
+        rows, rows_of_plane = float(height), float(max(height // 2, 1))
+        if physics.row_correlation > 0:
+            together = (1 + physics.row_correlation) / (1 - physics.row_correlation)
+            rows, rows_of_plane = max(rows / together, 1.0), max(rows_of_plane / together, 1.0)
+        return new_in_every_frame(frame, (variance, variance, variance / rows, variance / rows_of_plane))
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the offsets of rows."""
+        physics = plan.physics
+        rows = LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)
+        return slots._replace(rows=rows)
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Normal offset of each row, an autoregressive process of order 1."""
+        variance, correlation = site.physics.row_std_dn**2, site.physics.row_correlation
+        return gaussian(constant(variance))._replace(row_variance=variance, row_correlation=correlation)

@@ -1,0 +1,67 @@
+"""Shot noise: Poisson counts of the electrons of light (EMVA 1288), times the system gain K."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from unprocess_gen.core.types import NEAR_NORMAL, Float, Plan
+from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, frame_words
+from unprocess_gen.simulation.effects.expectation import ALWAYS_COUNTED, EffectNoise, Site, poisson_noise
+from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.reference.near_normal import counts_or_normals, near_limits
+from unprocess_gen.simulation.reference.poisson import poisson
+from unprocess_gen.simulation.slots import Slots
+
+if TYPE_CHECKING:
+    from unprocess_gen.simulation.effects import Physics
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotNumbers:
+    """System gain K, DN per electron."""
+
+    dn_per_e: float = number(
+        1.0, "system gain K", unit="DN per electron", kind=DN, forms=("per_iso",), required=True, highest=1e20
+    )
+
+
+def counts(plan: Plan, electrons: Float, origin: Shape = (0, 0)) -> Float:
+    """Draw the electrons of light, [H, W]: Poisson counts of their means."""
+    words = frame_words(plan, "shot", electrons.shape, origin)
+    if NEAR_NORMAL in plan.accuracy.methods:
+        return counts_or_normals(plan, words, electrons)
+    return poisson(words, electrons)
+
+
+def expected_counts(site: Site) -> EffectNoise:
+    """Shot noise; some recorded datasets have normal deviates at some rates."""
+    plan, gain = site.plan, site.gain_dn
+    is_near_normal = NEAR_NORMAL in plan.accuracy.methods and "gain_by_colour" not in plan.noise.effects
+    return poisson_noise(gain, lambda signal: signal / gain, near_limits(plan) if is_near_normal else ALWAYS_COUNTED)
+
+
+class Shot(Effect):
+    """Poisson counts of the electrons of light."""
+
+    name = "shot"
+    meaning = "Poisson counts of electrons"
+    cost_ns = 9.5
+    numbers = ShotNumbers
+    is_before_well = masks = True
+
+    def electrons(self, electrons: Float, part: Part) -> Float:
+        """Draw a count for each pixel."""
+        return counts(part.plan, electrons, part.origin)
+
+    def variance(self, physics: Physics, level_dn: float) -> float:
+        """Return K times the signal, DN²."""
+        return physics.dn_per_e * level_dn
+
+    def slots(self, slots: Slots, plan: Plan) -> Slots:
+        """Fill the counts of light."""
+        return slots._replace(light_stream="shot")
+
+    def expected(self, site: Site) -> EffectNoise:
+        """Poisson counts with the mean signal / K."""
+        return expected_counts(site)

@@ -1,0 +1,52 @@
+"""Fill the slots of a frame from the effects of its plan, in the order of their roundings."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from unprocess_gen.core.types import DarkPixels, Plan
+from unprocess_gen.simulation.effects.dark_frame import dark_frame_offsets
+from unprocess_gen.simulation.effects.order import effects_of
+from unprocess_gen.simulation.slots import Patterns, SiteNoise, Slots
+
+NORMAL_STREAM = "heteroscedastic"
+"""Stream of noise that is one normal deviate per site, with a variance linear in the signal."""
+
+
+@functools.lru_cache(maxsize=16)
+def slots_of(plan: Plan) -> Slots:
+    """Return the slots of a plan whose noise counts electrons."""
+    black_dn, physics = float(plan.sensor.black_level_dn), plan.noise.physics
+    if physics is None:
+        return _two_numbers(plan, black_dn)
+    slots = Slots(black_dn, physics.dn_per_e)
+    for effect in effects_of(plan):
+        slots = effect.slots(slots, plan)
+    return slots
+
+
+def fixed_patterns(plan: Plan) -> Patterns:
+    """Return the fixed patterns of a plan; frames that share them can be simulated in one pass."""
+    return slots_of(plan).patterns if plan.noise.physics is not None else Patterns()
+
+
+def fill_site_offsets(
+    plan: Plan,
+    dark_pixels: DarkPixels | None,
+    shape: tuple[int, int],
+    origin: tuple[int, int],
+    out: NDArray[np.float32],
+) -> None:
+    """Fill ``out`` with the frame's own offsets by site, DN."""
+    dark_frame_offsets(plan, dark_pixels, shape, origin, out=out)
+
+
+def _two_numbers(plan: Plan, black_dn: float) -> Slots:
+    """Return counts of light and normal noise whose variance line is that of the plan."""
+    a_dn, b_dn2 = plan.noise.variance_line
+    noise = SiteNoise(NORMAL_STREAM, math.sqrt(max(b_dn2, 0.0)))
+    return Slots(black_dn, a_dn, light_stream="shot", noise=noise)

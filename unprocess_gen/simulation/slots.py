@@ -1,0 +1,159 @@
+"""Define the slots of a noisy frame: what kernels simulate, whatever effects ask for it.
+
+An effect of the sensor fills one slot or more (`plan_slots`). Kernels know the slots and no effect, so a new effect
+that fits a slot touches no kernel. Light meets the slots in this order:
+
+    light factor → electron factor → counts of light → counts of one rate → defects → limit of the well
+    → gain by plane → noise of a site → offsets by row, column and plane → offsets by site → dead pixels
+
+An empty slot has its default. Fixed patterns belong to a camera body; all frames that are simulated in one pass share
+them (`Patterns`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+
+class RadialFactor(NamedTuple):
+    """Factor on the light that depends on the distance from the centre of the frame.
+
+    ``coefficients`` are those of r², r⁴ and r⁶, with r = 1 in the corners of a frame of ``frame_size``.
+    """
+
+    coefficients: tuple[float, float, float]
+    frame_size: tuple[int, int]
+
+
+class NormalPattern(NamedTuple):
+    """Fixed value of each pixel of a body: max(mean + std·n, least) for a normal deviate n, float32."""
+
+    body_key: int
+    stream: str
+    std: float
+    mean: float = 0.0
+    least: float = -math.inf
+
+
+class BrightPixels(NamedTuple):
+    """Share of the pixels of a body with additional electrons, chosen by words of ``stream``.
+
+    Their means are exponentially distributed with mean ``mean_e``; words of draw 1 select them. In each frame a Poisson
+    count of its mean is drawn for each of them, from words of the same stream.
+    """
+
+    body_key: int
+    stream: str
+    share: float
+    mean_e: float
+
+
+class DeadPixels(NamedTuple):
+    """Share of the pixels of a body that read 0, chosen by words of ``stream``."""
+
+    body_key: int
+    stream: str
+    share: float
+
+
+class Patterns(NamedTuple):
+    """Fixed patterns that all frames of a pass share.
+
+    Attributes
+    ----------
+    light : RadialFactor or None
+        Factor on the light, in the clean frame too.
+    electrons : NormalPattern or None
+        Factor on the electrons of light; if the clean frame contains the fixed patterns, on its light instead.
+    sites_dn : NormalPattern or None
+        Offsets by site, DN; the clean frame can contain them.
+    bright, dead : BrightPixels or None, DeadPixels or None
+        Defects: pixels with additional electrons, and pixels that read 0.
+    """
+
+    light: RadialFactor | None = None
+    electrons: NormalPattern | None = None
+    sites_dn: NormalPattern | None = None
+    bright: BrightPixels | None = None
+    dead: DeadPixels | None = None
+
+
+class Words(NamedTuple):
+    """Random words of a frame, or of a body: their key, stream, level, draw and frame."""
+
+    key: int
+    stream: str
+    level: int = 0
+    draw: int = 0
+    frame: int = 0
+
+
+class LineOffsets(NamedTuple):
+    """Offsets of rows or of columns, DN: ``std_dn`` times normal deviates of these words.
+
+    Neighbouring rows have the correlation ``correlation`` (`reference.noise.autoregressive`).
+    """
+
+    words: Words
+    std_dn: float
+    correlation: float = 0.0
+
+
+class UniformCounts(NamedTuple):
+    """Poisson counts of the rate ``rate_e`` at every site, less ``removed_e``."""
+
+    stream: str
+    rate_e: float
+    removed_e: float
+
+
+class SiteNoise(NamedTuple):
+    """Noise of each site: ``std_dn`` times a deviate of a quantile table (`lookup_tables.quantile_table`)."""
+
+    stream: str
+    std_dn: float
+    law: str = "gaussian"
+    shape: float = 0.0
+
+
+class Slots(NamedTuple):
+    """Hold the slots of a frame.
+
+    Attributes
+    ----------
+    black_dn, dn_per_e : float
+        Black level, DN, and system gain, DN per electron.
+    patterns : Patterns
+        Fixed patterns of the body.
+    light_stream : str
+        Stream of the Poisson counts of light; empty if the electrons of light are their mean.
+    uniform : UniformCounts or None
+        Counts of one rate.
+    full_well_e : float
+        Limit of the well, electrons, of a plane whose relative gain is 1.
+    plane_gains : tuple of four floats
+        Gain by plane, relative to ``dn_per_e``, of the sites (0, 0), (0, 1), (1, 0), (1, 1) of the frame's tile.
+    noise : SiteNoise or None
+        Noise of each site.
+    rows, columns, fixed_columns : LineOffsets or None
+        Offsets by row and by column that are new in every frame, and offsets by column of the body.
+    planes_dn : tuple of four floats
+        Offsets by plane, of the same sites as ``plane_gains``.
+    has_site_offsets : bool
+        Whether the frame has offsets by site of its own (`plan_slots.fill_site_offsets`).
+    """
+
+    black_dn: float
+    dn_per_e: float
+    patterns: Patterns = Patterns()
+    light_stream: str = ""
+    uniform: UniformCounts | None = None
+    full_well_e: float = math.inf
+    plane_gains: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    noise: SiteNoise | None = None
+    rows: LineOffsets | None = None
+    fixed_columns: LineOffsets | None = None
+    columns: LineOffsets | None = None
+    planes_dn: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    has_site_offsets: bool = False

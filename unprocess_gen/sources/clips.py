@@ -1,0 +1,66 @@
+"""Group sources into clips (``source.clips``), and warn about photographs that are no frames of one scene."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from unprocess_gen.core.types import Source
+from unprocess_gen.sources.reading import content_sha256
+
+
+def number_clips(root: str, sources: Sequence[Source]) -> tuple[Source, ...]:
+    """Make each folder a clip whose files are frames 0, 1, … in listing order; videos are clips already.
+
+    The digest of a clip's first file identifies the clip, so that adding or removing other clips changes nothing. If
+    that file cannot be read, the digest of its name is used.
+    """
+    clips: dict[str, list[Source]] = {}
+    for source in sources:
+        clips.setdefault(source.name if source.is_video else source.name.rpartition("/")[0] or ".", []).append(source)
+    seen: Counter[str] = Counter()
+    placed: dict[int, Source] = {}
+    for clip, frames in clips.items():
+        digest = content_sha256(root, frames[0])
+        for frame, source in enumerate(frames):
+            placed[source.index] = replace(
+                source, clip=clip, frame=frame, clip_sha256=digest, clip_occurrence=seen[digest], frames=len(frames)
+            )
+        seen[digest] += 1
+    return tuple(placed[source.index] for source in sources)
+
+
+def clip_warnings(sources: Sequence[Source]) -> tuple[str, ...]:
+    """Return a warning if one folder of several photographs is the only clip."""
+    clips = {source.clip for source in sources}
+    if len(sources) < 2 or len(clips) != 1 or sources[0].is_video:
+        return ()
+    return (
+        f"source.clips=true: all {len(sources)} photographs are in one folder and become frames of one clip; "
+        "expected one folder for each clip; set source.clips=false if they are different photographs",
+    )
+
+
+class ClipSizes:
+    """Compare the frame sizes of each clip as frames become known."""
+
+    def __init__(self) -> None:
+        self._sizes: dict[str, tuple[int, int] | None] = {}
+
+    def warnings(self, sizes: Iterable[tuple[str, int, int]]) -> tuple[str, ...]:
+        """Return a warning for each clip whose frames first differ in size.
+
+        ``sizes`` are the name of a clip, and width and height of one of its frames.
+        """
+        return tuple(text for size in sizes if (text := self._warning(*size)))
+
+    def _warning(self, clip: str, width: int, height: int) -> str:
+        known = self._sizes.setdefault(clip, (width, height))
+        if known is None or known == (width, height):
+            return ""
+        self._sizes[clip] = None  # one warning for each clip
+        return (
+            f"source.clips=true: clip {clip} has frames of {known[0]} x {known[1]} and of {width} x {height} pixels; "
+            "expected frames of one scene; set source.clips=false if they are different photographs"
+        )
