@@ -30,7 +30,7 @@ INTRODUCTION = """\
 # Noise profiles and their sources
 
 This page compares each physical noise profile with every published calibration of its camera, and lists the source and
-the uncertainty of each number (`noise.provenance`). Numbers are in DN of the calibration, without scatter.
+the uncertainty of each number (`noise.provenance`). Numbers are in DN of the calibration, as a default run has them.
 [Abbreviations of sources](#sources), such as ELD and PMN, are explained at the end.
 
 - Read noise is a standard deviation, in DN and, in parentheses, in electrons. "Tukey" is the standard deviation of a
@@ -59,12 +59,12 @@ def physical_profiles() -> dict[str, NoiseConfig]:
 
 
 def profile_at(noise: NoiseConfig, iso: float) -> Physics | None:
-    """Return the numbers of a profile at an ISO, in DN of its calibration, without scatter; None without a branch."""
+    """Return the numbers of a profile at an ISO, in DN of its calibration, as in a default run; None without a branch."""
     if branch_of(noise, iso) is None:
         return None
     assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
     sensor = SensorConfig(noise.bits, noise.black_level_dn, noise.white_level_dn)
-    config = Config(noise=replace(noise, iso=iso, scatter="off"), sensor=sensor)
+    config = Config(noise=replace(noise, iso=iso), sensor=sensor)
     return PhysicalNoise(config).draw([0.5] * COUNT, 0, 0)
 
 

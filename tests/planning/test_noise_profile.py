@@ -254,7 +254,7 @@ def test_scatter_by_image_differs_between_images_of_one_body(settings: Settings)
 @pytest.mark.parametrize("units", [1, 4])
 def test_a_body_has_one_value_per_iso(units: int, settings: Settings) -> None:
     for iso in (400, 3200):
-        chosen = (f"noise.iso={iso}", f"sensor.units={units}")
+        chosen = (f"noise.iso={iso}", f"sensor.units={units}", "noise.scatter=body")
         numbers = scatter_of(settings, *chosen, bodies=units)
         assert len(set(numbers)) == units
         assert numbers == scatter_of(
@@ -282,9 +282,37 @@ def test_bodies_and_isos_scatter_independently(settings: Settings) -> None:
 
 
 def test_images_with_patterns_of_their_own_share_the_scatter_of_an_iso(settings: Settings) -> None:
-    assert len(set(scatter_of(settings, "noise.iso=3200"))) == 1
-    assert len(set(scatter_of(settings, "noise.iso=3200", "seed=1"))) == 1
-    assert set(scatter_of(settings, "noise.iso=3200")) != set(scatter_of(settings, "noise.iso=3200", "seed=1"))
+    first, other = (
+        set(scatter_of(settings, "noise.iso=3200", "noise.scatter=body", f"seed={seed}")) for seed in (0, 1)
+    )
+    assert len(first) == len(other) == 1
+    assert first != other
+
+
+@pytest.mark.parametrize(("units", "bodies"), [("1", 1), ("4", 4), ("image", 40)])
+def test_a_unit_has_the_same_deviates_at_all_isos(units: str, bodies: int, settings: Settings) -> None:
+    """The noise of every body rises with the ISO, by the factor of the line."""
+    low, high = (
+        np.array(scatter_of(settings, "noise.scatter=unit", f"sensor.units={units}", f"noise.iso={iso}", bodies=bodies))
+        for iso in (400, 3200)
+    )
+    assert len(np.unique(low, axis=0)) == bodies
+    np.testing.assert_allclose((high / low).std(axis=0), 0, atol=1e-13)
+    assert (high[:, 1:] > low[:, 1:]).all()
+
+
+@pytest.mark.parametrize("profile", ["canon_5d4", "canon_70d", "canon_700d", "nikon_d850", "sony_a7s2", "oppo_reno10x"])
+def test_by_default_a_profile_has_the_noise_of_its_line(profile: str, settings: Settings) -> None:
+    """Read noise does not depend on the seed, nor fall as the ISO rises within a gain mode."""
+    config = settings(f"noise={profile}")
+    for branch in config.noise.branches:
+        isos = np.geomspace(branch.iso[0], branch.iso[1] - 1, 9)
+        stds = [
+            {physics(replaced(config, {"noise.iso": float(iso), "seed": seed})).read_std_dn for seed in range(3)}
+            for iso in isos
+        ]
+        assert all(len(same) == 1 for same in stds)
+        assert (np.diff([min(same) for same in stds]) > 0).all()
 
 
 def test_without_scatter_lines_and_the_median_shape_remain(settings: Settings) -> None:
@@ -303,7 +331,7 @@ def test_a_config_without_scatter_draws_by_image(settings: Settings) -> None:
     text = dataset_yaml(settings("noise=canon_70d", "noise.scatter=image"))
     assert "scatter" not in yaml.safe_load(text)["noise"]
     assert parse_dataset_yaml(text)[0].noise.scatter == "image"
-    assert yaml.safe_load(dataset_yaml(settings("noise=canon_70d")))["noise"]["scatter"] == "body"
+    assert yaml.safe_load(dataset_yaml(settings("noise=canon_70d")))["noise"]["scatter"] == "off"
 
 
 # Profiles in conf/ ----------------------------------------------------------------------------------------------------

@@ -196,7 +196,7 @@ MAX_ISO = 1e7
 SWITCH = Switch(("auto", "on", "off"))
 """Values of each effect."""
 
-SCATTER = Switch(("off", "body", "image"))
+SCATTER = Switch(("off", "unit", "body", "image"))
 
 DEQUANTIZE = Switch(("off", "dither", "dither_all"))
 

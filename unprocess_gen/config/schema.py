@@ -393,9 +393,9 @@ class NoiseConfig(Group):
     )
     scatter: str = key(
         "image",
-        "how the scatter of a physical profile's lines and its read_shape are drawn: body once for each camera body "
-        "and ISO (with sensor.units=image, once for each ISO), image for each image; off is no scatter and the median "
-        "shape",
+        "how the scatter of a physical profile's lines and its read_shape are drawn: unit once for each camera body, "
+        "body once for each body and ISO (with sensor.units=image, once for each ISO), image for each image; off is no "
+        "scatter and the median shape",
         limits.SCATTER,
         section=CHOSEN,
         since="0.2",

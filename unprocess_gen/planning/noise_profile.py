@@ -28,6 +28,8 @@ from unprocess_gen.simulation.reference import cfa
 
 MIDDLE = 0.5
 """Uniform at which a line has no scatter."""
+ANY_ISO = 0.0
+"""ISO that keys the scatter of a body at all its ISOs."""
 
 
 class PhysicalNoise:
@@ -97,15 +99,17 @@ class PhysicalNoise:
     def _scatter(self, uniforms: Sequence[float], iso: float, seed: int, unit: str) -> Callable[[Number], float]:
         """Return the uniform at which a number is drawn.
 
-        With ``sensor.units=image`` every image has its own fixed patterns. Its noise is still that of the calibrated
-        camera: the scatter of a fit does not say how bodies differ.
+        With ``body``, images that have fixed patterns of their own share the draw of an ISO.
         """
         if self.scatter == "image":
             return lambda declared: uniforms[declared.counter]
         if self.scatter == "off":
             return lambda declared: MIDDLE
-        body = body_key(seed, self.noise.name, "" if self.sensor.units == "image" else unit)
-        scatter = _scatter_of_body(body, iso)
+        if self.scatter == "unit":
+            scatter = _scatter_of_body(body_key(seed, self.noise.name, unit), ANY_ISO)
+        else:
+            body = body_key(seed, self.noise.name, "" if self.sensor.units == "image" else unit)
+            scatter = _scatter_of_body(body, iso)
         return lambda declared: scatter[declared.scatter]
 
     def _shape(self, branch: BranchConfig, iso: float, uniform: float) -> float:
