@@ -59,7 +59,7 @@ def physical_profiles() -> dict[str, NoiseConfig]:
 
 
 def profile_at(noise: NoiseConfig, iso: float) -> Physics | None:
-    """Return the numbers of a profile at an ISO, in DN of its calibration, as in a default run; None without a branch."""
+    """Return the numbers of a profile at an ISO, in DN of its calibration; None without a branch."""
     if branch_of(noise, iso) is None:
         return None
     assert noise.bits is not None and noise.black_level_dn is not None and noise.white_level_dn is not None
