@@ -51,14 +51,10 @@ Window = tuple[slice, slice]
 
 
 def detail_window(shape: tuple[int, ...]) -> Window:
-    """Return the centre of a frame, which begins at an even row and column like the Bayer tile."""
-    rows, columns = (_centre(length, most) for length, most in zip(shape, PANEL_PX, strict=True))
-    return rows, columns
-
-
-def _centre(length: int, most: int) -> slice:
-    start = max(0, length - most) // 4 * 2
-    return slice(start, start + min(length, most))
+    """Find the centre of a frame, which begins at an even row and column like the Bayer tile."""
+    starts = [max(0, length - most) // 4 * 2 for length, most in zip(shape, PANEL_PX, strict=True)]
+    ends = [start + min(length, most) for start, length, most in zip(starts, shape, PANEL_PX, strict=True)]
+    return slice(starts[0], ends[0]), slice(starts[1], ends[1])
 
 
 def average_planes(raw: Mosaic, panel_px: tuple[int, int]) -> Float:
@@ -72,7 +68,7 @@ def average_planes(raw: Mosaic, panel_px: tuple[int, int]) -> Float:
 
 
 def planes_to_rgb(planes: Float, pattern: str) -> Float:
-    """Return the mean of each channel over each tile, ``[h, w, 4]`` to ``[h, w, 3]``.
+    """Average each channel over each tile, ``[h, w, 4]`` to ``[h, w, 3]``.
 
     Nothing is interpolated: a demosaicking filter would add colour to every edge.
     """
@@ -81,7 +77,7 @@ def planes_to_rgb(planes: Float, pattern: str) -> Float:
 
 
 def colour_sites(values: Float, pattern: str) -> Float:
-    """Return each value of a mosaic ``[H, W]`` in the channel of its filter, ``[H, W, 3]``; other channels are 0."""
+    """Put each value of a mosaic ``[H, W]`` into the channel of its filter, ``[H, W, 3]``; other channels are 0."""
     image = np.zeros((*values.shape, 3))
     for (y, x), channel in np.ndenumerate(np.array(tile(pattern))):
         image[y::2, x::2, channel] = values[y::2, x::2]
@@ -89,7 +85,7 @@ def colour_sites(values: Float, pattern: str) -> Float:
 
 
 def to_codes(values: Float) -> Picture:
-    """Return 8-bit codes of grey or RGB values, clipped to [0, 1], ``[H, W, 3]``."""
+    """Convert to 8-bit codes grey or RGB values, clipped to [0, 1], ``[H, W, 3]``."""
     codes = np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
     return np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes
 
@@ -110,7 +106,7 @@ def fit_image(values: NDArray[Any], panel_px: tuple[int, int]) -> Float:
 def lay_out(
     heading: Sequence[str], panels: Sequence[SheetPanel], panel_px: tuple[int, int] = PANEL_PX, columns: int = COLUMNS
 ) -> Picture:
-    """Return a sheet: a heading, then rows of panels with title and note, overview, and detail if a panel has one."""
+    """Lay out a sheet: a heading, then rows of panels with title and note, overview, and detail if a panel has one."""
     width = columns * (panel_px[1] + MARGIN_PX) + MARGIN_PX
     bands = [_beside([_text(heading, width - 2 * MARGIN_PX)], width)]
     for start in range(0, len(panels), columns):
@@ -127,7 +123,7 @@ def _blank(height: int, width: int, grey: int = PAPER) -> Picture:
 
 
 def _beside(boxes: Sequence[Picture], width: int) -> Picture:
-    """Return boxes of equal width in one row, the lower ones padded."""
+    """Put boxes of equal width in one row, the lower ones padded."""
     band = _blank(max(len(box) for box in boxes) + MARGIN_PX // 2, width)
     for number, box in enumerate(boxes):
         left = MARGIN_PX + number * (box.shape[1] + MARGIN_PX)
@@ -145,7 +141,7 @@ def _centred(values: Float | None, panel_px: tuple[int, int]) -> Picture:
 
 
 def _text(paragraphs: Sequence[str], width_px: int) -> Picture:
-    """Return paragraphs as a picture; characters that OpenCV's font lacks become question marks."""
+    """Draw paragraphs; characters that OpenCV's font lacks become question marks."""
     lines = [line for text in paragraphs for line in textwrap.wrap(text, width_px // CHARACTER_PX)]
     box = _blank(LINE_PX * len(lines) + MARGIN_PX // 2, width_px)
     for number, line in enumerate(lines, start=1):
