@@ -796,5 +796,5 @@ def test_profile_with_two_numbers_is_printed_without_table(run_main: RunMain, tm
     fill(tmp_path / "photos", 1)
     done = run_main("plan", "source.root=photos", "noise=imx385_iso3200")
     assert done.code == 0
-    assert "effect    heteroscedastic: on; " in done.out
+    assert "effects   heteroscedastic" in done.out
     assert "ns/pixel" not in done.out

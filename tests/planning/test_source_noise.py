@@ -18,7 +18,7 @@ from unprocess_gen.dataset.shards import json_inside
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.planning.source_noise import noise_ratio, source_noise_dn, tile_noise
-from unprocess_gen.reports.effect_summary import source_noise_sentences
+from unprocess_gen.reports.plan_text import source_noise_sentence
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.sources.loader import downscaled
 
@@ -99,11 +99,12 @@ def test_ratio_compares_with_simulated_noise_at_the_same_signal(plan: Plan, line
 
 
 def test_sentence_counts_noisy_sources_and_names_the_remedy() -> None:
-    (sentence,) = source_noise_sentences([0.1, 0.21, 0.4], downscale=2)
+    sentence = source_noise_sentence([0.1, 0.21, 0.4], downscale=2)
+    assert sentence is not None
     assert sentence.startswith("the noise of 2 of 3 sources exceeds a fifth of the simulated noise (0.1 to 0.4 of it)")
     assert sentence.endswith("source.downscale=4 averages it")
-    assert "downscale" not in source_noise_sentences([0.1], downscale=1)[0]
-    assert source_noise_sentences([], downscale=1) == []
+    assert "downscale" not in (source_noise_sentence([0.1], downscale=1) or "")
+    assert source_noise_sentence([], downscale=1) is None
 
 
 # ------------------------------------------------------------------------------------------------------------ datasets

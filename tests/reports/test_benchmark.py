@@ -30,7 +30,8 @@ from unprocess_gen.reports.benchmark.complete_runs import RunFiles, RunMeasureme
 from unprocess_gen.reports.benchmark.measure import TIER_CONFIGS, BenchmarkReport, Measurement
 from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, BenchmarkProfiles, SampleSizes
 from unprocess_gen.reports.benchmark.timing import measure_in_turns
-from unprocess_gen.reports.estimate import estimate_run, format_estimate
+from unprocess_gen.reports.estimate import estimate_run
+from unprocess_gen.reports.plan_text import format_estimate
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.sources.loader import list_photographs, load_source
 
@@ -504,14 +505,14 @@ def test_dataset_folder_and_file_are_refused(run_main: RunMain, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("tier", "budget"),
     [
-        ("exact", "clean 0 DN, normals within 1e-06 σ"),
-        ("fast", "clean within 1 DN, a fraction of 0.001 changed, normals within 0.001 σ"),
+        ("exact", "clean within 0 DN (0 % changed), normals within 1e-06 σ"),
+        ("fast", "clean within 1 DN (0.1 % changed), normals within 0.001 σ"),
     ],
 )
 def test_plan_compares_the_time_with_the_tiers(tier: str, budget: str, settings: Settings, tmp_path: Path) -> None:
     config = settings(f"source.root={fill(tmp_path / 'p', 2)}", f"accuracy={tier}")
-    text = format_estimate(config, estimate_run(config, 1, True, TIERS))
+    text = format_estimate(estimate_run(config, 1, True, TIERS))
 
-    assert f"\naccuracy  {tier}: {budget}, exact shot noise; " in text
+    assert f"\naccuracy  {tier}: {budget}, shot noise within 0 (CDF); " in text
     other = {"exact": "fast", "fast": "exact"}[tier]
     assert re.search(rf"; [\d.e+]+ ns per pixel here \({other} [\d.e+]+\)\n", text)

@@ -29,7 +29,8 @@ from unprocess_gen.core.types import Patch, PatchRule
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.pipeline.verify import verify
-from unprocess_gen.reports.estimate import estimate_run, format_estimate
+from unprocess_gen.reports.estimate import estimate_run
+from unprocess_gen.reports.plan_text import format_estimate
 from unprocess_gen.sources import loader as photographs
 from unprocess_gen.sources.patches import list_patches, pixels_in_none
 
@@ -291,7 +292,7 @@ def test_failure_of_a_small_image_is_explained(settings: Settings, tmp_path: Pat
     with pytest.raises(SourceError, match=f"^{why}"):
         photographs.load_source(config.source, source)
     assert "fails     000.png: too_small\n          16 x 12 pixels contain no patch" in format_estimate(
-        config, estimate_run(config, 1, True)
+        estimate_run(config, 1, True)
     )
 
 
@@ -430,7 +431,7 @@ def test_plan_reports_bytes_and_pairs_exactly(patch: str, sources: Path, make: M
     config = replaced(config, {"source.root": str(sources)})
     estimated = estimate_run(config, 1, read_all=True)
     assert (estimated.bytes, estimated.pairs) == (made.bytes, made.pairs)
-    assert f"pairs     {made.pairs}, in 2 shards of 2" in format_estimate(config, estimated)
+    assert f"pairs     {made.pairs}, in 2 shards of 2" in format_estimate(estimated)
 
 
 @pytest.mark.parametrize(
@@ -442,4 +443,4 @@ def test_plan_reports_bytes_and_pairs_exactly(patch: str, sources: Path, make: M
 )
 def test_plan_reports_patches_and_unused_pixels(patch: str, line: str, sources: Path, settings: Settings) -> None:
     config = settings(f"source.root={sources}", patch)
-    assert line in format_estimate(config, estimate_run(config, 1, True))
+    assert line in format_estimate(estimate_run(config, 1, True))

@@ -36,11 +36,12 @@ def plan(call: Call) -> int:
 
 def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunEstimate, list[str]]:
     from unprocess_gen.pipeline.executors.local import effective_jobs
-    from unprocess_gen.reports.estimate import estimate_run, format_estimate
+    from unprocess_gen.reports.estimate import estimate_run
+    from unprocess_gen.reports.plan_text import format_estimate
 
     estimate = estimate_run(config, effective_jobs(config.n_jobs, 10**6), read_all, _tiers())
     blank = [""] if label and not label.startswith("1/") else []
-    return 0, estimate, [*blank, f"out       {config.out}", format_estimate(config, estimate)]
+    return 0, estimate, [*blank, f"out       {config.out}", format_estimate(estimate)]
 
 
 def accuracy(call: Call) -> int:

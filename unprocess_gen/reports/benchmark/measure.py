@@ -38,7 +38,6 @@ from unprocess_gen.config.accuracy import METHODS, Method, methods_of_stage
 from unprocess_gen.config.interpretation import accuracy_budget, is_normalised, is_physical
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import ConfigError
-from unprocess_gen.core.types import Srgb
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.benchmark import complete_runs, methods
 from unprocess_gen.reports.benchmark import session as sessions
@@ -126,21 +125,6 @@ def measure_accuracy(
     runs = tuple(complete_runs.run_rows(run_times, noises, frames))
     photographs = f"{counted(files.count, 'photograph')} ({files.pixels / 1e6:.1f} megapixels)"
     return BenchmarkReport(rows, runs, session.given_tier, photographs, _conditions(session, files, command))
-
-
-def measure_tier_times(config: Config, tiers: dict[str, AccuracyConfig], srgb: Srgb) -> dict[str, float]:
-    """Quick estimates of the time of a pair under the given budget and every tier, ns per pixel, by name of the tier.
-
-    They are medians of three calls on crops of one image.
-    """
-    sizes = sessions.SampleSizes(sampled=(16, 16), readable=(64, 96), compiled=(384, 512))
-    all_tiers = {**tiers, config.accuracy.name: config.accuracy}
-    session = BenchmarkSession({GIVEN: sessions.as_mosaics(config)}, all_tiers, (), sizes)
-    image = sessions.cut_image("", ("0" * 64, 0), srgb, sizes)
-    for tier in all_tiers.values():
-        methods.pair_ns(session, GIVEN, tier, image.corner())
-    calls = {name: partial(_tier_ns, session, GIVEN, tier, [image]) for name, tier in all_tiers.items()}
-    return {name: statistics.median(times) for name, times in measure_in_turns(calls, 3).items()}
 
 
 # --------------------------------------------------------------------------------------------------------------- rows
