@@ -69,7 +69,7 @@ def _labelled(label: str, sentences: Iterable[str | None], indent: str = "") -> 
 
 
 def _patch_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
-    """What is cut from each image and the fraction of its pixels in no patch; nothing for complete images."""
+    """State what is cut from each image, and the fraction of its pixels in no patch; nothing for complete images."""
     rule, readable = patch_rule(config.source), [source for source in estimates if source.patches]
     cropped = sum(source.unused_pixels > 0 for source in readable)
     if not readable or (rule is None and not cropped):
