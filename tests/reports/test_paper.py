@@ -22,17 +22,10 @@ from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports import report_files
 from unprocess_gen.reports.paper import figures as paper_figures
 from unprocess_gen.reports.paper import pictures as figure_pictures
-from unprocess_gen.reports.paper import sources as paper_sources
+from unprocess_gen.reports.paper.figures import INTERPRETATIONS, PaperOptions, Saturation
 from unprocess_gen.reports.paper.pictures import PaperFigure
-from unprocess_gen.reports.paper.sources import (
-    INTERPRETATIONS,
-    ImageSaturation,
-    PaperOptions,
-    SaturationCounts,
-)
 from unprocess_gen.simulation.pair import reference_pair
 from unprocess_gen.simulation.reference.cfa import PATTERNS
-from unprocess_gen.sources.loader import list_photographs
 from unprocess_gen.sources.scenes import synthetic
 
 FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
@@ -40,8 +33,8 @@ FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
 
 @pytest.fixture(scope="module")
 def options() -> PaperOptions:
-    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_sources.GAINS}
-    return PaperOptions(gains, read_option(conf_dir() / "noise" / f"{paper_sources.AUTHORS_NOISE}.yaml", NoiseConfig))
+    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_figures.GAINS}
+    return PaperOptions(gains, read_option(conf_dir() / "noise" / f"{paper_figures.AUTHORS_NOISE}.yaml", NoiseConfig))
 
 
 @pytest.fixture(scope="module")
@@ -90,10 +83,8 @@ def test_counts_of_figure_6_agree_with_the_reference(
     srgb = synthetic.scene("dead_leaves-0")
     planes = srgb[0::2, 0::2, 0], srgb[0::2, 1::2, 1], srgb[1::2, 0::2, 1], srgb[1::2, 1::2, 2]
     before = sum(int((plane == 255).sum()) for plane in planes)
-    subject = paper_sources.load_figure_source(
-        settings("source.limit=1"), options, list_photographs(settings().source).sources
-    )
-    after = {name: reference_pair(srgb, subject.plans[name]).counts.saturated for name in paper_sources.GAINS}
+    subject = paper_figures.load_figure_source(settings("source.limit=1"), options)
+    after = {name: reference_pair(srgb, subject.plans[name]).counts.saturated for name in paper_figures.GAINS}
 
     listed = {
         line[0]: tuple(int(cell.split()[0].replace(",", "")) for cell in line[2:4])
@@ -120,16 +111,12 @@ def test_only_gains_above_one_add_saturation(drawn: list[PaperFigure]) -> None:
 )
 def test_match_means_more_saturation_in_the_bottom_row_only(top: int, bottom: int, fits: bool) -> None:
     interpretation = INTERPRETATIONS[0]
-    counted = {
-        interpretation.top: [ImageSaturation(100, 5, top)],
-        interpretation.bottom: [ImageSaturation(100, 5, bottom)],
-    }
-    assert SaturationCounts(counted).count_matching(interpretation) == fits
+    counted = Saturation([100], [5], {interpretation.top: [top], interpretation.bottom: [bottom]})
+    assert counted.count_matching(interpretation) == fits
 
 
 def test_multiplication_matches_the_caption_and_division_does_not(settings: Settings, options: PaperOptions) -> None:
-    config = settings("source.limit=5")
-    counted = paper_sources.count_saturation(config, options, list_photographs(config.source).sources)
+    counted = paper_figures.load_figure_source(settings("source.limit=5"), options).saturation
     by_formula, by_pictures = (counted.count_matching(interpretation) for interpretation in INTERPRETATIONS)
     assert by_formula == 0
     assert by_pictures >= 3

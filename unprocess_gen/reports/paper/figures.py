@@ -5,38 +5,38 @@ from the article's text; the functions give it the numbers of the photograph. Ra
 (black) to the highest (white), as in the article. The article's photographs are not published, so its claims are
 checked on other photographs: those of Figure 6 on up to `PHOTOGRAPHS_COUNTED`.
 
-Figure 6 of the article has two interpretations (`paper.sources.INTERPRETATIONS`). The formula divides by g_rgb, so the
+Figure 6 of the article has two interpretations (`INTERPRETATIONS`). The formula divides by g_rgb, so the
 largest g_rgb gives the darkest raw frame. The caption describes the most saturation for the largest g_rgb, which
 multiplication by g_rgb gives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import Config, GainsConfig, NoiseConfig
 from unprocess_gen.config.values import value_text
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.sequences import evenly_spaced
-from unprocess_gen.core.types import Float, Frame, Plan
+from unprocess_gen.core.types import Float, Frame, Plan, Srgb
+from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.reports.html_pages import PageTable, render_page
-from unprocess_gen.reports.paper import pictures, sources
+from unprocess_gen.reports.paper import pictures
 from unprocess_gen.reports.paper.pictures import BLUE, GREEN, GREY, INK, ORANGE, PaperFigure, percent, show_picture
-from unprocess_gen.reports.paper.sources import AUTHORS_NOISE, DEFAULT_GAINS, GAINS, FigureSource, PaperOptions
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.simulation.pair import make_pair
 from unprocess_gen.simulation.reference import isp, unprocess
-from unprocess_gen.simulation.reference.cfa import tile
-from unprocess_gen.sources.loader import list_photographs
+from unprocess_gen.simulation.reference.cfa import mosaic, tile
+from unprocess_gen.sources.loader import list_photographs, load_source
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-__all__ = ["AUTHORS_NOISE", "GAINS", "PaperFigure", "PaperOptions", "draw_figures", "write_figures"]
 
 PAGE = "figures.html"
 
@@ -54,12 +54,111 @@ CODES = np.arange(256, dtype=np.uint8)
 CROP_PX = 64
 """Side of the crops in Figure 5."""
 
+
+# ------------------------------------------------------------------------------------------------------- photographs
+
+
+class GainInterpretation(NamedTuple):
+    """One interpretation of Figure 6: its description, and the gains (options of ``conf/gains``) of its two rows."""
+
+    description: str
+    top: str
+    bottom: str
+
+
+INTERPRETATIONS = (
+    GainInterpretation("with the formula, which divides by g_rgb", "paper_min", "paper_max"),
+    GainInterpretation("with the pictures, which multiply by it", "fig6_top", "fig6_bottom"),
+)
+DEFAULT_GAINS = "fixed"
+GAINS = (DEFAULT_GAINS, *(name for reading in INTERPRETATIONS for name in (reading.top, reading.bottom)))
+"""The options of ``conf/gains`` that the figures need."""
+
 SMALL_GAINS, LARGE_GAINS = "paper_max", "fig6_bottom"
 """The options of `GAINS` with the smallest and the largest inverse gains."""
 
+AUTHORS_NOISE = "imx385_iso3200_rvdd"
+"""The option of ``conf/noise`` with the noise profile of the article's author."""
+
+
+@dataclass(frozen=True, slots=True)
+class PaperOptions:
+    """The settings that the article fixes: the gains of `GAINS` by name, and its author's noise profile."""
+
+    gains: Mapping[str, GainsConfig]
+    authors_noise: NoiseConfig
+
+
+@dataclass(slots=True)
+class Saturation:
+    """Site counts of several photographs, the one in the figures first, and the photographs that cannot be read.
+
+    ``sites`` counts all, ``before`` those at the highest code before unprocessing, ``after`` those at white in the
+    clean frame for each option of `GAINS`.
+    """
+
+    sites: list[int] = field(default_factory=list)
+    before: list[int] = field(default_factory=list)
+    after: dict[str, list[int]] = field(default_factory=lambda: {name: [] for name in GAINS})
+    failed: list[str] = field(default_factory=list)
+
+    def count_matching(self, interpretation: GainInterpretation) -> int:
+        """Count the photographs that match the caption of Figure 6: more saturation in the bottom row only."""
+        columns = zip(self.before, self.after[interpretation.top], self.after[interpretation.bottom], strict=True)
+        return sum(top <= before < bottom for before, top, bottom in columns)
+
+
+@dataclass(frozen=True, slots=True)
+class FigureSource:
+    """The photograph in the figures, its plan for each option of `GAINS`, its plan with the author's noise, counts."""
+
+    name: str
+    srgb: Srgb
+    plans: Mapping[str, Plan]
+    authors: Plan
+    saturation: Saturation
+
+
+def load_figure_source(config: Config, options: PaperOptions) -> FigureSource:
+    """Read evenly spaced photographs, one at a time, and count their saturated sites; the first one is in the figures.
+
+    ConfigError if none can be read.
+    """
+    sources = evenly_spaced(list_photographs(config.source).sources, PHOTOGRAPHS_COUNTED)
+    saturation, subject = Saturation(), None
+    for source in sources:
+        try:
+            sha256, photograph = load_source(config.source, source)
+        except SourceError as error:
+            saturation.failed.append(f"{source.name} ({error.reason})")
+            continue
+        srgb, identity = photograph.srgb, source.stream_identity(sha256)
+        plans = {name: plan_image(replace(config, gains=options.gains[name]), *identity) for name in GAINS}
+        if subject is None:
+            authors = replace(config, noise=options.authors_noise, gains=options.gains[DEFAULT_GAINS])
+            subject = FigureSource(source.name, srgb, plans, plan_image(authors, *identity), saturation)
+        before = saturated_sites(srgb, config.sensor.pattern)
+        saturation.sites.append(before.size)
+        saturation.before.append(int(before.sum()))
+        for name, plan in plans.items():
+            saturation.after[name].append(make_pair(srgb, plan).counts.saturated)
+    if subject is None:
+        raise ConfigError(
+            f"source.root={config.source.root}: none of {len(sources)} photographs can be read; expected at least one"
+        )
+    return subject
+
+
+def saturated_sites(srgb: Srgb, pattern: str) -> NDArray[np.bool_]:
+    """The sites whose channel has the highest code in the photograph, ``[H, W]``."""
+    return np.asarray(mosaic(srgb.astype(np.float64), pattern) == np.iinfo(srgb.dtype).max)
+
+
+# ------------------------------------------------------------------------------------------------------------ figures
+
 
 def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
-    """Figures 2 to 7 for the first readable photograph of the source of a validated config.
+    """Draw Figures 2 to 7 for the first readable photograph of the source of a validated config.
 
     ConfigError if no photograph can be read, or ``source.patch`` is set.
     """
@@ -70,12 +169,10 @@ def draw_figures(config: Config, options: PaperOptions) -> list[PaperFigure]:
             f"source.patch={value_text(config.source.patch)}: the figures show complete photographs; expected null; "
             "leave it out"
         )
-    listed = list_photographs(config.source).sources
-    source = sources.load_figure_source(config, options, listed)
-    counts = sources.count_saturation(config, options, evenly_spaced(listed, PHOTOGRAPHS_COUNTED))
+    source = load_figure_source(config, options)
+    draw = (draw_tone, draw_gamma, draw_highlight_function, draw_default_raw, draw_saturation, draw_highlights)
     with rc_context(pictures.STYLE):
-        curves = [draw_tone(source), draw_gamma(source), draw_highlight_function(source)]
-        return [*curves, draw_default_raw(source), draw_saturation(source, counts), draw_highlights(source)]
+        return [function(source) for function in draw]
 
 
 def write_figures(figures: Sequence[PaperFigure], out: Path, command: str) -> list[str]:
@@ -90,26 +187,30 @@ def figures_page(figures: Sequence[PaperFigure], command: str) -> str:
     return render_page("paper_figures.html", title="Figures of the article", command=command, figures=figures)
 
 
+def _draw_inverse(axes: Axes, inputs: Float, forward: tuple[Float, str], inverse: tuple[Float, str], most: int) -> None:
+    """Draw a curve and its inverse, with the identity."""
+    axes.plot(inputs, inputs, color=GREY, linewidth=1, linestyle=":", label="identity")
+    for (values, label), colour in ((forward, ORANGE), (inverse, BLUE)):
+        axes.plot(inputs, values, color=colour, label=label)
+    limits = {"xlabel": "input", "ylabel": "output", "xlim": (0, most), "ylim": (0, most), "aspect": "equal"}
+    pictures.finish_curves(axes, "curves", **limits)
+
+
 def draw_tone(source: FigureSource) -> PaperFigure:
     """Figure 2: the tone curve, its inverse, and the photograph before and after the inverse."""
     figure, (curves, before, after, histogram) = pictures.panel_grid(2, 2, 8.4, 0.85)
     x = np.linspace(0, 1, 256)
-    inverse = unprocess.linear_light(CODES, "smoothstep", 1.0)
-    curves.plot(x, x, color=GREY, linewidth=1, linestyle=":", label="identity")
-    curves.plot(x, isp.smoothstep(x), color=ORANGE, label="tone curve 3x² − 2x³")
-    curves.plot(x, unprocess.inverse_smoothstep(x, 1 - x), color=BLUE, label="inverse")
-    curves.set(xlabel="input", ylabel="output", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    forward, backward = isp.smoothstep(x), unprocess.inverse_smoothstep(x, 1 - x)
+    _draw_inverse(curves, x, (forward, "tone curve 3x² − 2x³"), (backward, "inverse"), 1)
     small = pictures.small_photograph(source.srgb)
     show_picture(before, small, "photograph")
     show_picture(after, unprocess.inverse_smoothstep(small, 1 - small), "after the inverse tone curve")
+    inverse = unprocess.linear_light(CODES, "smoothstep", 1.0)
     codes = source.srgb if source.srgb.dtype == np.uint8 else (source.srgb >> 8).astype(np.uint8)
     shares = np.bincount(codes.ravel(), minlength=256) / codes.size
     for values, label, colour in ((CODES / 255, "photograph", ORANGE), (inverse, "after the inverse", BLUE)):
         histogram.hist(values, bins=64, range=(0, 1), weights=shares, histtype="step", color=colour, label=label)
-    histogram.set(xlabel="value", ylabel="fraction of all values", xlim=(0, 1))
-    for axes, title in ((curves, "curves"), (histogram, "histogram")):
-        axes.set_title(title, loc="left")
-        axes.legend(frameon=False)
+    pictures.finish_curves(histogram, "histogram", xlabel="value", ylabel="fraction of all values", xlim=(0, 1))
     as_written = 0.5 - np.sin(np.arcsin(1 - 2 * (CODES / 255)) / 3)
     numbers = {
         "name": source.name,
@@ -128,16 +229,12 @@ def draw_gamma(source: FigureSource) -> PaperFigure:
     panels = figure.subplot_mosaic(
         [["curve", "gradient"], ["curve", "compressed"], ["untoned", "linear"], ["untoned", "linear"]]
     )
-    curve = panels["curve"]
-    curve.plot(u * 255, u * 255, color=GREY, linewidth=1, linestyle=":", label="identity")
-    curve.plot(u * 255, isp.compress_gamma(u, GAMMA) * 255, color=ORANGE, label="v = u^(1/2.2)")
-    curve.plot(u * 255, unprocess.expand_gamma(u, GAMMA) * 255, color=BLUE, label="inverse, u = v^2.2")
-    curve.set(xlabel="input", ylabel="output", xlim=(0, 255), ylim=(0, 255), aspect="equal")
-    curve.set_title("curves", loc="left")
-    curve.legend(frameon=False, loc="upper left")
-    compressed = np.tile(isp.compress_gamma(u, GAMMA), (48, 1))
+    compressed, expanded = isp.compress_gamma(u, GAMMA), unprocess.expand_gamma(u, GAMMA)
+    _draw_inverse(
+        panels["curve"], u * 255, (compressed * 255, "v = u^(1/2.2)"), (expanded * 255, "inverse, u = v^2.2"), 255
+    )
     show_picture(panels["gradient"], np.tile(u, (48, 1)), "linear gradient, 0 to 255")
-    show_picture(panels["compressed"], compressed, "gradient after gamma compression")
+    show_picture(panels["compressed"], np.tile(compressed, (48, 1)), "gradient after gamma compression")
     small = pictures.small_photograph(source.srgb)
     untoned = unprocess.inverse_smoothstep(small, 1 - small)
     show_picture(panels["untoned"], untoned, "after the inverse tone curve")
@@ -185,16 +282,14 @@ def draw_default_raw(source: FigureSource) -> PaperFigure:
     signal = np.linspace(0, 400, 401)
     for noise, label, colour in ((plan.noise, "in (c)", BLUE), (authors.noise, "author's line", ORANGE)):
         axes[5].plot(signal, np.sqrt(np.maximum(noise.a_dn * signal + noise.b_dn2, 0)), color=colour, label=label)
-    axes[5].set(xlabel="DN above black", ylabel="standard deviation, DN", xlim=(0, 400))
+    pictures.finish_curves(axes[5], "noise", xlabel="DN above black", ylabel="standard deviation, DN", xlim=(0, 400))
     axes[5].set_ylim(bottom=0)
-    axes[5].set_title("noise", loc="left")
-    axes[5].legend(frameon=False)
     numbers = {
         "name": source.name,
         "plan": plan,
         "authors": authors.noise,
         "saturated": percent(pair.counts.saturated, pair.clean.size),
-        "before": percent(sources.saturated_sites(source.srgb, plan.sensor.pattern).sum(), pair.clean.size),
+        "before": percent(saturated_sites(source.srgb, plan.sensor.pattern).sum(), pair.clean.size),
         "zero_variance": percent(authors_pair.counts.zero_variance, pair.clean.size),
     }
     return PaperFigure("fig5.png", pictures.png(figure), numbers)
@@ -208,34 +303,34 @@ def _typical_crop(clean: Frame) -> tuple[slice, slice]:
     return sorted(squares, key=lambda square: float(clean[square].std()))[len(squares) // 2]
 
 
-def draw_saturation(source: FigureSource, counts: sources.SaturationCounts) -> PaperFigure:
+def draw_saturation(source: FigureSource) -> PaperFigure:
     """Figure 6: clean frames and their saturated sites at the extreme gains, in both interpretations."""
     figure, axes = pictures.panel_grid(2, 4, 11.0, pictures.panel_aspect(source.srgb))
-    for column, reading in enumerate(sources.INTERPRETATIONS):
-        for row, name in enumerate((reading.top, reading.bottom)):
+    panels, counts = iter(axes), source.saturation
+    for row in ("top", "bottom"):
+        for reading in INTERPRETATIONS:
+            name = getattr(reading, row)
             plan = source.plans[name]
             clean = make_pair(source.srgb, plan).clean
             saturated = clean == plan.sensor.white_level_dn
-            pictures.show_stretched(axes[row * 4 + column * 2], clean, f"{'bottom' if row else 'top'}: {name}")
+            pictures.show_stretched(next(panels), clean, f"{row}: {name}")
             fractions = pictures.channel_fractions(saturated, plan.sensor.pattern)
-            title = f"saturated: {percent(saturated.sum(), clean.size)}"
-            show_picture(axes[row * 4 + column * 2 + 1], fractions, title)
+            show_picture(next(panels), fractions, f"saturated: {percent(saturated.sum(), clean.size)}")
     lines = []
-    for name in GAINS:
-        first, images = counts.by_gains[name][0], counts.by_gains[name]  # the first is the one in the figure
-        sites, before, after = (sum(image[index] for image in images) for index in range(3))
+    for name, after in counts.after.items():
         inverse_gains = ", ".join(f"{gain:.3g}" for gain in source.plans[name].camera.inverse_gains)
-        of_first = [f"{count:,} ({percent(count, first.sites)})" for count in (first.before, first.after)]
-        more = f"{sum(image.after > image.before for image in images)} of {len(images)}"
-        lines.append((name, inverse_gains, *of_first, percent(before, sites), percent(after, sites), more))
+        own = [f"{count:,} ({percent(count, counts.sites[0])})" for count in (counts.before[0], after[0])]
+        total = [percent(sum(images), sum(counts.sites)) for images in (counts.before, after)]
+        more = sum(image > before for before, image in zip(counts.before, after, strict=True))
+        lines.append((name, inverse_gains, *own, *total, f"{more} of {len(after)}"))
     headings = (
         *("gains", "inverse gains R, G, B", "saturated in the photograph", "in its raw frame"),
         *("in all photographs", "in all raw frames", "photographs with more than before"),
     )
     numbers = {
         "name": source.name,
-        "readings": [(reading, counts.count_matching(reading)) for reading in sources.INTERPRETATIONS],
-        "counted": len(counts.by_gains[DEFAULT_GAINS]),
+        "readings": [(reading, counts.count_matching(reading)) for reading in INTERPRETATIONS],
+        "counted": len(counts.sites),
         "failed": counts.failed,
     }
     return PaperFigure("fig6.png", pictures.png(figure), numbers, PageTable(headings, lines, range(1, len(headings))))
@@ -282,6 +377,5 @@ def _draw_profile(axes: Axes, with_function: Frame, without: Frame, added: Float
     for frame, label, colour in ((with_function, "with the function", BLUE), (without, "without", ORANGE)):
         values = (frame[row, start::2].astype(np.float64) - black_dn) / (white_dn - black_dn)
         axes.plot(columns, values, color=colour, linewidth=0.8, label=label)
-    axes.set(xlabel="column", ylabel="fraction of white", ylim=(-0.03, 1.03))
-    axes.set_title(f"green sites of row {row}", loc="left")
-    axes.legend(frameon=False, loc="upper left")
+    labels = {"xlabel": "column", "ylabel": "fraction of white", "ylim": (-0.03, 1.03)}
+    pictures.finish_curves(axes, f"green sites of row {row}", **labels)

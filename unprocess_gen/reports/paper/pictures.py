@@ -77,6 +77,13 @@ def show_stretched(axes: Axes, raw: Frame, title: str) -> None:
     show_picture(axes, block_means(raw, is_mosaic=True), title, float(raw.min()), float(raw.max()))
 
 
+def finish_curves(axes: Axes, title: str, **settings: Any) -> None:
+    """Set title, labels and limits of a panel with curves, and show what they are."""
+    axes.set(**settings)
+    axes.set_title(title, loc="left")
+    axes.legend(frameon=False)
+
+
 def panel_grid(rows: int, columns: int, width: float, aspect: float) -> tuple[Figure, list[Axes]]:
     """A figure ``width`` inches wide with equal panels whose heights are ``aspect`` times their widths."""
     from matplotlib.figure import Figure
