@@ -16,11 +16,10 @@ from unprocess_gen.config.accuracy import (
     IMPLEMENTATIONS,
     METHODS,
     STAGES,
-    Budget,
     choose_methods,
     methods_of_stage,
 )
-from unprocess_gen.config.interpretation import accuracy_budget
+from unprocess_gen.config.schema import AccuracyConfig
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import NEAR_NORMAL
@@ -30,8 +29,8 @@ from unprocess_gen.simulation.pair import make_pair, reference_pair
 from unprocess_gen.sources.scenes import synthetic
 
 METHODS_BY_NAME = {method.spelled: method for method in METHODS}
-EXACT = Budget("exact", False, 0.0, 0.0, 1e-6, 0.0)
-ALL = Budget("anything", False, math.inf, 1.0, math.inf, 1.0)
+EXACT = AccuracyConfig("exact", False, 0.0, 0.0, 1e-6, 0.0)
+ALL = AccuracyConfig("anything", False, math.inf, 1.0, math.inf, 1.0, normal_shot=False)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +43,7 @@ def scene() -> np.ndarray:
 
 @pytest.mark.parametrize("tier", ["reference", "exact", "fast"])
 def test_each_tier_has_a_method_for_every_stage(settings: Settings, tier: str) -> None:
-    chosen = choose_methods(accuracy_budget(settings(f"accuracy={tier}").accuracy), counts_electrons=True)
+    chosen = choose_methods(settings(f"accuracy={tier}").accuracy, counts_electrons=True)
 
     assert [one.partition(":")[0] for one in chosen] == list(STAGES)
 
@@ -70,7 +69,7 @@ def test_normals_replace_counts_only_if_the_settings_ask_for_it(changes: dict[st
     distance=st.sampled_from([0.0, 5e-3]),
 )
 def test_chosen_methods_fit_and_nothing_cheaper_does(dn: float, share: float, normal: float, distance: float) -> None:
-    some = Budget("some", False, dn, share, normal, distance)
+    some = AccuracyConfig("some", False, dn, share, normal, distance, normal_shot=False)
     chosen = [METHODS_BY_NAME[spelled] for spelled in choose_methods(some, counts_electrons=False)]
     cheaper = IMPLEMENTATIONS[: IMPLEMENTATIONS.index(chosen[0].implementation)]
 
@@ -91,15 +90,15 @@ def test_noise_without_counts_has_no_shot_method() -> None:
 
 
 def test_reference_tier_uses_numpy_methods_only(settings: Settings) -> None:
-    chosen = choose_methods(accuracy_budget(settings("accuracy=reference").accuracy), counts_electrons=True)
+    chosen = choose_methods(settings("accuracy=reference").accuracy, counts_electrons=True)
 
     assert all(one.readable for one in METHODS if one.spelled in set(chosen))
 
 
 def test_custom_budget_chooses_by_its_limits(settings: Settings) -> None:
     limits = ("accuracy.name=mine", "accuracy.normal_error=6e-4", "accuracy.clean_dn=1")
-    own = accuracy_budget(settings(*limits, "accuracy.clean_changed_share=1e-3").accuracy)
-    stricter = accuracy_budget(settings(*limits, "accuracy.clean_changed_share=1e-4").accuracy)
+    own = settings(*limits, "accuracy.clean_changed_share=1e-3").accuracy
+    stricter = settings(*limits, "accuracy.clean_changed_share=1e-4").accuracy
 
     assert "normal:polynomial_float32" in choose_methods(own, counts_electrons=False)
     assert "normal:quadratic_float64" in choose_methods(stricter, counts_electrons=False)
@@ -132,7 +131,7 @@ def test_plan_contains_the_methods_of_its_tier(settings: Settings, noise: str, s
     plan = plan_image(config, "ab" * 32, 0, facts_for(config, scene))
 
     assert (plan.accuracy.name, plan.accuracy.law_distance) == ("fast", 5e-3)
-    assert plan.accuracy.methods == choose_methods(accuracy_budget(config.accuracy), noise == "noise=nikon_d850")
+    assert plan.accuracy.methods == choose_methods(config.accuracy, noise == "noise=nikon_d850")
 
 
 @pytest.mark.parametrize("noise", ["noise=imx385_iso3200", "noise=sony_a7s2"])

@@ -19,7 +19,6 @@ from helpers.datasets import Settings, TreeHash
 
 import unprocess_gen as ug
 from unprocess_gen.config.accuracy import choose_methods
-from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import dataset_yaml, parse_dataset_yaml, read_dataset_yaml
 from unprocess_gen.core.types import NEAR_NORMAL
@@ -111,7 +110,7 @@ def test_new_fast_settings_count_electrons(fast: Path, settings: Settings) -> No
 
     changed = set(dataset_yaml(new).splitlines()) ^ set(text.splitlines())
     assert changed == {"  normal_shot: false"}
-    assert NEAR_NORMAL not in choose_methods(accuracy_budget(new.accuracy), counts_electrons=True)
+    assert NEAR_NORMAL not in choose_methods(new.accuracy, counts_electrons=True)
     with_two_numbers = settings("accuracy=fast")
     assert "normal_shot" not in dataset_yaml(with_two_numbers)  # as 0.2 recorded it
 

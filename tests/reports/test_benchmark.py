@@ -18,7 +18,6 @@ from helpers.photographs import fill
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import METHODS, STAGES, Method, choose_methods
-from unprocess_gen.config.interpretation import accuracy_budget
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SceneConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
@@ -97,8 +96,8 @@ def test_only_fused_readout_has_no_time(measured: BenchmarkReport) -> None:
 
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.spelled)
 def test_budget_for_a_method_chooses_it_and_changes_no_other(method: Method) -> None:
-    budget = accuracy_budget(session.budget_for(method, TIERS))
-    exact = set(choose_methods(accuracy_budget(TIERS[EXACT]), counts_electrons=True))
+    budget = session.budget_for(method, TIERS)
+    exact = set(choose_methods(TIERS[EXACT], counts_electrons=True))
 
     assert method.spelled in session.chosen_methods(budget)
     if method.implementation == "float64":

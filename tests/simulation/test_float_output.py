@@ -23,8 +23,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
-from unprocess_gen.config.accuracy import Budget, choose_methods
-from unprocess_gen.config.schema import replaced
+from unprocess_gen.config.accuracy import choose_methods
+from unprocess_gen.config.schema import AccuracyConfig, replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core import random_streams as streams
 from unprocess_gen.core.lookup_tables import tukey_table
@@ -279,7 +279,8 @@ def test_packed_frames_contain_the_values_of_mosaics(name: str) -> None:
 
 @pytest.mark.parametrize("counts", [False, True])
 def test_all_budgets_except_reference_select_the_same_methods(counts: bool) -> None:
-    exact, fast = Budget("e", False, 0, 0, 1e-6, 0), Budget("f", False, 1, 1e-3, 1e-3, 5e-3)
+    exact = AccuracyConfig("e", False, 0, 0, 1e-6, 0)
+    fast = AccuracyConfig("f", False, 1, 1e-3, 1e-3, 5e-3, normal_shot=False)
     assert choose_methods(exact, counts, normalised=True) == choose_methods(fast, counts, normalised=True)
     assert not any(one.startswith("quantise:") for one in choose_methods(exact, counts, normalised=True))
 

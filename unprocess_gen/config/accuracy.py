@@ -17,45 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from unprocess_gen.config.schema import AccuracyConfig
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import CameraPlan
-
-
-@dataclass(frozen=True, slots=True)
-class Budget:
-    """Limit the errors accepted for speed.
-
-    Attributes
-    ----------
-    name : str
-        Name of the tier, recorded in each row.
-    readable : bool
-        Allow only the NumPy reference.
-    clean_dn : float
-        Largest error of a clean value, DN.
-    clean_changed_share : float
-        Largest fraction of clean values that differ, at 14 bits.
-    normal_error : float
-        Largest error of a normal deviate, in standard deviations.
-    law_distance : float
-        Largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead, by
-        the first Edgeworth term (`simulation.reference.near_normal.gaussian_distance`).
-    normal_shot : bool
-        Whether normals are drawn instead within ``law_distance``, as in versions 0.1 and 0.2.
-    """
-
-    name: str
-    readable: bool
-    clean_dn: float
-    clean_changed_share: float
-    normal_error: float
-    law_distance: float
-    normal_shot: bool = False
-
-    @property
-    def draws_normals(self) -> bool:
-        """True if normals replace counts."""
-        return self.normal_shot and self.law_distance > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +35,9 @@ class Method:
     meaning : str
         Description for the accuracy report.
     clean_dn, clean_changed_share, normal_error : float
-        Largest errors; units as in `Budget`.
+        Largest errors; units as in `AccuracyConfig`.
     approximates_law : bool
-        Whether a normal distribution replaces the Poisson distribution within ``Budget.law_distance``.
+        Whether a normal distribution replaces the Poisson distribution within ``AccuracyConfig.law_distance``.
     """
 
     stage: str
@@ -95,7 +59,7 @@ class Method:
         """Return whether the method belongs to the NumPy reference."""
         return self.implementation == "numpy"
 
-    def fits(self, budget: Budget) -> bool:
+    def fits(self, budget: AccuracyConfig) -> bool:
         """Return whether all errors of the method are within a budget."""
         return (
             (self.readable or not budget.readable)
@@ -171,13 +135,13 @@ def is_steep(camera: CameraPlan, exposure: float) -> bool:
 
 
 def choose_methods(
-    budget: Budget, counts_electrons: bool, normalised: bool = False, steep: bool = False
+    budget: AccuracyConfig, counts_electrons: bool, normalised: bool = False, steep: bool = False
 ) -> tuple[str, ...]:
     """Choose a method for each stage: the cheapest implementation whose errors are within the budget.
 
     Parameters
     ----------
-    budget : Budget
+    budget : AccuracyConfig
         Limits on the errors.
     counts_electrons : bool
         Whether the noise has Poisson counts, which have no float32 implementation.
@@ -215,13 +179,13 @@ def methods_of_stage(stage: str) -> tuple[Method, ...]:
     return tuple(method for method in METHODS if method.stage == stage)
 
 
-def _first(stage: str, implementation: str, budget: Budget) -> Method | None:
+def _first(stage: str, implementation: str, budget: AccuracyConfig) -> Method | None:
     """Return the cheapest method of a stage and implementation within a budget."""
     candidates = (method for method in methods_of_stage(stage) if method.implementation == implementation)
     return next((method for method in candidates if method.fits(budget)), None)
 
 
-def _smallest_error(stages: Sequence[str], budget: Budget) -> str:
+def _smallest_error(stages: Sequence[str], budget: AccuracyConfig) -> str:
     """Return a message about the first limit that no method keeps, with the smallest error possible."""
     for key in ("clean_dn", "clean_changed_share", "normal_error"):
         for stage in stages:

@@ -15,9 +15,8 @@ from typing import Any
 
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, spelled
 from unprocess_gen.config.limits import Drawn
-from unprocess_gen.config.values import is_number, value_text
+from unprocess_gen.config.values import is_number, refusal
 from unprocess_gen.core import fixed_point
-from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.exact_distributions import DIGITS, normal_cdf, normal_quantile
 from unprocess_gen.core.types import Distribution
 
@@ -183,14 +182,14 @@ def parse_distribution(key: str, value: Any, allowed: tuple[str, ...]) -> Distri
     if is_number(value):
         return Distribution("constant", (float(value),))
     if not isinstance(value, list | tuple) or not value or value[0] not in allowed:
-        raise ConfigError(f"{key}={value_text(value)}: expected a finite number or a distribution: {forms}")
+        raise refusal(key, value, f"expected a finite number or a distribution: {forms}")
     kind, numbers = str(value[0]), value[1:]
     form = DISTRIBUTION_FORMS[kind]
     if (len(numbers) != len(form.numbers) and kind != "choice") or not all(is_number(number) for number in numbers):
-        raise ConfigError(f"{key}={value_text(value)}: expected finite numbers: {spelled(kind, form)}")
+        raise refusal(key, value, f"expected finite numbers: {spelled(kind, form)}")
     problem = _PROBLEMS[kind](*numbers)
     if problem:
-        raise ConfigError(f"{key}={value_text(value)}: {problem}")
+        raise refusal(key, value, problem)
     return Distribution(kind, tuple(float(number) for number in numbers))
 
 
@@ -203,7 +202,7 @@ def parse_drawn(key: str, value: Any, limit: Drawn) -> Distribution:
     if distribution.kind != "log_linear_in_a" and not (
         limit.low <= lowest(distribution) and highest(distribution) <= limit.high
     ):
-        raise ConfigError(f"{key}={value_text(value)}: expected {limit.range}")
+        raise refusal(key, value, f"expected {limit.range}")
     return distribution
 
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-from unprocess_gen.config.accuracy import Budget
 from unprocess_gen.config.distributions import lowest, parse_drawn
 from unprocess_gen.config.limits import (
     DEQUANTIZE,
@@ -27,7 +26,6 @@ from unprocess_gen.config.limits import (
 )
 from unprocess_gen.config.schema import (
     BRANCH_FIELDS,
-    AccuracyConfig,
     BranchConfig,
     Config,
     EffectsConfig,
@@ -36,8 +34,7 @@ from unprocess_gen.config.schema import (
     ProvenanceConfig,
     SourceConfig,
 )
-from unprocess_gen.config.values import is_integer, is_number, value_text
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
 from unprocess_gen.simulation.effects import BY_NAME
 from unprocess_gen.simulation.effects.dark_current import HEAT
@@ -62,7 +59,7 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
     a = parse_drawn("noise.a", noise.a, VARIANCE_SLOPE)
     b = parse_drawn("noise.b", noise.b, VARIANCE_OFFSET)
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
-        raise ConfigError(f"noise.a={value_text(noise.a)}: expected more than 0, because noise.b depends on ln a")
+        raise refusal("noise.a", noise.a, "expected more than 0, because noise.b depends on ln a")
     return a, b
 
 
@@ -75,7 +72,7 @@ def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
     if is_integer(levels) and 1 <= levels <= MAX_LEVELS:
         return (noise,) * levels
     if not isinstance(levels, list | tuple) or not 1 <= len(levels) <= MAX_LEVELS:
-        raise ConfigError(f"noise.levels={value_text(levels)}: expected {LEVELS}")
+        raise refusal("noise.levels", levels, f"expected {LEVELS}")
     return tuple(_level(noise, level) for level in levels)
 
 
@@ -86,10 +83,8 @@ def _level(noise: NoiseConfig, level: Any) -> NoiseConfig:
         return dataclasses.replace(noise, a=level["a"], b=level["b"])
     wanted = "an ISO" if is_physical(noise) else "{a: …, b: …}"
     advice = "; for ISOs, choose a physical profile" if is_number(level) else ""
-    raise ConfigError(
-        f"noise.levels={value_text(noise.levels)}: {value_text(level)} is not {wanted}; expected a list of them for "
-        f"noise={noise.name}, or how many levels{advice}"
-    )
+    expected = f"expected a list of them for noise={noise.name}, or how many levels"
+    raise refusal("noise.levels", noise.levels, f"{value_text(level)} is not {wanted}; {expected}{advice}")
 
 
 # --------------------------------------------------------------------------------------------------- noise profiles
@@ -216,7 +211,7 @@ def patch_rule(source: SourceConfig) -> PatchRule | None:
             return PatchRule("grid", side, stride=stride)
         case ["random", side, count] if _is_patch_length(side) and _is_patch_count(count):
             return PatchRule("random", side, count=count)
-    raise ConfigError(f"source.patch={value_text(source.patch)}: expected {PATCH}")
+    raise refusal("source.patch", source.patch, f"expected {PATCH}")
 
 
 def _is_patch_length(value: Any) -> bool:
@@ -269,8 +264,3 @@ def has_float_clean(config: Config) -> bool:
 def is_normalised(config: Config) -> bool:
     """Return whether noisy frames are normalised."""
     return config.output.dtype == FLOAT32
-
-
-def accuracy_budget(accuracy: AccuracyConfig) -> Budget:
-    """Convert the configured limits on errors."""
-    return Budget(**dataclasses.asdict(accuracy))

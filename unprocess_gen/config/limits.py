@@ -45,7 +45,7 @@ class Boolean(Limit):
 class Choice(Limit):
     """One of a few words."""
 
-    def __init__(self, words: tuple[str, ...]) -> None:
+    def __init__(self, *words: str) -> None:
         self.words = words
         super().__init__(
             f"one of {', '.join(words)}",
@@ -193,14 +193,14 @@ MAX_BRANCH_NUMBER = 1e9
 
 MAX_ISO = 1e7
 
-SWITCH = Switch(("auto", "on", "off"))
+SWITCH = Switch("auto", "on", "off")
 """Values of each effect."""
 
-SCATTER = Switch(("off", "unit", "body", "image"))
+SCATTER = Switch("off", "unit", "body", "image")
 
-DEQUANTIZE = Switch(("off", "dither", "dither_all"))
+DEQUANTIZE = Switch("off", "dither", "dither_all")
 
-CAMERA_LAWS = Choice(("fixed", "convex", "choice", "identity", "custom"))
+CAMERA_LAWS = Choice("fixed", "convex", "choice", "identity", "custom")
 
 GAIN_TEXT = f"a gain above 0, from {MIN_GAIN:g} to {MAX_GAIN:g}"
 GAIN = Drawn(("uniform", "truncated_normal"), MIN_GAIN, MAX_GAIN, GAIN_TEXT)
@@ -232,6 +232,11 @@ PATCH = Described(
     f"{MIN_PATCH} to {MAX_PATCH} pixels, count is 1 to {MAX_RANDOM_PATCHES}"
 )
 LEVELS = Described(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
+DIGEST = Limit(
+    "64 hexadecimal digits",
+    lambda value: re.fullmatch("[0-9a-f]{64}", value) is not None,
+    lambda value: value_text(value)[:80],
+)
 ISO_RANGE = Described("the lowest and the highest ISO, [100, 6400]")
 BLACK_ERROR = Described(
     "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "

@@ -1,8 +1,8 @@
 """Define the configuration as typed dataclasses: one for each folder of ``conf/``, and `Config` for all of them.
 
-Each key is declared once, with its meaning, unit and allowed values (`settings.key`). OmegaConf checks keys and types
-against these dataclasses; `validation` checks values by the same declarations. A config is immutable and hashable:
-lists become tuples. `replaced` returns a copy with other values.
+Each key is declared once, with its unit and allowed values (`settings.key`); the docstring of its group has its
+meaning. OmegaConf checks keys and types against these dataclasses; `validation` checks values by the same declarations.
+A config is immutable and hashable: lists become tuples. `replaced` returns a copy with other values.
 
 A parameter that is drawn for every image is a number or a distribution, written as a list: ``[uniform, 1.9, 2.4]``. An
 override replaces a list completely. A mapping would be merged with the default's mapping, into a mixture of both.
@@ -63,156 +63,166 @@ class Group:
 @documented
 @dataclass(frozen=True)
 class SourceConfig(Group):
-    """Select and prepare the source images."""
+    """Select and prepare the source images.
+
+    Attributes
+    ----------
+    root
+        folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://
+    include
+        glob patterns of images; one with a slash matches the path below root, others the file name, in any case
+    recursive
+        descend into folders
+    limit
+        use only the first sources, in the order of their names
+    max_pixels
+        images with more pixels fail with reason too_large
+    max_failed
+        number of failed sources up to which a run exits with code 0; with more it exits with code 3
+    icc
+        colour profiles of photographs: ignore reads pixels as sRGB; with refuse, images with another profile
+        fail (extra icc)
+    clips
+        treat each folder, and each file that matches video, as a clip: its frames share camera, gains, noise
+        level and fixed patterns
+    video
+        glob patterns of video files, used if clips is true (extra video)
+    downscale
+        side of the squares whose mean becomes one pixel of 16 bits; 2 removes JPEG artefacts, as Brooks et al.
+        did
+    dequantize
+        dither moves 8-bit codes by up to half a code at random, so that gray areas have more than 256 raw
+        levels; 0, 255 and highlights keep their codes; dither_all moves highlights too, and code 254 up to
+        white
+    patch
+        cut images into square patches, after downscaling
+    """
 
     root: Optional[str] = key(
-        None,
-        "folder of photographs, or one photograph; a path, or a URL s3://, gs:// or az://",
-        Described("a folder, a file, a URL, or null"),
-        null="the built-in synthetic scenes",
-        decides_data=False,
+        None, Described("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
     )
-    include: tuple[str, ...] = key(
-        (),
-        "glob patterns of images; one with a slash matches the path below root, others the file name, in any case",
-        Described("a list of at least one pattern such as '*.jpg'"),
-    )
-    recursive: bool = key(True, "descend into folders", Boolean())
-    limit: Optional[int] = key(
-        None, "use only the first sources, in the order of their names", Integers(1, 10**9), null="all sources"
-    )
-    max_pixels: int = key(
-        2**26, "images with more pixels fail with reason too_large", Integers(1, 2**40), unit="pixels"
-    )
-    max_failed: int = key(
-        0,
-        "number of failed sources up to which a run exits with code 0; with more it exits with code 3",
-        Integers(0, 10**9),
-        decides_data=False,
-    )
-    icc: str = key(
-        "ignore",
-        "colour profiles of photographs: ignore reads pixels as sRGB; with refuse, images with another profile fail "
-        "(extra icc)",
-        Choice(("ignore", "refuse")),
-    )
-    clips: bool = key(
-        False,
-        "treat each folder, and each file that matches video, as a clip: its frames share camera, gains, noise level "
-        "and fixed patterns",
-        Boolean(),
-    )
-    video: tuple[str, ...] = key(
-        (), "glob patterns of video files, used if clips is true (extra video)", Described("a list of patterns")
-    )
-    downscale: int = key(
-        1,
-        "side of the squares whose mean becomes one pixel of 16 bits; 2 removes JPEG artefacts, as Brooks et al. did",
-        Integers(1, 64),
-        unit="pixels",
-    )
-    dequantize: str = key(
-        "off",
-        "dither moves 8-bit codes by up to half a code at random, so that gray areas have more than 256 raw levels; 0, "
-        "255 and highlights keep their codes; dither_all moves highlights too, and code 254 up to white",
-        limits.DEQUANTIZE,
-    )
-    patch: Any = key(
-        None, "cut images into square patches, after downscaling", limits.PATCH, unit="pixels", null="complete images"
-    )
+    include: tuple[str, ...] = key((), Described("a list of at least one pattern such as '*.jpg'"))
+    recursive: bool = key(True, Boolean())
+    limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
+    max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
+    max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
+    icc: str = key("ignore", Choice("ignore", "refuse"))
+    clips: bool = key(False, Boolean())
+    video: tuple[str, ...] = key((), Described("a list of patterns"))
+    downscale: int = key(1, Integers(1, 64), unit="pixels")
+    dequantize: str = key("off", limits.DEQUANTIZE)
+    patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
 
 
 @documented
 @dataclass(frozen=True)
 class CameraConfig(Group):
-    """Choose the colour matrix of the camera."""
+    """Choose the colour matrix of the camera.
 
-    name: str = key("convex", "name of the camera, recorded in each row", Name())
-    law: str = key(
-        "convex",
-        "choice of an image's matrix: fixed is the camera called name, convex a mix of four cameras, choice one of the "
-        "four, identity linear sRGB, custom xyz2cam",
-        limits.CAMERA_LAWS,
-    )
+    Attributes
+    ----------
+    name
+        name of the camera, recorded in each row
+    law
+        choice of an image's matrix: fixed is the camera called name, convex a mix of four cameras, choice one
+        of the four, identity linear sRGB, custom xyz2cam
+    xyz2cam
+        matrix from XYZ (D65) to the camera, row by row, for law=custom
+    """
+
+    name: str = key("convex", Name())
+    law: str = key("convex", limits.CAMERA_LAWS)
     xyz2cam: Optional[tuple[float, ...]] = key(
-        None,
-        "matrix from XYZ (D65) to the camera, row by row, for law=custom",
-        Described("nine numbers of an invertible matrix"),
-        null="a law other than custom",
+        None, Described("nine numbers of an invertible matrix"), null="a law other than custom"
     )
 
 
 @documented
 @dataclass(frozen=True)
 class GainsConfig(Group):
-    """Define white balance, brightening and the treatment of highlights."""
+    """Define white balance, brightening and the treatment of highlights.
 
-    red: Any = key(None, "forward white-balance gain of red", limits.GAIN)
-    blue: Any = key(None, "forward white-balance gain of blue", limits.GAIN)
-    inverse_rgb: Any = key(None, "inverse of the brightening gain; the image is multiplied by it", limits.INVERSE_GAIN)
-    highlight: str = key(
-        "per_channel",
-        "how highlights are preserved: per_channel as in the article, gray_mean as in the code of Brooks et al., none",
-        Choice(("per_channel", "gray_mean", "none")),
-    )
-    threshold: float = key(0.9, "linear signal above which highlights are preserved", Numbers(0, 1, open_high=True))
+    Attributes
+    ----------
+    red
+        forward white-balance gain of red
+    blue
+        forward white-balance gain of blue
+    inverse_rgb
+        inverse of the brightening gain; the image is multiplied by it
+    highlight
+        how highlights are preserved: per_channel as in the article, gray_mean as in the code of Brooks et al.,
+        none
+    threshold
+        linear signal above which highlights are preserved
+    """
+
+    red: Any = key(None, limits.GAIN)
+    blue: Any = key(None, limits.GAIN)
+    inverse_rgb: Any = key(None, limits.INVERSE_GAIN)
+    highlight: str = key("per_channel", Choice("per_channel", "gray_mean", "none"))
+    threshold: float = key(0.9, Numbers(0, 1, open_high=True))
 
 
 @documented
 @dataclass(frozen=True)
 class IspConfig(Group):
-    """Define the curves that the camera applied after the colour matrix."""
+    """Define the curves that the camera applied after the colour matrix.
 
-    tone: str = key("smoothstep", "tone curve that is inverted", Choice(("smoothstep", "none")))
-    gamma: Any = key(
-        2.2,
-        "exponent that is inverted, or srgb for the piecewise curve of IEC 61966-2-1",
-        NumberOrWord("srgb", Numbers(0.1, 10), "a number from {numbers}, or {word}"),
-    )
+    Attributes
+    ----------
+    tone
+        tone curve that is inverted
+    gamma
+        exponent that is inverted, or srgb for the piecewise curve of IEC 61966-2-1
+    """
+
+    tone: str = key("smoothstep", Choice("smoothstep", "none"))
+    gamma: Any = key(2.2, NumberOrWord("srgb", Numbers(0.1, 10), "a number from {numbers}, or {word}"))
 
 
 @documented
 @dataclass(frozen=True)
 class SensorConfig(Group):
-    """Define the digital output of the sensor."""
+    """Define the digital output of the sensor.
 
-    bits: int = key(12, "bits per sample", Integers(1, 16))
-    black_level_dn: int = key(240, "black level, the value without light", limits.BLACK_LEVEL, unit="DN")
-    white_level_dn: int = key(4095, "white level, the value at saturation", limits.WHITE_LEVEL, unit="DN")
-    pattern: str = key(
-        "RGGB", "CFA pattern of the top-left 2x2 sites, row by row", Choice(("RGGB", "BGGR", "GRBG", "GBRG"))
-    )
-    clip: str = key(
-        "sensor",
-        "clipping of noisy frames: sensor at 0 and 2^bits - 1, black at the black level instead of 0, none only with "
-        "float32",
-        Choice(("sensor", "black", "none")),
-    )
-    saturated: str = key(
-        "noisy",
-        "noisy value at sites where the clean frame is saturated: noisy is the clipped value plus noise, as in the "
-        "article; pinned is the white level; auto is pinned for physical profiles that reach a full well or the end of "
-        "the converter, otherwise noisy",
-        Choice(("noisy", "pinned", "auto")),
-    )
-    dark_offset: str = key(
-        "removed",
-        "mean of the dark current: removed as a camera does with optical-black pixels, or kept",
-        Choice(("removed", "kept")),
-    )
-    units: Any = key(
-        "image",
-        "camera bodies, each with its own fixed patterns: image is a new body for each image; with a number, each "
-        "image has one of that many bodies",
-        NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"),
-    )
+    Attributes
+    ----------
+    bits
+        bits per sample
+    black_level_dn
+        black level, the value without light
+    white_level_dn
+        white level, the value at saturation
+    pattern
+        CFA pattern of the top-left 2x2 sites, row by row
+    clip
+        clipping of noisy frames: sensor at 0 and 2^bits - 1, black at the black level instead of 0, none only
+        with float32
+    saturated
+        noisy value at sites where the clean frame is saturated: noisy is the clipped value plus noise, as in
+        the article; pinned is the white level; auto is pinned for physical profiles that reach a full well or
+        the end of the converter, otherwise noisy
+    dark_offset
+        mean of the dark current: removed as a camera does with optical-black pixels, or kept
+    units
+        camera bodies, each with its own fixed patterns: image is a new body for each image; with a number, each
+        image has one of that many bodies
+    """
+
+    bits: int = key(12, Integers(1, 16))
+    black_level_dn: int = key(240, limits.BLACK_LEVEL, unit="DN")
+    white_level_dn: int = key(4095, limits.WHITE_LEVEL, unit="DN")
+    pattern: str = key("RGGB", Choice("RGGB", "BGGR", "GRBG", "GBRG"))
+    clip: str = key("sensor", Choice("sensor", "black", "none"))
+    saturated: str = key("noisy", Choice("noisy", "pinned", "auto"))
+    dark_offset: str = key("removed", Choice("removed", "kept"))
+    units: Any = key("image", NumberOrWord("image", Integers(1, 10**6), "{word}, or a number of bodies, {numbers}"))
 
 
 CHOSEN, PROFILE = "Chosen for a run", "Every profile"
 TWO_PARAMETERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
 """Sections of the keys of `NoiseConfig`."""
-
-AS_ALL = "the value of all"
 
 Body = TypeVar("Body")
 
@@ -236,6 +246,14 @@ def with_fields(added: Fields, before: str = "") -> Callable[[type[Body]], type[
     return add
 
 
+class EffectGroup(Group):
+    """Base of the groups whose fields follow from the declarations of the effects."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
 def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
     """Return type and default of the key of a number."""
     kind: Any
@@ -245,16 +263,13 @@ def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
         kind = Optional[float] if number.count == 1 else Optional[tuple[float, ...]]
     if number.in_branch:
         kind = str if number.words else Any
-    declared = key(
-        number.key_default,
-        number.key_meaning or number.meaning,
-        limit,
-        unit=number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit),
-        null=null,
-        section="" if number.in_branch else PHYSICAL,
-        since=number.since,
-    )
-    return kind, declared
+    details = {
+        "meaning": number.key_meaning or number.meaning,
+        "unit": number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit),
+        "section": "" if number.in_branch else PHYSICAL,
+        "since": number.since,
+    }
+    return kind, key(number.key_default, limit, null=null, **details)
 
 
 def _limit(number: Number) -> Limit:
@@ -262,7 +277,7 @@ def _limit(number: Number) -> Limit:
     if number.kind in (SHAPE, SITES):
         return limits.READ_SHAPE if number.kind == SHAPE else limits.BLACK_ERROR
     if number.in_branch:
-        return Choice(number.words) if number.words else IsoForm(number.forms)
+        return Choice(*number.words) if number.words else IsoForm(number.forms)
     numbers = Numbers(number.low, number.high)
     return numbers if number.count == 1 else NumberList(number.count, numbers)
 
@@ -274,7 +289,10 @@ PROFILE_FIELDS: Fields = {
     name: _number_field(effect, number) for name, (effect, number) in profile_keys().items() if not number.in_branch
 }
 SWITCH_FIELDS: Fields = {
-    effect.name: (Optional[str], key(None, effect.meaning, limits.SWITCH, null=AS_ALL, since=effect.since))
+    effect.name: (
+        Optional[str],
+        key(None, limits.SWITCH, meaning=effect.meaning, null="the value of all", since=effect.since),
+    )
     for effect in EFFECTS
     if effect.has_switch
 }
@@ -283,81 +301,115 @@ SWITCH_FIELDS: Fields = {
 @documented
 @dataclass(frozen=True)
 @with_fields(BRANCH_FIELDS)
-class BranchConfig(Group):
+class BranchConfig(EffectGroup):
     """Hold the numbers of a physical noise profile that depend on ISO, for one range of ISO.
 
     A number may be written as a form of `forms.ISO_FORMS`.
+
+    Attributes
+    ----------
+    iso
+        lowest and highest ISO of the branch
     """
 
-    if TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any: ...
-
-    iso: tuple[float, ...] = key((), "lowest and highest ISO of the branch", limits.ISO_RANGE)
+    iso: tuple[float, ...] = key((), limits.ISO_RANGE)
 
 
 @documented
 @dataclass(frozen=True)
 class ProvenanceConfig(Group):
-    """State the source and the uncertainty of numbers of a physical noise profile."""
+    """State the source and the uncertainty of numbers of a physical noise profile.
 
-    numbers: tuple[str, ...] = key(
-        (), "keys of a branch or of the profile", Described("a list of keys whose values are numbers")
-    )
-    iso: tuple[float, ...] = key((), "lowest and highest ISO the statement holds for; empty: all", limits.ISO_RANGE)
-    source: str = key("", "where the numbers come from", Text("a text"))
-    uncertainty: str = key("", "how far the numbers may be off, or how far sources differ", Text("a text"))
+    Attributes
+    ----------
+    numbers
+        keys of a branch or of the profile
+    iso
+        lowest and highest ISO the statement holds for; empty: all
+    source
+        where the numbers come from
+    uncertainty
+        how far the numbers may be off, or how far sources differ
+    """
+
+    numbers: tuple[str, ...] = key((), Described("a list of keys whose values are numbers"))
+    iso: tuple[float, ...] = key((), limits.ISO_RANGE)
+    source: str = key("", Text("a text"))
+    uncertainty: str = key("", Text("a text"))
 
 
 @documented
 @dataclass(frozen=True)
 @with_fields(PROFILE_FIELDS, before="assumed")
-class NoiseConfig(Group):
-    """Define the noise: two numbers (variance a·x + b), or a physical profile with ``branches`` by ISO."""
+class NoiseConfig(EffectGroup):
+    """Define the noise: two numbers (variance a·x + b), or a physical profile with ``branches`` by ISO.
 
-    if TYPE_CHECKING:
+    Attributes
+    ----------
+    name
+        name of the profile, recorded in each row
+    units
+        units of a and b: dn, or normalized (0 at black, 1 at white)
+    black
+        whether the signal x of the variance a * x + b has the black level subtracted or included
+    bits
+        bits of the sensor that a profile in DN was calibrated with
+    black_level_dn
+        black level of the calibration
+    white_level_dn
+        white level of the calibration
+    a
+        slope of the variance a * x + b
+    b
+        offset of the variance a * x + b
+    negative_variance
+        profiles whose variance at black is negative: refuse them, or clip the variance at 0
+    law
+        distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times
+        a plus a normal distribution of variance b
+    iso
+        ISO at which a physical profile is used, in place of scene.iso
+    scatter
+        how the scatter of a physical profile's lines and its read_shape are drawn: unit once for each camera
+        body, body once for each body and ISO (with sensor.units=image, once for each ISO), image for each image;
+        off is no scatter and the median shape
+    levels
+        noise levels of each clean frame
+    draws
+        noisy frames at each level
+    dark_frames
+        folder of dark frames of the camera at one ISO and exposure; the noise of the read-out is sampled from
+        them
+    dark_frames_sha256
+        SHA-256 of the set of dark frames, which a run records; frames of another set are refused
+    dark_frames_black_dn
+        black level of the dark frames
+    dark_shading
+        mean of dark frames at each site (dark shading): keep adds it to the noisy frames, remove subtracts the
+        mean of the frames of dark_frames, a path subtracts a map of your own; config.yaml has its digest, not
+        the path
+    dark_shading_sha256
+        SHA-256 of the dark-shading map, which a run records; another map is refused
+    branches
+        numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters
+    assumed
+        keys whose numbers no source gives for this camera; effects.assumed controls their effects
+    provenance
+        source and uncertainty of the numbers, which plan prints
+    """
 
-        def __getattr__(self, name: str) -> Any: ...
-
-    name: str = key("none", "name of the profile, recorded in each row", Name(), section=PROFILE)
-    units: Optional[str] = key(
-        None,
-        "units of a and b: dn, or normalized (0 at black, 1 at white)",
-        Choice(("dn", "normalized")),
-        section=PROFILE,
-    )
-    black: Optional[str] = key(
-        None,
-        "whether the signal x of the variance a * x + b has the black level subtracted or included",
-        Choice(("subtracted", "included")),
-        section=PROFILE,
-    )
-    bits: Optional[int] = key(
-        None,
-        "bits of the sensor that a profile in DN was calibrated with",
-        Integers(1, 32),
-        null="with units=normalized",
-        section=PROFILE,
-    )
+    name: str = key("none", Name(), section=PROFILE)
+    units: Optional[str] = key(None, Choice("dn", "normalized"), section=PROFILE)
+    black: Optional[str] = key(None, Choice("subtracted", "included"), section=PROFILE)
+    bits: Optional[int] = key(None, Integers(1, 32), null="with units=normalized", section=PROFILE)
     black_level_dn: Optional[int] = key(
-        None,
-        "black level of the calibration",
-        limits.BLACK_LEVEL,
-        unit="DN of the profile",
-        null="with units=normalized",
-        section=PROFILE,
+        None, limits.BLACK_LEVEL, unit="DN of the profile", null="with units=normalized", section=PROFILE
     )
     white_level_dn: Optional[int] = key(
-        None,
-        "white level of the calibration",
-        limits.WHITE_LEVEL,
-        unit="DN of the profile",
-        null="with units=normalized",
-        section=PROFILE,
+        None, limits.WHITE_LEVEL, unit="DN of the profile", null="with units=normalized", section=PROFILE
     )
     a: Any = key(
         None,
-        "slope of the variance a * x + b",
         limits.VARIANCE_SLOPE,
         unit="DN, or 1 with units=normalized",
         null="a physical profile",
@@ -365,64 +417,27 @@ class NoiseConfig(Group):
     )
     b: Any = key(
         None,
-        "offset of the variance a * x + b",
         limits.VARIANCE_OFFSET,
         unit="DN², or 1 with units=normalized",
         null="a physical profile",
         section=TWO_PARAMETERS,
     )
-    negative_variance: str = key(
-        "refuse",
-        "profiles whose variance at black is negative: refuse them, or clip the variance at 0",
-        Choice(("refuse", "clip")),
-        section=TWO_PARAMETERS,
-    )
-    law: str = key(
-        "gaussian",
-        "distribution of two-parameter noise: gaussian is one normal distribution, poisson a Poisson count times a "
-        "plus a normal distribution of variance b",
-        Choice(("gaussian", "poisson")),
-        section=CHOSEN,
-    )
-    iso: Any = key(
-        None,
-        "ISO at which a physical profile is used, in place of scene.iso",
-        limits.ISO,
-        null="the ISO of the scene",
-        section=CHOSEN,
-    )
-    scatter: str = key(
-        "image",
-        "how the scatter of a physical profile's lines and its read_shape are drawn: unit once for each camera body, "
-        "body once for each body and ISO (with sensor.units=image, once for each ISO), image for each image; off is no "
-        "scatter and the median shape",
-        limits.SCATTER,
-        section=CHOSEN,
-        since="0.2",
-    )
-    levels: Any = key(
-        None, "noise levels of each clean frame", limits.LEVELS, null="one level, as the profile has it", section=CHOSEN
-    )
-    draws: int = key(1, "noisy frames at each level", Integers(1, limits.MAX_LEVELS), section=CHOSEN)
+    negative_variance: str = key("refuse", Choice("refuse", "clip"), section=TWO_PARAMETERS)
+    law: str = key("gaussian", Choice("gaussian", "poisson"), section=CHOSEN)
+    iso: Any = key(None, limits.ISO, null="the ISO of the scene", section=CHOSEN)
+    scatter: str = key("image", limits.SCATTER, section=CHOSEN, since="0.2")
+    levels: Any = key(None, limits.LEVELS, null="one level, as the profile has it", section=CHOSEN)
+    draws: int = key(1, Integers(1, limits.MAX_LEVELS), section=CHOSEN)
     dark_frames: Optional[str] = key(
         None,
-        "folder of dark frames of the camera at one ISO and exposure; the noise of the read-out is sampled from them",
         Described("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"),
         null="the noise of the profile",
         decides_data=False,
         section=CHOSEN,
     )
-    dark_frames_sha256: Optional[str] = key(
-        None,
-        "SHA-256 of the set of dark frames, which a run records; frames of another set are refused",
-        Described("64 hexadecimal digits"),
-        null="any frames",
-        section=CHOSEN,
-        since="0.2",
-    )
+    dark_frames_sha256: Optional[str] = key(None, limits.DIGEST, null="any frames", section=CHOSEN, since="0.2")
     dark_frames_black_dn: Optional[float] = key(
         None,
-        "black level of the dark frames",
         Numbers(0, 65535),
         unit="DN of the profile",
         null="the black level in the raw files, else the median of all pixels, minus a map above black if there is one",
@@ -431,35 +446,17 @@ class NoiseConfig(Group):
     )
     dark_shading: str = key(
         "keep",
-        "mean of dark frames at each site (dark shading): keep adds it to the noisy frames, remove subtracts the mean "
-        "of the frames of dark_frames, a path subtracts a map of your own; config.yaml has its digest, not the path",
         Text("keep, remove, a map (NPY, PNG, TIFF or raw), or a folder of maps with names such as iso1600.npy"),
         section=CHOSEN,
         since="0.2",
     )
-    dark_shading_sha256: Optional[str] = key(
-        None,
-        "SHA-256 of the dark-shading map, which a run records; another map is refused",
-        Described("64 hexadecimal digits"),
-        null="any map, or none",
-        section=CHOSEN,
-        since="0.2",
-    )
+    dark_shading_sha256: Optional[str] = key(None, limits.DIGEST, null="any map, or none", section=CHOSEN, since="0.2")
     branches: tuple[BranchConfig, ...] = key(
-        (),
-        "numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters",
-        Described("a list of mappings with the keys of a branch"),
-        section=PHYSICAL,
+        (), Described("a list of mappings with the keys of a branch"), section=PHYSICAL
     )
-    assumed: tuple[str, ...] = key(
-        (),
-        "keys whose numbers no source gives for this camera; effects.assumed controls their effects",
-        Described("a list of keys of this section or of a branch"),
-        section=PHYSICAL,
-    )
+    assumed: tuple[str, ...] = key((), Described("a list of keys of this section or of a branch"), section=PHYSICAL)
     provenance: tuple[ProvenanceConfig, ...] = key(
         (),
-        "source and uncertainty of the numbers, which plan prints",
         Described("a list of mappings with the keys numbers, iso, source and uncertainty"),
         decides_data=False,
         section=PHYSICAL,
@@ -482,61 +479,66 @@ ASSUMABLE = (
 @documented
 @dataclass(frozen=True)
 class SceneConfig(Group):
-    """Describe the exposure of a scene; each value is a number or a distribution."""
+    """Describe the exposure of a scene; each value is a number or a distribution.
 
-    name: str = key("daylight", "name of the scene, recorded in each row", Name())
-    iso: Any = key(100, "ISO of a physical noise profile", limits.ISO)
-    exposure_s: Any = key(0.001, "exposure time", limits.EXPOSURE_S, unit="seconds")
-    temperature_c: Any = key(25, "temperature of the sensor", limits.TEMPERATURE_C, unit="degrees Celsius")
-    exposure_ratio: Any = key(
-        1,
-        "number by which the light of the photograph is divided: 100 leaves a hundredth; the frames are not brightened "
-        "afterwards",
-        limits.EXPOSURE_RATIO,
-    )
+    Attributes
+    ----------
+    name
+        name of the scene, recorded in each row
+    iso
+        ISO of a physical noise profile
+    exposure_s
+        exposure time
+    temperature_c
+        temperature of the sensor
+    exposure_ratio
+        number by which the light of the photograph is divided: 100 leaves a hundredth; the frames are not
+        brightened afterwards
+    """
+
+    name: str = key("daylight", Name())
+    iso: Any = key(100, limits.ISO)
+    exposure_s: Any = key(0.001, limits.EXPOSURE_S, unit="seconds")
+    temperature_c: Any = key(25, limits.TEMPERATURE_C, unit="degrees Celsius")
+    exposure_ratio: Any = key(1, limits.EXPOSURE_RATIO)
 
 
 @documented
 @dataclass(frozen=True)
 @with_fields(SWITCH_FIELDS)
-class EffectsConfig(Group):
-    """Choose the sensor effects to simulate."""
+class EffectsConfig(EffectGroup):
+    """Choose the sensor effects to simulate.
 
-    if TYPE_CHECKING:
+    Attributes
+    ----------
+    all
+        auto omits effects that together stay within tolerance, on simulates all effects, off none; the switch
+        of a named effect takes precedence
+    tolerance
+        largest ratio of the omitted effects to the masking noise, in each statistic
+    assumed
+        effects with an assumed number of a physical profile (noise.assumed): use treats them like other
+        effects, off simulates them only if they are switched on by name
+    """
 
-        def __getattr__(self, name: str) -> Any: ...
-
-    all: str = key(
-        "auto",
-        "auto omits effects that together stay within tolerance, on simulates all effects, off none; the switch of a "
-        "named effect takes precedence",
-        limits.SWITCH,
-    )
-    tolerance: float = key(
-        0.1,
-        "largest ratio of the omitted effects to the masking noise, in each statistic",
-        Numbers(0, 10, open_low=True),
-    )
-    assumed: str = key(
-        "off",
-        "effects with an assumed number of a physical profile (noise.assumed): use treats them like other effects, off "
-        "simulates them only if they are switched on by name",
-        Choice(("use", "off")),
-        since="0.2",
-    )
+    all: str = key("auto", limits.SWITCH)
+    tolerance: float = key(0.1, Numbers(0, 10, open_low=True))
+    assumed: str = key("off", Choice("use", "off"), since="0.2")
 
 
 @documented
 @dataclass(frozen=True)
 class CleanConfig(Group):
-    """Choose what clean frames contain."""
+    """Choose what clean frames contain.
 
-    includes_fixed_pattern: bool = key(
-        False,
-        "whether clean frames contain the fixed-pattern noise of the camera body, like an average of many frames; they "
-        "are then clipped like noisy frames",
-        Boolean(),
-    )
+    Attributes
+    ----------
+    includes_fixed_pattern
+        whether clean frames contain the fixed-pattern noise of the camera body, like an average of many frames;
+        they are then clipped like noisy frames
+    """
+
+    includes_fixed_pattern: bool = key(False, Boolean())
 
 
 @documented
@@ -544,28 +546,37 @@ class CleanConfig(Group):
 class AccuracyConfig(Group):
     """Limit the errors accepted for speed.
 
-    The keys are those of `accuracy.Budget`.
+    Attributes
+    ----------
+    name
+        name of the tier, recorded in each row
+    readable
+        allow only the NumPy reference
+    clean_dn
+        largest error of a clean value
+    clean_changed_share
+        largest fraction of clean values that differ, at 14 bits
+    normal_error
+        largest error of a normal deviate against the true quantile
+    law_distance
+        largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead
+    normal_shot
+        normal distribution in place of Poisson counts within law_distance, as in 0.1 and 0.2; simulated with
+        NumPy, which is slow
     """
 
-    name: str = key("exact", "name of the tier, recorded in each row", Name())
-    readable: bool = key(False, "allow only the NumPy reference", Boolean())
-    clean_dn: float = key(0.0, "largest error of a clean value", Numbers(0), unit="DN")
-    clean_changed_share: float = key(0.0, "largest fraction of clean values that differ, at 14 bits", Numbers(0))
-    normal_error: float = key(
-        1e-6, "largest error of a normal deviate against the true quantile", Numbers(0), unit="standard deviations"
-    )
-    law_distance: float = key(
-        0.0,
-        "largest difference between the CDFs of shot plus read noise and of the normal distribution drawn instead",
-        Numbers(0),
-    )
-    normal_shot: bool = key(
-        True,
-        "normal distribution in place of Poisson counts within law_distance, as in 0.1 and 0.2; simulated with NumPy, "
-        "which is slow",
-        Boolean(),
-        since="0.3",
-    )
+    name: str = key("exact", Name())
+    readable: bool = key(False, Boolean())
+    clean_dn: float = key(0.0, Numbers(0), unit="DN")
+    clean_changed_share: float = key(0.0, Numbers(0))
+    normal_error: float = key(1e-06, Numbers(0), unit="standard deviations")
+    law_distance: float = key(0.0, Numbers(0))
+    normal_shot: bool = key(True, Boolean(), since="0.3")
+
+    @property
+    def draws_normals(self) -> bool:
+        """True if normals replace counts."""
+        return self.normal_shot and self.law_distance > 0
 
 
 AUTO = "auto"
@@ -575,39 +586,30 @@ AUTO = "auto"
 @documented
 @dataclass(frozen=True)
 class OutputConfig(Group):
-    """Define the format of the dataset."""
+    """Define the format of the dataset.
 
-    dtype: str = key(
-        "uint16",
-        "type of the arrays: uint16 in DN, or float32 with 0 at black and 1 at white, not rounded",
-        Choice(("uint16", "float32")),
-    )
-    clean_dtype: Optional[str] = key(
-        None,
-        "type of clean frames: float32 stores the unrounded mean, 0 at black and 1 at white, next to noisy frames in "
-        "uint16",
-        Choice(("uint16", "float32")),
-        null="the type of dtype",
-        since="0.2",
-    )
-    layout: str = key(
-        "mosaic",
-        "layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue rows, "
-        "B",
-        Choice(("mosaic", "packed")),
-    )
-    pairs_per_shard: Any = key(
-        8,
-        "sources per shard, the unit of work and of a retry; auto chooses the number for shards of about 256 MB, and "
-        "config.yaml records it",
-        NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"),
-    )
-    parquet: bool = key(
-        False,
-        "write manifest.parquet too: the manifest as typed columns, compressed with zstd; needs pyarrow",
-        Boolean(),
-        since="0.2",
-    )
+    Attributes
+    ----------
+    dtype
+        type of the arrays: uint16 in DN, or float32 with 0 at black and 1 at white, not rounded
+    clean_dtype
+        type of clean frames: float32 stores the unrounded mean, 0 at black and 1 at white, next to noisy frames
+        in uint16
+    layout
+        layout of the arrays: mosaic is [H, W], packed is [4, H/2, W/2] with planes R, G of red rows, G of blue
+        rows, B
+    pairs_per_shard
+        sources per shard, the unit of work and of a retry; auto chooses the number for shards of about 256 MB,
+        and config.yaml records it
+    parquet
+        write manifest.parquet too: the manifest as typed columns, compressed with zstd; needs pyarrow
+    """
+
+    dtype: str = key("uint16", Choice("uint16", "float32"))
+    clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype", since="0.2")
+    layout: str = key("mosaic", Choice("mosaic", "packed"))
+    pairs_per_shard: Any = key(8, NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"))
+    parquet: bool = key(False, Boolean(), since="0.2")
 
     def __post_init__(self) -> None:
         """Convert the text of an integer, such as the value of an environment variable."""
@@ -620,51 +622,57 @@ class OutputConfig(Group):
 @documented
 @dataclass(frozen=True)
 class ExecutorConfig(Group):
-    """Choose what runs the workers; no byte of a dataset depends on it."""
+    """Choose what runs the workers; no byte of a dataset depends on it.
 
-    kind: str = key(
-        "local",
-        "what runs the workers: local is processes of this machine, dask a Dask cluster (extra dask)",
-        Choice(("local", "dask")),
-        decides_data=False,
-    )
+    Attributes
+    ----------
+    kind
+        what runs the workers: local is processes of this machine, dask a Dask cluster (extra dask)
+    address
+        address of a running Dask scheduler, such as tcp://10.0.0.1:8786, used if kind is dask
+    chunk_s
+        work in one Dask task; the first tasks contain less, because the time of a shard must be measured first
+    window
+        Dask tasks that are submitted for each worker at a time
+    no_workers_s
+        time without any Dask worker after which the run ends with exit code 5
+    lost_worker_s
+        time without progress after which the shards of a Dask worker are given to another one
+    """
+
+    kind: str = key("local", Choice("local", "dask"), decides_data=False)
     address: Optional[str] = key(
         None,
-        "address of a running Dask scheduler, such as tcp://10.0.0.1:8786, used if kind is dask",
         Text("the address of a Dask scheduler"),
         null="start a scheduler and n_jobs workers on this machine",
         decides_data=False,
     )
-    chunk_s: float = key(
-        30.0,
-        "work in one Dask task; the first tasks contain less, because the time of a shard must be measured first",
-        Numbers(0, 86400, open_low=True),
-        unit="seconds",
-        decides_data=False,
-    )
-    window: int = key(
-        2, "Dask tasks that are submitted for each worker at a time", Integers(1, 1000), decides_data=False
-    )
-    no_workers_s: float = key(
-        300.0,
-        "time without any Dask worker after which the run ends with exit code 5",
-        Numbers(0, 86400, open_low=True),
-        unit="seconds",
-        decides_data=False,
-    )
-    lost_worker_s: float = key(
-        60.0,
-        "time without progress after which the shards of a Dask worker are given to another one",
-        Numbers(1, 86400),
-        unit="seconds",
-        decides_data=False,
-    )
+    chunk_s: float = key(30.0, Numbers(0, 86400, open_low=True), unit="seconds", decides_data=False)
+    window: int = key(2, Integers(1, 1000), decides_data=False)
+    no_workers_s: float = key(300.0, Numbers(0, 86400, open_low=True), unit="seconds", decides_data=False)
+    lost_worker_s: float = key(60.0, Numbers(1, 86400), unit="seconds", decides_data=False)
 
 
 @documented
 @dataclass(frozen=True)
 class Config(Group):
-    """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level."""
+    """Hold the complete configuration of a run: a dataclass for each group, and the keys at the top level.
+
+    Attributes
+    ----------
+    seed
+        seed of all random streams
+    out
+        folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the
+        datasets
+    n_jobs
+        number of worker processes
+    self_test
+        what happens if this machine computes other values than the reference: stop ends the run, go_on
+        continues and records the differences in dataset.json
+    check_disk
+        refuse to start if the free disk space is smaller than the estimated size of the dataset
+    """
 
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
@@ -678,33 +686,11 @@ class Config(Group):
     accuracy: AccuracyConfig = field(default_factory=AccuracyConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
-    seed: int = key(0, "seed of all random streams", Integers(0, 2**63 - 1))
-    out: str = key(
-        "ds",
-        "folder of the dataset, or its URL s3://, gs:// or az://; in a sweep, the local folder that contains the "
-        "datasets",
-        OutputPlace("the name of a folder or a URL s3://, gs:// or az://"),
-        decides_data=False,
-    )
-    n_jobs: int = key(
-        -1,
-        "number of worker processes",
-        Integers(1, 1024, other=-1, remark=" or -1 for one per core"),
-        decides_data=False,
-    )
-    self_test: str = key(
-        "stop",
-        "what happens if this machine computes other values than the reference: stop ends the run, go_on continues and "
-        "records the differences in dataset.json",
-        Choice(("stop", "go_on")),
-        decides_data=False,
-    )
-    check_disk: bool = key(
-        True,
-        "refuse to start if the free disk space is smaller than the estimated size of the dataset",
-        Boolean(),
-        decides_data=False,
-    )
+    seed: int = key(0, Integers(0, 2**63 - 1))
+    out: str = key("ds", OutputPlace("the name of a folder or a URL s3://, gs:// or az://"), decides_data=False)
+    n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)
+    self_test: str = key("stop", Choice("stop", "go_on"), decides_data=False)
+    check_disk: bool = key(True, Boolean(), decides_data=False)
 
 
 GROUPS: dict[str, type[Any]] = {

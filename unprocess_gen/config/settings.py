@@ -1,12 +1,15 @@
 """Describe settings: `key` declares a field of the schema, `settings_of` returns what it declared.
 
-The description of a setting is in one place, the field's metadata. Checks and messages (`validation`), ``--help`` and
-shell completion (`cli`), docstrings and ``docs/reference/settings.md`` read it. OmegaConf ignores the metadata.
+The field's metadata has the description, whose words are those of the docstring of the group (`documented`). Checks and
+messages (`validation`), ``--help`` and shell completion (`cli`), and ``docs/reference/settings.md`` read it. OmegaConf
+ignores the metadata.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,18 +24,19 @@ METADATA = "setting"
 Group = TypeVar("Group", bound=type)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Setting:
     """Describe one key of a config group.
 
-    ``meaning`` is one sentence without a period. ``null`` says what null means, and is empty if null is not allowed.
-    ``config.yaml`` omits keys that do not decide data. ``section`` is the part of the group that the key belongs to.
+    ``meaning`` is one sentence without a period, from the docstring of the group. ``null`` says what null means, and is
+    empty if null is not allowed. ``config.yaml`` omits keys that do not decide data. ``section`` is the part of the
+    group that the key belongs to.
     ``since`` is the first version that records the key: a ``config.yaml`` without it has its default in the dataclass,
     which is what versions before did; ``config.yaml`` omits the key at that value.
     """
 
-    meaning: str
     limit: Limit
+    meaning: str = ""
     unit: str = ""
     null: str = ""
     decides_data: bool = True
@@ -51,9 +55,9 @@ class Setting:
             raise ConfigError(f"{key}={self.limit.shown(value)}: expected {self.allowed}")
 
 
-def key(default: Any, meaning: str, limit: Limit, **details: Any) -> Any:
+def key(default: Any, limit: Limit, **details: Any) -> Any:
     """Return a field of the schema with its description; ``details`` are other fields of `Setting`."""
-    return dataclasses.field(default=default, metadata={METADATA: Setting(meaning, limit, **details)})
+    return dataclasses.field(default=default, metadata={METADATA: Setting(limit, **details)})
 
 
 def settings_of(group: Any) -> Mapping[str, Setting]:
@@ -62,11 +66,18 @@ def settings_of(group: Any) -> Mapping[str, Setting]:
 
 
 def documented(group: Group) -> Group:
-    """Append the descriptions of a group's keys to its docstring, in the form of numpydoc."""
-    if group.__doc__:
+    """Take the meanings of a group's keys from its docstring, and add units and allowed values to the docstring.
+
+    The section Attributes has the name of each key and, indented, its meaning. Fields that are added to the group have
+    a meaning already.
+    """
+    if group.__doc__:  # python -OO removes docstrings
+        summary, _, section = inspect.cleandoc(group.__doc__).partition("\n\nAttributes\n----------\n")
+        meanings = {name: " ".join(text.split()) for name, text in re.findall(r"^(\w+)\n((?: .+\n?)+)", section, re.M)}
         types = {field.name: str(field.type) for field in dataclasses.fields(group)}
-        lines = [group.__doc__.rstrip(), "", "Attributes", "----------"]
+        lines = [summary, "", "Attributes", "----------"]
         for name, setting in settings_of(group).items():
+            setting.meaning = setting.meaning or meanings[name]
             details = [setting.meaning, f"unit: {setting.unit}"] if setting.unit else [setting.meaning]
             details += [f"allowed: {setting.allowed}"]
             details += [f"null: {setting.null}"] if setting.null else []

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from unprocess_gen.core.errors import ConfigError
 
+LONGEST_VALUE = 80
+"""Characters of a value that a message quotes."""
 
-def one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
+
+def refusal(key: str, value: Any, problem: str) -> ConfigError:
+    """Return the error about the value of a key: ``key=value: problem``."""
+    text = value_text(value)
+    return ConfigError(f"{key}={text[:LONGEST_VALUE]}{'…' * (len(text) > LONGEST_VALUE)}: {problem}")
+
+
+def one_of(key: str, value: Any, allowed: Collection[str]) -> None:
     """Check that a value is one of a few words."""
     if value not in allowed:
-        raise ConfigError(f"{key}={value_text(value)}: expected one of {', '.join(allowed)}")
+        raise refusal(key, value, f"expected one of {', '.join(allowed)}")
 
 
 def in_range(key: str, value: int, low: int, high: int, remark: str = "") -> None:
     """Raise ConfigError unless ``low <= value <= high``; the message ends with ``remark``."""
     if not low <= value <= high:
-        raise ConfigError(f"{key}={value_text(value)}: expected {low} to {high}{remark}")
+        raise refusal(key, value, f"expected {low} to {high}{remark}")
 
 
 def is_integer(value: Any) -> bool:
@@ -37,11 +46,13 @@ def is_number(value: Any) -> bool:
 
 
 def value_text(value: Any) -> str:
-    """Format a value for a message as YAML writes it: None as ``null``, lists in brackets."""
+    """Format a value for a message as YAML writes it: ``null``, ``true``, lists in brackets."""
     if isinstance(value, list | tuple):
         return "[" + ", ".join(value_text(item) for item in value) + "]"
     if is_integer(value) and value.bit_length() > MAX_PRINTED_BITS:
         return f"an integer of {value.bit_length()} bits"  # Python refuses to convert the longest to text
+    if isinstance(value, bool):
+        return str(value).lower()
     return "null" if value is None else str(value)
 
 

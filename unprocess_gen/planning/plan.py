@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
 from unprocess_gen.config.interpretation import (
-    accuracy_budget,
     dequantize_method,
     effect_switch,
     gain_distributions,
@@ -172,7 +171,7 @@ class Planner:
         self._is_physical = is_physical(config.noise)
         kind = PhysicalLevel if self._is_physical else TwoNumberLevel
         self._levels = [kind(level, number) for number, level in enumerate(levels)]
-        budget, counts_electrons = accuracy_budget(config.accuracy), uses_physics(config.noise)
+        budget, counts_electrons = config.accuracy, uses_physics(config.noise)
         self._accuracy, self._steep_accuracy = (
             AccuracyPlan(
                 config.accuracy.name,

@@ -35,7 +35,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from unprocess_gen.config.accuracy import METHODS, Method, methods_of_stage
-from unprocess_gen.config.interpretation import accuracy_budget, is_normalised, is_physical
+from unprocess_gen.config.interpretation import is_normalised, is_physical
 from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.pipeline.progress import Progress
@@ -162,7 +162,7 @@ def _method_rows(
     errors: Mapping[RowKey, tuple[methods.Deviation, str]],
     times: Mapping[RowKey, Sequence[float]],
 ) -> Iterator[Measurement]:
-    by_tier = {name: sessions.chosen_methods(accuracy_budget(tier)) for name, tier in session.tiers.items()}
+    by_tier = {name: sessions.chosen_methods(tier) for name, tier in session.tiers.items()}
     for method in METHODS:
         tiers = " ".join(name for name, chosen in by_tier.items() if method.spelled in chosen)
         error, unit = errors[method.stage, method.name]

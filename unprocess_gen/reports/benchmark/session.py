@@ -8,8 +8,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from unprocess_gen.config.accuracy import METHODS, Budget, Method, choose_methods
-from unprocess_gen.config.interpretation import accuracy_budget, is_physical
+from unprocess_gen.config.accuracy import METHODS, Method, choose_methods
+from unprocess_gen.config.interpretation import is_physical
 from unprocess_gen.config.schema import (
     AccuracyConfig,
     CleanConfig,
@@ -143,7 +143,7 @@ class BenchmarkSession:
 # ----------------------------------------------------------------------------------------------------------- budgets
 
 
-def chosen_methods(budget: Budget) -> frozenset[str]:
+def chosen_methods(budget: AccuracyConfig) -> frozenset[str]:
     """Methods that a budget chooses for two-parameter or physical noise."""
     return frozenset(name for counts in (False, True) for name in choose_methods(budget, counts))
 
@@ -151,7 +151,7 @@ def chosen_methods(budget: Budget) -> frozenset[str]:
 def budget_for(method: Method, tiers: dict[str, AccuracyConfig]) -> AccuracyConfig:
     """The budget that chooses a method, together with the others of its implementation, and is exact otherwise."""
     exact = tiers[EXACT]
-    if method.spelled in chosen_methods(accuracy_budget(exact)):
+    if method.spelled in chosen_methods(exact):
         return exact
     if method.approximates_law:
         return replace(exact, law_distance=LAW_DISTANCE, normal_shot=True)
