@@ -9,7 +9,7 @@ from scene_page import scenes_page
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.cli.help import default_text, hydra_flag, spelled, synopsis
+from unprocess_gen.cli.help import default_text, spelled, synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
@@ -244,7 +244,7 @@ def command_line_page() -> str:
             blocks.append(table(["argument", "meaning"], arguments))
     flags = [_argument(argument) for argument in STANDARD]
     flags += [["`-h, --help`", "print the help of the verb"], ["`--version`", "print the version"]]
-    hydra = [[code(hydra_flag(spellings)), text] for spellings, (_, text) in HYDRA_FLAGS.items()]
+    hydra = [_argument(argument) for argument in HYDRA_FLAGS]
     codes = [[", ".join(map(str, one.codes)), one.meaning] for one in EXIT_CODES]
     blocks += ["## Flags of every verb", table(["flag", "meaning"], flags)]
     blocks += [HYDRA_INTRODUCTION, table(["flag", "meaning"], hydra)]

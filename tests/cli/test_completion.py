@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from helpers.commands import COMMAND, RunMain
 
-from unprocess_gen.cli.completion import FILES, FOLDERS, SCRIPTS, WORDS, complete
+from unprocess_gen.cli.completion import FILES, FOLDERS, SHELLS, WORDS, complete
 from unprocess_gen.cli.verbs import VERBS
 
 CANDIDATES = [
@@ -120,7 +120,7 @@ class Terminal:
         os.close(self._at)
 
 
-@pytest.fixture(params=SCRIPTS)
+@pytest.fixture(params=SHELLS)
 def terminal(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Terminal]:
     """Return an interactive shell that evaluated its completion script."""
     shell = str(request.param)

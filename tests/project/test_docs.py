@@ -15,7 +15,7 @@ from helpers.datasets import Settings
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.cli.help import global_help, hydra_flag, spelled, synopsis
+from unprocess_gen.cli.help import global_help, spelled, synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
@@ -168,10 +168,8 @@ def test_every_verb_and_flag_is_explained() -> None:
         for argument in verb.arguments:
             assert argument.help and f"| `{spelled(argument)}` | {argument.help}" in text, spelled(argument)
         assert verb.place is None or f"| `{verb.place.metavar}` | {verb.place.expected} |" in text
-    for argument in STANDARD:
+    for argument in (*STANDARD, *HYDRA_FLAGS):
         assert argument.help and f"| `{spelled(argument)}` | {argument.help} |" in page
-    for spellings, (_, text) in HYDRA_FLAGS.items():
-        assert text and f"| `{hydra_flag(spellings)}` | {text} |" in page
 
 
 def test_every_exit_code_is_explained() -> None:

@@ -21,25 +21,6 @@ from unprocess_gen.core.suggestions import did_you_mean
 if TYPE_CHECKING:
     from unprocess_gen.core.paths import AnyPath
 
-ANY_VALUE = ("…",)
-HYDRA_FLAGS: dict[tuple[str, ...], tuple[tuple[str, ...], str]] = {
-    ("-m", "--multirun"): ((), "sweep over comma-separated values"),
-    ("-c", "--cfg"): (("job", "hydra", "all"), "print the settings and stop"),
-    ("-cd", "--config-dir"): (ANY_VALUE, "add a folder of your own options"),
-    ("-cn", "--config-name"): (ANY_VALUE, "use another primary config"),
-    ("-cp", "--config-path"): (ANY_VALUE, "use another folder for the primary config"),
-    ("-p", "--package"): (ANY_VALUE, "with --cfg: print only this part of the settings"),
-    ("--resolve",): ((), "with --cfg: resolve interpolations"),
-    ("-i", "--info"): (
-        ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
-        "print information about Hydra and stop",
-    ),
-    ("-r", "--run"): ((), "run once; the default"),
-    ("-sc", "--shell-completion"): (ANY_VALUE, "Hydra's completion of settings; see gen-dataset completion"),
-    ("--hydra-help",): ((), "print Hydra's help and stop"),
-}
-"""Flags of the verbs that take settings, in each spelling: the values they take (none, any or these), help."""
-
 
 @dataclass(frozen=True, slots=True)
 class Argument:
@@ -47,7 +28,8 @@ class Argument:
 
     Its names are spellings: ``--flag`` is followed by its value, ``key`` means ``key=value``. A switch has no metavar.
     ``read`` converts the text of the value and raises ValueError unless it is as ``expected`` says. Shells complete
-    the value as ``folders`` or ``files``. The verb itself checks that a required argument is given.
+    the value as ``folders`` or ``files``, or as one of its ``choices``. The verb itself checks that a required argument
+    is given.
     """
 
     names: tuple[str, ...]
@@ -57,6 +39,7 @@ class Argument:
     expected: str = "text"
     completes: str = ""
     required: bool = False
+    choices: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -73,6 +56,37 @@ class Argument:
     def settings(self) -> tuple[str, ...]:
         """Spellings of the form ``key=value``."""
         return tuple(name for name in self.names if not name.startswith("-"))
+
+
+STANDARD = (
+    Argument(("-q", "--quiet"), "show only warnings and errors on stderr; results still go to stdout"),
+    Argument(("-v", "--verbose"), "show details on stderr"),
+    Argument(("--log-file",), "append all messages to FILE, with the time of each", "FILE", completes="files"),
+)
+"""Flags of every verb."""
+
+
+def _hydra(names: tuple[str, ...], text: str, *choices: str, value: bool = False) -> Argument:
+    metavar = "{" + ",".join(choices) + "}" if choices else "VALUE" if value else ""
+    return Argument(names, text, metavar, completes="" if choices else "files", choices=choices)
+
+
+INFORMATION = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+COMPLETION_TEXT = "Hydra's completion of settings; see gen-dataset completion"
+HYDRA_FLAGS = (
+    _hydra(("-m", "--multirun"), "sweep over comma-separated values"),
+    _hydra(("-c", "--cfg"), "print the settings and stop", "job", "hydra", "all"),
+    _hydra(("-cd", "--config-dir"), "add a folder of your own options", value=True),
+    _hydra(("-cn", "--config-name"), "use another primary config", value=True),
+    _hydra(("-cp", "--config-path"), "use another folder for the primary config", value=True),
+    _hydra(("-p", "--package"), "with --cfg: print only this part of the settings", value=True),
+    _hydra(("--resolve",), "with --cfg: resolve interpolations"),
+    _hydra(("-i", "--info"), "print information about Hydra and stop", *INFORMATION),
+    _hydra(("-r", "--run"), "run once; the default"),
+    _hydra(("-sc", "--shell-completion"), COMPLETION_TEXT, value=True),
+    _hydra(("--hydra-help",), "print Hydra's help and stop"),
+)
+"""Flags of Hydra, for the verbs that take settings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +117,16 @@ class Verb:
     extra: Argument | None = None
     resumes: bool = False
 
+    @property
+    def accepted(self) -> tuple[Argument, ...]:
+        """All arguments: those of the verb, of every verb, and of Hydra."""
+        return (*self.arguments, *STANDARD, *(HYDRA_FLAGS if self.composes else ()))
+
+    @property
+    def settings(self) -> dict[str, Argument]:
+        """Arguments of the verb by their spellings of the form ``key=value``."""
+        return {name: argument for argument in self.arguments for name in argument.settings}
+
 
 @dataclass(frozen=True, slots=True)
 class Call:
@@ -124,13 +148,6 @@ class Call:
         return [word for part in parts for word in part]
 
 
-STANDARD = (
-    Argument(("-q", "--quiet"), "show only warnings and errors on stderr; results still go to stdout"),
-    Argument(("-v", "--verbose"), "show details on stderr"),
-    Argument(("--log-file",), "append all messages to FILE, with the time of each", "FILE", completes="files"),
-)
-"""Flags of every verb."""
-
 SOURCE = Argument(
     ("--source", "source.root"),
     "folder of the photographs; by default the one recorded in dataset.json",
@@ -150,21 +167,13 @@ class _Parser(argparse.ArgumentParser):
 def flag_parser(verb: Verb) -> argparse.ArgumentParser:
     """Return the parser of a verb's flags; it knows no words."""
     parser = _Parser(prog=f"gen-dataset {verb.name}", add_help=False, allow_abbrev=False)
-    for argument in (*verb.arguments, *STANDARD):
-        if argument.flags:
-            _add(parser, argument.flags, argument.key, argument.metavar)
-    for spellings, (values, _) in HYDRA_FLAGS.items() if verb.composes else ():
-        _add(parser, spellings, spellings[-1], "VALUE" if values else "", None if values == ANY_VALUE else values)
+    for argument in verb.accepted:
+        if argument.flags and argument.metavar:
+            choices = argument.choices or None
+            parser.add_argument(*argument.flags, dest=argument.key, metavar=argument.metavar, choices=choices)
+        elif argument.flags:
+            parser.add_argument(*argument.flags, dest=argument.key, action="store_true", default=None)
     return parser
-
-
-def _add(
-    parser: argparse.ArgumentParser, flags: Sequence[str], dest: str, metavar: str, choices: Sequence[str] | None = None
-) -> None:
-    if metavar:
-        parser.add_argument(*flags, dest=dest, metavar=metavar, choices=choices)
-    else:
-        parser.add_argument(*flags, dest=dest, action="store_true", default=None)
 
 
 def parse(verb: Verb, arguments: Sequence[str]) -> Call:
@@ -180,22 +189,19 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
     for word in rest:
         if word.startswith("-") and word != "-" and not (verb.extra and word[1:].isdecimal()):
             raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}{_setting_hint(verb, word)}")
-    flags = {argument.key: argument for argument in (*verb.arguments, *STANDARD)}
-    given = {key: text for key, text in vars(parsed).items() if text is not None}
+    flags = {argument.key: argument for argument in verb.accepted}
     values = {
         key: _read(flags[key], f"{verb.name}: {flags[key].flags[-1]} ", text)
-        for key, text in given.items()
-        if key in flags
+        for key, text in vars(parsed).items()
+        if text is not None
     }
     words = [*rest, *after]
     path = _take_place(verb, words)
     if verb.extra is not None and words and "=" not in words[0]:
         values[verb.extra.key] = _read(verb.extra, f"{verb.name}: ", words.pop(0))
     others = _take_settings(verb, words, values)
-    hydra = {key: text for key, text in given.items() if key not in flags}
-    if empty := next((flag for flag, text in hydra.items() if text == ""), None):
-        raise ConfigError(f"{verb.name}: {empty}: a value is missing; see gen-dataset {verb.name} --help")
     if verb.composes:
+        hydra = {flag.flags[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
         return Call(values, overrides=_with_source(others, values.get("source")), hydra=hydra)
     if path is None:
         return Call(values, words=others)
@@ -219,9 +225,8 @@ def _take_place(verb: Verb, words: list[str]) -> str | None:
     """Remove the verb's place from words: the first that exists, without one the first that is no setting."""
     if verb.place is None:
         return None
-    known = {name for argument in verb.arguments for name in argument.settings}
     existing = None if verb.extra else next((word for word in words if os.path.lexists(word)), None)
-    path = existing or next((word for word in words if word and word.partition("=")[0] not in known), None)
+    path = existing or next((word for word in words if word and word.partition("=")[0] not in verb.settings), None)
     if path is None:
         raise ConfigError(f"{verb.name}: expected {verb.place.expected}")
     words.remove(path)
@@ -230,16 +235,14 @@ def _take_place(verb: Verb, words: list[str]) -> str | None:
 
 def _take_settings(verb: Verb, words: Iterable[str], values: dict[str, Any]) -> list[str]:
     """Read the settings of the verb itself into values; return the other words that it accepts."""
-    known = {name: argument for argument in verb.arguments for name in argument.settings}
     others: list[str] = []
     for word in words:
         key, equals, text = word.partition("=")
-        if equals and key in known:
-            if known[key].key in values:
-                raise ConfigError(
-                    f"{verb.name}: {word}: given twice, also as {known[key].names[0]}; expected one of them"
-                )
-            values[known[key].key] = _read(known[key], f"{verb.name}: {key}=", text)
+        if equals and (argument := verb.settings.get(key)):
+            if argument.key in values:
+                twice = f"given twice, also as {argument.names[0]}"
+                raise ConfigError(f"{verb.name}: {word}: {twice}; expected one of them")
+            values[argument.key] = _read(argument, f"{verb.name}: {key}=", text)
         elif verb.words or (verb.composes and (equals or word.startswith("~"))):
             others.append(word)
         elif verb.composes:
@@ -280,16 +283,14 @@ def _setting_hint(verb: Verb, flag: str) -> str:
 
     name, _, value = flag.lstrip("-").partition("=")
     group, _, key = name.partition(".")
-    own = {setting for argument in verb.arguments for setting in argument.settings}
     keys = settings_of(GROUPS.get(group, Config))
-    if name in own or (verb.composes and (name in GROUPS or (key or name) in keys)):
+    if name in verb.settings or (verb.composes and (name in GROUPS or (key or name) in keys)):
         return f"; {name} is a setting: write {name}={value or '…'}"
     return ""
 
 
 def _expected(verb: Verb, word: str) -> str:
     """Return what a verb accepts, and what ``word`` may have meant."""
-    hydra = [spellings[-1] for spellings in HYDRA_FLAGS] if verb.composes else []
-    options = [name for argument in (*verb.arguments, *STANDARD) for name in argument.names]
-    spelled_out = [name for name in (*options, *hydra) if not re.match("-[^-]", name)]
+    names = [name for argument in verb.accepted for name in argument.names]
+    spelled_out = [name for name in names if not re.match("-[^-]", name)]
     return f"expected {', '.join(spelled_out)}{did_you_mean(word.partition('=')[0], spelled_out)}"

@@ -14,7 +14,7 @@ import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
-from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Call
+from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.limits import Boolean, Choice
 from unprocess_gen.config.option_files import conf_dir, group_options
@@ -25,49 +25,8 @@ from unprocess_gen.core.suggestions import did_you_mean
 
 WORDS, FOLDERS, FILES = "words", "folders", "files"
 
-BASH = r"""
-_gen_dataset() {
-    local IFS=$'\n' lines word=${COMP_WORDS[COMP_CWORD]}
-    lines=($("$1" completion query "${COMP_LINE:0:COMP_POINT}" 2>/dev/null)) || return
-    [[ $word == "=" ]] && word=
-    case ${lines[0]} in
-        folders) compopt -o filenames; COMPREPLY=($(compgen -d -- "$word")) ;;
-        files) compopt -o filenames; COMPREPLY=($(compgen -f -- "$word")) ;;
-        words)
-            COMPREPLY=("${lines[@]:1}")
-            if [[ $COMP_WORDBREAKS == *=* ]]; then  # bash replaces only what follows the last "="
-                local typed=${COMP_LINE:0:COMP_POINT}
-                typed=${typed##*[[:space:]]}
-                if [[ $typed == *=* ]]; then COMPREPLY=("${COMPREPLY[@]#"${typed%=*}="}"); fi
-            fi
-            [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *[.=] ]] && compopt -o nospace ;;
-    esac
-    return 0
-}
-complete -F _gen_dataset gen-dataset
-"""
-
-ZSH = r"""
-_gen_dataset() {
-    local word
-    local -a lines closed open
-    lines=("${(@f)$("${words[1]}" completion query "${(j: :)words[1,CURRENT-1]} $PREFIX" 2>/dev/null)}")
-    case ${lines[1]} in
-        folders) compset -P '*='; _files -/ ;;
-        files) compset -P '*='; _files ;;
-        words)
-            for word in "${(@)lines[2,-1]}"; do
-                if [[ $word == *[.=] ]]; then open+=("$word"); else closed+=("$word"); fi
-            done
-            (( $#closed )) && compadd -- "${(@)closed}"
-            (( $#open )) && compadd -S '' -- "${(@)open}" ;;
-    esac
-}
-(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }
-compdef _gen_dataset gen-dataset
-"""
-
-SCRIPTS = {"bash": BASH, "zsh": ZSH}
+SHELLS = ("bash", "zsh")
+"""Shells, whose scripts are next to this module."""
 
 
 def completion(call: Call) -> int:
@@ -76,11 +35,11 @@ def completion(call: Call) -> int:
         case ["query", line]:
             kind, candidates = complete(line)
             print("\n".join([kind, *candidates]))
-        case [shell] if shell in SCRIPTS:
-            print(SCRIPTS[shell].lstrip("\n"), end="")
+        case [shell] if shell in SHELLS:
+            print(Path(__file__).with_suffix(f".{shell}").read_text(encoding="utf-8"), end="")
         case words:
             word = " ".join(words)
-            raise ConfigError(f"completion: {word or 'no shell'}: expected bash or zsh{did_you_mean(word, SCRIPTS)}")
+            raise ConfigError(f"completion: {word or 'no shell'}: expected bash or zsh{did_you_mean(word, SHELLS)}")
     return 0
 
 
@@ -92,26 +51,19 @@ def complete(line: str) -> tuple[str, list[str]]:
     *before, current = _split(line)
     name = next(iter(before[1:2]), "")
     verb = VERBS.get(name, VERBS["generate"])
-    arguments = (*verb.arguments, *STANDARD)
-    hydra = HYDRA_FLAGS if verb.composes else {}
     last = before[-1] if len(before) > 1 else ""
-    for argument in arguments:
+    for argument in verb.accepted:
         if argument.metavar and last in argument.flags:
-            return argument.completes or WORDS, []
-    for spellings, (values, _) in hydra.items():
-        if values and last in spellings:
-            return (FILES, []) if values == ANY_VALUE else (WORDS, _starting(current, values))
+            return argument.completes or WORDS, _starting(current, argument.choices)
     if current.startswith("-"):
-        flags = [flag for argument in arguments for flag in argument.flags]
-        flags += ["-h", "--help", *(["--version"] if len(before) == 1 else [])]
-        return WORDS, _starting(current, [*flags, *itertools.chain(*hydra)])
+        flags = [flag for argument in verb.accepted for flag in argument.flags]
+        return WORDS, _starting(current, [*flags, "-h", "--help", *(["--version"] if len(before) == 1 else [])])
     key, equals, _ = current.partition("=")
     if equals:
-        for argument in arguments:
-            if key in argument.settings:
-                return argument.completes or WORDS, []
+        if key in verb.settings:
+            return verb.settings[key].completes or WORDS, []
         return _values(key, current, _option_folders(before)) if verb.composes else (WORDS, [])
-    candidates = [f"{key}=" for argument in arguments for key in argument.settings]
+    candidates = [f"{key}=" for key in verb.settings]
     candidates += VERBS if len(before) == 1 and re.fullmatch("[a-z]*", current) else ()
     candidates += _settings(current, _option_folders(before)) if verb.composes else ()
     words = _starting(current, [*candidates, *verb.words])

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.cli.arguments import ANY_VALUE, HYDRA_FLAGS, STANDARD, Argument, Verb
+from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.settings import Setting, settings_of
@@ -36,7 +36,7 @@ value. gen-dataset --help GROUP explains the options and keys of a group. Each g
 its options and, in parentheses, its keys:
 """
 
-SHOWN_HYDRA_FLAGS = (("-m", "--multirun"), ("-c", "--cfg"), ("-cd", "--config-dir"), ("--hydra-help",))
+SHOWN_HYDRA_FLAGS = ("multirun", "cfg", "config_dir", "hydra_help")
 """Flags of Hydra that the help of the program names; that of a verb names all."""
 
 ENDING = """
@@ -69,9 +69,9 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     groups = [_hanging(f"  {group:<{INDENT}}", text) for group, text in group_lines(described["groups"], conf)]
     keys = [_hanging(f"  {key:<{INDENT + 6}}", text) for key, text in described["top"].items()]
     blocks = [INTRODUCTION + "\n".join(lines), SETTINGS + "\n".join(groups), "\nKeys at the top level:", *keys]
-    flags = [(hydra_flag(spellings), HYDRA_FLAGS[spellings][1]) for spellings in SHOWN_HYDRA_FLAGS]
-    flags += [(spelled(argument), argument.help) for argument in STANDARD]
-    flags += [
+    shown = [*(flag for flag in HYDRA_FLAGS if flag.key in SHOWN_HYDRA_FLAGS), *STANDARD]
+    flags = [
+        *((spelled(argument), argument.help) for argument in shown),
         ("-h, --help [VERB or GROUP]", "show this help, or that of a verb or group"),
         ("--version", "show the version"),
         ("--", "everything after it is a file or folder, even with a leading hyphen"),
@@ -153,9 +153,7 @@ def verb_help(verb: Verb) -> str:
             for argument in (*verb.arguments, *STANDARD)
         ]
         + [("-h, --help", "show this help")],
-        "Hydra's flags": [
-            (hydra_flag(spellings), text) for spellings, (_, text) in HYDRA_FLAGS.items() if verb.composes
-        ],
+        "Hydra's flags": [(spelled(flag), flag.help) for flag in HYDRA_FLAGS if verb.composes],
     }
     parts = [f"usage: {synopsis(verb)}", textwrap.fill(_sentence(verb), WIDTH)]
     for title, lines in sections.items():
@@ -180,13 +178,6 @@ def spelled(argument: Argument) -> str:
     """Return the spellings of an argument with the name of its value, such as ``--source ROOT, source.root=ROOT``."""
     flags = [", ".join(argument.flags) + (f" {argument.metavar}" if argument.metavar else "")] if argument.flags else []
     return ", ".join([*flags, *(f"{key}={argument.metavar}" for key in argument.settings)])
-
-
-def hydra_flag(spellings: tuple[str, ...]) -> str:
-    """Return the spellings of a flag of Hydra with its values."""
-    values, _ = HYDRA_FLAGS[spellings]
-    shown = "VALUE" if values == ANY_VALUE else "{" + ",".join(values) + "}"
-    return ", ".join(spellings) + (f" {shown}" if values else "")
 
 
 def _sentence(verb: Verb) -> str:

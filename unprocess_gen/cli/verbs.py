@@ -6,38 +6,18 @@ from dataclasses import replace
 
 from unprocess_gen.cli.arguments import SOURCE, Argument, Place, Verb
 
-DARK_FRAMES = Argument(
-    ("--dark-frames", "noise.dark_frames"),
-    "folder of the dark frames, if it is not the recorded one",
-    "FOLDER",
-    completes="folders",
-)
-DARK_SHADING = Argument(
-    ("--dark-shading", "noise.dark_shading"),
-    "dark-shading map, or folder of maps, if it is not the recorded one",
-    "PATH",
-    completes="files",
-)
-DATASET = Place("DIR", "the folder of a dataset")
-KEYS = Argument(
-    ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
-)
 
+def _integer(name: str, text: str, low: int | None = None, metavar: str = "N", *, required: bool = False) -> Argument:
+    """Return an argument that is an integer, of ``low`` or more."""
 
-def _count(text: str) -> int:
-    if (number := int(text)) < 0:
-        raise ValueError
-    return number
+    def read(written: str) -> int:
+        number = int(written)
+        if low is not None and number < low:
+            raise ValueError
+        return number
 
-
-def _positive(text: str) -> int:
-    if (number := int(text)) < 1:
-        raise ValueError
-    return number
-
-
-def _whole_number(names: tuple[str, ...], text: str, metavar: str = "N") -> Argument:
-    return Argument(names, text, metavar, int, "an integer")
+    expected = "an integer" if low is None else f"an integer of {low} or more"
+    return Argument((name,), text, metavar, read, expected, required=required)
 
 
 def _local_path(text: str) -> str:
@@ -51,43 +31,54 @@ def _to(text: str, metavar: str, *, required: bool = False) -> Argument:
     return Argument(("--to",), text, metavar, _local_path, f"a local {kind}", f"{kind}s", required)
 
 
-PREPARED = Place("OUT", "the folder of a prepared run")
-PART = Argument(("part",), "number of the part, from 0", "K", _count, "an integer of 0 or more")
+def _composing(name: str, summary: str, run: str, *arguments: Argument, resumes: bool = False) -> Verb:
+    """Return a verb that takes the settings of a run."""
+    return Verb(name, summary, run, (*arguments, SETTINGS_SOURCE), composes=True, resumes=resumes)
+
 
 SETTINGS_SOURCE = Argument(
     ("--source",), "folder of the photographs, or one photograph: source.root=ROOT", "ROOT", completes="files"
 )
+PARTS = _integer("parts", "number of parts", 1, required=True)
+PREPARED = Place("OUT", "the folder of a prepared run")
+PART = _integer("part", "number of the part, from 0", 0, "K")
+DATASET = Place("DIR", "the folder of a dataset")
+KEYS = Argument(
+    ("--keys",), "rows by source index, range or key, such as 3,7-9,00000012-p0007", "KEYS", expected="keys"
+)
+REGENERATE = _integer("--regenerate", "regenerate N pairs and compare them", 0)
+OUT = Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True)
+INPUTS = (
+    SOURCE,
+    Argument(
+        ("--dark-frames", "noise.dark_frames"),
+        "folder of the dark frames, if it is not the recorded one",
+        "FOLDER",
+        completes="folders",
+    ),
+    Argument(
+        ("--dark-shading", "noise.dark_shading"),
+        "dark-shading map, or folder of maps, if it is not the recorded one",
+        "PATH",
+        completes="files",
+    ),
+)
+"""Where the files are that pairs are regenerated from."""
 
 VERBS: dict[str, Verb] = {
     verb.name: verb
     for verb in (
-        Verb(
-            "generate",
-            "generate a dataset; the default verb",
-            "runs.generate",
-            (SETTINGS_SOURCE,),
-            composes=True,
-            resumes=True,
-        ),
-        Verb(
-            "prepare",
-            "list the sources of a run and split it into parts, for separate jobs",
-            "parts.prepare",
-            (
-                Argument(("parts",), "number of parts", "N", _positive, "an integer of 1 or more", required=True),
-                SETTINGS_SOURCE,
-            ),
-            composes=True,
+        _composing("generate", "generate a dataset; the default verb", "runs.generate", resumes=True),
+        _composing(
+            "prepare", "list the sources of a run and split it into parts, for separate jobs", "parts.prepare", PARTS
         ),
         Verb(
             "part",
             "generate part K (from 0) of a prepared run; default: that of the array job",
             "parts.part",
             (
-                _whole_number(("n_jobs",), "number of worker processes; -1: all cores; default: as prepared"),
-                Argument(
-                    ("--source", "source.root"), "folder of the photographs on this host", "ROOT", completes="folders"
-                ),
+                _integer("n_jobs", "number of worker processes; -1: all cores; default: as prepared"),
+                replace(SOURCE, help="folder of the photographs on this host"),
             ),
             PREPARED,
             extra=PART,
@@ -101,38 +92,25 @@ VERBS: dict[str, Verb] = {
             PREPARED,
         ),
         Verb("merge", "write manifest.csv and dataset.json when all parts are finished", "parts.merge", place=PREPARED),
-        Verb(
+        _composing(
             "plan",
             "estimate pairs, bytes and time, and explain the effects; write nothing",
             "reports.plan",
-            (Argument(("--all",), "read every photograph, for exact sizes"), SETTINGS_SOURCE),
-            composes=True,
+            Argument(("--all",), "read every photograph, for exact sizes"),
         ),
-        Verb(
-            "accuracy",
-            "measure error and time of each tier; write a report; default out: accuracy",
-            "reports.accuracy",
-            (SETTINGS_SOURCE,),
-            composes=True,
+        _composing(
+            "accuracy", "measure error and time of each tier; write a report; default out: accuracy", "reports.accuracy"
         ),
-        Verb(
-            "figures",
-            "draw the article's figures for the first photograph; default out: figures",
-            "reports.figures",
-            (SETTINGS_SOURCE,),
-            composes=True,
+        _composing(
+            "figures", "draw the article's figures for the first photograph; default out: figures", "reports.figures"
         ),
         Verb(
             "verify",
             "check every byte of a dataset or sweep; repair, regenerate, check noise",
             "checks.verify",
             (
-                SOURCE,
-                DARK_FRAMES,
-                DARK_SHADING,
-                Argument(
-                    ("--regenerate",), "regenerate N pairs and compare them", "N", _count, "an integer of 0 or more"
-                ),
+                *INPUTS,
+                REGENERATE,
                 _to("with --noise: draw the fits in FILE (PNG)", "FILE"),
                 Argument(("--repair",), "restore damaged files to the same bytes"),
                 Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
@@ -144,9 +122,7 @@ VERBS: dict[str, Verb] = {
             "regenerate rows and compare them, or write their arrays",
             "checks.replay",
             (
-                SOURCE,
-                DARK_FRAMES,
-                DARK_SHADING,
+                *INPUTS,
                 Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
                 KEYS,
                 _to("write the arrays to FOLDER", "FOLDER"),
@@ -157,7 +133,7 @@ VERBS: dict[str, Verb] = {
             "report",
             "write an HTML page about a dataset",
             "reports.report",
-            (_to("write FILE instead of DIR/report.html", "FILE"), SOURCE, DARK_FRAMES, DARK_SHADING),
+            (_to("write FILE instead of DIR/report.html", "FILE"), *INPUTS),
             DATASET,
         ),
         Verb(
@@ -189,14 +165,12 @@ VERBS: dict[str, Verb] = {
             "regenerate a dataset from its config.yaml in another folder, and compare",
             "runs.again",
             (
-                SOURCE,
-                DARK_FRAMES,
-                DARK_SHADING,
-                Argument(("out",), "folder of the new dataset", "FOLDER", completes="folders", required=True),
-                _whole_number(("n_jobs",), "number of worker processes; -1: all cores"),
+                *INPUTS,
+                OUT,
+                _integer("n_jobs", "number of worker processes; -1: all cores"),
                 Argument(("executor",), "what runs the workers: local or dask", "NAME"),
                 Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
-                _whole_number(("source.max_failed",), "largest number of failed sources with exit code 0"),
+                _integer("source.max_failed", "largest number of failed sources with exit code 0"),
             ),
             DATASET,
             resumes=True,
