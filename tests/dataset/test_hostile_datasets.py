@@ -6,16 +6,13 @@ import csv
 import hashlib
 import io
 import json
-import os
 import shutil
 import tarfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.commands import RunMain
 from helpers.datasets import Make
 from helpers.photographs import fill
 
@@ -361,28 +358,3 @@ def test_explanation_survives_the_manifest(tmp_path: Path, original: Path) -> No
         write_rows(stream, [row])
     assert list(read_rows(tmp_path / "manifest.csv")) == [row]
     assert [at for at, _ in rows_with_offsets(tmp_path / "manifest.csv")] == [len(",".join(NAMES)) + 1]
-
-
-def replace_by_pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        replace_by_pipe,
-        lambda path: path.write_text("x" * 200_000),
-        lambda path: path.write_bytes(b"\xff\xfe,1\n"),
-    ],
-    ids=["pipe", "long field", "not UTF-8"],
-)
-@pytest.mark.parametrize("verb", ["verify", "again"])
-def test_unreadable_manifest_is_damage_in_one_line(
-    verb: str, damage: Callable[[Path], None], copy: Path, original: Path, run_main: RunMain
-) -> None:
-    damage(copy / "manifest.csv")
-    arguments = (f"source.root={original.parent}/p", "out=made", "n_jobs=1") if verb == "again" else ()
-    done = run_main(verb, str(copy), *arguments)
-    assert done.code == 4
-    assert "manifest.csv" in done.err and "Traceback" not in done.err

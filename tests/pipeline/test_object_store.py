@@ -32,8 +32,8 @@ from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.shards import ShardWriter
 from unprocess_gen.pipeline import workspace as workspaces
 from unprocess_gen.pipeline.generate import Summary, generate
-from unprocess_gen.pipeline.listing_record import write_listing
-from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.run_records import write_listing
+from unprocess_gen.pipeline.storage import Storage
 
 
 @pytest.fixture(autouse=True)
@@ -209,11 +209,11 @@ def test_run_with_other_settings_loses_the_race(
 
 
 def test_record_of_sources_is_never_replaced(bucket: ObjectPath) -> None:
-    storage = open_storage(str(bucket / "ds"))
+    storage = Storage(str(bucket / "ds"))
     sources = [Source(0, "a", "a", 1, etag="1")]
-    assert write_listing(storage, "ds", sources) == write_listing(storage, "ds", sources)
+    assert write_listing(storage, sources) == write_listing(storage, sources)
     with pytest.raises(ConfigError, match="out=ds: was begun with other sources"):
-        write_listing(storage, "ds", [replace(sources[0], etag="2")])
+        write_listing(storage, [replace(sources[0], etag="2")])
 
 
 def test_writer_that_fails_leaves_no_object(
@@ -301,7 +301,7 @@ def test_run_in_parts_writes_the_same_bytes(
 
 
 def test_provisional_rows_keep_the_records(twelve: Path, bucket: ObjectPath) -> None:
-    storage = open_storage(str(bucket / "ds"))
+    storage = Storage(str(bucket / "ds"))
     storage.write(".work/rows/00000.json", "{}")
     storage.remove_work(keep_records=True)
     assert storage.read(".work/rows/00000.json") == "{}"

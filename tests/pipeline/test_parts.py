@@ -24,10 +24,10 @@ from helpers.promise_report import Figure
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.dataset.manifest import read_rows
-from unprocess_gen.pipeline import deaths, parts
+from unprocess_gen.pipeline import parts, run_records
 from unprocess_gen.pipeline.parts import left_text, shards_of_part
 from unprocess_gen.pipeline.progress import COMPILING
-from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.verify import verify
 from unprocess_gen.simulation import self_test
 
@@ -193,7 +193,7 @@ def test_part_ended_at_its_walltime_counts_no_death(
     """Batch systems send SIGTERM at the end of the walltime."""
     half_made.terminate()
     assert half_made.wait(WAIT_S) == 143
-    assert list((tmp_path / "ds" / deaths.FOLDER).iterdir()) == []
+    assert list((tmp_path / "ds" / run_records.DEATHS).iterdir()) == []
     assert run_main("part", "ds", 0, "-q").code == 0
     assert run_main("merge", "ds").code == 0
     assert tree_hash(tmp_path / "ds") == undisturbed
@@ -388,8 +388,8 @@ def test_photograph_that_kills_its_part_gets_provisional_rows(
     killer = shutil.copy(photographs / "004.png", tmp_path / "killer.png")
     assert run_main("prepare", "parts=2", ROOT, ONE, "n_jobs=1", "out=ds").code == 0
     env = imported_first(tmp_path, POISON) | {"KILLER": str(killer)}
-    codes = [cli("part", "ds", 0, **env).returncode for _ in range(deaths.LIMIT)]
-    assert codes == [-signal.SIGKILL] * deaths.LIMIT
+    codes = [cli("part", "ds", 0, **env).returncode for _ in range(run_records.LIMIT)]
+    assert codes == [-signal.SIGKILL] * run_records.LIMIT
     done = cli("part", "ds", 0, **env)
     assert done.returncode == 0, done.stderr
     assert (
@@ -429,7 +429,7 @@ def test_coordinators_delete_the_same_records_at_once(tmp_path: Path) -> None:
     (tmp_path / "ds/.work/rows").mkdir(parents=True)
     for number in range(500):
         (tmp_path / "ds/.work/rows" / f"{number:05d}.json").touch()
-    storages = [open_storage(str(tmp_path / "ds")) for _ in range(4)]
+    storages = [Storage(str(tmp_path / "ds")) for _ in range(4)]
     with ThreadPoolExecutor(4) as pool:
         for done in [pool.submit(storage.remove_work, keep_records=False) for storage in storages]:
             done.result()

@@ -350,25 +350,6 @@ def test_damage_of_a_finished_dataset_is_reported(
         make(finished / "p", finished / "ds", TWO)
 
 
-@pytest.mark.parametrize(
-    ("state", "name"),
-    [
-        ("begun", "config.yaml"),
-        ("begun", ".work/sources/00000.json"),
-        ("begun", ".work/listing.json"),
-        ("finished", "dataset.json"),
-    ],
-)
-def test_unreadable_dataset_file_is_reported_in_one_line(
-    state: str, name: str, request: pytest.FixtureRequest, run_main: RunMain
-) -> None:
-    folder: Path = request.getfixturevalue(state)
-    (folder / "ds" / name).write_text("{[")
-    done = run_main("source.root=p", TWO, "n_jobs=1")
-    assert done.code in (2, 4)
-    assert done.err.count("\n") == 1
-
-
 def test_records_of_many_shards_are_deleted(begun: Path, make: Make) -> None:
     """More files than one thread deletes at a time."""
     for number in range(100, 300):

@@ -26,6 +26,11 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+import msgspec
+from msgspec.structs import asdict
+
+from unprocess_gen.core.records import parse_record
+
 POLL_S = 0.05
 """Delay between two attempts while another process holds the lock."""
 HEARTBEAT_S = 10.0
@@ -38,12 +43,21 @@ _HELD: set[str] = set()
 """Marks of the locks that this process holds. A file of this process that is not among them could not be deleted."""
 
 
+class _Owner(msgspec.Struct, frozen=True):
+    """Hold the content of a lock file: host and process, when the process started, and the mark of the lock."""
+
+    host: str
+    pid: int
+    start: str | None
+    mark: str
+
+
 class LockFile:
     """Hold a lock from `acquire` until `release` or the end of the process; ``path`` is in a folder that exists."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._text = ""
+        self._text = self._mark = ""
         self._released = threading.Event()
         self._handle: int | None = None
 
@@ -54,8 +68,7 @@ class LockFile:
         created.
         """
         mark = uuid.uuid4().hex
-        owner = {"host": host(), "pid": os.getpid(), "start": process_start(os.getpid()), "mark": mark}
-        text = json.dumps(owner)
+        text = json.dumps(asdict(_Owner(host(), os.getpid(), process_start(os.getpid()), mark)))
         _HELD.add(mark)  # before the file exists: another thread would take it for one that could not be deleted
         try:
             while not self._create(text):
@@ -67,7 +80,7 @@ class LockFile:
         except BaseException:
             _HELD.discard(mark)
             raise
-        self._text = text
+        self._text, self._mark = text, mark
         self._released.clear()
         threading.Thread(target=self._renew, args=(self._released,), daemon=True).start()
 
@@ -76,7 +89,7 @@ class LockFile:
         if not self._text:
             return
         self._released.set()
-        _HELD.discard(json.loads(self._text)["mark"])
+        _HELD.discard(self._mark)
         if self._handle is not None:
             os.close(self._handle)
             self._handle = None
@@ -149,15 +162,15 @@ def has_ended(path: Path) -> bool | None:
     None if the owner ran on another host or is not named, or if this system reports no processes.
     """
     try:
-        owner = json.loads(path.read_text(encoding="utf-8"))
-        if owner["host"] != host():
-            return None
-        if owner["pid"] == os.getpid():
-            return owner["mark"] not in _HELD
-        start = process_start(int(owner["pid"]))
-        return None if start is None or owner["start"] is None else bool(start != owner["start"])
-    except (OSError, ValueError, KeyError, TypeError):
+        owner = parse_record(path.read_bytes(), _Owner)
+    except (OSError, ValueError):
         return None  # its owner has created the file and not yet written it, or has deleted it
+    if owner.host != host():
+        return None
+    if owner.pid == os.getpid():
+        return owner.mark not in _HELD
+    start = process_start(owner.pid)
+    return None if start is None or owner.start is None else start != owner.start
 
 
 def _age_s(path: Path) -> float:

@@ -1,7 +1,8 @@
-"""Check JSON that is read back against typed records (msgspec), so that an edited file gives one sentence."""
+"""Parse JSON that is read back as typed records (msgspec), so that an edited file gives one sentence."""
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -13,27 +14,28 @@ Digest = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 """SHA-256, 64 hexadecimal digits."""
 Amount = Annotated[float, msgspec.Meta(ge=0)]
 
+MAX_BYTES = 2**30
+"""Largest file that is read back, such as the ``dataset.json`` of three million shards."""
 
-def decode_record(content: bytes | str, kind: type[Record]) -> Record:
-    """Decode JSON as a typed record; ValueError names key and expectation."""
+
+def parse_json(content: bytes | str) -> Any:
+    """Parse JSON; ValueError if it is none, or nested too deeply."""
     try:
-        return msgspec.json.decode(content, type=kind)
-    except msgspec.ValidationError as error:
-        raise _problem(error) from None
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise ValueError(f"not JSON: {error}") from None
+        return json.loads(content)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def parse_record(content: bytes | str, kind: type[Record]) -> Record:
+    """Parse JSON as a typed record; ValueError names key and expectation."""
+    return check_record(parse_json(content), kind)
 
 
 def check_record(value: Any, kind: type[Record]) -> Record:
-    """Convert a decoded JSON value to a typed record; ValueError names key and expectation."""
+    """Convert a parsed JSON value to a typed record; ValueError names key and expectation."""
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        raise _problem(error) from None
-
-
-def _problem(error: Exception) -> ValueError:
-    """Problem in the form ``shards[3].bytes: expected `int` >= 0``."""
-    problem, _, place = str(error).partition(" - at `$")
-    problem = problem[0].lower() + problem[1:]
-    return ValueError(f"{place.strip('.`')}: {problem}" if place else problem)
+        problem, _, place = str(error).partition(" - at `$")
+        problem = problem[0].lower() + problem[1:]
+        raise ValueError(f"{place.strip('.`')}: {problem}" if place else problem) from None

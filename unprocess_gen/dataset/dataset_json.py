@@ -9,9 +9,6 @@ import msgspec
 from unprocess_gen.core.records import Amount, Count, Digest, check_record
 from unprocess_gen.dataset.shards import shard_name
 
-MAX_BYTES = 2**30
-"""Largest ``dataset.json`` that is read: three million shards."""
-
 PARQUET_SHA256 = "parquet_sha256"
 """Key of the digest of ``manifest.parquet``; missing if the dataset has no such file."""
 
@@ -82,9 +79,14 @@ def check_dataset_json(facts: Any) -> DatasetFacts:
     """Check the types and ranges of a loaded ``dataset.json`` of this or an older version; ValueError names the key."""
     checked = check_record(facts, DatasetFacts)
     for number, entry in enumerate(checked.shards):
-        name = f"shards/{shard_name(number)}"
-        if entry.file not in (None, name):
-            raise ValueError(f"shards[{number}].file={entry.file[:40]!r}: expected null or {name}")
-        if entry.file is not None and entry.sha256 is None:
-            raise ValueError(f"shards[{number}].sha256=null: expected 64 hexadecimal digits")
+        check_shard(number, entry)
     return checked
+
+
+def check_shard(number: int, entry: ShardFacts) -> None:
+    """Raise ValueError if the entry of a shard has another file than the shard."""
+    name = f"shards/{shard_name(number)}"
+    if entry.file not in (None, name):
+        raise ValueError(f"shards[{number}].file={entry.file[:40]!r}: expected null or {name}")
+    if entry.file is not None and entry.sha256 is None:
+        raise ValueError(f"shards[{number}].sha256=null: expected 64 hexadecimal digits")

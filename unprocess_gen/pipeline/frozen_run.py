@@ -2,23 +2,24 @@
 
     .work/plan.json     version, digests of settings and listing, settings that decide no data, and the canary
 
-The settings themselves are in ``config.yaml``, and the sources in the files of `listing_record`. The canary is one
+The settings themselves are in ``config.yaml``, and the sources in files of `run_records`. The canary is one
 image of the run. The process that prepares the run records the digest of its rows, which contain the digests of its
 frames. Every other process regenerates the canary before its first shard, and generates no shard if the digest differs.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import os
 import platform
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.metadata import version
+from typing import Annotated
+
+import msgspec
 
 from unprocess_gen.config.interpretation import shading_place
 from unprocess_gen.config.schema import Config, replaced
@@ -27,14 +28,14 @@ from unprocess_gen.config.validation import check_values
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError
 from unprocess_gen.core.paths import absolute_text
+from unprocess_gen.core.records import Count, Digest, parse_record
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset.manifest import row_json
 from unprocess_gen.dataset.shards import ShardWriter
-from unprocess_gen.pipeline.listing_record import INDEX, RecordedListing, write_listing
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.run import Run
-from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.storage import WORK, Storage, open_storage
+from unprocess_gen.pipeline.run_records import INDEX, RecordedListing, ShardRecords, text_sha256, write_listing
+from unprocess_gen.pipeline.storage import WORK, Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardTask
 from unprocess_gen.pipeline.worker import make_and_commit, make_image
 from unprocess_gen.pipeline.workspace import Workspace
@@ -50,12 +51,14 @@ TRIED = 64
 """Sources of which the smallest usable one becomes the canary; without one, only the self-test compares hosts."""
 
 
+Positive = Annotated[int, msgspec.Meta(ge=1, le=2**63 - 1)]
+
+
 class CanaryError(MachineError):
     """Report a host that makes other bytes than the host that froze the run."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrozenPlan:
+class FrozenPlan(msgspec.Struct, frozen=True):
     """Hold what all processes of a run must agree on, and the settings that decide no data.
 
     Attributes
@@ -73,21 +76,25 @@ class FrozenPlan:
     """
 
     version: str
-    config_sha256: str
-    sources: int
-    listing_sha256: str
-    pairs_per_shard: int
+    config_sha256: Digest
+    sources: Count
+    listing_sha256: Digest
+    pairs_per_shard: Positive
     root: str | None
-    max_failed: int
+    max_failed: Count
     n_jobs: int
     self_test: str
-    not_matched: int
-    skipped_links: int
-    canary_source: int | None
+    not_matched: Count
+    skipped_links: Count
+    canary_source: Count | None
     canary_sha256: str
     dark_frames: str | None = None
     dark_shading: str | None = None
-    parts: int | None = None
+    parts: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.parts is not None and self.parts > self.shards:
+            raise ValueError(f"parts={self.parts}: expected 1 to {self.shards}, the number of shards")
 
     @property
     def shards(self) -> int:
@@ -97,7 +104,7 @@ class FrozenPlan:
     @property
     def text(self) -> str:
         """Content of ``plan.json``."""
-        return json.dumps(dataclasses.asdict(self), indent=1) + "\n"
+        return json.dumps(msgspec.structs.asdict(self), indent=1) + "\n"
 
 
 def freeze(
@@ -108,23 +115,23 @@ def freeze(
     Raises ConfigError if another version of unprocess_gen froze the run, CanaryError if this host makes another canary
     than the one recorded, MachineError if the self-test fails or a file cannot be written.
     """
-    storage, out = workspace.storage, workspace.out
-    plan = recorded_plan(storage, out)
+    storage = workspace.storage
+    plan = recorded_plan(storage)
     if plan is None:
         plan = _new_plan(workspace, run, on_compiling, parts)
         if storage.create(PLAN, plan.text):
             return plan
-        plan = recorded_plan(storage, out) or plan
+        plan = recorded_plan(storage) or plan
     check_canary(plan, run.settings, run.sources, on_compiling)
     if parts is not None and plan.parts is None:  # a run on a cluster is continued in parts
-        plan = dataclasses.replace(plan, parts=parts)
+        plan = msgspec.structs.replace(plan, parts=parts)
         storage.write(PLAN, plan.text)
     return plan
 
 
 def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, parts: int | None) -> FrozenPlan:
     if workspace.storage.size(INDEX) is None:  # version 0.1 began the dataset
-        write_listing(workspace.storage, workspace.out, run.sources)
+        write_listing(workspace.storage, run.sources)
     smallest_first = sorted(run.sources[:TRIED], key=lambda source: source.size_bytes or 0)
     index, sha256 = _make_canary(run.settings, smallest_first, on_compiling)
     config = run.config
@@ -152,7 +159,7 @@ def _make_canary(
     settings: PairSettings, sources: Iterable[Source], on_compiling: OnCompiling | None
 ) -> tuple[int | None, str]:
     """Make the first usable source; return its index and the digest of its rows, None and "" without one."""
-    storage = open_storage(settings.config.out)
+    storage = Storage(settings.config.out)
     context = RunContext(settings, str(storage.scratch), os.getpid(), on_compiling=on_compiling)
     path = storage.scratch / "canary.tar"
     try:
@@ -167,34 +174,26 @@ def _make_canary(
         storage.close()
 
 
-def text_sha256(text: str) -> str:
-    """SHA-256 of a text, 64 hexadecimal digits."""
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def recorded_plan(storage: Storage, out: str) -> FrozenPlan | None:
+def recorded_plan(storage: Storage) -> FrozenPlan | None:
     """Read the plan of a run, None if there is none; raise ConfigError if another version recorded it."""
-    try:
-        plan = FrozenPlan(**json.loads(storage.read(PLAN)))
-    except FileNotFoundError:
+    if not storage.has(PLAN):
         return None
-    except (ValueError, TypeError) as error:
-        raise DamageError(
-            f"{out}/{PLAN}: cannot be read ({error_in_one_line(error)}); remove the folder and start again"
-        ) from error
+    plan = storage.record(PLAN, lambda content: parse_record(content, FrozenPlan))
     if plan.version != version(PACKAGE):
         raise ConfigError(
-            f"out={out}: was begun by {PACKAGE} {plan.version}, this is {version(PACKAGE)}; use that version, or "
-            "prepare another out"
+            f"out={storage.out}: was begun by {PACKAGE} {plan.version[:20]}, this is {version(PACKAGE)}; use that "
+            "version, or prepare another out"
         )
     return plan
 
 
-def read_plan(storage: Storage, out: str) -> FrozenPlan:
+def read_plan(storage: Storage) -> FrozenPlan:
     """Read the plan of a run; raise ConfigError without one, or if ``config.yaml`` or the listing are not its own."""
-    plan = recorded_plan(storage, out)
+    plan = recorded_plan(storage)
     if plan is None:
-        raise ConfigError(f"out={out}: contains no plan of a run in parts; expected one; run gen-dataset prepare first")
+        raise ConfigError(
+            f"out={storage.out}: contains no plan of a run in parts; expected one; run gen-dataset prepare first"
+        )
     for name, sha256 in (("config.yaml", plan.config_sha256), (INDEX, plan.listing_sha256)):
         try:
             is_prepared = text_sha256(storage.read(name)) == sha256
@@ -202,7 +201,9 @@ def read_plan(storage: Storage, out: str) -> FrozenPlan:
             is_prepared = False
         if not is_prepared:
             what = "listing of sources" if name == INDEX else name
-            raise ConfigError(f"out={out}: its {what} is not the one that was prepared; prepare another out")
+            raise ConfigError(f"out={storage.out}: its {what} is not the one that was prepared; prepare another out")
+    if (count := RecordedListing(storage).count) != plan.sources:
+        raise storage.unusable(PLAN, f"sources={plan.sources}: expected {count}, as in {INDEX}")
     return plan
 
 
@@ -240,12 +241,11 @@ class FrozenRun:
     """
 
     def __init__(self, out: str, root: str | None = None) -> None:
-        self.out = out
-        self.storage = open_storage(out)
-        self.records = ShardRecords(self.storage, out)
-        self.plan = read_plan(self.storage, out)
+        self.storage = Storage(out)
+        self.records = ShardRecords(self.storage)
+        self.plan = read_plan(self.storage)
         self.config = self._config(root)
-        self._listing = RecordedListing(self.storage, out)
+        self._listing = RecordedListing(self.storage)
 
     def _config(self, root: str | None) -> Config:
         plan = self.plan
@@ -253,8 +253,8 @@ class FrozenRun:
             config, _ = parse_dataset_yaml(self.storage.read("config.yaml"))
             check_values(config)
         except (ValueError, ConfigError) as error:
-            raise DamageError(f"{self.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
-        changes = {"out": self.out, "n_jobs": plan.n_jobs, "self_test": plan.self_test}
+            raise DamageError(f"{self.storage.out}/config.yaml: cannot be read ({error_in_one_line(error)})") from error
+        changes = {"out": self.storage.out, "n_jobs": plan.n_jobs, "self_test": plan.self_test}
         changes |= {"source.root": root or plan.root, "source.max_failed": plan.max_failed}
         return with_dark_places(replaced(config, changes), DarkPlaces(plan.dark_frames, plan.dark_shading))
 
@@ -266,7 +266,7 @@ class FrozenRun:
     def check_host(self, on_compiling: OnCompiling | None = None) -> None:
         """Run the self-test and make the canary; errors are those of `check_canary`."""
         if (index := self.plan.canary_source) is not None:
-            check_canary(self.plan, self.settings, self._listing.sources(index, index + 1), on_compiling)
+            check_canary(self.plan, self.settings, [*self._listing.sources(index, index + 1)], on_compiling)
 
     def task(self, shard: int) -> ShardTask:
         """Read the sources of a shard."""

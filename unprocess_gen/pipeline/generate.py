@@ -6,7 +6,7 @@ A shard is the unit of work, retry and commit:
 * `executors.local`: starts worker processes; its docstring says what happens when one dies.
 * `executors.dask`: gives shards to the workers of a Dask cluster.
 * `worker`: makes one shard in a temporary file, commits it and reports counts.
-* `shard_records`, `listing_record`: what a run keeps until it is finished.
+* `run_records`: what a run keeps until it is finished.
 * `workspace`: checks and locks the output folder; writes ``manifest.csv`` and ``dataset.json``.
 * `storage`: the files below ``out``.
 
@@ -29,10 +29,11 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml, source_kind
 from unprocess_gen.core.paths import AnyPath, absolute_text, any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
-from unprocess_gen.pipeline.frozen_run import freeze, text_sha256
+from unprocess_gen.pipeline.frozen_run import freeze
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.run import Run, resolve
+from unprocess_gen.pipeline.run_records import text_sha256
 from unprocess_gen.pipeline.sizes import check_free_space
 from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.pipeline.tasks import SHOWN, RunContext, ShardReport, ShardTask, StageTimes

@@ -29,8 +29,8 @@ from unprocess_gen.pipeline.generate import Summary, begin, dataset_json_facts, 
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import COMPILING, LOGGER, Progress
 from unprocess_gen.pipeline.run import resolve
-from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.run_records import ShardRecords
+from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
 
@@ -126,7 +126,7 @@ def prepare(config: Config, parts: int) -> Prepared:
         if workspace.is_complete():
             workspace.check_complete(run.sources)
             return Prepared(parts, shards, sources, complete=True)
-        plan = recorded_plan(workspace.storage, workspace.out)
+        plan = recorded_plan(workspace.storage)
         if plan is not None and plan.parts not in (None, parts):
             raise ConfigError(
                 f"parts={parts}: {config.out} was prepared with parts={plan.parts}; expected that number; choose "
@@ -176,12 +176,12 @@ def parts_status(out: str) -> PartsStatus:
 
     Raises ConfigError if ``out`` was not prepared; DamageError if a record of the run cannot be read.
     """
-    storage = open_storage(out)
+    storage = Storage(out)
     if _is_complete(out):
         return PartsStatus(0, 0, 0, (), complete=True)
-    plan = read_plan(storage, out)
+    plan = read_plan(storage)
     parts = _parts(plan, out)
-    recorded = ShardRecords(storage, out).recorded(range(plan.shards))
+    recorded = ShardRecords(storage).recorded(range(plan.shards))
     left = (part for part in range(parts) if not recorded.issuperset(shards_of_part(part, parts, plan.shards)))
     return PartsStatus(parts, plan.shards, len(recorded), tuple(left))
 

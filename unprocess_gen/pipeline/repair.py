@@ -28,6 +28,7 @@ from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml, 
 from unprocess_gen.config.validation import check_parquet
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.core.files import commit_file, file_sha256, machine_error
+from unprocess_gen.core.records import parse_json
 from unprocess_gen.core.types import Frame, Row
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.columns import HEADERS, NAMES
@@ -331,7 +332,7 @@ class _Repair:
     def _restore_dataset_json(self, config: Config) -> RepairStep:
         """Restore ``dataset.json`` from the other files: to the same bytes if its facts about the run are readable."""
         try:
-            old = dict(json.loads((self._folder / "dataset.json").read_bytes()))
+            old = dict(parse_json((self._folder / "dataset.json").read_bytes()))
         except (OSError, ValueError, TypeError):
             old = {}
         rows = read_rows(self._manifest_file)

@@ -6,11 +6,11 @@ damage of the dataset: it is reported separately, with exit code 5 instead of 4.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from unprocess_gen.config.schema import SourceConfig
@@ -19,8 +19,10 @@ from unprocess_gen.core.files import array_xxh3, machine_error
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.records import parse_record
 from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import NO_CLIP, Pair, Photograph, Plan, Row, Source
+from unprocess_gen.dataset.dataset_json import DarkFrameFacts, SourceFacts
 from unprocess_gen.dataset.keys import image_key
 from unprocess_gen.dataset.manifest import patch_from_row, plan_from_row, read_row, read_rows, rows_with_offsets
 from unprocess_gen.pipeline.pairs import PlannedImage
@@ -66,26 +68,33 @@ class ReplayResult:
         return SourceChangedError.exit_code if self.source_changed else DamageError.exit_code
 
 
+class _Places(msgspec.Struct, frozen=True):
+    """Hold the places of sources and dark frames that a ``dataset.json`` records."""
+
+    source: SourceFacts = SourceFacts("synthetic", None)
+    dark_frames: DarkFrameFacts | None = None
+
+
+def _recorded_places(manifest: AnyPath) -> _Places:
+    """Read the places from ``dataset.json``, which may be damaged otherwise; none if they cannot be read."""
+    try:
+        return parse_record((manifest.parent / "dataset.json").read_bytes(), _Places)
+    except (OSError, ValueError):
+        return _Places()
+
+
 def source_root(manifest: AnyPath, root: str | None) -> str | None:
-    """Return the folder of the sources."""
-    return root if root is not None else _recorded_root(manifest, "source")
+    """Find the folder of the sources: the given one, or the one that ``dataset.json`` records."""
+    return root if root is not None else _recorded_places(manifest).source.root
 
 
 def dark_places(manifest: AnyPath, frames: str | None = None, shading: str | None = None) -> DarkPlaces:
     """Find the dark frames of a dataset and their dark-shading map."""
+    recorded = _recorded_places(manifest).dark_frames or DarkFrameFacts()
     return DarkPlaces(
-        frames if frames is not None else _recorded_root(manifest, "dark_frames"),
-        shading if shading is not None else _recorded_root(manifest, "dark_frames", "shading"),
+        frames if frames is not None else recorded.root,
+        shading if shading is not None else recorded.shading or None,
     )
-
-
-def _recorded_root(manifest: AnyPath, what: str, key: str = "root") -> str | None:
-    """Return the place that ``dataset.json`` records for ``source`` or ``dark_frames``."""
-    try:
-        recorded = json.loads((manifest.parent / "dataset.json").read_text(encoding="utf-8"))[what][key]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    return None if recorded is None else str(recorded)
 
 
 def check_source_sizes(manifest: AnyPath, root: str) -> None:

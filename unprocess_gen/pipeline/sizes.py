@@ -22,7 +22,7 @@ from unprocess_gen.core.sequences import evenly_spaced
 from unprocess_gen.core.types import PACKED, Source
 from unprocess_gen.dataset.manifest import json_size
 from unprocess_gen.dataset.shards import array_format, image_bytes, shard_bytes
-from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardTask
 from unprocess_gen.sources.image.headers import probe
 from unprocess_gen.sources.loader import load_source
@@ -119,7 +119,7 @@ def resolve_pairs_per_shard(config: Config, sources: Sequence[Source]) -> Config
 def _recorded_pairs_per_shard(out: str) -> int | None:
     """Read the number in ``config.yaml``, None without one; later checks report what is wrong with the file."""
     try:
-        config, _ = parse_dataset_yaml(open_storage(out).read("config.yaml"))
+        config, _ = parse_dataset_yaml(Storage(out).read("config.yaml"))
     except (OSError, ValueError, ConfigError):
         return None
     number = config.output.pairs_per_shard

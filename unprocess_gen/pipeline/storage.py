@@ -18,12 +18,14 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from unprocess_gen.core.errors import RESUME, ConfigError, LockedError, UnprocessGenError
+from unprocess_gen.config.values import error_in_one_line
+from unprocess_gen.core.errors import RESUME, ConfigError, LockedError, MachineError, UnprocessGenError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.locks import LockFile, has_ended, is_held
 from unprocess_gen.core.object_store import Item, ObjectPath, Result, StoreAccessError
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import LocalPath, any_path
+from unprocess_gen.core.records import MAX_BYTES
 
 WORK = ".work"
 """Folder below ``out`` for what a run needs until the dataset is finished."""
@@ -50,6 +52,7 @@ class Storage:
     """
 
     def __init__(self, out: str | os.PathLike[str] | ObjectPath) -> None:
+        self.out = str(out)
         self._out = any_path(out)
         self._lock = None if isinstance(self._out, ObjectPath) else LockFile(self._out / WORK / LOCK)
         self._owner: LockFile | None = None
@@ -100,13 +103,33 @@ class Storage:
         """Size of a file in bytes, None if there is no such file."""
         return self._path(name).size()
 
+    def has(self, name: str) -> bool:
+        """Check whether there is a file, folder or anything else of this name."""
+        return self._path(name).is_listed()
+
     def read(self, name: str) -> str:
         """Return the text of a file; raise FileNotFoundError if there is none."""
         return self.read_bytes(name).decode()
 
     def read_bytes(self, name: str) -> bytes:
-        """Return the content of a file; raise FileNotFoundError if there is none."""
-        return self._path(name).read_bytes()
+        """Return the content of a regular file of at most `MAX_BYTES`; raise FileNotFoundError if there is none."""
+        path = self._path(name)
+        if isinstance(path, LocalPath) and (path.size() or 0) > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES} bytes")
+        return path.read_bytes()
+
+    def record(self, name: str, parse: Callable[[bytes], Result]) -> Result:
+        """Read a file of the run; MachineError if that, or ``parse`` with a ValueError, fails."""
+        try:
+            return parse(self.read_bytes(name))
+        except (OSError, ValueError) as error:
+            if isinstance(error, FileNotFoundError) and not self._out.exists():
+                raise  # out was deleted, which the caller reports
+            raise self.unusable(name, error_in_one_line(error)) from error
+
+    def unusable(self, name: str, problem: str) -> MachineError:
+        """Error of a file of the run that was edited or damaged."""
+        return MachineError(f"{self.out}/{name}: cannot be read ({problem}); delete {self.out}/{WORK} and run again")
 
     def write(self, name: str, text: str) -> None:
         """Write a file durably, or replace it."""
@@ -174,11 +197,6 @@ class Storage:
 
     def _path(self, name: str) -> LocalPath | ObjectPath:
         return self._out / name if name else self._out
-
-
-def open_storage(out: str) -> Storage:
-    """Return the storage of a value of ``out``."""
-    return Storage(out)
 
 
 def cannot_write(error: OSError, out: str) -> UnprocessGenError:

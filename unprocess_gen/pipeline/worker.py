@@ -26,10 +26,9 @@ from unprocess_gen.core.types import Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
 from unprocess_gen.dataset.manifest import failed_row, pair_row, row_json
 from unprocess_gen.dataset.shards import CLEAN, ShardWriter, noisy_member, shard_name
-from unprocess_gen.pipeline.deaths import LIMIT, Deaths
 from unprocess_gen.pipeline.pairs import plan_pixels
-from unprocess_gen.pipeline.shard_records import commit_shard
-from unprocess_gen.pipeline.storage import open_storage
+from unprocess_gen.pipeline.run_records import LIMIT, Deaths, commit_shard
+from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardReport, ShardResult, ShardTask
 from unprocess_gen.planning.source_noise import source_noise_dn
 from unprocess_gen.simulation import self_test
@@ -51,9 +50,9 @@ Mark = Callable[[Source], object]
 def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
     """Make one shard and commit it; raise MachineError if disk, memory or self-test fail.
 
-    If deaths are counted and `deaths.LIMIT` workers have died at the shard, commit provisional rows.
+    If deaths are counted and `run_records.LIMIT` workers have died at the shard, commit provisional rows.
     """
-    storage = open_storage(context.config.out)
+    storage = Storage(context.config.out)
     try:
         if not context.counts_deaths:
             return commit_shard(storage, make_shard(context, task))
@@ -81,7 +80,7 @@ def commit_provisional(context: RunContext, task: ShardTask, source: Source, dea
     rows = tuple(failed_row(lost, None, task.shard, seed, "worker_died", detail) for lost in task.sources)
     result = ShardResult(task.shard, None, 0, None, rows, killer=f"{source.name}: {in_progress}")
     try:
-        return commit_shard(open_storage(context.config.out), result)
+        return commit_shard(Storage(context.config.out), result)
     except OSError as error:
         raise machine_error(error, any_path(context.config.out), RESUME) from error
 

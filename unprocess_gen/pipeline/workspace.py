@@ -2,9 +2,9 @@
 
     out/config.yaml              the resolved config, written first
     out/.work/lock               the process that coordinates a run (`core.locks`)
-    out/.work/sources/           all sources as the first run listed them (`listing_record`)
+    out/.work/sources/           all sources as the first run listed them (`run_records`)
     out/.work/tmp/WRITER/        unfinished files of one writer, which it deletes when it ends
-    out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists (`shard_records`)
+    out/.work/rows/00000.json    rows and entry of a committed shard, until manifest.csv exists (`run_records`)
     out/shards/                  complete shards
     out/manifest.csv             written once every shard is committed or provisional
     out/manifest.parquet         the manifest as typed columns, if output.parquet is true
@@ -24,7 +24,7 @@ import json
 import operator
 import re
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,13 +36,13 @@ from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
 from unprocess_gen.core.files import file_sha256, machine_error
 from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.records import MAX_BYTES, parse_json
 from unprocess_gen.core.types import Source
 from unprocess_gen.dataset import parquet
-from unprocess_gen.dataset.dataset_json import MAX_BYTES, PARQUET_SHA256, check_dataset_json
+from unprocess_gen.dataset.dataset_json import PARQUET_SHA256, check_dataset_json
 from unprocess_gen.dataset.manifest import header_text, read_rows
-from unprocess_gen.pipeline.listing_record import INDEX, RecordedFile, recorded_files, write_listing
-from unprocess_gen.pipeline.shard_records import ShardRecords
-from unprocess_gen.pipeline.storage import WORK, cannot_write, open_storage
+from unprocess_gen.pipeline.run_records import INDEX, ShardRecords, recorded_sources, write_listing
+from unprocess_gen.pipeline.storage import WORK, Storage, cannot_write
 from unprocess_gen.pipeline.tally import Tally
 from unprocess_gen.sources.reading import content_sha256
 
@@ -52,9 +52,6 @@ REPORT = "report.html"
 SHOWN = 3
 """Differences named in an error; the others are counted."""
 
-
-KnownFile = tuple[str, RecordedFile]
-"""Name of a source, and what identifies its content."""
 
 Digest = Callable[[Source, str | None], str | None]
 """Function of a source and its known SHA-256 that returns the present SHA-256, None if it is not known."""
@@ -69,8 +66,8 @@ class Workspace:
     def __init__(self, out: str | Path, config_yaml: str) -> None:
         self.out = str(out)
         self.config_yaml = config_yaml
-        self.storage = open_storage(self.out)
-        self.records = ShardRecords(self.storage, self.out)
+        self.storage = Storage(self.out)
+        self.records = ShardRecords(self.storage)
 
     def __enter__(self) -> Workspace:
         return self
@@ -112,7 +109,7 @@ class Workspace:
         if self.storage.size("dataset.json") is None:
             return None
         try:
-            return parse_dataset(self.storage.read("dataset.json"), f"{self.out}/dataset.json")
+            return read_dataset(any_path(self.out) / "dataset.json")
         except DamageError as error:
             raise DamageError(f"{error}; gen-dataset verify {self.out} --repair restores it") from error
 
@@ -123,7 +120,7 @@ class Workspace:
         changed, another one can have another number among identical files, and so other noise.
         """
         self._check_same_settings(root)
-        known = partial(recorded_files, self.storage, self.out)
+        known = partial(recorded_sources, self.storage)
         if next(known(), None) is not None:
             self._check_same_sources(known, sources, partial(_digest_if_recorded, root))
 
@@ -135,7 +132,7 @@ class Workspace:
         try:
             self._check_same_settings()  # another run may have begun since `check_begun`, where there are no locks
             if self.storage.size(INDEX) is None:
-                write_listing(self.storage, self.out, sources)
+                write_listing(self.storage, sources)
             if not self.storage.create("config.yaml", self.config_yaml):
                 self._check_same_settings()
             self.storage.begin()  # after config.yaml, by which a later run recognises the folder
@@ -164,7 +161,7 @@ class Workspace:
                 "--repair restores it"
             )
         self._check_same_settings()
-        known = partial(_files_of_rows, any_path(self.out) / "manifest.csv")
+        known = partial(_sources_of_rows, any_path(self.out) / "manifest.csv")
         self._check_same_sources(known, sources, lambda source, _: source.sha256)
         facts = self.facts()
         assert facts is not None
@@ -205,22 +202,17 @@ class Workspace:
             )
 
     def _check_same_sources(
-        self, known: Callable[[], Iterator[KnownFile]], sources: Sequence[Source], digest: Digest
+        self, known: Callable[[], Iterator[Source]], sources: Sequence[Source], digest: Digest
     ) -> None:
         """Raise ConfigError if the sources are not those that are known; name the differences.
 
         Both are in the order of the listing, so equal ones are compared without holding the known ones: a million take
         0.4 GB.
         """
-        pairs = itertools.zip_longest(
-            (next(of_file) for _, of_file in itertools.groupby(known(), key=operator.itemgetter(0))),
-            (next(of_file) for _, of_file in itertools.groupby(sources, key=operator.attrgetter("name"))),
-        )
-        if all(
-            file and source and file[0] == source.name and _is_same(file[1], source, digest) for file, source in pairs
-        ):
+        pairs = itertools.zip_longest(_first_of_files(known()), _first_of_files(sources))
+        if all(old and new and old.name == new.name and _is_same(old, new, digest) for old, new in pairs):
             return
-        files, listed = dict(known()), {source.name: source for source in sources}
+        files, listed = ({source.name: source for source in side} for side in (known(), sources))
         changes = (_change(name, files.get(name), listed.get(name), digest) for name in listed | files)
         differing = [change for change in changes if change]
         if differing:
@@ -282,14 +274,19 @@ def _digest_if_recorded(root: str | None, source: Source, recorded: str | None) 
     return content_sha256(root, source)
 
 
-def _files_of_rows(manifest: AnyPath) -> Iterator[KnownFile]:
-    """Yield the file of every row."""
-    for row in read_rows(manifest):
-        size, sha256 = row["source_bytes"], row["source_sha256"]
-        yield str(row["source"]), RecordedFile(size if isinstance(size, int) else None, str(sha256))
+def _sources_of_rows(manifest: AnyPath) -> Iterator[Source]:
+    """Yield the source of every row, with name, size and digest only."""
+    for index, row in enumerate(read_rows(manifest)):
+        size, name = row["source_bytes"], str(row["source"])
+        yield Source(index, name, name, size if isinstance(size, int) else None, sha256=str(row["source_sha256"]))
 
 
-def _change(name: str, file: RecordedFile | None, source: Source | None, digest: Digest) -> str:
+def _first_of_files(sources: Iterable[Source]) -> Iterator[Source]:
+    """Yield the first of consecutive sources that are in one file."""
+    return (next(of_file) for _, of_file in itertools.groupby(sources, key=operator.attrgetter("name")))
+
+
+def _change(name: str, file: Source | None, source: Source | None, digest: Digest) -> str:
     """Describe how a source differs from the known file of its name; empty if it does not."""
     if file is None or source is None:
         return f"{name} is new" if file is None else f"{name} was deleted"
@@ -298,12 +295,11 @@ def _change(name: str, file: RecordedFile | None, source: Source | None, digest:
     return "" if _is_same(file, source, digest) else f"{name} has other bytes than it had"
 
 
-def _is_same(file: RecordedFile, source: Source, digest: Digest) -> bool:
-    """Return whether a source has the known size, and digest and ETag if both are known."""
-    size, known, etag = file
-    if source.size_bytes != size or (etag and source.etag not in (None, etag)):
+def _is_same(file: Source, source: Source, digest: Digest) -> bool:
+    """Check whether a source has the size of the known one, and its digest and ETag if both are known."""
+    if source.size_bytes != file.size_bytes or (file.etag and source.etag not in (None, file.etag)):
         return False
-    return not known or digest(source, known) in (None, known)
+    return not file.sha256 or digest(source, file.sha256) in (None, file.sha256)
 
 
 def dataset_facts(
@@ -341,24 +337,16 @@ def read_dataset(path: AnyPath) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"more than {MAX_BYTES} bytes")
-        text = path.read_bytes().decode("ascii")
-    except (OSError, ValueError) as error:
-        raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
-    return parse_dataset(text, str(path))
-
-
-def parse_dataset(text: str, place: str) -> dict[str, Any]:
-    """Parse the text of a ``dataset.json`` as `read_dataset` does; ``place`` names it in messages."""
-    try:
-        facts = json.loads(text)
+        content = path.read_bytes()
+        facts = parse_json(content)
         facts.pop("dataset_sha256")
-        intact = dataset_text(facts) == text
+        intact = dataset_text(facts).encode() == content
         if intact:
             check_dataset_json(facts)
-    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
-        raise DamageError(f"{place}: cannot be read ({error_in_one_line(error)})") from error
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise DamageError(f"{path}: cannot be read ({error_in_one_line(error)})") from error
     if not intact:
-        raise DamageError(f"{place}: was changed: its SHA-256 differs from dataset_sha256")
+        raise DamageError(f"{path}: was changed: its SHA-256 differs from dataset_sha256")
     return dict(facts)
 
 

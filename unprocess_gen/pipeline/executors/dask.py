@@ -7,7 +7,7 @@ commit shards themselves, so a chunk that is lost or made twice costs time, but 
 What happens when something fails:
 
 * A worker dies, or sends no sign of life for ``executor.lost_worker_s``: other workers get the shards of its chunks.
-  A shard that ends its workers gets provisional rows after `deaths.LIMIT` deaths, which workers count below ``.work``.
+  A shard that ends its workers gets provisional rows after `run_records.LIMIT` deaths, counted below ``.work``.
 * A worker is slow: once no shard waits, idle workers take shards from the end of its chunks.
 * A worker makes other bytes (canary, self-test): it gets no chunk. Without any other worker the run ends.
 * A worker reports a system error: it gets no chunk for `PAUSE_S`. The run ends if this repeats (`TRIES`).
@@ -43,10 +43,9 @@ from distributed.versions import VersionMismatchWarning
 from unprocess_gen.config.schema import ExecutorConfig
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, MachineError, SourceChangedError, UnprocessGenError
-from unprocess_gen.pipeline.deaths import forget_deaths
 from unprocess_gen.pipeline.executors.local import interrupts_ignored
 from unprocess_gen.pipeline.frozen_run import PLAN, FrozenRun, open_run
-from unprocess_gen.pipeline.shard_records import ShardRecords
+from unprocess_gen.pipeline.run_records import ShardRecords, forget_deaths
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardReport
 from unprocess_gen.pipeline.worker import KEPT_BYTES
