@@ -517,12 +517,6 @@ class Plan:
         assert self.noise.physics is not None
         return self.noise.physics
 
-    @property
-    def parts(self) -> tuple[Any, ...]:
-        """All records of the plan, except `Physics`."""
-        source, scene, camera, isp, sensor = self.source, self.scene, self.camera, self.isp, self.sensor
-        return source, scene, camera, isp, sensor, self.noise, self.noise.dark, self.accuracy, self.output
-
     def __hash__(self) -> int:
         """Hash a few numbers: those of all fields take ten times as long, and patches look up their plan's records."""
         return hash((self.stream_key, self.noise.level, self.noise.draw, self.noise.frame))
@@ -568,11 +562,13 @@ class Plan:
         return self.brightest * float(self.sensor.span_dn) + float(self.sensor.black_level_dn)
 
 
-_PARTS: dict[str, Any] = {
+PARTS: dict[str, Any] = {
     "source": SourcePlan, "scene": ScenePlan, "camera": CameraPlan, "isp": IspPlan, "sensor": SensorPlan,
     "noise": NoisePlan, "accuracy": AccuracyPlan, "output": OutputPlan,
 }  # fmt: skip
-_PART_OF = {field.name: part for part, record in _PARTS.items() for field in fields(record) if field.name != "name"}
+"""Records of a plan by the names of their fields."""
+
+_PART_OF = {field.name: part for part, record in PARTS.items() for field in fields(record) if field.name != "name"}
 _PART_OF |= {field.name: "" for field in fields(Plan)}
 """Part of a plan in which each field is; empty for the plan's own fields."""
 

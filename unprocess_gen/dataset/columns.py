@@ -40,30 +40,51 @@ from unprocess_gen.core.types import (
 )
 from unprocess_gen.simulation.effects import NUMBERS, RECORDED_NUMBERS, Physics
 
+MAX_PATH = 2**15
+"""Characters of the percent-encoded path of a source."""
+
 FIRST = "0.1"
 """The version of the first manifests. Every manifest has the columns of this version."""
 
 
+def number_or_text(cell: str) -> str | int | float:
+    """Return the number that a cell holds, or its text."""
+    for kind in (int, float):
+        try:
+            return kind(cell)
+        except ValueError:
+            continue
+    return cell
+
+
 class Range(NamedTuple):
-    """Hold the least and greatest number that a column allows; NaN is in no range."""
+    """Hold the least and greatest number that a column allows, and words instead; NaN is in no range."""
 
     low: float
     high: float
     words: tuple[str, ...] = ()
+    type: Callable[[str], str | int | float] = float
 
     def __contains__(self, value: object) -> bool:
         if isinstance(value, str):
             return value in self.words
-        return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
+        kinds = int if self.type is int else int | float
+        return isinstance(value, kinds) and not isinstance(value, bool) and self.low <= value <= self.high
 
     def __str__(self) -> str:
         return " or ".join([f"a number from {self.low:.12g} to {self.high:.12g}", *self.words])
+
+
+def integers(low: int, high: int) -> Range:
+    """Range of integers."""
+    return Range(low, high, type=int)
 
 
 class Words(tuple[str, ...]):
     """Hold the words that a column allows."""
 
     __slots__ = ()
+    type = str
 
     def __str__(self) -> str:
         return " or ".join(filter(None, self))
@@ -74,6 +95,7 @@ class Text(NamedTuple):
 
     pattern: re.Pattern[str]
     description: str
+    type: Callable[[str], str] = str
 
     def __contains__(self, value: object) -> bool:
         return isinstance(value, str) and self.pattern.fullmatch(value) is not None
@@ -82,13 +104,13 @@ class Text(NamedTuple):
         return self.description
 
 
-class RelativePath(NamedTuple):
+class RelativePath:
     """Allow the percent-encoded path of a file below the source folder, so that nothing outside it is looked up."""
 
-    max_characters: int = 2**15
+    type = str
 
     def __contains__(self, value: object) -> bool:
-        if not isinstance(value, str) or value not in ANY_TEXT or not 0 < len(value) <= self.max_characters:
+        if not isinstance(value, str) or value not in ANY_TEXT or not 0 < len(value) <= MAX_PATH:
             return False
         path = _PERCENT.sub(lambda match: chr(int(match[1], 16)), value)
         return not path.startswith("/") and ".." not in path.split("/") and "\0" not in path
@@ -111,16 +133,6 @@ class Spelling(NamedTuple):
     read: Callable[[Any], Any]
 
 
-def number_or_text(cell: str) -> str | int | float:
-    """Return the number that a cell holds, or its text."""
-    for kind in (int, float):
-        try:
-            return kind(cell)
-        except ValueError:
-            continue
-    return cell
-
-
 TYPE_NAMES: Mapping[Any, str] = {int: "integer", float: "number", str: "text", number_or_text: "number or text"}
 
 FAILED = "the source failed"
@@ -131,15 +143,6 @@ NO_DARK_FRAME = "there is no dark frame"
 NO_VIDEO = "the source failed, unless it is a frame of a video"
 
 
-def _same(value: Any) -> Any:
-    return value
-
-
-_SPELLINGS: Mapping[Any, Spelling] = {
-    int: Spelling(_same, int),
-    float: Spelling(_same, float),
-    str: Spelling(_same, _same),
-}
 HEXADECIMAL = Spelling("{:016x}".format, lambda text: int(text, 16))
 LIST = Spelling(";".join, lambda text: tuple(text.split(";")) if text else ())
 SWITCH = Spelling(int, bool)
@@ -149,11 +152,11 @@ GAMMA = Spelling(
 
 FINITE = Range(-1.7976931348623157e308, 1.7976931348623157e308)
 NOT_NEGATIVE = Range(0, FINITE.high)
-COUNT = Range(0, 2**63 - 1)
+COUNT = integers(0, 2**63 - 1)
 SHARE = Range(0, 1)
-COORDINATE = Range(0, 2**32 - 1)
+COORDINATE = integers(0, 2**32 - 1)
 """Pixel coordinates and frame numbers are 32-bit counters of the random streams."""
-SIDE = Range(1, 2**32)
+SIDE = integers(1, 2**32)
 MATRIX_ENTRY = Range(-1e10, 1e10)
 GAIN = Range(1e-4, 1e4)
 ANY_TEXT = Text(re.compile("[^\x00-\x1f\x7f\ud800-\udfff]*"), "text without control characters")
@@ -171,18 +174,16 @@ class Column:
     ----------
     name : str
         Name in the header of ``manifest.csv`` and in ``KEY.json``.
-    type : callable
-        Converts a cell's text to its value: `int`, `float`, `str` or `number_or_text`.
     meaning : str
         One phrase for users.
     allowed : Range, Words, Text or RelativePath
-        Values other than the empty cell.
+        Values other than the empty cell, and their type.
     of : type, optional
         Dataclass whose field the column holds.
     field : str
         Name of that field; empty if it is the name of the column. Columns that share a field hold its items in order.
     spelling : Spelling, optional
-        Conversion between field and value; None: the one of ``type``.
+        Conversion between field and value; None if both are the same.
     since : str
         First version of unprocess_gen that writes the column. Older manifests do not have it; it then reads as empty.
     in_json : bool
@@ -194,7 +195,6 @@ class Column:
     """
 
     name: str
-    type: Callable[[str], str | int | float]
     meaning: str
     allowed: Allowed
     of: Record | None = None
@@ -206,13 +206,18 @@ class Column:
     empty_if: str = FAILED
 
     @property
+    def type(self) -> Callable[[str], str | int | float]:
+        """Function that converts the text of a cell: `int`, `float`, `str` or `number_or_text`."""
+        return self.allowed.type
+
+    @property
     def type_name(self) -> str:
         """Name of the type for users."""
         return TYPE_NAMES[self.type]
 
     @property
     def empty(self) -> Value:
-        """Return the value of an empty cell, and of a column that a manifest does not have."""
+        """Value of an empty cell, and of a column that a manifest does not have."""
         return "" if self.type is str else None
 
     @property
@@ -235,12 +240,12 @@ class Column:
 
     def check(self, value: Value) -> None:
         """Raise ValueError if the column does not allow a value."""
-        if value not in self.allowed or (self.type is int and not isinstance(value, int)):
+        if value not in self.allowed:
             raise ValueError(f"{self.name}={_short(value)}: expected {self.allowed}")
 
     def from_field(self, value: Any) -> Value:
         """Return the value of the column for a value of its field."""
-        return (self.spelling or _SPELLINGS[self.type]).write(value)
+        return self.spelling.write(value) if self.spelling else value
 
     def to_field(self, row: Mapping[str, Value]) -> Any:
         """Return the value of the field for a row; ValueError if the row's value is missing or not allowed."""
@@ -248,7 +253,7 @@ class Column:
         if value is None or (value == "" and self.spelling is not LIST):
             raise ValueError(f"{self.name} is empty")
         self.check(value)
-        return (self.spelling or _SPELLINGS[self.type]).read(value)
+        return (self.spelling.read if self.spelling else self.type)(value)  # type: ignore[arg-type]
 
 
 def _short(value: object) -> str:
@@ -261,224 +266,140 @@ def _columns_of_numbers(*names: str) -> Iterator[Column]:
     for field_name in names:
         number = NUMBERS[field_name]
         allowed = Words((*number.words, "none")) if number.words else Range(number.lowest, number.highest)
+        since, empty_if = number.since or FIRST, number.empty_if if number.since else FAILED
         for name, meaning in (number.columns or {field_name: number.meaning}).items():
-            yield Column(
-                name,
-                str if number.words else float,
-                meaning,
-                allowed,
-                Physics,
-                field_name,
-                unit=number.unit,
-                since=number.since or FIRST,
-                empty_if=number.empty_if if number.since else FAILED,
-            )
+            yield Column(name, meaning, allowed, Physics, field_name, unit=number.unit, since=since, empty_if=empty_if)
 
 
 COLUMNS = (
-    Column(
-        "key", str, "source index as eight digits, then number of patch, level and draw if there are several", KEY_TEXT,
-        empty_if="",
-    ),
-    Column(
-        "source", str, "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name",
-        empty_if="",
-    ),
-    Column("source_sha256", str, "SHA-256 of the source's bytes", HEX_256, empty_if="the source cannot be read"),
-    Column(
-        "source_bytes", int, "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes",
-        unit="bytes", empty_if="there is no readable file",
-    ),
-    Column("status", str, "ok, or failed if the source could not be used", Words(("ok", "failed")), empty_if=""),
-    Column(
-        "reason", str, "reason of the failure", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt"),
-        empty_if="the source did not fail",
-    ),
-    Column("width", int, "width of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
-    Column("height", int, "height of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
-    Column("orientation", int, "EXIF orientation that was applied to the source, 1 to 8", Range(1, 8)),
-    Column("shard", int, "number of the shard", Range(0, 10**9), empty_if=""),
-    Column("seed", int, "seed of the run", COUNT, Plan, empty_if=""),
-    Column("stream_key", str, "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
-    Column("camera", str, "convex, or the name of the camera", ANY_TEXT, CameraPlan, "name"),
+    Column("key", "source index as eight digits, then number of patch, level and draw if there are several", KEY_TEXT,
+           empty_if=""),
+    Column("source", "path below the source folder, percent-encoded where unsafe", RelativePath(), Source, "name",
+           empty_if=""),
+    Column("source_sha256", "SHA-256 of the source's bytes", HEX_256, empty_if="the source cannot be read"),
+    Column("source_bytes", "size of the source; 0 for a built-in scene", COUNT, Source, "size_bytes", unit="bytes",
+           empty_if="there is no readable file"),
+    Column("status", "ok, or failed if the source could not be used", Words(("ok", "failed")), empty_if=""),
+    Column("reason", "reason of the failure", Text(re.compile("[a-z0-9_]*"), "a reason such as corrupt"),
+           empty_if="the source did not fail"),
+    Column("width", "width of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
+    Column("height", "height of the frame; packed planes have half of it", SIDE, Patch, unit="pixels"),
+    Column("orientation", "EXIF orientation that was applied to the source, 1 to 8", integers(1, 8)),
+    Column("shard", "number of the shard", integers(0, 10**9), empty_if=""),
+    Column("seed", "seed of the run", COUNT, Plan, empty_if=""),
+    Column("stream_key", "key of the image's random streams, 16 hex digits", HEX_64, Plan, spelling=HEXADECIMAL),
+    Column("camera", "convex, or the name of the camera", ANY_TEXT, CameraPlan, "name"),
     *(
-        Column(
-            f"w_{camera}", float, "weight of this camera in the mix; 0 if it is not part of it",
-            SHARE, CameraPlan, "weights",
-        )
+        Column(f"w_{camera}", "weight of this camera in the mix; 0 if it is not part of it", SHARE, CameraPlan,
+               "weights")
         for camera in ("nexus_6p", "sony_a7r", "olympus_em10", "sony_rx100")
     ),
     *(
-        Column(
-            f"rgb2cam_{i}{j}", float, f"matrix from linear sRGB to the camera, row {i}, column {j}",
-            MATRIX_ENTRY, CameraPlan, "rgb2cam",
-        )
-        for i in range(3)
-        for j in range(3)
+        Column(f"rgb2cam_{i}{j}", f"matrix from linear sRGB to the camera, row {i}, column {j}", MATRIX_ENTRY,
+               CameraPlan, "rgb2cam")
+        for i in range(3) for j in range(3)
     ),
-    Column("red_gain", float, "forward white-balance gain of red", GAIN, CameraPlan),
-    Column("blue_gain", float, "forward white-balance gain of blue", GAIN, CameraPlan),
-    Column(
-        "inverse_rgb_gain", float, "inverse of the brightening gain; all channels are multiplied by it", GAIN,
-        CameraPlan,
-    ),
-    Column("tone", str, "inverted tone curve: smoothstep or none", Words(("smoothstep", "none")), IspPlan),
-    Column(
-        "gamma", number_or_text, "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",)), IspPlan,
-        spelling=GAMMA,
-    ),
-    Column(
-        "highlight", str, "preservation of highlights: per_channel, gray_mean or none",
-        Words(("per_channel", "gray_mean", "none")), CameraPlan,
-    ),
-    Column(
-        "highlight_threshold", float, "linear signal above which highlights are preserved, 1 is white",
-        Range(0, math.nextafter(1, 0)), CameraPlan,
-    ),
-    Column(
-        "pattern", str, "CFA pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), SensorPlan
-    ),
-    Column("bits", int, "bits per sample of the sensor", Range(1, 16), SensorPlan),
-    Column("black_level_dn", int, "black level", Range(0, 65534), SensorPlan, unit="DN"),
-    Column("white_level_dn", int, "white level (saturation)", Range(1, 65535), SensorPlan, unit="DN"),
-    Column(
-        "sensor_clip", str, "clipping of the noisy frame: sensor, black or none",
-        Words(("sensor", "black", "none")), NoisePlan,
-    ),
-    Column("noise", str, "name of the noise profile", ANY_TEXT, NoisePlan, "name"),
-    Column(
-        "a_dn", float, "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2",
-        Range(-1e30, 1e30), NoisePlan, unit="DN",
-    ),
-    Column(
-        "b_dn2", float, "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2",
-        FINITE, NoisePlan, unit="DN²",
-    ),
-    Column(
-        "effects", str, "simulated effects, in order, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
-        empty_if="no effect was simulated, or the source failed",
-    ),
-    Column(
-        "skipped", str, "skipped effects, each with its reason, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
-        empty_if="no effect was skipped, or the source failed",
-    ),
-    Column("accuracy", str, "name of the accuracy tier", ANY_TEXT, AccuracyPlan, "name"),
-    Column("methods", str, "method of each stage, separated by ;", ANY_TEXT, AccuracyPlan, spelling=LIST),
-    Column("clean_xxh3", str, "XXH3-128 of the clean array's little-endian bytes", HEX_128),
-    Column("noisy_xxh3", str, "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
-    Column("clean_clipped_low", int, "clean sites below black before clipping", COUNT, Counts, unit="sites"),
-    Column("clean_clipped_high", int, "clean sites above white before clipping", COUNT, Counts, unit="sites"),
-    Column("noisy_clipped_low", int, "noisy sites below the lowest DN before clipping", COUNT, Counts, unit="sites"),
-    Column("noisy_clipped_high", int, "noisy sites above the highest DN before clipping", COUNT, Counts, unit="sites"),
-    Column("saturated", int, "clean sites at the white level", COUNT, Counts, unit="sites"),
-    Column("zero_variance", int, "sites at which the noise has no variance", COUNT, Counts, unit="sites"),
-    Column(
-        "law_distance", float, "largest accepted CDF distance of shot plus read noise",
-        NOT_NEGATIVE, AccuracyPlan,
-    ),
-    Column("scene", str, "name of the scene", ANY_TEXT, ScenePlan, "name"),
-    Column("exposure_ratio", float, "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
-    Column(
-        "saturated_as", str, "noisy sites whose clean site is saturated: noisy, or pinned to white",
-        Words(("noisy", "pinned")), NoisePlan, "saturated",
-    ),
-    Column(
-        "noise_law", str, "distribution of a two-parameter profile: gaussian or poisson",
-        Words(("gaussian", "poisson")), NoisePlan, "law",
-    ),
-    Column("iso", float, "ISO of a physical profile", Range(0, 1e9), Physics),
-    Column("exposure_s", float, "exposure time", Range(0, 1e7), Physics, unit="seconds"),
-    Column("temperature_c", float, "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius"),
+    Column("red_gain", "forward white-balance gain of red", GAIN, CameraPlan),
+    Column("blue_gain", "forward white-balance gain of blue", GAIN, CameraPlan),
+    Column("inverse_rgb_gain", "inverse of the brightening gain; all channels are multiplied by it", GAIN, CameraPlan),
+    Column("tone", "inverted tone curve: smoothstep or none", Words(("smoothstep", "none")), IspPlan),
+    Column("gamma", "inverted gamma: a number or srgb", Range(0.1, 10, ("srgb",), number_or_text), IspPlan,
+           spelling=GAMMA),
+    Column("highlight", "preservation of highlights: per_channel, gray_mean or none",
+           Words(("per_channel", "gray_mean", "none")), CameraPlan),
+    Column("highlight_threshold", "linear signal above which highlights are preserved, 1 is white",
+           Range(0, math.nextafter(1, 0)), CameraPlan),
+    Column("pattern", "CFA pattern of the top-left 2x2 sites", Words(("RGGB", "BGGR", "GRBG", "GBRG")), SensorPlan),
+    Column("bits", "bits per sample of the sensor", integers(1, 16), SensorPlan),
+    Column("black_level_dn", "black level", integers(0, 65534), SensorPlan, unit="DN"),
+    Column("white_level_dn", "white level (saturation)", integers(1, 65535), SensorPlan, unit="DN"),
+    Column("sensor_clip", "clipping of the noisy frame: sensor, black or none", Words(("sensor", "black", "none")),
+           NoisePlan),
+    Column("noise", "name of the noise profile", ANY_TEXT, NoisePlan, "name"),
+    Column("a_dn", "slope of the noise variance, which is a_dn (x - black) + dark_variance_dn2", Range(-1e30, 1e30),
+           NoisePlan, unit="DN"),
+    Column("b_dn2", "noise variance at black of two-parameter noise, or of read noise; see dark_variance_dn2", FINITE,
+           NoisePlan, unit="DN²"),
+    Column("effects", "simulated effects, in order, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
+           empty_if="no effect was simulated, or the source failed"),
+    Column("skipped", "skipped effects, each with its reason, separated by ;", ANY_TEXT, NoisePlan, spelling=LIST,
+           empty_if="no effect was skipped, or the source failed"),
+    Column("accuracy", "name of the accuracy tier", ANY_TEXT, AccuracyPlan, "name"),
+    Column("methods", "method of each stage, separated by ;", ANY_TEXT, AccuracyPlan, spelling=LIST),
+    Column("clean_xxh3", "XXH3-128 of the clean array's little-endian bytes", HEX_128),
+    Column("noisy_xxh3", "XXH3-128 of the noisy array's little-endian bytes", HEX_128),
+    Column("clean_clipped_low", "clean sites below black before clipping", COUNT, Counts, unit="sites"),
+    Column("clean_clipped_high", "clean sites above white before clipping", COUNT, Counts, unit="sites"),
+    Column("noisy_clipped_low", "noisy sites below the lowest DN before clipping", COUNT, Counts, unit="sites"),
+    Column("noisy_clipped_high", "noisy sites above the highest DN before clipping", COUNT, Counts, unit="sites"),
+    Column("saturated", "clean sites at the white level", COUNT, Counts, unit="sites"),
+    Column("zero_variance", "sites at which the noise has no variance", COUNT, Counts, unit="sites"),
+    Column("law_distance", "largest accepted CDF distance of shot plus read noise", NOT_NEGATIVE, AccuracyPlan),
+    Column("scene", "name of the scene", ANY_TEXT, ScenePlan, "name"),
+    Column("exposure_ratio", "divisor of the light in the photograph", Range(1e-4, 1e7), ScenePlan),
+    Column("saturated_as", "noisy sites whose clean site is saturated: noisy, or pinned to white",
+           Words(("noisy", "pinned")), NoisePlan, "saturated"),
+    Column("noise_law", "distribution of a two-parameter profile: gaussian or poisson", Words(("gaussian", "poisson")),
+           NoisePlan, "law"),
+    Column("iso", "ISO of a physical profile", Range(0, 1e9), Physics),
+    Column("exposure_s", "exposure time", Range(0, 1e7), Physics, unit="seconds"),
+    Column("temperature_c", "temperature of the sensor", Range(-300, 1000), Physics, unit="degrees Celsius"),
     *_columns_of_numbers(*RECORDED_NUMBERS[0]),
-    Column("dark_offset", str, "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics),
+    Column("dark_offset", "mean dark current: removed or kept", Words(("removed", "kept", "none")), Physics),
     *_columns_of_numbers(*RECORDED_NUMBERS[1]),
-    Column("sensor_unit", str, "camera body", ANY_TEXT, Physics),
-    Column("body_key", str, "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
-    Column(
-        "fixed_pattern_in_clean", int, "1 if the clean frame has the fixed patterns too", SHARE, Physics,
-        spelling=SWITCH,
-    ),
-    Column("level", int, "number of the noise level, from 0", Range(0, 99), NoisePlan),
-    Column("draw", int, "number of the draw at this level, from 0", Range(0, 99), NoisePlan),
-    Column("frame", int, "number of the frame in its clip, from 0", COORDINATE, NoisePlan, empty_if=NO_VIDEO),
-    Column("clip", str, "name of the clip; none for single photographs", ANY_TEXT, Source, empty_if=NO_VIDEO),
-    Column(
-        "downscale", int, "side of the squares of source pixels that were averaged", Range(1, 64), SourcePlan,
-        unit="pixels",
-    ),
-    Column(
-        "dequantize", str, "dequantization of 8-bit codes: off, dither or dither_all",
-        Words(("off", "dither", "dither_all")), SourcePlan,
-    ),
-    Column("patch", int, "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
-    Column(
-        "patch_y", int, "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels"
-    ),
-    Column(
-        "patch_x", int, "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels"
-    ),
-    Column(
-        "dtype", str, "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)",
-        Words((UINT16, FLOAT32)), OutputPlan,
-    ),
-    Column("layout", str, "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), OutputPlan),
-    Column(
-        "detail", str, "explanation of the failure, one line", ANY_TEXT, since="0.2", in_json=False,
-        empty_if="the source did not fail",
-    ),
-    Column(
-        "assumed", str, "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT,
-        NoisePlan, spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off",
-    ),
-    Column(
-        "clean_dtype", str, "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), OutputPlan,
-        since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed",
-    ),
+    Column("sensor_unit", "camera body", ANY_TEXT, Physics),
+    Column("body_key", "key of the fixed patterns, 16 hex digits", HEX_64, Physics, spelling=HEXADECIMAL),
+    Column("fixed_pattern_in_clean", "1 if the clean frame has the fixed patterns too", integers(0, 1), Physics,
+           spelling=SWITCH),
+    Column("level", "number of the noise level, from 0", integers(0, 99), NoisePlan),
+    Column("draw", "number of the draw at this level, from 0", integers(0, 99), NoisePlan),
+    Column("frame", "number of the frame in its clip, from 0", COORDINATE, NoisePlan, empty_if=NO_VIDEO),
+    Column("clip", "name of the clip; none for single photographs", ANY_TEXT, Source, empty_if=NO_VIDEO),
+    Column("downscale", "side of the squares of source pixels that were averaged", integers(1, 64), SourcePlan,
+           unit="pixels"),
+    Column("dequantize", "dequantization of 8-bit codes: off, dither or dither_all",
+           Words(("off", "dither", "dither_all")), SourcePlan),
+    Column("patch", "number of the patch in its image; 0 for a complete image too", COORDINATE, Patch, "number"),
+    Column("patch_y", "first row of the arrays in the full frame; even", COORDINATE, Patch, "y", unit="pixels"),
+    Column("patch_x", "first column of the arrays in the full frame; even", COORDINATE, Patch, "x", unit="pixels"),
+    Column("dtype", "dtype of the arrays: uint16 (DN), or float32 (0 at black, 1 at white)", Words((UINT16, FLOAT32)),
+           OutputPlan),
+    Column("layout", "layout of the arrays: mosaic, or packed planes", Words((MOSAIC, PACKED)), OutputPlan),
+    Column("detail", "explanation of the failure, one line", ANY_TEXT, since="0.2", in_json=False,
+           empty_if="the source did not fail"),
+    Column("assumed", "assumed numbers of the profile that the simulated effects use, separated by ;", ANY_TEXT,
+           NoisePlan, spelling=LIST, since="0.2", empty_if="no effect uses one, or effects.assumed is off"),
+    Column("clean_dtype", "dtype of the clean array, if it is not that of dtype", Words((FLOAT32,)), OutputPlan,
+           since="0.2", empty_if="the clean array has the dtype of the noisy one, or the source failed"),
     *_columns_of_numbers(*RECORDED_NUMBERS[2]),
     *(
-        Column(
-            f"frame_{side}", int, f"{side} of the full frame, to which the lens shading belongs", COORDINATE, Physics,
-            "frame_size", unit="pixels", since="0.2", empty_if="there is no lens shading",
-        )
+        Column(f"frame_{side}", f"{side} of the full frame, to which the lens shading belongs", COORDINATE, Physics,
+               "frame_size", unit="pixels", since="0.2", empty_if="there is no lens shading")
         for side in ("height", "width")
     ),
-    Column(
-        "source_noise_dn", float, "estimated noise of the source itself, in the green plane of the clean frame",
-        NOT_NEGATIVE, unit="DN", since="0.2", in_json=False,
-        empty_if="the source failed, is a built-in scene or an array, or no tile of 32 x 32 pixels is free of clipping",
-    ),
-    Column(
-        "dark_frame", str, "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256,
-        DarkFramePlan, "sha256", since="0.2", empty_if=NO_DARK_FRAME,
-    ),
+    Column("source_noise_dn", "estimated noise of the source itself, in the green plane of the clean frame",
+           NOT_NEGATIVE, unit="DN", since="0.2", in_json=False,
+           empty_if="the source failed, is a built-in scene or an array, or no tile of 32 x 32 pixels is free of "
+           "clipping"),
+    Column("dark_frame", "SHA-256 of the dark frame from which the noise of the read-out is sampled", HEX_256,
+           DarkFramePlan, "sha256", since="0.2", empty_if=NO_DARK_FRAME),
     *(
-        Column(
-            f"dark_frame_{axis}", int, f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
-            DarkFramePlan, "shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0",
-        )
+        Column(f"dark_frame_{axis}", f"first {side} of the dark frame that the full frame uses; even", COORDINATE,
+               DarkFramePlan, "shift", unit="pixels", since="0.2", empty_if="there is no dark frame, or both are 0")
         for axis, side in (("y", "row"), ("x", "column"))
     ),
-    Column(
-        "dark_black_dn", float, "value that is subtracted from all sites of the dark frame: its black level, or 0 if "
-        "the map of dark_shading contains that", Range(0, 65535), DarkFramePlan, "black_dn",
-        unit="DN of the dark frame", since="0.2",
-        empty_if="there is no dark frame, or it is 0",
-    ),
-    Column(
-        "dark_scale", float, "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan, "scale",
-        since="0.2",
-        empty_if="there is no dark frame, or it is 1",
-    ),
-    Column(
-        "dark_shading", str, "SHA-256 of the dark-shading map that is subtracted from the dark frame: of its file, or "
-        "of the set of dark frames whose mean it is", HEX_256, DarkFramePlan, "shading",
-        since="0.2", empty_if="no map is subtracted",
-    ),
-    Column(
-        "dark_variance_dn2", float, "noise variance of a site at black, by all simulated effects except hot pixels, "
-        "dead pixels and rounding; ug.noise_std uses it", FINITE, unit="DN²", since="0.3", in_json=False,
-        empty_if="the source failed",
-    ),
+    Column("dark_black_dn", "value that is subtracted from all sites of the dark frame: its black level, or 0 if the "
+           "map of dark_shading contains that",
+           Range(0, 65535), DarkFramePlan, "black_dn", unit="DN of the dark frame", since="0.2",
+           empty_if="there is no dark frame, or it is 0"),
+    Column("dark_scale", "DN of the sensor per DN of the dark frame", Range(1e-9, 1e9), DarkFramePlan,
+           "scale", since="0.2", empty_if="there is no dark frame, or it is 1"),
+    Column("dark_shading", "SHA-256 of the dark-shading map that is subtracted from the dark frame: of its file, or of "
+           "the set of dark frames whose mean it is",
+           HEX_256, DarkFramePlan, "shading", since="0.2", empty_if="no map is subtracted"),
+    Column("dark_variance_dn2", "noise variance of a site at black, by all simulated effects except hot pixels, dead "
+           "pixels and rounding; ug.noise_std uses it",
+           FINITE, unit="DN²", since="0.3", in_json=False, empty_if="the source failed"),
     *_columns_of_numbers(*(name for name, number in NUMBERS.items() if number.since not in ("", "0.2"))),
 )  # fmt: skip
 """All columns, in the order of ``manifest.csv``. New columns are appended."""

@@ -22,23 +22,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO, TypeVar
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.paths import AnyPath
-from unprocess_gen.core.types import (
-    AccuracyPlan,
-    CameraPlan,
-    DarkFramePlan,
-    IspPlan,
-    NoisePlan,
-    OutputPlan,
-    Pair,
-    Patch,
-    Plan,
-    Row,
-    ScenePlan,
-    SensorPlan,
-    Source,
-    SourcePlan,
-    Value,
-)
+from unprocess_gen.core.types import PARTS, DarkFramePlan, NoisePlan, Pair, Patch, Plan, Row, Source, Value
 from unprocess_gen.dataset.columns import COLUMNS, COLUMNS_OF, FIRST, HEADERS, NAMES, Column, Record
 from unprocess_gen.dataset.keys import key_text
 from unprocess_gen.simulation.effects import Physics, dark_variance_dn2
@@ -173,8 +157,8 @@ def _plan_cells(plan: Plan) -> dict[str, Value]:
     """Return the values of all columns that hold a plan."""
     physics = plan.noise.physics
     cells: dict[str, Value] = {}
-    for part in (plan, *plan.parts):
-        cells |= _cells(part)
+    for record in (plan, plan.noise.dark, *(getattr(plan, part) for part in PARTS)):
+        cells |= _cells(record)
     if physics is not None:
         return cells | _cells(physics)
     return cells | {column.name: column.not_applicable for column in COLUMNS if column.of is Physics}
@@ -263,17 +247,8 @@ def plan_from_row(row: Row) -> Plan:
     try:
         physics = None if row.get("read_law") == "none" else _part(row, Physics)
         noise = NoisePlan(**_fields(row, NoisePlan), physics=physics, dark=_part(row, DarkFramePlan))
-        plan = Plan(
-            **_fields(row, Plan),
-            source=_part(row, SourcePlan),
-            scene=_part(row, ScenePlan),
-            camera=_part(row, CameraPlan),
-            isp=_part(row, IspPlan),
-            sensor=_part(row, SensorPlan),
-            noise=noise,
-            accuracy=_part(row, AccuracyPlan),
-            output=_part(row, OutputPlan),
-        )
+        parts = {name: _part(row, record) for name, record in PARTS.items() if record is not NoisePlan}
+        plan = Plan(**_fields(row, Plan), **parts, noise=noise)
         _check_plan(plan)
     except ValueError as error:
         raise DamageError(f"row {_key_of(row)}: not a plan ({error})") from error
@@ -377,17 +352,8 @@ def _check_together(row: Row) -> None:
 
 
 _NEEDED = (
-    "width",
-    "height",
-    "shard",
-    "level",
-    "draw",
-    "frame",
-    "dtype",
-    "layout",
-    "pattern",
-    "clean_xxh3",
-    "noisy_xxh3",
+    *("width", "height", "shard", "level", "draw", "frame"),
+    *("dtype", "layout", "pattern", "clean_xxh3", "noisy_xxh3"),
 )
 """Columns without which the members of a pair can neither be found nor checked."""
 
