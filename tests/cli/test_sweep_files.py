@@ -300,6 +300,6 @@ def test_primary_config_that_the_built_in_one_hides_is_refused(mine: Path, run_m
     done = run_main("--config-dir", "mine", "--config-name", "config", "--cfg", "job")
     assert (done.code, done.err) == (
         2,
-        "gen-dataset: --config-name config: mine/config.yaml has the name of a built-in config, which would be used "
+        "gen-dataset: --config-name config: mine/config.yaml has the name of a built-in file, which would be used "
         "instead; rename the file\n",
     )

@@ -130,7 +130,7 @@ def test_mistakes_are_explained_in_one_sentence(override: str, sentence: str) ->
 
 def test_options_that_a_built_in_option_hides_are_refused(own: Path) -> None:
     (own / "noise/none.yaml").write_text(OWN_PROFILE)
-    with pytest.raises(ConfigError, match=r"noise=none: .*mine/noise/none.yaml has the name of a built-in option"):
+    with pytest.raises(ConfigError, match=r"noise=none: .*mine/noise/none.yaml has the name of a built-in file"):
         load_config(["noise=none"], own)
     assert load_config(["noise=own", "noise.bits=null"], own).noise.name == "own"
 

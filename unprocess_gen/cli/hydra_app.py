@@ -84,22 +84,12 @@ def _check_overrides(overrides: Sequence[str]) -> None:
 
 
 def _option_folders(hydra: Mapping[str, Any]) -> OptionFolders:
-    """Return the folders and the primary config that flags choose; a config that Hydra would not use is refused."""
+    """Return the folders and the primary config that flags choose."""
     from unprocess_gen.config.composition import OptionFolders
-    from unprocess_gen.config.option_files import conf_dir
 
     own, main = (Path(hydra[flag]) if flag in hydra else None for flag in ("--config-dir", "--config-path"))
-    name = hydra.get("--config-name", "config").removesuffix(".yaml")
-    if (
-        own
-        and "--config-name" in hydra
-        and all((path / f"{name}.yaml").is_file() for path in (own, main or conf_dir()))
-    ):
-        raise ConfigError(
-            f"--config-name {name}: {own / name}.yaml has the name of a built-in config, which would be used instead; "
-            "rename the file"
-        )
-    return OptionFolders(main, name, own)
+    name = hydra.get("--config-name")
+    return OptionFolders(main, None if name is None else name.removesuffix(".yaml"), own)
 
 
 # ------------------------------------------------------------------------------------------------------------ sweeps

@@ -21,12 +21,10 @@ import hydra
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.errors import HydraException
-from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -34,7 +32,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from unprocess_gen.config.composition_errors import explain, unknown_key
-from unprocess_gen.config.option_files import check_override, conf_dir, group_options
+from unprocess_gen.config.option_files import check_override, conf_dir
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import writable_node
 from unprocess_gen.config.validation import validate_config
@@ -58,10 +56,13 @@ PATH_KEYS = ("source.root", "out")
 
 @dataclass(frozen=True, slots=True)
 class OptionFolders:
-    """The folder with the primary config (None: `conf_dir`), its name, and the user's folder, searched after it."""
+    """The folder with the primary config, its name, and the user's folder, which is searched after it.
+
+    None: `conf_dir`, ``config``, and no folder of the user.
+    """
 
     main: Path | None = None
-    name: str = "config"
+    name: str | None = None
     own: Path | None = None
 
 
@@ -115,11 +116,10 @@ def compose_node(overrides: Sequence[str], folders: OptionFolders | None = None)
     folders = folders or OptionFolders()
     if folders.own is not None and not folders.own.is_dir():
         raise ConfigError(f"--config-dir {folders.own}: no such folder; expected a folder of option files")
-    _refuse_hidden_options(overrides, folders)
     try:
+        _check_own_options(overrides, folders)
         with _hydra_for(folders):
-            prepared = [_checked_searchpath(quoted_path(one)) for one in overrides]
-            return hydra.compose(folders.name, prepared, return_hydra_config=True)
+            return hydra.compose(folders.name or "config", [*map(quoted_path, overrides)], return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError, *PLAIN_ERRORS) as error:
         raise ConfigError(explain(error, overrides)) from error
 
@@ -171,30 +171,32 @@ def quoted_path(override: str) -> str:
     return f"{key}='{path}'"
 
 
-def _refuse_hidden_options(overrides: Sequence[str], folders: OptionFolders) -> None:
-    """Refuse a chosen option of the user that has the name of a built-in one, which Hydra would use instead."""
-    if folders.own is None:
-        return
+def _check_own_options(overrides: Sequence[str], folders: OptionFolders) -> None:
+    """Refuse chosen option files of the user that Hydra would not use, or could not read safely.
+
+    Hydra uses a built-in option of the same name, and OmegaConf has no limits on nesting and aliases.
+    """
+    chosen = {override: override.lstrip("+").replace("=", "/", 1) for override in overrides}
+    if folders.name is not None:
+        chosen[f"--config-name {folders.name}"] = folders.name
+    for folder in [folders.own, *_searchpath(overrides)]:
+        for text, name in chosen.items():
+            file = Path(folder or "", f"{name}.yaml")
+            if folder is None or not file.is_file():
+                continue
+            if folder == folders.own and (folders.main or conf_dir()).joinpath(f"{name}.yaml").is_file():
+                problem = "has the name of a built-in file, which would be used instead"
+                raise ConfigError(f"{text}: {file} {problem}; rename the file")
+            read_yaml_mapping(file)
+
+
+def _searchpath(overrides: Sequence[str]) -> Iterator[Path]:
+    """Yield the local folders of an override of ``hydra.searchpath``."""
     for override in overrides:
-        group, _, name = override.lstrip("+").partition("=")
-        if all(name in group_options(group, folder) for folder in (folders.own, folders.main or conf_dir())):
-            raise ConfigError(
-                f"{override}: {folders.own / group / name}.yaml has the name of a built-in option, which would be used "
-                "instead; rename the file"
-            )
-
-
-def _checked_searchpath(override: str) -> str:
-    """Return an override of ``hydra.searchpath`` with folders that are read through `CheckedFiles`."""
-    if not override.startswith("hydra.searchpath="):
-        return override
-    value = OverridesParser.create().parse_override(override).value()
-    if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
-        return override  # Hydra reports it
-    paths = [path.removeprefix("file://") for path in value]
-    checked = [path if "://" in path else f"{CheckedFiles.scheme()}://{Path(path).absolute()}" for path in paths]
-    quoted = ",".join("'" + re.sub(r"(\\*)'", r"\1\1\\'", path) + "'" for path in checked)
-    return f"hydra.searchpath=[{quoted}]"
+        if override.startswith("hydra.searchpath="):
+            paths = OverridesParser.create().parse_override(override).value()
+            for path in paths if isinstance(paths, list) else []:
+                yield Path(str(path).removeprefix("file://"))
 
 
 def _unknown_keys(node: Any, schema: Any, prefix: str = "") -> Iterator[str]:
@@ -219,47 +221,7 @@ class OwnOptions(SearchPathPlugin):
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Append the folder of the composition in progress, if it has one."""
         if _own_folder is not None:
-            search_path.append("command-line", f"{CheckedFiles.scheme()}://{_own_folder.absolute()}")
-
-
-class CheckedFiles(ConfigSource):
-    """Read the user's option files, after checking that they can be read safely."""
-
-    @staticmethod
-    def scheme() -> str:
-        """Return the prefix of search paths that Hydra reads through this class."""
-        return "checked-file"
-
-    def _file(self, config_path: str) -> Path:
-        return Path(self.path, self._normalize_file_name(config_path))
-
-    def available(self) -> bool:
-        """Return whether the folder exists."""
-        return self.is_group("")
-
-    def is_group(self, config_path: str) -> bool:
-        """Return whether a path is a folder."""
-        return Path(self.path, config_path).is_dir()
-
-    def is_config(self, config_path: str) -> bool:
-        """Return whether a path names a YAML file."""
-        return self._file(config_path).is_file()
-
-    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """Return the groups and configs in a folder."""
-        found: list[str] = []
-        for path in Path(self.path, config_path).iterdir():
-            self._list_add_result(found, os.path.join(config_path, path.name), path.name, results_filter)
-        return sorted(set(found))
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        """Read one YAML file."""
-        path = self._file(config_path)
-        read_yaml_mapping(path)  # OmegaConf has no limits on nesting and aliases, and accepts an empty file
-        text = path.read_text(encoding="utf-8")
-        config = OmegaConf.create(text)
-        header = self._get_header_dict(text[:512])
-        return ConfigResult(provider=self.provider, path=self.full_path(), config=config, header=header)
+            search_path.append("command-line", f"file://{_own_folder.absolute()}")
 
 
 @contextmanager
@@ -267,9 +229,7 @@ def _hydra_for(folders: OptionFolders) -> Iterator[None]:
     """Initialise Hydra's Compose API; afterwards restore the state of the application that runs, if any."""
     global _own_folder
     with _LOCK:
-        plugins = Plugins.instance()
-        for plugin in (OwnOptions, CheckedFiles):
-            plugins.register(plugin)
+        Plugins.instance().register(OwnOptions)
         application, version = GlobalHydra.instance(), VersionBase.instance()
         state, base = application.hydra, version.version_base
         job_name = JobRuntime.instance().get("name")

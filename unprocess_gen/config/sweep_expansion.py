@@ -6,7 +6,6 @@ Design: ``docs/design/composition_and_sweeps.md``.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,9 +24,6 @@ from unprocess_gen.core.errors import ConfigError
 MAX_JOBS = 100_000
 """Most jobs of one sweep: each takes 0.2 s to compose, so a larger number is a mistake."""
 
-TOO_MANY_JOBS = f"a sweep of more than {MAX_JOBS} jobs; expected fewer values"
-
-PLUGIN_KEYS = ("sweeper", "launcher")
 BUILT_IN = "hydra._internal.core_plugins.basic_"
 """Start of the ``_target_`` of Hydra's own sweeper and launcher, which the sweep of this package replaces."""
 
@@ -144,7 +140,7 @@ def expand(
         return Expansion(None, plugins=plugins, described_by=described, fixed=equal, out=out)
     jobs = tuple(itertools.islice(_jobs(choices, bases), MAX_JOBS + 1))
     if len(jobs) > MAX_JOBS:
-        raise ConfigError(TOO_MANY_JOBS)
+        raise ConfigError(f"a sweep of more than {MAX_JOBS} jobs; expected fewer values")
     return Expansion(None, jobs)
 
 
@@ -157,15 +153,10 @@ def _jobs(choices: list[_Choice], bases: Mapping[tuple[str, ...], _Base]) -> Ite
     for own in _combinations(choices):
         base = bases[tuple(own[key] for key in added)]
         for params in _combinations(base.params):
-            yield _job(own | params, [*choices, *base.params], base.origin)
-
-
-def _job(overrides: dict[str, str], choices: list[_Choice], origin: tuple[str, ...]) -> SweepJob:
-    named = [
-        overrides[choice.key] for choice in choices if not choice.sets_hydra and overrides[choice.key] not in origin
-    ]
-    swept = {choice.name: overrides[choice.key].partition("=")[2] for choice in choices if choice.swept}
-    return SweepJob(tuple(overrides.values()), tuple(named), swept)
+            job, both = own | params, [*choices, *base.params]
+            named = [job[choice.key] for choice in both if not choice.sets_hydra and job[choice.key] not in base.origin]
+            swept = {choice.name: job[choice.key].partition("=")[2] for choice in both if choice.swept}
+            yield SweepJob(tuple(job.values()), tuple(named), swept)
 
 
 def composed_job(job: SweepJob, folders: OptionFolders) -> DictConfig:
@@ -199,8 +190,6 @@ def _parse(overrides: Sequence[str], folders: OptionFolders) -> list[_Choice]:
             choices[key] = choice
     except (HydraException, ValueError, RecursionError) as error:
         raise ConfigError(explain(error, overrides)) from error
-    if math.prod(max(len(choice.values), 1) for choice in choices.values()) > MAX_JOBS:
-        raise ConfigError(TOO_MANY_JOBS)
     return list(choices.values())
 
 
@@ -214,9 +203,8 @@ def _refuse_repetition(choice: _Choice, earlier: Iterable[_Choice]) -> None:
             )
 
 
-def _combinations(choices: Iterable[_Choice]) -> Iterator[dict[str, str]]:
+def _combinations(choices: Sequence[_Choice]) -> Iterator[dict[str, str]]:
     """Yield one override for each key; the last key changes fastest."""
-    choices = list(choices)
     for values in itertools.product(*(choice.overrides() for choice in choices)):
         yield dict(zip((choice.key for choice in choices), values, strict=True))
 
@@ -275,7 +263,7 @@ def _described_by(
 
 def _plugins(node: DictConfig) -> tuple[str, ...]:
     """Return the classes of a sweeper or launcher that is not Hydra's own."""
-    targets = [resolved_value(node, f"hydra.{key}._target_") for key in PLUGIN_KEYS]
+    targets = [resolved_value(node, f"hydra.{key}._target_") for key in ("sweeper", "launcher")]
     return tuple(target for target in targets if target is not None and not str(target).startswith(BUILT_IN))
 
 
@@ -303,11 +291,11 @@ def _refuse_values_without_sweep(choices: Sequence[_Choice], node: DictConfig) -
 
 
 class _GroupOptions:
-    """Answer ``glob(…)`` of Hydra's override parser with the options of a group."""
+    """Answer ``glob(…)`` of Hydra's override parser with the options of a group, built-in ones and the user's."""
 
     def __init__(self, folders: OptionFolders) -> None:
         self._folders = [folders.main or conf_dir(), *([folders.own] if folders.own else [])]
 
     def get_group_options(self, group_name: str, *_: Any, **__: Any) -> list[str]:
-        """Return the names of the group's options, built-in ones and the user's."""
+        """Return the names of the group's options."""
         return group_options(group_name, *self._folders)
