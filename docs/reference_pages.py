@@ -9,7 +9,7 @@ from scene_page import scenes_page
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.cli.help import default_text, spelled, synopsis
+from unprocess_gen.cli.help import spelled, synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
@@ -18,6 +18,7 @@ from unprocess_gen.config.interpretation import needed_numbers
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.schema import GROUPS, BranchConfig, ProvenanceConfig, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
+from unprocess_gen.config.values import value_text
 from unprocess_gen.core.errors import REASONS
 from unprocess_gen.dataset.columns import COLUMNS, FIRST
 from unprocess_gen.simulation.effects import EFFECTS, Physics
@@ -134,7 +135,7 @@ def _keys(group: str | None, settings: Mapping[str, Setting]) -> str:
         [
             code(name),
             setting.meaning + (f"; null: {setting.null}" if setting.null else ""),
-            code(default_text(values[name])) if name in values else "",
+            code(value_text(values[name])) if name in values else "",
             setting.unit,
             str(setting.limit),
             setting.since,

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.verbs import VERBS
-from unprocess_gen.config.limits import Boolean, Choice
+from unprocess_gen.config.limits import BOOLEAN, Choice
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import settings_of
@@ -109,7 +109,7 @@ def _values(key: str, current: str, folders: list[Path]) -> tuple[str, list[str]
         return (FOLDERS if key == "out" else FILES), []
     limit = next((setting.limit for *path, setting in all_settings() if ".".join(filter(None, path)) == key), None)
     values: Iterable[str] = () if "." in key else group_options(key.lstrip("+"), *folders)
-    if isinstance(limit, Boolean):
+    if limit is BOOLEAN:
         values = ("true", "false")
     elif isinstance(limit, Choice):
         values = limit.words

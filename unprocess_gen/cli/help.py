@@ -56,7 +56,7 @@ def described_keys() -> dict[str, Any]:
     from unprocess_gen.config.schema import GROUPS, Config
 
     top = {
-        f"{name}={default_text(getattr(Config, name))}": _description(setting)
+        f"{name}={value_text(getattr(Config, name))}": _description(setting)
         for name, setting in settings_of(Config).items()
     }
     return {"groups": {group: list(settings_of(kind)) for group, kind in GROUPS.items()}, "top": top}
@@ -116,7 +116,7 @@ def group_help(group: str, conf: Path) -> str:
         chosen = f" with {group}={option}" if option != "default" else ""
         title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
         lines = [
-            _two_columns(f"{name}={default_text(values[name])}"[: WIDTH - 2], _description(setting))
+            _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], _description(setting))
             for name, setting in settings_of(GROUPS[group]).items()
         ]
         parts.append("\n".join([title, *lines]))
@@ -128,11 +128,6 @@ def _description(setting: Setting) -> str:
     unit = f", in {setting.unit}" if setting.unit else ""
     null = f"; null: {setting.null}" if setting.null else ""
     return f"{setting.meaning}{unit}. Allowed: {setting.limit}{null}"
-
-
-def default_text(value: Any) -> str:
-    """Return a value as users write it."""
-    return str(value).lower() if isinstance(value, bool) else value_text(value)
 
 
 def _hanging(start: str, text: str) -> str:

@@ -8,22 +8,8 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
+from unprocess_gen.config import limits
 from unprocess_gen.config.distributions import lowest, parse_drawn
-from unprocess_gen.config.limits import (
-    DEQUANTIZE,
-    GAIN,
-    INVERSE_GAIN,
-    ISO,
-    LEVELS,
-    MAX_LEVELS,
-    MAX_PATCH,
-    MAX_RANDOM_PATCHES,
-    MIN_PATCH,
-    PATCH,
-    SWITCH,
-    VARIANCE_OFFSET,
-    VARIANCE_SLOPE,
-)
 from unprocess_gen.config.schema import (
     BRANCH_FIELDS,
     BranchConfig,
@@ -48,16 +34,16 @@ SHADING_WORDS = ("keep", "remove")
 def gain_distributions(gains: GainsConfig) -> tuple[Distribution, Distribution, Distribution]:
     """Parse the distributions of the gains."""
     return (
-        parse_drawn("gains.red", gains.red, GAIN),
-        parse_drawn("gains.blue", gains.blue, GAIN),
-        parse_drawn("gains.inverse_rgb", gains.inverse_rgb, INVERSE_GAIN),
+        parse_drawn("gains.red", gains.red, limits.GAIN),
+        parse_drawn("gains.blue", gains.blue, limits.GAIN),
+        parse_drawn("gains.inverse_rgb", gains.inverse_rgb, limits.INVERSE_GAIN),
     )
 
 
 def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]:
     """Parse the distributions of the two numbers of a noise profile."""
-    a = parse_drawn("noise.a", noise.a, VARIANCE_SLOPE)
-    b = parse_drawn("noise.b", noise.b, VARIANCE_OFFSET)
+    a = parse_drawn("noise.a", noise.a, limits.VARIANCE_SLOPE)
+    b = parse_drawn("noise.b", noise.b, limits.VARIANCE_OFFSET)
     if b.kind == "log_linear_in_a" and not lowest(a) > 0:
         raise refusal("noise.a", noise.a, "expected more than 0, because noise.b depends on ln a")
     return a, b
@@ -69,10 +55,10 @@ def noise_distributions(noise: NoiseConfig) -> tuple[Distribution, Distribution]
 def noise_levels(noise: NoiseConfig) -> tuple[NoiseConfig, ...]:
     """Split a noise profile into its noise levels."""
     levels = 1 if noise.levels is None else noise.levels
-    if is_integer(levels) and 1 <= levels <= MAX_LEVELS:
+    if is_integer(levels) and 1 <= levels <= limits.MAX_LEVELS:
         return (noise,) * levels
-    if not isinstance(levels, list | tuple) or not 1 <= len(levels) <= MAX_LEVELS:
-        raise refusal("noise.levels", levels, f"expected {LEVELS}")
+    if not isinstance(levels, list | tuple) or not 1 <= len(levels) <= limits.MAX_LEVELS:
+        raise refusal("noise.levels", levels, f"expected {limits.LEVELS}")
     return tuple(_level(noise, level) for level in levels)
 
 
@@ -109,20 +95,7 @@ def branch_of(noise: NoiseConfig, iso: float) -> BranchConfig | None:
 def row_of_stop(iso: float) -> int:
     """Return the row of a table ``by_stop``: ⌊2·log2(ISO / 100)⌋, in exact arithmetic; 0 below ISO 100.
 
-    Parameters
-    ----------
-    iso : float
-        The ISO.
-
-    Returns
-    -------
-    int
-        Row, from 0. Rows 2k and 2k + 1 are for ISO 100·2^k to 100·2^(k + 1).
-
-    Examples
-    --------
-    >>> [row_of_stop(iso) for iso in (100, 141, 142, 200, 6400, 25600)]
-    [0, 0, 1, 2, 12, 16]
+    Rows 2k and 2k + 1 are for ISO 100·2^k to 100·2^(k + 1).
     """
     ratio = (Fraction(iso) / 100) ** 2
     return max((ratio.numerator // ratio.denominator).bit_length() - 1, 0)
@@ -170,7 +143,7 @@ def shading_place(noise: NoiseConfig) -> str | None:
 def run_iso(config: Config) -> float:
     """Return the ISO of a run with dark frames, which has only one."""
     iso = config.scene.iso if config.noise.iso is None else config.noise.iso
-    return parse_drawn("iso", iso, ISO).numbers[0]
+    return parse_drawn("iso", iso, limits.ISO).numbers[0]
 
 
 def without_dark_frames(config: Config) -> Config:
@@ -211,15 +184,15 @@ def patch_rule(source: SourceConfig) -> PatchRule | None:
             return PatchRule("grid", side, stride=stride)
         case ["random", side, count] if _is_patch_length(side) and _is_patch_count(count):
             return PatchRule("random", side, count=count)
-    raise refusal("source.patch", source.patch, f"expected {PATCH}")
+    raise refusal("source.patch", source.patch, f"expected {limits.PATCH}")
 
 
 def _is_patch_length(value: Any) -> bool:
-    return is_integer(value) and MIN_PATCH <= value <= MAX_PATCH and value % 2 == 0
+    return is_integer(value) and limits.MIN_PATCH <= value <= limits.MAX_PATCH and value % 2 == 0
 
 
 def _is_patch_count(value: Any) -> bool:
-    return is_integer(value) and 1 <= value <= MAX_RANDOM_PATCHES
+    return is_integer(value) and 1 <= value <= limits.MAX_RANDOM_PATCHES
 
 
 def canonical_patch(source: SourceConfig) -> list[Any] | None:
@@ -248,12 +221,12 @@ def saturated_as(config: Config) -> str:
 
 def effect_switch(effects: EffectsConfig, effect: str) -> str:
     """Return the switch of an effect."""
-    return str(SWITCH.word(getattr(effects, effect) or effects.all))
+    return str(limits.SWITCH.word(getattr(effects, effect) or effects.all))
 
 
 def dequantize_method(source: SourceConfig) -> str:
     """Return how 8-bit codes are dequantized."""
-    return str(DEQUANTIZE.word(source.dequantize))
+    return str(limits.DEQUANTIZE.word(source.dequantize))
 
 
 def has_float_clean(config: Config) -> bool:

@@ -20,7 +20,8 @@ Test = Callable[[Any], bool]
 class Limit:
     """Allowed values of one setting.
 
-    ``text`` names them, ``allows`` tests a value by itself, ``shown`` is the value in messages. ``is_float`` limits
+    ``text`` names them, ``allows`` tests a value by itself, ``shown`` is the value in messages. Without ``allows``, a
+    value is checked together with other settings, or by the function that parses it. ``is_float`` limits
     are for numbers that are written as floats.
     """
 
@@ -29,17 +30,6 @@ class Limit:
 
     def __str__(self) -> str:
         return self.text
-
-
-class Described(Limit):
-    """Values that are checked together with other settings, or by the function that parses them."""
-
-
-class Boolean(Limit):
-    """True or false; OmegaConf converts and checks it."""
-
-    def __init__(self) -> None:
-        super().__init__("true or false")
 
 
 class Choice(Limit):
@@ -115,33 +105,9 @@ class NumberOrWord(Limit):
         self.is_float = numbers.is_float
 
 
-class Name(Limit):
-    """A name that rows of a manifest contain."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "up to 100 letters, digits, and . _ + -",
-            lambda value: re.fullmatch(r"[\w.+-]{1,100}", value, re.ASCII) is not None,
-            lambda value: repr(value[:40]),
-        )
-
-
-class Text(Limit):
-    """Text that is not empty; ``what`` names it."""
-
-    def __init__(self, what: str) -> None:
-        super().__init__(what, bool, repr)
-
-
-class OutputPlace(Limit):
-    """A local path, or the URL of an object store; another URL would become a folder named after its scheme."""
-
-    def __init__(self, what: str) -> None:
-        super().__init__(
-            what,
-            lambda value: bool(value) and ("://" not in value or is_url(value)),
-            lambda value: value or repr(value),
-        )
+def text(what: str) -> Limit:
+    """Return the limit of a text that is not empty; ``what`` names it."""
+    return Limit(what, bool, repr)
 
 
 class LevelRange(Limit):
@@ -193,6 +159,23 @@ MAX_BRANCH_NUMBER = 1e9
 
 MAX_ISO = 1e7
 
+BOOLEAN = Limit("true or false")
+"""OmegaConf converts and checks it."""
+
+NAME = Limit(
+    "up to 100 letters, digits, and . _ + -",
+    lambda value: re.fullmatch(r"[\w.+-]{1,100}", value, re.ASCII) is not None,
+    lambda value: repr(value[:40]),
+)
+"""Names that rows of a manifest contain."""
+
+OUTPUT_PLACE = Limit(
+    "the name of a folder or a URL s3://, gs:// or az://",
+    lambda value: bool(value) and ("://" not in value or is_url(value)),
+    lambda value: value or repr(value),
+)
+"""A local path, or the URL of an object store; another URL would become a folder named after its scheme."""
+
 SWITCH = Switch("auto", "on", "off")
 """Values of each effect."""
 
@@ -227,18 +210,18 @@ READ_SHAPE = Drawn(
 )
 READ_SHAPE.text += "; or by ISO: by_stop, by_iso"
 
-PATCH = Described(
+PATCH = Limit(
     "null, a side, [grid, side], [grid, side, stride] or [random, side, count]; side and stride are even, "
     f"{MIN_PATCH} to {MAX_PATCH} pixels, count is 1 to {MAX_RANDOM_PATCHES}"
 )
-LEVELS = Described(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
+LEVELS = Limit(f"how many, 1 to {MAX_LEVELS}, or a list of ISOs or {{a, b}}")
 DIGEST = Limit(
     "64 hexadecimal digits",
     lambda value: re.fullmatch("[0-9a-f]{64}", value) is not None,
     lambda value: value_text(value)[:80],
 )
-ISO_RANGE = Described("the lowest and the highest ISO, [100, 6400]")
-BLACK_ERROR = Described(
+ISO_RANGE = Limit("the lowest and the highest ISO, [100, 6400]")
+BLACK_ERROR = Limit(
     "a number, four (the 2x2 sites), [by_colour, R, G1, B, G2], or a table, [by_stop, [four], …] or [by_log_iso, "
     "[four], …], whose fours are in the order R, G1, B, G2 if by_colour precedes it"
 )

@@ -16,20 +16,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Optional, TypeVar
 
 from unprocess_gen.config import limits
-from unprocess_gen.config.limits import (
-    Boolean,
-    Choice,
-    Described,
-    Integers,
-    IsoForm,
-    Limit,
-    Name,
-    NumberList,
-    NumberOrWord,
-    Numbers,
-    OutputPlace,
-    Text,
-)
+from unprocess_gen.config.limits import Choice, Integers, IsoForm, Limit, NumberList, NumberOrWord, Numbers
 from unprocess_gen.config.settings import Setting, documented, key, settings_of
 from unprocess_gen.simulation.effects import EFFECTS, profile_keys
 from unprocess_gen.simulation.effects.effect import Effect
@@ -99,16 +86,16 @@ class SourceConfig(Group):
     """
 
     root: Optional[str] = key(
-        None, Described("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
+        None, Limit("a folder, a file, a URL, or null"), null="the built-in synthetic scenes", decides_data=False
     )
-    include: tuple[str, ...] = key((), Described("a list of at least one pattern such as '*.jpg'"))
-    recursive: bool = key(True, Boolean())
+    include: tuple[str, ...] = key((), Limit("a list of at least one pattern such as '*.jpg'"))
+    recursive: bool = key(True, limits.BOOLEAN)
     limit: Optional[int] = key(None, Integers(1, 10**9), null="all sources")
     max_pixels: int = key(2**26, Integers(1, 2**40), unit="pixels")
     max_failed: int = key(0, Integers(0, 10**9), decides_data=False)
     icc: str = key("ignore", Choice("ignore", "refuse"))
-    clips: bool = key(False, Boolean())
-    video: tuple[str, ...] = key((), Described("a list of patterns"))
+    clips: bool = key(False, limits.BOOLEAN)
+    video: tuple[str, ...] = key((), Limit("a list of patterns"))
     downscale: int = key(1, Integers(1, 64), unit="pixels")
     dequantize: str = key("off", limits.DEQUANTIZE)
     patch: Any = key(None, limits.PATCH, unit="pixels", null="complete images")
@@ -130,10 +117,10 @@ class CameraConfig(Group):
         matrix from XYZ (D65) to the camera, row by row, for law=custom
     """
 
-    name: str = key("convex", Name())
+    name: str = key("convex", limits.NAME)
     law: str = key("convex", limits.CAMERA_LAWS)
     xyz2cam: Optional[tuple[float, ...]] = key(
-        None, Described("nine numbers of an invertible matrix"), null="a law other than custom"
+        None, Limit("nine numbers of an invertible matrix"), null="a law other than custom"
     )
 
 
@@ -332,10 +319,10 @@ class ProvenanceConfig(Group):
         how far the numbers may be off, or how far sources differ
     """
 
-    numbers: tuple[str, ...] = key((), Described("a list of keys whose values are numbers"))
+    numbers: tuple[str, ...] = key((), Limit("a list of keys whose values are numbers"))
     iso: tuple[float, ...] = key((), limits.ISO_RANGE)
-    source: str = key("", Text("a text"))
-    uncertainty: str = key("", Text("a text"))
+    source: str = key("", limits.text("a text"))
+    uncertainty: str = key("", limits.text("a text"))
 
 
 @documented
@@ -398,7 +385,7 @@ class NoiseConfig(EffectGroup):
         source and uncertainty of the numbers, which plan prints
     """
 
-    name: str = key("none", Name(), section=PROFILE)
+    name: str = key("none", limits.NAME, section=PROFILE)
     units: Optional[str] = key(None, Choice("dn", "normalized"), section=PROFILE)
     black: Optional[str] = key(None, Choice("subtracted", "included"), section=PROFILE)
     bits: Optional[int] = key(None, Integers(1, 32), null="with units=normalized", section=PROFILE)
@@ -430,7 +417,7 @@ class NoiseConfig(EffectGroup):
     draws: int = key(1, Integers(1, limits.MAX_LEVELS), section=CHOSEN)
     dark_frames: Optional[str] = key(
         None,
-        Described("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"),
+        Limit("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"),
         null="the noise of the profile",
         decides_data=False,
         section=CHOSEN,
@@ -446,18 +433,18 @@ class NoiseConfig(EffectGroup):
     )
     dark_shading: str = key(
         "keep",
-        Text("keep, remove, a map (NPY, PNG, TIFF or raw), or a folder of maps with names such as iso1600.npy"),
+        limits.text("keep, remove, a map (NPY, PNG, TIFF or raw), or a folder of maps with names such as iso1600.npy"),
         section=CHOSEN,
         since="0.2",
     )
     dark_shading_sha256: Optional[str] = key(None, limits.DIGEST, null="any map, or none", section=CHOSEN, since="0.2")
     branches: tuple[BranchConfig, ...] = key(
-        (), Described("a list of mappings with the keys of a branch"), section=PHYSICAL
+        (), Limit("a list of mappings with the keys of a branch"), section=PHYSICAL
     )
-    assumed: tuple[str, ...] = key((), Described("a list of keys of this section or of a branch"), section=PHYSICAL)
+    assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), section=PHYSICAL)
     provenance: tuple[ProvenanceConfig, ...] = key(
         (),
-        Described("a list of mappings with the keys numbers, iso, source and uncertainty"),
+        Limit("a list of mappings with the keys numbers, iso, source and uncertainty"),
         decides_data=False,
         section=PHYSICAL,
         since="0.2",
@@ -496,7 +483,7 @@ class SceneConfig(Group):
         brightened afterwards
     """
 
-    name: str = key("daylight", Name())
+    name: str = key("daylight", limits.NAME)
     iso: Any = key(100, limits.ISO)
     exposure_s: Any = key(0.001, limits.EXPOSURE_S, unit="seconds")
     temperature_c: Any = key(25, limits.TEMPERATURE_C, unit="degrees Celsius")
@@ -538,7 +525,7 @@ class CleanConfig(Group):
         they are then clipped like noisy frames
     """
 
-    includes_fixed_pattern: bool = key(False, Boolean())
+    includes_fixed_pattern: bool = key(False, limits.BOOLEAN)
 
 
 @documented
@@ -565,13 +552,13 @@ class AccuracyConfig(Group):
         NumPy, which is slow
     """
 
-    name: str = key("exact", Name())
-    readable: bool = key(False, Boolean())
+    name: str = key("exact", limits.NAME)
+    readable: bool = key(False, limits.BOOLEAN)
     clean_dn: float = key(0.0, Numbers(0), unit="DN")
     clean_changed_share: float = key(0.0, Numbers(0))
     normal_error: float = key(1e-06, Numbers(0), unit="standard deviations")
     law_distance: float = key(0.0, Numbers(0))
-    normal_shot: bool = key(True, Boolean(), since="0.3")
+    normal_shot: bool = key(True, limits.BOOLEAN, since="0.3")
 
     @property
     def draws_normals(self) -> bool:
@@ -609,7 +596,7 @@ class OutputConfig(Group):
     clean_dtype: Optional[str] = key(None, Choice("uint16", "float32"), null="the type of dtype", since="0.2")
     layout: str = key("mosaic", Choice("mosaic", "packed"))
     pairs_per_shard: Any = key(8, NumberOrWord(AUTO, Integers(1, 10**6), "{numbers}, or {word}"))
-    parquet: bool = key(False, Boolean(), since="0.2")
+    parquet: bool = key(False, limits.BOOLEAN, since="0.2")
 
     def __post_init__(self) -> None:
         """Convert the text of an integer, such as the value of an environment variable."""
@@ -643,7 +630,7 @@ class ExecutorConfig(Group):
     kind: str = key("local", Choice("local", "dask"), decides_data=False)
     address: Optional[str] = key(
         None,
-        Text("the address of a Dask scheduler"),
+        limits.text("the address of a Dask scheduler"),
         null="start a scheduler and n_jobs workers on this machine",
         decides_data=False,
     )
@@ -687,10 +674,10 @@ class Config(Group):
     output: OutputConfig = field(default_factory=OutputConfig)
     executor: ExecutorConfig = field(default_factory=ExecutorConfig)
     seed: int = key(0, Integers(0, 2**63 - 1))
-    out: str = key("ds", OutputPlace("the name of a folder or a URL s3://, gs:// or az://"), decides_data=False)
+    out: str = key("ds", limits.OUTPUT_PLACE, decides_data=False)
     n_jobs: int = key(-1, Integers(1, 1024, other=-1, remark=" or -1 for one per core"), decides_data=False)
     self_test: str = key("stop", Choice("stop", "go_on"), decides_data=False)
-    check_disk: bool = key(True, Boolean(), decides_data=False)
+    check_disk: bool = key(True, limits.BOOLEAN, decides_data=False)
 
 
 GROUPS: dict[str, type[Any]] = {
