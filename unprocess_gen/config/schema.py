@@ -506,11 +506,15 @@ class EffectsConfig(EffectGroup):
     assumed
         effects with an assumed number of a physical profile (noise.assumed): use treats them like other
         effects, off simulates them only if they are switched on by name
+    scope
+        what auto decides about: image decides every effect for each image; body decides fixed patterns for each
+        body and scene, and simulates a full well only where the converter does not end first
     """
 
     all: str = key("auto", limits.SWITCH)
     tolerance: float = key(0.1, Numbers(0, 10, open_low=True))
     assumed: str = key("off", Choice("use", "off"), since="0.2")
+    scope: str = key("image", Choice("image", "body"), since="0.3")
 
 
 @documented

@@ -16,6 +16,7 @@ import yaml
 from unprocess_gen.config.interpretation import (
     canonical_patch,
     has_float_clean,
+    is_physical,
     saturated_as,
     shading_place,
     uses_assumed,
@@ -76,6 +77,8 @@ def dataset_yaml(config: Config) -> str:
         settings["noise"].pop("dark_shading", None)  # dark_shading_sha256 identifies the map
     if not uses_assumed(config):
         settings["effects"].pop("assumed", None)  # decides nothing
+    if not is_physical(config.noise):
+        settings["effects"].pop("scope", None)  # decides nothing
     if not (config.accuracy.law_distance and uses_physics(config.noise)):
         settings["accuracy"].pop("normal_shot", None)  # decides nothing
     if not has_float_clean(config):

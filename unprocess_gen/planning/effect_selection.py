@@ -7,6 +7,9 @@ thresholds in units of the noise.
 
 Hot and dead pixels above one standard deviation of the masking noise are too rare for a variance. They are counted
 instead, and simulated if at least `MIN_OUTLIERS` are expected per frame.
+
+With ``effects.scope=body``, fixed patterns are decided for a body in a scene: for a frame of `BODY_FRAME` that has all the
+light of the scene. So a body has its pattern in all images or in none.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from unprocess_gen.config.distributions import lowest, parse_drawn
 from unprocess_gen.config.interpretation import (
     assumed_numbers,
     effect_switch,
@@ -27,6 +31,7 @@ from unprocess_gen.config.interpretation import (
     uses_assumed,
     uses_dark_frames,
 )
+from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.types import Facts, Srgb
 from unprocess_gen.planning.frame_model import FrameModel, SignalRange, ratio_to_noise
@@ -35,6 +40,12 @@ from unprocess_gen.simulation.effects.prediction import STATISTICS
 
 MIN_OUTLIERS = 0.1
 """Expected outliers per frame from which hot and dead pixels are simulated."""
+
+
+BODY_FRAME = 4000, 6000
+"""Height and width of the frame for which the fixed patterns of a body are decided, pixels."""
+BODY_CLIP = 100
+"""Frames of a clip for which they are decided."""
 
 
 def facts_of(srgb: Srgb, frames: int = 1) -> Facts:
@@ -154,6 +165,11 @@ class EffectRules:
         Effects of later versions whose numbers the profile lacks; rows do not name them as skipped.
     dark_frames : bool
         Whether ``dark_frame`` takes the place of ``read``. Its variance is then the read variance of `Physics`.
+    converter_dn : float
+        Highest value of the converter, DN above black; infinity with ``effects.scope=image``, or without clipping.
+    body_light_dn : float or None
+        Most light of the scene, DN above black, for which fixed patterns are decided; None with
+        ``effects.scope=image``.
     """
 
     forced: Mapping[str, ForcedDecision | None]
@@ -162,6 +178,8 @@ class EffectRules:
     assumed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     unnamed: frozenset[str] = frozenset()
     dark_frames: bool = False
+    converter_dn: float = math.inf
+    body_light_dn: float | None = None
 
 
 def effect_rules(config: Config) -> EffectRules:
@@ -174,16 +192,32 @@ def effect_rules(config: Config) -> EffectRules:
         {effect: assumed_numbers(noise, effect) for effect in effects} if uses_assumed(config) else {},
         frozenset(effect for effect in effects if BY_NAME[effect].since and missing_number(noise, effect) is not None),
         uses_dark_frames(noise),
+        *_rules_of_body(config),
     )
+
+
+def _rules_of_body(config: Config) -> tuple[float, float | None]:
+    """Return ``converter_dn`` and ``body_light_dn`` of the rules."""
+    sensor = config.sensor
+    if config.effects.scope == "image":
+        return math.inf, None
+    ends = math.inf if sensor.clip == "none" else 2.0**sensor.bits - 1 - sensor.black_level_dn
+    ratio = lowest(parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO))
+    return ends, min(1 / ratio, 1.0) * (sensor.white_level_dn - sensor.black_level_dn)
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Effects that are simulated for one image (``on``), and predictions for all effects on demand."""
+    """Effects that are simulated for one image (``on``), and predictions for all effects on demand.
+
+    ``body`` is the frame for which fixed patterns are decided, with all effects that are simulated there, if it is not
+    the image.
+    """
 
     rules: EffectRules
     frame: FrameModel
     on: frozenset[str]
+    body: tuple[FrameModel, frozenset[str]] | None = None
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -213,7 +247,8 @@ class Selection:
 
     def prediction(self, effect: str) -> Prediction:
         """Return the prediction of one effect; that of ``read`` is the one of dark frames if they replace it."""
-        found = _prediction(effect, self.frame, self.on, self.rules.forced[effect], self.rules.tolerance)
+        frame, on = (self.frame, self.on) if self.body is None or not BY_NAME[effect].is_fixed else self.body
+        found = _prediction(effect, frame, on, self.rules.forced[effect], self.rules.tolerance)
         return replace(found, effect="dark_frame") if self.rules.dark_frames and effect == "read" else found
 
     def predictions(self) -> tuple[Prediction, ...]:
@@ -223,23 +258,37 @@ class Selection:
 
 def select_effects(rules: EffectRules, physics: Physics, facts: Facts, signals: SignalRange) -> Selection:
     """Decide about every effect of a physical noise profile for one image."""
-    frame = FrameModel(physics, facts, signals, rules.black_level_dn)
+    frame = FrameModel(physics, facts, signals, rules.black_level_dn, rules.converter_dn)
     free = [effect for effect, decision in rules.forced.items() if decision is None]
     on = frozenset(effect for effect, decision in rules.forced.items() if decision is None or decision.on)
-    return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free))
+    patterns = [effect for effect in free if BY_NAME[effect].is_fixed]
+    if rules.body_light_dn is None or not patterns:
+        return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free))
+    height, width = BODY_FRAME
+    largest = replace(facts, width=width, height=height, frames=BODY_CLIP if facts.frames > 1 else 1)
+    body = FrameModel(
+        physics, largest, SignalRange(0.0, rules.body_light_dn), rules.black_level_dn, rules.converter_dn
+    )
+    simulated = omit_weakest(rules.tolerance, body, on, free)
+    omitted = [effect for effect in patterns if effect not in simulated]
+    temporal = [effect for effect in free if effect not in patterns]
+    on = omit_weakest(rules.tolerance, frame, on - frozenset(omitted), temporal, omitted)
+    return Selection(rules, frame, on, (body, simulated))
 
 
-def omit_weakest(tolerance: float, frame: FrameModel, on: frozenset[str], free: Sequence[str]) -> frozenset[str]:
+def omit_weakest(
+    tolerance: float, frame: FrameModel, on: frozenset[str], free: Sequence[str], before: Sequence[str] = ()
+) -> frozenset[str]:
     """Return the effects that remain after omitting the weakest ``free`` ones within ``tolerance``.
 
-    Effects are tried from weakest to strongest. The first omission that exceeds the tolerance, or drops `MIN_OUTLIERS`
+    ``before`` are effects that were omitted already. Effects are tried from weakest to strongest. The first omission that exceeds the tolerance, or drops `MIN_OUTLIERS`
     outliers, ends the search; so a larger tolerance never simulates more.
     """
 
     def strength(effect: str) -> tuple[bool, float, str]:
         return frame.outliers(effect, on) >= MIN_OUTLIERS, frame.ratio([effect], on - {effect}), effect
 
-    omitted: list[str] = []
+    omitted = list(before)
     for effect in sorted(free, key=strength):
         omitted.append(effect)
         rest = on - {effect}

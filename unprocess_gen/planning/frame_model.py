@@ -49,8 +49,15 @@ def signal_range(facts: Facts, isp: IspPlan, camera: CameraPlan, exposure: float
 class FrameModel(FrameFacts):
     """Predictions for a frame, and results that several predictions share; effects are given by their names."""
 
-    def __init__(self, physics: Physics, facts: Facts, signals: SignalRange, black_level_dn: float) -> None:
-        super().__init__(physics, facts, black_level_dn)
+    def __init__(
+        self,
+        physics: Physics,
+        facts: Facts,
+        signals: SignalRange,
+        black_level_dn: float,
+        converter_dn: float = math.inf,
+    ) -> None:
+        super().__init__(physics, facts, black_level_dn, converter_dn)
         self._roots = tuple(map(math.sqrt, self.counts))
         full_dn = physics.full_well_e * physics.dn_per_e
         self._levels = signals.dark_dn, signals.bright_dn

@@ -38,9 +38,10 @@ class FullWell(Effect):
         return np.minimum(electrons, part.physics.full_well_e / part.relative_gain)
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
-        """Predict the most that any pixel can lose."""
+        """Predict the most that any pixel can lose; nothing if the converter ends below the full well."""
         physics = frame.physics
-        if physics.full_well_e == 0:
+        lowest_dn = physics.full_well_e * physics.dn_per_e - FARTHEST_NORMAL * physics.read_std_dn
+        if physics.full_well_e == 0 or lowest_dn >= frame.converter_dn:
             return independent(frame, 0.0)
         signal_e = level_dn / physics.dn_per_e * (1 + FARTHEST_NORMAL * physics.prnu_std)
         reach_e = _reach(signal_e) + _reach(physics.dark_e) + _reach(FARTHEST_HOT * physics.hot_pixel_e)

@@ -50,6 +50,8 @@ class FrameFacts:
         Size and number of frames.
     black_level_dn : float
         Black level of the sensor, DN.
+    converter_dn : float
+        Highest value of the converter, DN above black; infinity if it limits nothing, as in rules of 0.2.
 
     Attributes
     ----------
@@ -57,8 +59,11 @@ class FrameFacts:
         Number of sites that each statistic is a mean of, in one frame and in all frames of the clip.
     """
 
-    def __init__(self, physics: Physics, facts: Facts, black_level_dn: float) -> None:
+    def __init__(
+        self, physics: Physics, facts: Facts, black_level_dn: float, converter_dn: float = math.inf
+    ) -> None:
         self.physics, self.facts, self.black_level_dn = physics, facts, black_level_dn
+        self.converter_dn = converter_dn
         width, height, frames = facts.width, facts.height, float(facts.frames)
         sites = 1.0, float(width), float(height), float((width + 1) // 2 * ((height + 1) // 2))
         self.per_frame: PerStatistic = sites if facts.frames == 1 else (*sites, *sites)
