@@ -112,7 +112,7 @@ def test_effects_are_judged_against_the_noise_of_the_frames(tmp_path: Path) -> N
         save_frames(folder, 2, black=2000, std=std)
         pair = ug.make_pair(
             np.full((64, 64, 3), 120, np.uint8),
-            ug.load_config([*NOISE, f"noise.dark_frames={folder}", "effects.tolerance=0.12"]),
+            ug.load_config([*NOISE, f"noise.dark_frames={folder}", "effects.tolerance=0.12", "effects.scope=image"]),
         )
         simulated[std] = pair.plan.noise.effects
         assert pair.plan.noise.b_dn2 == pytest.approx((SCALE * std) ** 2 * (1 + 1 / 4 + 1 / 9), rel=0.2)

@@ -266,9 +266,7 @@ def select_effects(rules: EffectRules, physics: Physics, facts: Facts, signals: 
         return Selection(rules, frame, omit_weakest(rules.tolerance, frame, on, free))
     height, width = BODY_FRAME
     largest = replace(facts, width=width, height=height, frames=BODY_CLIP if facts.frames > 1 else 1)
-    body = FrameModel(
-        physics, largest, SignalRange(0.0, rules.body_light_dn), rules.black_level_dn, rules.converter_dn
-    )
+    body = FrameModel(physics, largest, SignalRange(0.0, rules.body_light_dn), rules.black_level_dn, rules.converter_dn)
     simulated = omit_weakest(rules.tolerance, body, on, free)
     omitted = [effect for effect in patterns if effect not in simulated]
     temporal = [effect for effect in free if effect not in patterns]

@@ -59,9 +59,7 @@ class FrameFacts:
         Number of sites that each statistic is a mean of, in one frame and in all frames of the clip.
     """
 
-    def __init__(
-        self, physics: Physics, facts: Facts, black_level_dn: float, converter_dn: float = math.inf
-    ) -> None:
+    def __init__(self, physics: Physics, facts: Facts, black_level_dn: float, converter_dn: float = math.inf) -> None:
         self.physics, self.facts, self.black_level_dn = physics, facts, black_level_dn
         self.converter_dn = converter_dn
         width, height, frames = facts.width, facts.height, float(facts.frames)
