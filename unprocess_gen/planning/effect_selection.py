@@ -8,8 +8,8 @@ thresholds in units of the noise.
 Hot and dead pixels above one standard deviation of the masking noise are too rare for a variance. They are counted
 instead, and simulated if at least `MIN_OUTLIERS` are expected per frame.
 
-With ``effects.scope=body``, fixed patterns are decided for a body in a scene: for a frame of `BODY_FRAME` that has all the
-light of the scene. So a body has its pattern in all images or in none.
+With ``effects.scope=body``, fixed patterns are decided for a body in a scene: for a frame of `BODY_FRAME` that has all
+the light of the scene. So a body has its pattern in all images or in none.
 """
 
 from __future__ import annotations
@@ -279,8 +279,9 @@ def omit_weakest(
 ) -> frozenset[str]:
     """Return the effects that remain after omitting the weakest ``free`` ones within ``tolerance``.
 
-    ``before`` are effects that were omitted already. Effects are tried from weakest to strongest. The first omission that exceeds the tolerance, or drops `MIN_OUTLIERS`
-    outliers, ends the search; so a larger tolerance never simulates more.
+    ``before`` are effects that were omitted already. The others are tried from weakest to strongest. The first omission
+    that exceeds the tolerance, or drops `MIN_OUTLIERS` outliers, ends the search; so a larger tolerance never simulates
+    more.
     """
 
     def strength(effect: str) -> tuple[bool, float, str]:
