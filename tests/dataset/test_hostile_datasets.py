@@ -17,21 +17,18 @@ from helpers.datasets import Make
 from helpers.photographs import fill
 
 from unprocess_gen import DamageError, RawPairs
-from unprocess_gen.dataset.columns import COLUMNS, HEADERS, NAMES
+from unprocess_gen.dataset.columns import HEADERS, NAMES
 from unprocess_gen.dataset.dataset_json import check_dataset_json
 from unprocess_gen.dataset.manifest import (
     MAX_DETAIL,
     MAX_LINE_BYTES,
     detail_text,
-    failed_row,
     plan_from_row,
     read_header,
     read_row,
     read_rows,
-    row_json,
     row_of_values,
     rows_of_json,
-    rows_with_offsets,
     write_rows,
 )
 from unprocess_gen.dataset.reader import sweep_folders
@@ -146,12 +143,6 @@ def test_source_outside_the_root_is_never_looked_up(copy: Path, monkeypatch: pyt
     monkeypatch.setattr("os.stat", refuse)
     with pytest.raises(DamageError, match=r"source='\.\./secret\.png': expected a path below the source folder"):
         list(replay(select_rows(manifest, None, "1"), str(copy.parent / "p")))
-
-
-def test_names_with_dots_and_percent_signs_stay_allowed() -> None:
-    (column,) = (column for column in COLUMNS if column.name == "source")
-    for name in ("..a.png", "a../b.png", "%3Dx.png", "50%25.png", "a/%2Da.png", "dead_leaves-0", "été.png"):
-        assert name in column.allowed
 
 
 def test_line_of_megabytes_is_damage(copy: Path) -> None:
@@ -286,12 +277,6 @@ def test_malformed_sweep_table_is_damage_or_empty(content: bytes, tmp_path: Path
 # Datasets of version 0.1 ----------------------------------------------------------------------------------------------
 
 
-def test_version_0_1_has_the_first_columns() -> None:
-    assert HEADERS[-1] == NAMES
-    assert HEADERS[0] == NAMES[: len(HEADERS[0])]
-    assert "detail" not in HEADERS[0]
-
-
 def test_dataset_of_0_1_is_read_verified_and_replayed(copy: Path, original: Path) -> None:
     old = as_version_0_1(copy)
     assert read_header(old / "manifest.csv") == HEADERS[0]
@@ -301,19 +286,6 @@ def test_dataset_of_0_1_is_read_verified_and_replayed(copy: Path, original: Path
     assert [sample.row["key"] for sample in RawPairs(old)] == ["00000000", "00000001", "00000002"]
     replayed = list(replay(select_rows(old / "manifest.csv", None, "0-3"), str(original.parent / "p")))
     assert [one.complaint for one in replayed] == ["", "", ""]
-
-
-def test_header_of_0_1_restores_its_bytes(copy: Path) -> None:
-    before = (as_version_0_1(copy) / "manifest.csv").read_bytes()
-    stream = io.StringIO(newline="")
-    write_rows(stream, read_rows(copy / "manifest.csv"), read_header(copy / "manifest.csv"))
-    assert stream.getvalue().encode() == before
-
-
-def test_sample_json_does_not_have_the_column_detail(original: Path) -> None:
-    (row, *_) = read_rows(original / "manifest.csv")
-    assert "detail" not in json.loads(row_json([row]))
-    assert row_json([{**row, "detail": "x"}]) == row_json([row])
 
 
 def test_committed_rows_of_0_1_are_completed(original: Path) -> None:
@@ -348,13 +320,3 @@ def test_failed_row_carries_its_explanation(original: Path) -> None:
 def test_explanation_is_one_bounded_harmless_line(text: str, line: str) -> None:
     assert detail_text(text) == line
     assert len(line) <= MAX_DETAIL
-
-
-def test_explanation_survives_the_manifest(tmp_path: Path, original: Path) -> None:
-    from helpers.records import SOURCE
-
-    row = failed_row(SOURCE, None, 0, 0, "corrupt", 'a "quoted", long text; with = signs')
-    with (tmp_path / "manifest.csv").open("w", encoding="utf-8", newline="") as stream:
-        write_rows(stream, [row])
-    assert list(read_rows(tmp_path / "manifest.csv")) == [row]
-    assert [at for at, _ in rows_with_offsets(tmp_path / "manifest.csv")] == [len(",".join(NAMES)) + 1]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -63,56 +62,13 @@ LATER = tuple(effect.name for effect in ALL_EFFECTS if effect.since)
 """Effects that version 0.1 did not have."""
 
 CONTRACT = [
-    "key",
-    "source",
-    "source_sha256",
-    "status",
-    "reason",
-    "width",
-    "height",
-    "orientation",
-    "shard",
-    "seed",
-    "stream_key",
-    "camera",
-    "w_nexus_6p",
-    "w_sony_a7r",
-    "w_olympus_em10",
-    "w_sony_rx100",
-    "rgb2cam_00",
-    "rgb2cam_01",
-    "rgb2cam_02",
-    "rgb2cam_10",
-    "rgb2cam_11",
-    "rgb2cam_12",
-    "rgb2cam_20",
-    "rgb2cam_21",
-    "rgb2cam_22",
-    "red_gain",
-    "blue_gain",
-    "inverse_rgb_gain",
-    "tone",
-    "gamma",
-    "highlight",
-    "highlight_threshold",
-    "pattern",
-    "bits",
-    "black_level_dn",
-    "white_level_dn",
-    "noise",
-    "a_dn",
-    "b_dn2",
-    "effects",
-    "skipped",
-    "accuracy",
-    "methods",
-    "clean_xxh3",
-    "noisy_xxh3",
-    "clean_clipped_low",
-    "clean_clipped_high",
-    "noisy_clipped_low",
-    "noisy_clipped_high",
-    "saturated",
+    *("key", "source", "source_sha256", "status", "reason", "width", "height", "orientation", "shard", "seed"),
+    *("stream_key", "camera", "w_nexus_6p", "w_sony_a7r", "w_olympus_em10", "w_sony_rx100"),
+    *(f"rgb2cam_{row}{column}" for row in range(3) for column in range(3)),
+    *("red_gain", "blue_gain", "inverse_rgb_gain", "tone", "gamma", "highlight", "highlight_threshold"),
+    *("pattern", "bits", "black_level_dn", "white_level_dn", "noise", "a_dn", "b_dn2", "effects", "skipped"),
+    *("accuracy", "methods", "clean_xxh3", "noisy_xxh3", "clean_clipped_low", "clean_clipped_high"),
+    *("noisy_clipped_low", "noisy_clipped_high", "saturated"),
 ]
 
 PHYSICAL = PLAN.replace(effects=("prnu", "shot", "read", "quantise"), skipped=("row: hidden",), physics=PHYSICS)
@@ -153,31 +109,17 @@ def levels(bits: int) -> st.SearchStrategy[tuple[int, int, int]]:
     return black.flatmap(lambda low: st.tuples(st.just(bits), st.just(low), st.integers(low + 1, 2**bits - 1)))
 
 
+NUMBERS = [field.name for field in dataclasses.fields(Physics) if field.type == "float" and field.name in BY_NAME]
 word = st.text(st.characters(codec="ascii", categories=["Ll", "Nd"]), min_size=1, max_size=9)
 physics = st.builds(
     Physics,
-    iso=number("iso"),
-    exposure_s=number("exposure_s"),
-    temperature_c=number("temperature_c"),
-    dn_per_e=st.floats(1e-9, 1e20),
-    prnu_std=number("prnu_std"),
-    dark_e=number("dark_e"),
+    **{name: number(name) for name in NUMBERS} | {"dn_per_e": st.floats(1e-9, 1e20)},
     dark_offset=st.sampled_from(["removed", "kept"]),
-    hot_pixel_share=number("hot_pixel_share"),
-    hot_pixel_e=number("hot_pixel_e"),
-    full_well_e=number("full_well_e"),
     read_law=st.sampled_from(["gaussian", "tukey", "tukey_lambda"]),
-    read_shape=number("read_shape"),
-    read_std_dn=number("read_std_dn"),
-    row_std_dn=number("row_std_dn"),
-    column_std_dn=number("column_std_dn"),
     black_error_dn=st.tuples(*[number("black_error_dn_00")] * 4),
-    dead_pixel_share=number("dead_pixel_share"),
     sensor_unit=st.integers(0, 2**64 - 1).map("{:016x}".format) | st.integers(0, 10**6).map(str),
     body_key=st.integers(0, 2**64 - 1),
     fixed_pattern_in_clean=st.booleans(),
-    row_correlation=number("row_correlation"),
-    column_temporal_std_dn=number("column_temporal_std_dn"),
     gain_by_colour=st.tuples(*[number("gain_r")] * 3),
     lens_shading=st.tuples(*[number("lens_shading_2")] * 3),
     frame_size=st.tuples(st.integers(1, 2**32 - 1), st.integers(1, 2**32 - 1)),
@@ -193,11 +135,8 @@ plans = st.builds(
         name=word,
         weights=st.tuples(*[number("w_nexus_6p")] * 4),
         rgb2cam=st.tuples(*[number("rgb2cam_00")] * 9),
-        red_gain=number("red_gain"),
-        blue_gain=number("blue_gain"),
-        inverse_rgb_gain=number("inverse_rgb_gain"),
         highlight=st.sampled_from(["per_channel", "gray_mean", "none"]),
-        highlight_threshold=number("highlight_threshold"),
+        **{name: number(name) for name in ("red_gain", "blue_gain", "inverse_rgb_gain", "highlight_threshold")},
     ),
     isp=st.builds(IspPlan, st.sampled_from(["smoothstep", "none"]), st.just("srgb") | st.floats(0.1, 10)),
     sensor=st.builds(
@@ -232,14 +171,7 @@ names = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_
 
 def test_columns_have_the_order_of_the_contract() -> None:
     assert [name for name in NAMES if name in CONTRACT] == CONTRACT
-
-
-def test_column_names_are_unique() -> None:
-    assert len(set(NAMES)) == len(NAMES) == len(COLUMNS)
-
-
-def test_every_column_has_a_meaning() -> None:
-    assert all(column.meaning for column in COLUMNS)
+    assert len(set(NAMES)) == len(NAMES)
 
 
 (UNMEASURED,) = (column.empty_if for column in COLUMNS if column.name == "source_noise_dn")
@@ -288,26 +220,9 @@ def assert_typed(row: Row) -> None:
         assert type(row[column.name]) is expected or column.empty_if in BY_DEFAULT, column.name
 
 
-def test_no_value_of_a_pair_is_none() -> None:
-    for plan in (PLAN, PHYSICAL):
-        row = row_of(plan)
-        assert None not in [row[column.name] for column in COLUMNS if column.empty_if not in BY_DEFAULT]
-
-
 def test_physical_columns_of_another_profile_are_0_or_none() -> None:
     values = {name: row_of(PLAN)[name] for name in PHYSICAL_NAMES}
     assert values == {column.name: "none" if column.type is str else 0 for column in COLUMNS if column.name in values}
-
-
-@pytest.mark.parametrize(("gamma", "value"), [(2.2, 2.2), (1.0, 1), ("srgb", "srgb")])
-def test_gamma_is_a_number_or_srgb(gamma: float | str, value: float | str) -> None:
-    assert row_of(PLAN.replace(gamma=gamma))["gamma"] == value
-
-
-def test_a_failed_row_has_the_columns_of_any_row() -> None:
-    row = failed_row(SOURCE, None, 0, 7, "empty")
-    assert list(row) == list(NAMES)
-    assert (row["status"], row["reason"], row["seed"], row["source_sha256"]) == ("failed", "empty", 7, "")
 
 
 @pytest.mark.parametrize(("index", "key"), [(0, "00000000"), (12345678, "12345678"), (123456789, "123456789")])
@@ -318,27 +233,19 @@ def test_keys_have_eight_digits_or_more(index: int, key: str) -> None:
 # A row is a plan ------------------------------------------------------------------------------------------------------
 
 
-@given(plans)
-def test_row_has_its_plan(plan: Plan) -> None:
-    assert plan_from_row(row_of(plan)) == plan
-
-
 @given(plan=plans, name=names)
-def test_row_read_from_csv_has_the_same_plan(plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory) -> None:
-    (row,) = through_csv([row_of(plan, dataclasses.replace(SOURCE, name=name))], tmp_path_factory.mktemp("csv"))
+def test_row_read_from_csv_is_the_row_of_the_same_plan(
+    plan: Plan, name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    written = row_of(plan, dataclasses.replace(SOURCE, name=name))
+    (row,) = through_csv([written], tmp_path_factory.mktemp("csv"))
+    assert repr(row) == repr(dict(written))
     assert repr(plan_from_row(row)) == repr(plan)
-    assert row["source"] == name
 
 
 @given(plans)
 def test_row_read_from_json_has_the_same_plan(plan: Plan) -> None:
     assert repr(plan_from_row(json.loads(row_json([row_of(plan)])))) == repr(plan)
-
-
-@given(plan=plans)
-def test_row_read_from_csv_is_the_row(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> None:
-    (row,) = through_csv([row_of(plan)], tmp_path_factory.mktemp("csv"))
-    assert repr(row) == repr(dict(row_of(plan)))
 
 
 @pytest.mark.parametrize("reason", REASONS)
@@ -347,18 +254,14 @@ def test_failed_row_read_from_csv_is_the_row(reason: str, tmp_path: Path) -> Non
     assert through_csv([row], tmp_path) == [dict(row)]
 
 
-def test_drawn_plans_survive_csv(settings: Callable[..., Any], tmp_path: Path) -> None:
-    for noise in ("brooks2019", "imx385_iso3200_rvdd", "none"):
-        for camera in ("convex", "choice", "identity"):
-            plan = plan_image(settings(f"noise={noise}", f"camera={camera}", "isp=srgb"), SHA256)
-            assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
+PROFILES = ("sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x")
 
 
-@pytest.mark.parametrize("noise", ["sony_a7s2", "nikon_d850", "canon_5d4", "canon_70d", "canon_700d", "oppo_reno10x"])
-def test_drawn_physical_plans_survive_csv(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
-    for scene in ("daylight", "night"):
-        plan = plan_image(settings(f"noise={noise}", f"scene={scene}"), SHA256, facts=FACTS)
-        assert plan.noise.physics is not None
+@pytest.mark.parametrize("noise", ["brooks2019", "imx385_iso3200_rvdd", "none", *PROFILES])
+def test_drawn_plans_survive_csv(settings: Callable[..., Any], noise: str, tmp_path: Path) -> None:
+    for options in (("camera=choice", "isp=srgb"), ("camera=identity", "scene=night")):
+        plan = plan_image(settings(f"noise={noise}", *options), SHA256, facts=FACTS)
+        assert (plan.noise.physics is not None) == (noise in PROFILES)
         assert plan_from_row(through_csv([row_of(plan)], tmp_path)[0]) == plan
 
 
@@ -423,21 +326,11 @@ def test_floats_are_spelled_as_pythons_shortest_repr() -> None:
     assert {"0.1", "1e+22"} <= set(cells)
 
 
-def test_values_that_do_not_apply_are_empty() -> None:
-    cells = csv_text([failed_row(Source(0, "x", "x", None), None, 0, 0, "empty")]).splitlines()[1].split(",")
-    assert [cell for cell in cells if cell] == ["00000000", "x", "failed", "empty", "0", "0"]
-
-
 def test_unknown_columns_are_left_out(tmp_path: Path) -> None:
     lines = csv_text([row_of()]).splitlines()
     (tmp_path / "m.csv").write_text(f"{lines[0]},later\n{lines[1]},9\n", encoding="utf-8")
     (row,) = read_rows(tmp_path / "m.csv")
     assert list(row) == list(NAMES)
-
-
-def test_a_missing_manifest_is_damage(tmp_path: Path) -> None:
-    with pytest.raises(DamageError, match=r"manifest.csv: no such manifest"):
-        list(read_rows(tmp_path / "manifest.csv"))
 
 
 HEADER = ",".join(NAMES)
@@ -457,12 +350,6 @@ BROKEN = [
 def test_a_broken_manifest_is_damage(content: str, sentence: str, tmp_path: Path) -> None:
     (tmp_path / "m.csv").write_text(content, encoding="utf-8")
     with pytest.raises(DamageError, match=r"m.csv: " + sentence):
-        list(read_rows(tmp_path / "m.csv"))
-
-
-def test_a_manifest_that_is_not_utf8_is_damage(tmp_path: Path) -> None:
-    (tmp_path / "m.csv").write_bytes(csv_text([row_of()]).encode("utf-8").replace(b"a, b", b"\xff, b"))
-    with pytest.raises(DamageError, match="not a readable manifest"):
         list(read_rows(tmp_path / "m.csv"))
 
 
@@ -589,13 +476,6 @@ def test_row_longer_than_its_json_size_is_an_error() -> None:
 def test_json_size_is_a_multiple_of_tar_blocks(length: int) -> None:
     assert json_size("x" * length) % 512 == 0
     assert json_size("x" * length) >= JSON_BYTES + 2 * (length + 2)
-
-
-def test_json_contains_no_nan(settings: Callable[..., Any]) -> None:
-    loaded = json.loads(
-        row_json([row_of(plan_image(settings(), SHA256))]), parse_constant=lambda text: pytest.fail(text)
-    )
-    assert all(math.isfinite(value) for value in loaded.values() if isinstance(value, float))
 
 
 def test_key_that_is_no_number_is_damage(dataset: Path, tmp_path: Path) -> None:

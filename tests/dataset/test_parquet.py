@@ -88,12 +88,9 @@ def test_rerun_of_a_finished_dataset_keeps_it(copy: Path, original: Path, make: 
     assert verify(copy) == []
 
 
-@pytest.mark.parametrize("at", [0, 1000, -3])
-def test_changed_byte_is_found_and_repaired(
-    at: int, copy: Path, original: Path, run_main: RunMain, tree_hash: TreeHash
-) -> None:
+def test_changed_byte_is_found_and_repaired(copy: Path, original: Path, run_main: RunMain, tree_hash: TreeHash) -> None:
     content = bytearray((copy / "manifest.parquet").read_bytes())
-    content[at] ^= 1
+    content[1000] ^= 1
     (copy / "manifest.parquet").write_bytes(content)
     (damage,) = verify(copy)
     assert str(damage).startswith("manifest.parquet: its SHA-256 is ")
@@ -104,17 +101,11 @@ def test_changed_byte_is_found_and_repaired(
     assert tree_hash(copy) == tree_hash(original)
 
 
-def test_missing_parquet_is_found_and_repaired(copy: Path, original: Path, run_main: RunMain) -> None:
-    (copy / "manifest.parquet").unlink()
-    assert [damage.file for damage in verify(copy)] == ["manifest.parquet"]
-    assert run_main("verify", copy, "--repair").code == 0
-    assert (copy / "manifest.parquet").read_bytes() == (original / "manifest.parquet").read_bytes()
-
-
 def test_repair_by_another_pyarrow_records_its_digest(
     copy: Path, original: Path, run_main: RunMain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (copy / "manifest.parquet").unlink()
+    assert [damage.file for damage in verify(copy)] == ["manifest.parquet"]
     monkeypatch.setattr(parquet, "BLOCK_BYTES", 2048)  # gives other bytes, as other versions do
     assert run_main("verify", copy, "--repair").code == 0
     assert (copy / "manifest.parquet").read_bytes() != (original / "manifest.parquet").read_bytes()

@@ -18,8 +18,6 @@ from typing import Any
 import numpy as np
 import pytest
 import xxhash
-from hypothesis import given
-from hypothesis import strategies as st
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.errors import DamageError
@@ -62,11 +60,6 @@ def in_json(row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def read_json(path: Path, name: str) -> dict:
-    with tarfile.open(path, "r:") as archive:
-        return json.load(archive.extractfile(name))
-
-
 def written(path: Path, *pairs: Pair, json_bytes: int = 512) -> ShardWriter:
     with ShardWriter(path) as writer:
         for i, one in enumerate(pairs):
@@ -87,27 +80,10 @@ def shard(tmp_path: Path) -> Path:
 NAMES = [f"{i:08d}.{name}" for i in range(2) for name in ("clean.npy", "noisy.npy", "json")]
 
 
-def test_tar_lists_the_members_of_an_image_consecutively(shard: Path) -> None:
-    done = subprocess.run(["tar", "-tf", shard], capture_output=True, text=True, check=True)
+def test_tar_unpacks_members_in_order_and_numpy_loads_them(shard: Path, tmp_path: Path) -> None:
+    done = subprocess.run(["tar", "-xvf", shard, "-C", tmp_path], capture_output=True, text=True, check=True)
     assert (done.stdout.splitlines(), done.stderr) == (NAMES, "")
-
-
-def test_tar_unpacks_arrays_that_numpy_loads(shard: Path, tmp_path: Path) -> None:
-    subprocess.run(["tar", "-xf", shard, "-C", tmp_path], check=True)
-    assert np.array_equal(np.load(tmp_path / "00000001.noisy.npy"), pair(8, 4, 2).noisy)
-
-
-def test_pythons_tarfile_reads_members_that_numpy_loads(shard: Path) -> None:
-    with tarfile.open(shard, "r:") as archive:
-        assert archive.getnames() == NAMES
-        for name, expected in (
-            ("00000000.clean.npy", pair(5, 7, 1).clean),
-            ("00000000.noisy.npy", pair(5, 7, 1).noisy),
-        ):
-            member = archive.extractfile(name)
-            assert member is not None
-            loaded = np.load(io.BytesIO(member.read()))
-            assert (loaded.dtype, loaded.tolist()) == (np.dtype("<u2"), expected.tolist())
+    np.testing.assert_array_equal(np.load(tmp_path / "00000001.noisy.npy"), pair(8, 4, 2).noisy, strict=True)
 
 
 def test_headers_contain_no_time_owner_or_other_mode(shard: Path) -> None:
@@ -115,14 +91,6 @@ def test_headers_contain_no_time_owner_or_other_mode(shard: Path) -> None:
         for info in archive:
             assert (info.mtime, info.uid, info.gid, info.uname, info.gname, info.mode) == (0, 0, 0, "", "", 0o644)
             assert info.isreg()
-
-
-def test_same_members_give_the_same_bytes_at_any_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written(tmp_path / "a.tar", pair(5, 7))
-    for clock in ("time", "time_ns"):
-        monkeypatch.setattr(time, clock, lambda: 2 * 10**9)
-    written(tmp_path / "b.tar", pair(5, 7))
-    assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
 
 
 def test_arrays_of_any_layout_give_the_same_bytes(tmp_path: Path) -> None:
@@ -133,42 +101,20 @@ def test_arrays_of_any_layout_give_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a.tar").read_bytes() == (tmp_path / "b.tar").read_bytes()
 
 
-def test_size_and_digest_are_those_of_the_file(tmp_path: Path) -> None:
-    writer = written(tmp_path / "a.tar", pair(5, 7), pair(33, 65))
-    content = (tmp_path / "a.tar").read_bytes()
-    assert writer.sha256 == hashlib.sha256(content).hexdigest()
-    assert writer.bytes == len(content)
-
-
 SIZES = [(1, 1), (1, 2), (2, 1), (3, 5), (16, 16), (17, 31), (1, 191), (1, 193), (255, 1), (1000, 1)]
 
 
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_size_of_a_pair_is_predicted_exactly(height: int, width: int, tmp_path: Path) -> None:
-    writer = written(tmp_path / "a.tar", pair(height, width), json_bytes=700)
-    assert shard_bytes([image_bytes(uint16(height, width), 700)]) == writer.bytes
-
-
 def test_size_of_a_shard_is_predicted_exactly(tmp_path: Path) -> None:
-    writer = written(tmp_path / "a.tar", *(pair(height, width) for height, width in SIZES))
-    assert shard_bytes([image_bytes(uint16(height, width), 512) for height, width in SIZES]) == writer.bytes
-
-
-def test_shard_without_pairs_has_no_bytes() -> None:
+    for json_bytes in (512, 700):
+        path = tmp_path / f"{json_bytes}.tar"
+        writer = written(path, *(pair(height, width) for height, width in SIZES), json_bytes=json_bytes)
+        predicted = shard_bytes([image_bytes(uint16(height, width), json_bytes) for height, width in SIZES])
+        assert predicted == writer.bytes == path.stat().st_size
     assert shard_bytes([]) == 0
 
 
-@given(width=st.integers(1, 10**6), height=st.integers(1, 10**6))
-def test_samples_fill_complete_tar_blocks(width: int, height: int) -> None:
-    assert (image_bytes(uint16(height, width), 512) - 4 * width * height) > 0
-    assert image_bytes(uint16(height, width), 512) % 512 == 0
-
-
-@pytest.mark.parametrize(
-    ("number", "name"), [(0, "shard-00000.tar"), (99999, "shard-99999.tar"), (100000, "shard-100000.tar")]
-)
-def test_shards_are_numbered(number: int, name: str) -> None:
-    assert shard_name(number) == name
+def test_shards_are_numbered_with_five_digits_or_more() -> None:
+    assert [shard_name(number) for number in (0, 100_000)] == ["shard-00000.tar", "shard-100000.tar"]
 
 
 def test_a_digest_is_xxh3_of_the_little_endian_bytes() -> None:
@@ -289,20 +235,11 @@ def test_mapped_arrays_are_those_written(shard: Path) -> None:
         assert np.array_equal(map_array(shard, index[f"{i:08d}.noisy.npy"], uint16(*one.clean.shape)), one.noisy)
 
 
-def test_json_member_is_read_by_name(shard: Path) -> None:
-    assert read_json(shard, "00000001.json") == {"key": 1}
-
-
 @pytest.mark.parametrize("kept", [0, 1, 511, 512, 700, 1024, 3000])
 def test_truncated_shard_is_damage(kept: int, shard: Path) -> None:
     os.truncate(shard, kept)
     with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
         read_index(shard)
-
-
-def test_a_missing_shard_is_damage(tmp_path: Path) -> None:
-    with pytest.raises(DamageError, match=r"a.tar: not a complete shard"):
-        read_index(tmp_path / "a.tar")
 
 
 def test_a_header_that_changed_is_damage(shard: Path) -> None:
@@ -345,10 +282,3 @@ def test_the_webdataset_library_loads_a_dataset_as_it_is(dataset: Path) -> None:
         assert np.array_equal(sample["clean.npy"], sample_of_reader.clean)
         assert np.array_equal(sample["noisy.npy"], sample_of_reader.noisy)
         assert sample["json"] == in_json(sample_of_reader.row)
-
-
-def test_rows_in_the_shards_are_typed_rows_of_the_manifest(dataset: Path) -> None:
-    for sample in RawPairs(dataset):
-        path = dataset / "shards" / shard_name(sample.row["shard"])
-        row = read_json(path, f"{sample.row['key']}.json")
-        assert repr(row) == repr(in_json(sample.row))

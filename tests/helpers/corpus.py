@@ -256,20 +256,22 @@ def resized(data: bytes, kind: str, width: int, height: int) -> bytes:
     elif kind == "webp":
         struct.pack_into("<HH", edited, 26, width & 0x3FFF, height & 0x3FFF)
     elif kind == "tiff":
-        _retag(edited, {256: width, 257: height, 278: height})
+        return retagged(data, {256: width, 257: height, 278: height})
     return bytes(edited)
 
 
-def _retag(data: bytearray, values: dict[int, int]) -> None:
-    order = ">" if data[:2] == b"MM" else "<"
+def retagged(data: bytes, values: dict[int, int]) -> bytes:
+    """Return a TIFF with other numbers in tags of its first page that hold one number."""
+    edited, order = bytearray(data), ">" if data[:2] == b"MM" else "<"
     (first,) = struct.unpack_from(order + "I", data, 4)
     if data[2:4] not in (b"*\0", b"\0*") or first + 2 > len(data):
-        return
+        return data
     (entries,) = struct.unpack_from(order + "H", data, first)
     for at in range(first + 2, min(first + 2 + 12 * entries, len(data) - 12), 12):
         (tag,) = struct.unpack_from(order + "H", data, at)
         if tag in values:
-            struct.pack_into(order + "HII", data, at + 2, 4, 1, values[tag])
+            struct.pack_into(order + "HII", edited, at + 2, 4, 1, values[tag])
+    return bytes(edited)
 
 
 if __name__ == "__main__":

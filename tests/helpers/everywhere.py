@@ -90,13 +90,20 @@ def facts(given: str) -> dict[str, Any]:
         "versions": {name: version(name) for name in runner.PACKAGES},
         "optimize": sys.flags.optimize,
         "numpy": [name for name in np._core._multiarray_umath.__cpu_dispatch__ if features[name]],
-        "opencv": [one[1:] for one in cv2.getCPUFeaturesLine().split() if one[0] == "*" and one[-1] != "?"],
+        "opencv": opencv_features(),
         "ipp": cv2.ipp.useIPP(),
         "product": product(),
         "libm": digest(repr([function(k / 999) for k in range(1, 999) for function in LIBM]).encode()),
         "kernels": kernels(),
         "doubles": [given, doubles()],
     }
+
+
+def opencv_features() -> list[str]:
+    """Return the optional instruction sets that OpenCV uses."""
+    import cv2
+
+    return [one[1:] for one in cv2.getCPUFeaturesLine().split() if one[0] == "*" and one[-1] != "?"]
 
 
 def hash_kernel_arguments() -> Any:

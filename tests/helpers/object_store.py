@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import os
 import socket
 import subprocess
 import sys
@@ -87,14 +86,6 @@ def upload(folder: Path, to: ObjectPath) -> None:
     for path in sorted(folder.rglob("*")):
         if path.is_file():
             (to / path.relative_to(folder).as_posix()).write_bytes(path.read_bytes())
-
-
-def download(prefix: ObjectPath, to: Path) -> None:
-    """Copy the objects below a URL to files."""
-    for entry in prefix.walk_entries():
-        path = to / entry.path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes((prefix / entry.path).read_bytes())
 
 
 @dataclass
@@ -229,11 +220,6 @@ def one_object_server(content: bytes) -> Iterator[tuple[str, list[Request]]]:
     finally:
         server.shutdown()
         server.server_close()
-
-
-def environment_of(endpoint: str) -> dict[str, str]:
-    """Return the environment of this process with the variables of a server."""
-    return {**os.environ, **variables(endpoint)}
 
 
 def put(endpoint: str, path: ObjectPath, content: bytes) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.cases import slow_except
 from helpers.commands import RunMain, messages
 from helpers.configs import with_branch
 from helpers.datasets import Settings
@@ -24,7 +25,6 @@ from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import CameraPlan, Facts, IspPlan, Plan, Srgb
-from unprocess_gen.pipeline import generate
 from unprocess_gen.planning.effect_selection import Prediction, effect_rules, facts_of, select_effects
 from unprocess_gen.planning.frame_model import SignalRange, signal_range
 from unprocess_gen.planning.plan import plan_image, plan_levels
@@ -100,22 +100,14 @@ def switched(config: Config, switch: str, srgb: Srgb, number: int) -> Plan:
     return plan_image(config, f"{number:064x}", 0, facts_of(srgb))
 
 
-def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset[str]) -> int:
-    """Assert that the noise masks the effects that ``auto`` omits; return the number of images with such effects."""
+def hold(config: Config, pictures: dict[str, Srgb]) -> int:
+    """Assert that the noise masks the effects that ``auto`` omits; return how many statistics have some."""
     held = 0
     for name, srgb in pictures.items():
-        found: dict[str, list[np.ndarray]] = {}
-        for number in range(frames):
-            everything, auto = (switched(config, switch, srgb, number) for switch in ("on", "auto"))
-            everything = everything.replace(
-                effects=tuple(one for one in everything.noise.effects if one in free or one in auto.noise.effects)
-            )
-            if everything.noise.effects == auto.noise.effects:
-                continue
-            for statistic, squares in omission(srgb, everything, auto).items():
-                found.setdefault(statistic, []).append(squares)
-        for statistic, parts in found.items():
-            squares = np.concatenate(parts)
+        everything, auto = (switched(config, switch, srgb, 0) for switch in ("on", "auto"))
+        if everything.noise.effects == auto.noise.effects:
+            continue
+        for statistic, squares in omission(srgb, everything, auto).items():
             rms = float(np.sqrt(squares.mean()))
             most = limit(config.effects.tolerance, independent(statistic, squares.size, srgb))
             assert rms <= most, f"{name}, {statistic}: {rms} of the noise, at most {most}"
@@ -126,35 +118,18 @@ def hold(config: Config, pictures: dict[str, Srgb], frames: int, free: frozenset
 # Omitted effects are masked -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("noise", PROFILES)
-def test_omitted_effects_are_masked_by_the_noise(
-    settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
-) -> None:
-    config = configured(settings, f"noise={noise}", f"scene={scene}")
-    hold(config, {name: pictures[name] for name in ("gradients-0", "gray 255")}, 1, frozenset(EFFECTS) - ASSUMED)
-
-
 QUICK = {(noise, list(SCENES)[number % len(SCENES)]) for number, noise in enumerate(PROFILES)}
 """Each profile with one scene; all combinations are slow."""
 
 
-@pytest.mark.parametrize(
-    ("noise", "scene"),
-    [
-        pytest.param(noise, scene, marks=() if (noise, scene) in QUICK else pytest.mark.slow)
-        for noise in PROFILES
-        for scene in SCENES
-    ],
-)
-def test_omitted_effects_are_masked_if_auto_decides_about_all(
+@pytest.mark.parametrize(("noise", "scene"), slow_except(QUICK, itertools.product(PROFILES, SCENES)))
+def test_omitted_effects_are_masked_by_the_noise(
     settings: Settings, pictures: dict[str, Srgb], noise: str, scene: str
 ) -> None:
     """No number is marked as assumed, and a full well cuts bright signals."""
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
     some = {name: pictures[name] for name in ("night_lamps-0", "gradients-0", "gray 255", "cyan")}
-    assert hold(config, some, 1, frozenset(EFFECTS)) > 0
+    assert hold(config, some) > 0
 
 
 @pytest.mark.slow
@@ -165,7 +140,7 @@ def test_omitted_effects_are_masked_in_larger_frames(settings: Settings, noise: 
     config = configured(settings, f"noise={noise}", f"scene={scene}", "noise.assumed=[]", "noise.full_well_e=20000")
     names = ("highlights-0", "night_lamps-0", "gradients-0", "dead_leaves-0")
     pictures = {name: cut(name, 380, 440) for name in names} | {"cyan": flat(0, 200, 200, height=381, width=441)}
-    hold(config, pictures, 1, frozenset(EFFECTS))
+    hold(config, pictures)
 
 
 def sensor(rng: np.random.Generator, physics: Physics) -> Physics:
@@ -560,24 +535,6 @@ def test_equal_images_of_8_and_16_bits_have_equal_effects(settings: Settings, pi
         deep = srgb.astype(np.uint16) * np.uint16(257)
         narrow, wide = (switched(config, "auto", one, 0) for one in (srgb, deep))
         assert (narrow.noise.effects, narrow.noise.skipped) == (wide.noise.effects, wide.noise.skipped)
-
-
-def test_selection_does_not_depend_on_order_of_pixels(settings: Settings) -> None:
-    """Only facts enter the selection, and they do not depend on order."""
-    config = configured(settings, "noise=sony_a7s2", "scene=low_light", "noise.assumed=[]")
-    srgb = cut("gradients-0", 40, 56)
-    assert switched(config, "auto", srgb, 0) == switched(config, "auto", np.ascontiguousarray(srgb[::-1, ::-1]), 0)
-
-
-@pytest.mark.slow  # `test_selection_does_not_depend_on_order_of_pixels`: only facts of the image enter it
-def test_number_of_workers_does_not_change_the_selection(
-    make: Callable[..., generate.Summary], tree_hash: Callable[[Path], str], tmp_path: Path
-) -> None:
-    photos = fill(tmp_path / "photos", 4)
-    chosen = ("noise=oppo_reno10x", "scene=indoor", "noise.assumed=[]", "output.pairs_per_shard=2")
-    for n_jobs in (1, 2):
-        make(photos, tmp_path / f"{n_jobs}", *chosen, n_jobs=n_jobs)
-    assert tree_hash(tmp_path / "1") == tree_hash(tmp_path / "2")
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (3, 3), (1, 500)])

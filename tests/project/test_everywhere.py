@@ -108,6 +108,8 @@ def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: 
             timeout=300,
             check=False,
         )
+        if done.returncode == -signal.SIGILL:
+            pytest.skip("this processor lacks instructions of another")
         assert done.returncode == 0, done.stdout + done.stderr
         facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
         return Made(tree_hash(folder / "ds"), facts, folder / "ds")
@@ -164,19 +166,16 @@ SURROUNDINGS = {
 }
 
 
-def without_vector_code(plain: Made) -> dict[str, str]:
-    """Return the settings that disable all optional vector code of OpenCV."""
-    return {"OPENCV_CPU_DISABLE": ",".join(plain.facts["opencv"]), "OPENCV_IPP": "disabled"}
+OLD_OPENCV = {"OPENCV_CPU_DISABLE": ",".join(everywhere.opencv_features()), "OPENCV_IPP": "disabled"}
+"""Disable all optional vector code of OpenCV."""
+LIBRARIES = OLD_OPENCV | {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
 
 
-@pytest.mark.parametrize("flags", [(), pytest.param(("-O",), marks=pytest.mark.slow)], ids=" ".join)
+@pytest.mark.parametrize("flags", [(), *(pytest.param((flag,), marks=pytest.mark.slow) for flag in ("-O", "-OO"))])
 def test_all_settings_together_change_no_byte(flags: tuple[str, ...], make: Make, plain: Made, figure: Figure) -> None:
     """Libraries use their oldest code; ``-O`` compiles all Python modules again, without assertions."""
-    libraries = {"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED), "GLIBC_TUNABLES": WITHOUT_FMA}
-
-    made = make(sys.executable, *flags, **SURROUNDINGS, **libraries, **without_vector_code(plain))
-
-    assert made.facts["optimize"] == len(flags)
+    made = make(sys.executable, *flags, **SURROUNDINGS, **LIBRARIES)
+    assert made.facts["optimize"] == "".join(flags).count("O")
     assert (made.facts["numpy"], made.facts["opencv"], made.facts["ipp"]) == ([], [], False)
     assert_same(made, plain)
     figure("machines", f"same bytes in {len(files(plain))} files")
@@ -189,46 +188,28 @@ def test_uncompiled_kernels_change_no_byte(make: Make, plain: Made) -> None:
     assert_same(made, plain)
 
 
-# Surroundings ---------------------------------------------------------------------------------------------------------
+# One setting ----------------------------------------------------------------------------------------------------------
+
+SETTINGS = [
+    *({"LC_ALL": "C.UTF-8"}, {"LC_ALL": "tr_TR.UTF-8"}, {"LC_ALL": "", "LANG": "tr_TR.UTF-8"}),
+    *({name: value} for name, value in SURROUNDINGS.items() if name != "LC_ALL"),
+    *(OLD_OPENCV, {"GLIBC_TUNABLES": WITHOUT_FMA}),
+    *({"NPY_DISABLE_CPU_FEATURES": " ".join(ENABLED[first:])} for first in range(len(ENABLED))),
+    *({"OPENBLAS_CORETYPE": core} for core in ("Prescott", "Nehalem", "Haswell", "Zen", "SkylakeX")),
+]
+CHANGED = {"OPENCV_CPU_DISABLE": "opencv", "GLIBC_TUNABLES": "libm"}
+CHANGED |= {"NPY_DISABLE_CPU_FEATURES": "numpy", "OPENBLAS_CORETYPE": "product"}
+"""The fact in which a setting shows."""
 
 
 @pytest.mark.slow
-def test_more_workers_than_cores_change_no_byte(make: Make, plain: Made) -> None:
-    made = make(n_jobs=8)
-
-    assert json.loads((made.out / "dataset.json").read_text(encoding="utf-8"))["run"]["n_jobs"] == 8
-    assert made.tree == plain.tree
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "value"), [("LC_ALL", "C.UTF-8"), ("LC_ALL", "tr_TR.UTF-8"), ("LANG", "tr_TR.UTF-8")])
-def test_no_locale_changes_a_byte(name: str, value: str, make: Make, plain: Made, figure: Figure) -> None:
-    assert_same(make(**{"LC_ALL": "", name: value}), plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("flag", "level"), [("-O", 1), ("-OO", 2)])
-def test_python_without_assertions_changes_no_byte(
-    flag: str, level: int, make: Make, plain: Made, figure: Figure
-) -> None:
-    made = make(sys.executable, flag)
-
-    assert made.facts["optimize"] == level
+@pytest.mark.parametrize("env", SETTINGS, ids=lambda env: " ".join(f"{name}={value}" for name, value in env.items()))
+def test_one_setting_changes_no_byte(env: dict[str, str], make: Make, plain: Made, figure: Figure) -> None:
+    made = make(**env)
+    for name in env.keys() & CHANGED.keys():
+        if made.facts[CHANGED[name]] == plain.facts[CHANGED[name]]:
+            pytest.skip(f"{name} changes nothing on this machine")
     assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-def test_the_content_of_fresh_memory_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
-    assert_same(make(MALLOC_PERTURB_="165"), plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "value"), [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_IO_MAX_IMAGE_PIXELS", "100")])
-def test_no_opencv_setting_changes_a_byte(name: str, value: str, make: Make, plain: Made, figure: Figure) -> None:
-    assert_same(make(**{name: value}), plain)
     figure("machines", f"same bytes in {len(files(plain))} files")
 
 
@@ -259,58 +240,6 @@ def test_a_photograph_is_not_corrupt_when_memory_is_short(photographs: Path, tmp
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
 
     assert done.stdout.strip() in ("MachineError", "MemoryError")
-
-
-# Processors, as libraries see them ------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kept", [ENABLED[:i] for i in range(len(ENABLED))], ids=lambda kept: "+".join(kept) or "none")
-def test_numpys_instruction_sets_change_no_byte(kept: list[str], make: Make, plain: Made, figure: Figure) -> None:
-    made = make(NPY_DISABLE_CPU_FEATURES=" ".join(name for name in ENABLED if name not in kept))
-
-    assert made.facts["numpy"] == kept
-    assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("core", ["Prescott", "Nehalem", "Haswell", "Zen", "SkylakeX"])
-def test_openblas_kernels_change_no_byte(core: str, make: Make, plain: Made, figure: Figure) -> None:
-    product = "import numpy; numpy.ones((50, 50)) @ numpy.ones((50, 50))"
-    tried = subprocess.run([sys.executable, "-c", product], env=environment(OPENBLAS_CORETYPE=core), check=False)
-    if tried.returncode == -signal.SIGILL:
-        pytest.skip(f"this processor lacks instructions of {core}")
-
-    made = make(OPENBLAS_CORETYPE=core)
-
-    if made.facts["product"] == plain.facts["product"]:
-        pytest.skip(f"a matrix product for {core} is the same as here")
-    assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-def test_opencv_without_vector_code_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
-    if not plain.facts["opencv"]:
-        pytest.skip("this OpenCV has one kind of code only")
-
-    made = make(**without_vector_code(plain))
-
-    assert made.facts["opencv"] == []
-    assert not made.facts["ipp"]
-    assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
-
-
-@pytest.mark.slow
-def test_a_c_library_without_fma_changes_no_byte(make: Make, plain: Made, figure: Figure) -> None:
-    made = make(GLIBC_TUNABLES=WITHOUT_FMA)
-
-    if made.facts["libm"] == plain.facts["libm"]:
-        pytest.skip("the C library computes sines, powers and logarithms as before")
-    assert_same(made, plain)
-    figure("machines", f"same bytes in {len(files(plain))} files")
 
 
 WITHOUT_VECTOR_CODE = """
@@ -383,35 +312,23 @@ def code(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_the_machine_code_of_every_kernel_is_inspected(code: dict[str, Any]) -> None:
-    assert code["not compiled"] == []
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("target", ["Numba's own", *everywhere.TARGETS])
 def test_no_kernel_contains_a_fused_multiply_add(target: str, code: dict[str, Any], figure: Figure) -> None:
     kernels, free_to_fuse = code["instructions"][target]
     if kernels is None:
         pytest.skip("this LLVM was built without that target")
-
+    assert code["not compiled"] == []
     assert free_to_fuse["fused"]
-    assert kernels["fused"] == []
-    assert kernels["guessed"] == []
+    assert kernels == {"fused": [], "guessed": []}
     figure("machines", f"{len(kernels['fused'])} fused multiply-adds in the kernels for {target}")
 
 
 @pytest.mark.slow
-def test_no_kernel_has_fast_math_flags(code: dict[str, Any]) -> None:
+def test_kernels_call_only_exact_functions_without_fast_math(code: dict[str, Any]) -> None:
     kernels, free = code["fast-math flags"]
-
     assert free
     assert kernels == []
-
-
-@pytest.mark.slow
-def test_kernels_call_only_exact_functions(code: dict[str, Any]) -> None:
     called = {re.sub(r"^llvm\.|\.v?\d*f(?:32|64)$", "", name) for name in code["called"]}
-
     assert "sqrt" in called
     loads = {name for name in called if re.match(r"masked\.(load|gather)\.v\d+f(32|64)\.", name)}
     read = {"PyFloat_AsDouble", "PyNumber_Float"}  # arguments

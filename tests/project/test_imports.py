@@ -7,6 +7,7 @@ import functools
 from pathlib import Path
 
 import pytest
+from helpers.everywhere import KERNELS
 
 import unprocess_gen
 
@@ -14,10 +15,7 @@ PACKAGE = Path(unprocess_gen.__file__).parent
 
 ONLY_IN = {
     "hydra": {
-        "cli.jobs",
-        "config.composition",
-        "config.composition_errors",
-        "config.sweep_expansion",
+        *("cli.jobs", "config.composition", "config.composition_errors", "config.sweep_expansion"),
         "cli.sweep_plugins",
     },
     "omegaconf": {
@@ -28,18 +26,9 @@ ONLY_IN = {
     "llvmlite": {"simulation.kernels.simd"},
     "numba": {"core.jit", "simulation.kernels.simd"},
     "cv2": {
-        *(
-            "sources.image.decode",
-            "sources.mosaics",
-            "reports.dataset_page.page",
-            "reports.sheets.contact_sheet",
-            "reports.sheets.panels",
-        ),
-        *(
-            "reports.benchmark.complete_runs",
-            "simulation.reference.isp",
-            "pipeline.worker",
-        ),
+        *("sources.image.decode", "sources.mosaics", "simulation.reference.isp", "pipeline.worker"),
+        *("reports.dataset_page.page", "reports.sheets.contact_sheet", "reports.sheets.panels"),
+        "reports.benchmark.complete_runs",
     },
     "PIL": {"sources.image.decode"},
     "av": {"sources.video.colours", "sources.video.decode"},
@@ -76,24 +65,6 @@ def test_libraries_are_imported_in_listed_modules_only(library: str) -> None:
     assert found == ONLY_IN[library]
 
 
-def test_no_fast_math_on_the_way_to_the_output() -> None:
-    from unprocess_gen.simulation.kernels import (
-        body,
-        clean,
-        electrons,
-        gaussian,
-        normal,
-        philox,
-        poisson,
-        readout,
-        render,
-        rounding,
-        strips,
-    )
-
-    modules = (body, clean, electrons, gaussian, normal, philox, poisson, readout, render, rounding, strips)
-    kernels = [value for module in modules for value in vars(module).values()]
-    kernels = [value for value in kernels if hasattr(value, "targetoptions")]
-
-    assert len(kernels) >= 20
-    assert not any(kernel.targetoptions.get("fastmath") for kernel in kernels)
+def test_no_kernel_is_compiled_with_fast_math() -> None:
+    assert len(KERNELS) >= 20
+    assert not any(kernel.targetoptions.get("fastmath") for kernel in KERNELS.values())

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import itertools
 import json
 import os
 import re
@@ -32,8 +33,6 @@ from PIL import Image
 
 from unprocess_gen import RawPairs
 from unprocess_gen.core.types import Source
-from unprocess_gen.dataset.selection import select_rows
-from unprocess_gen.pipeline.replay import replay
 from unprocess_gen.sources.listing import list_folder
 from unprocess_gen.sources.names import decode_name, encode_name
 from unprocess_gen.sources.reading import read_bytes
@@ -196,21 +195,6 @@ def test_members_are_named_by_key_and_have_the_names_of_the_manifest(made: Hosti
 # Replay, verify, read -------------------------------------------------------------------------------------------------
 
 
-def test_replay_finds_each_source_by_its_key(made: HostileDataset) -> None:
-    """The manifest is read once for all keys, and once for each of every tenth."""
-    wanted = [(row["key"], row["source"], "") for row in table(made.out)]
-    for some in (wanted, *([one] for one in wanted[::10])):
-        rows = select_rows(made.out / "manifest.csv", None, ",".join(key for key, _, _ in some))
-        assert [(one.key, one.source, one.complaint) for one in replay(rows, str(made.root))] == some
-
-
-def test_replay_names_arrays_by_key(made: HostileDataset, run_main: RunMain, tmp_path: Path) -> None:
-    done = run_main("replay", made.out, "--keys", "00000000,00000007", "--to", tmp_path / "kept")
-    assert done.code == 0
-    kept = sorted(path.name for path in (tmp_path / "kept").iterdir())
-    assert kept == [f"0000000{key}.{kind}.npy" for key in (0, 7) for kind in ("clean", "noisy")]
-
-
 def test_verify_regenerates_every_pair(made: HostileDataset, run_main: RunMain) -> None:
     count = len(made.contents)
     done = run_main("verify", made.out, "--regenerate", count)
@@ -299,8 +283,9 @@ VERB_ARGUMENTS = {
 DATASET_NAMES = ("camera=sony_a7r,seed=1", "source.root=x", "out=2", "-x", "--to", "a b", "verify", "~x")
 
 
-@pytest.mark.parametrize("name", DATASET_NAMES)
-@pytest.mark.parametrize("verb", VERB_ARGUMENTS)
+@pytest.mark.parametrize(
+    ("verb", "name"), [*itertools.product(VERB_ARGUMENTS, ("--to",)), *itertools.product(("again",), DATASET_NAMES)]
+)
 def test_every_verb_takes_a_dataset_of_any_name(
     verb: str, name: str, wide: Path, run_main: RunMain, tmp_path: Path
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -111,14 +110,6 @@ def test_patch_equals_the_crop_of_its_full_pair(
         assert crops >= 14, patch
         equal += crops
     figure("patches", f"{equal} patches are crops of their frames")
-
-
-@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-def test_patch_has_the_pattern_of_its_full_frame(pattern: str, sources: Path, make: Make, tmp_path: Path) -> None:
-    for name, patch in (("full", "source.patch=null"), ("patched", "source.patch=[grid,32,14]")):
-        make(sources, tmp_path / name, patch, f"sensor.pattern={pattern}", "gains=fixed")
-    assert_cut_outs(tmp_path / "patched", tmp_path / "full")
-    assert {row["pattern"] for row in rows(tmp_path / "patched") if row["status"] == "ok"} == {pattern}
 
 
 def test_frames_of_a_clip_have_patches_at_the_same_places(make: Make, tmp_path: Path) -> None:
@@ -309,13 +300,6 @@ def test_every_pair_of_every_patch_has_a_row(cut_up: Path) -> None:
     ]
 
 
-def test_every_patch_is_one_sample(cut_up: Path) -> None:
-    with tarfile.open(cut_up / "shards" / "shard-00001.tar") as shard:
-        names = shard.getnames()
-    members = ("clean.npy", "noisy.npy", "noisy.l00d01.npy", "noisy.l01d00.npy", "noisy.l01d01.npy", "json")
-    assert names == [f"00000003-p{patch:04d}.{member}" for patch in range(5) for member in members]
-
-
 @pytest.mark.filterwarnings("ignore")  # those of another library
 def test_the_webdataset_library_loads_every_patch_as_a_sample(cut_up: Path) -> None:
     wds = pytest.importorskip("webdataset")
@@ -340,12 +324,6 @@ def test_adding_a_photograph_moves_no_other_patches(sources: Path, cut_up: Path,
     names = ("source", "patch", "patch_y", "patch_x", "level", "draw", "noisy_xxh3")
     before, after = ([tuple(row[name] for name in names) for row in rows(out)] for out in (cut_up, tmp_path / "ds"))
     assert [row for row in after if row[0] != "0.png"] == before
-
-
-def test_more_patches_leave_the_first_bytes_unchanged(sources: Path, cut_up: Path, make: Make, tmp_path: Path) -> None:
-    make(sources, tmp_path / "ds", *LEVELS, "source.patch=[random,30,9]")
-    more = {row["key"]: row["noisy_xxh3"] for row in rows(tmp_path / "ds")}
-    assert {row["key"]: row["noisy_xxh3"] for row in rows(cut_up)}.items() < more.items()
 
 
 # Verify, replay, repair -----------------------------------------------------------------------------------------------
