@@ -384,7 +384,7 @@ def test_patches_share_correlated_rows_beyond_their_own(make: Make, tmp_path: Pa
 
 def test_levels_and_draws_are_checked(make: Make, tmp_path: Path) -> None:
     make(None, tmp_path / "ds", "source.limit=2", "noise=brooks2019", "noise.levels=2", "noise.draws=2")
-    checker = Checker(tmp_path / "ds")
+    checker = Checker(np.array(list(overlaps(tmp_path / "ds"))))
     for clean, noisy, row in RawPairs(tmp_path / "ds"):
         checker.add(row, pair_sums(clean, noisy, row))
     assert (checker.count, checker.alarms, checker.wrong_pairs) == (8, [], 0)

@@ -6,6 +6,7 @@ the row. Alarms are raised by `noise_check.checks`, not by the fits.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -16,8 +17,8 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.output_paths import check_output_file
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Float
-from unprocess_gen.dataset.reader import RawPairs
-from unprocess_gen.reports.noise_check.checks import Checker, pair_sums
+from unprocess_gen.dataset.reader import RawPairs, Sample
+from unprocess_gen.reports.noise_check.checks import Checker, overlaps, pair_sums
 from unprocess_gen.reports.noise_check.scores import joined, row_offsets, variance_points
 from unprocess_gen.reports.noise_check.sums import Plane, Sums
 from unprocess_gen.reports.report_files import require_libraries
@@ -79,10 +80,14 @@ def examine_dataset(folder: AnyPath, dark_pixels: DarkPixels | None = None) -> N
 
     Pairs with too few usable sites are counted as unchecked; those with dark frames too if there is no access to them.
     """
+    return examine_pairs(RawPairs(folder), Checker(np.array(list(overlaps(folder))).reshape(-1, 2)), dark_pixels)
+
+
+def examine_pairs(pairs: Iterable[Sample], checker: Checker, dark_pixels: DarkPixels | None = None) -> NoiseSummary:
+    """Fit and check the noise of pairs, one at a time."""
     count, worst = 0, None
     first: list[NoiseFit] = []
-    checker = Checker(folder)
-    for clean, noisy, row in RawPairs(folder):
+    for clean, noisy, row in pairs:
         sums = pair_sums(clean, noisy, row, dark_pixels)
         checker.add(row, sums)
         fit = None if sums is None else fit_sums(str(row["key"]), sums)

@@ -34,20 +34,13 @@ from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.pipeline.workspace import REPORT, read_dataset
 from unprocess_gen.reports import photon_transfer
-from unprocess_gen.reports.dataset_page.statistics import (
-    NUMBER_COLUMNS,
-    SITE_COLUMNS,
-    ManifestStatistics,
-    NumberSummary,
-    read_statistics,
-    values_text,
-)
+from unprocess_gen.reports.dataset_page.statistics import SITE_COLUMNS, NumberSummary, read_statistics, values_text
 from unprocess_gen.reports.formatting import byte_size, short_number
-from unprocess_gen.reports.html_pages import PageTable, data_uri, render_page
-from unprocess_gen.reports.noise_check.checks import Alarm, failed_checks, pair_scores, pair_sums, threshold
+from unprocess_gen.reports.html_pages import data_uri, render_page
+from unprocess_gen.reports.noise_check.checks import Checker
 from unprocess_gen.reports.report_files import require_libraries, write_files
 from unprocess_gen.reports.sheets.contact_sheet import contact_sheet
-from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkFolder, DarkPlaces
+from unprocess_gen.sources.dark_frames import NO_DARK_FRAMES, DarkPlaces
 from unprocess_gen.sources.names import encode_name
 
 PAIRS_FITTED = 8
@@ -55,6 +48,15 @@ SHARDS_LISTED = 20
 JPEG_QUALITY = 88
 
 MEANINGS = {column.name: ", ".join(filter(None, (column.meaning, column.unit))) for column in COLUMNS}
+
+SETTINGS_SHOWN = (
+    *("seed", "source.limit", "source.clips", "source.downscale", "source.dequantize", "source.patch"),
+    *("camera.name", "camera.xyz2cam", "gains.red", "gains.blue", "gains.inverse_rgb", "gains.highlight"),
+    *("isp.tone", "isp.gamma", "sensor.bits", "sensor.black_level_dn", "sensor.white_level_dn", "sensor.pattern"),
+    *("sensor.clip", "sensor.saturated", "noise.name", "noise.law", "noise.iso", "noise.levels", "noise.draws"),
+    *("scene.name", "scene.exposure_ratio", "effects.all", "effects.tolerance", "accuracy.name"),
+)
+"""Settings in the table; the others are in the folded ``config.yaml``."""
 
 
 def write_dataset_report(
@@ -67,7 +69,6 @@ def write_dataset_report(
     not finished or was changed; MachineError if writing fails.
     """
     require_libraries("report")
-    _check_finished(folder)
     file = _file_to_write(folder, to)
     write_files(file.parent, {file.name: dataset_page(folder, source, dark).encode()})
     return file
@@ -87,14 +88,14 @@ def _file_to_write(folder: AnyPath, to: Path | None) -> Path:
 
 
 def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlaces = NO_DARK_FRAMES) -> str:
-    """Return the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
+    """Render the HTML page of a finished dataset; DamageError as for `write_dataset_report`."""
     from jinja2 import TemplateError  # optional library, extra "figures"
 
     facts, config = _checked_facts(folder)
     rows = with_bar(read_rows(folder / "manifest.csv"), "row", facts["pairs"] + sum(facts["failed"].values()))
     statistics = read_statistics(rows, facts["pairs"])
-    sections = {} if statistics.first_pair is None else _pair_sections(folder, source, dark, statistics)
-    name = folder_name(folder)
+    first, name = statistics.first_pair, folder_name(folder)
+    settings = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}
     try:
         return render_page(
             "dataset.html",
@@ -102,28 +103,26 @@ def dataset_page(folder: AnyPath, source: AnyPath | None = None, dark: DarkPlace
             facts=facts,
             size=byte_size(sum(entry["bytes"] for entry in facts["shards"])),
             config_yaml=(folder / "config.yaml").read_text(encoding="utf-8"),
-            settings=_settings(config),
+            settings={key: value_text(value) for key, value in settings.items() if value is not None},
             statistics=statistics,
-            pixels=values_text(statistics.sizes) if sections else "no pair",
-            site_columns=SITE_COLUMNS,
+            values_text=values_text,
+            short_number=short_number,
             meanings=MEANINGS,
+            site_columns=SITE_COLUMNS,
+            charts=[_chart(column) for column in statistics.numbers.values() if column.least < column.greatest],
             shards=[(shard_name(number), entry) for number, entry in enumerate(facts["shards"][:SHARDS_LISTED])],
             name=name,
             quoted=shlex.quote(name),
-            **sections,
+            **({} if first is None else _pair_values(folder, source, dark, first)),
         )
     except (TypeError, ValueError, ZeroDivisionError, TemplateError) as error:  # what a row of facts should have
         raise DamageError(f"{folder / 'dataset.json'}: cannot be shown ({error_in_one_line(error)})") from error
 
 
-def _check_finished(folder: AnyPath) -> None:
+def _checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
+    """Read ``dataset.json`` and the config, after comparing the digests of manifest and config."""
     if not (folder / "dataset.json").exists():
         raise DamageError(f"{folder}: dataset.json does not exist; expected a finished dataset")
-
-
-def _checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
-    """Return ``dataset.json`` and the config, after comparing the digests of manifest and config."""
-    _check_finished(folder)
     facts = read_dataset(folder / "dataset.json")
     for name, key in (("manifest.csv", "manifest_sha256"), ("config.yaml", "config_sha256")):
         path = folder / name
@@ -137,74 +136,47 @@ def _checked_facts(folder: AnyPath) -> tuple[dict[str, Any], Config]:
         raise DamageError(str(error)) from error
 
 
-# --------------------------------------------------------------------------------------------------------- sections
+def _pair_values(folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, first: Row) -> dict[str, Any]:
+    """Values of the sections about pairs; the contact sheet is a JPEG, because noise makes a PNG four times as large.
 
-
-SETTINGS_SHOWN = (
-    *("seed", "source.limit", "source.clips", "source.downscale", "source.dequantize", "source.patch"),
-    *("camera.name", "camera.xyz2cam", "gains.red", "gains.blue", "gains.inverse_rgb", "gains.highlight"),
-    *("isp.tone", "isp.gamma", "sensor.bits", "sensor.black_level_dn", "sensor.white_level_dn", "sensor.pattern"),
-    *("sensor.clip", "sensor.saturated", "noise.name", "noise.law", "noise.iso", "noise.levels", "noise.draws"),
-    *("scene.name", "scene.exposure_ratio", "effects.all", "effects.tolerance", "accuracy.name"),
-)
-"""Settings in the table; the others are in the folded ``config.yaml``."""
-
-
-def _settings(config: Config) -> PageTable:
-    values = {key: functools.reduce(getattr, key.split("."), config) for key in SETTINGS_SHOWN}
-    return PageTable(
-        ("setting", "value"), [(key, value_text(value)) for key, value in values.items() if value is not None]
+    The noise of a few evenly spaced pairs is checked and fitted, unless their dark frames are not available.
+    """
+    _, sheet = cv2.imencode(
+        ".jpg", contact_sheet(folder, source=source)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     )
-
-
-def _pair_sections(
-    folder: AnyPath, source: AnyPath | None, dark: DarkPlaces, statistics: ManifestStatistics
-) -> dict[str, Any]:
-    """Return the values of the sections about pairs."""
-    numbers, first = statistics.numbers, statistics.first_pair
-    assert first is not None
-    texts = [(name, values_text(counts), MEANINGS[name]) for name, counts in statistics.texts.items()]
-    constants = [
-        (name, short_number(column.least, 6), MEANINGS[name])
-        for name, column in numbers.items()
-        if column.least == column.greatest != 0 and name in NUMBER_COLUMNS
-    ]
-    charts = {name: _chart(column) for name, column in numbers.items() if column.least < column.greatest}
-    omitted = [
-        (effect, f"{count:,}", next(iter(reasons)) if len(reasons) == 1 else f"for example: {next(iter(reasons))}")
-        for (effect, count), reasons in zip(statistics.omitted.items(), statistics.reasons.values(), strict=True)
-    ]
+    pairs, figure, missing, noise = RawPairs(folder), io.BytesIO(), "", None
+    numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
+    try:
+        access = dark.open() if first["dark_frame"] else None
+        if first["dark_frame"] and access is None:
+            raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
+        examined = with_bar((pairs[number] for number in numbers), "pair checked", len(numbers))
+        noise = photon_transfer.examine_pairs(examined, Checker(np.ones((len(numbers), 2), int)), access)
+        if noise.first:
+            photon_transfer.draw_fits(noise.first, figure)
+    except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
+        missing = str(error)
     return {
-        "contact_sheet": _contact_sheet(folder, source),
-        "omitted": PageTable(("omitted effect", "pairs", "reason"), omitted, {1}),
-        "constants": PageTable(("column", "value (number of pairs, if several)", "meaning"), [*texts, *constants]),
-        "parameter_charts": [charts[name] for name in NUMBER_COLUMNS if name in charts],
-        "site_charts": [charts[name] for name in SITE_COLUMNS if name in charts],
-        "noise": _noise_check(folder, dark),
+        "contact_sheet": data_uri(sheet.tobytes(), "jpeg"),
+        "noise": noise,
+        "missing": missing,
+        "count": len(numbers),
+        "figure": data_uri(figure.getvalue()),
         "first_shard": f"{folder_name(folder)}/shards/{shard_name(int(first['shard'] or 0))}",
         "first_key": sample_key(first),
     }
 
 
-def _contact_sheet(folder: AnyPath, source: AnyPath | None) -> str:
-    """Return the contact sheet as a ``data:`` address; as JPEG, because noise makes a PNG four times as large."""
-    sheet = contact_sheet(folder, source=source)
-    _, content = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return data_uri(content.tobytes(), "jpeg")
-
-
 class Chart(NamedTuple):
-    """The histogram of a column as a ``data:`` address, and the texts around it."""
+    """The histogram of a column as a ``data:`` address, and its caption."""
 
     column: str
-    meaning: str
-    ends: str
+    caption: str
     picture: str
 
 
 LOGARITHMIC_RATIO = 20
 """Ratio of greatest to least value from which the scale of a histogram is logarithmic."""
-
 
 BARS = 24
 
@@ -212,7 +184,7 @@ BARS = 24
 def _chart(column: NumberSummary) -> Chart:
     from matplotlib.figure import Figure  # optional library, extra "figures"
 
-    figure = Figure(figsize=(3, 1.1), layout="constrained")
+    figure, content = Figure(figsize=(3, 1.1), layout="constrained"), io.BytesIO()
     axes = figure.subplots()
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.set_yticks([])
@@ -220,53 +192,8 @@ def _chart(column: NumberSummary) -> Chart:
     axes.set_xscale("log" if is_logarithmic else "linear")
     space = np.geomspace if is_logarithmic else np.linspace
     axes.hist(column.values, space(column.least, column.greatest, BARS + 1).tolist())
-    content = io.BytesIO()
     figure.savefig(content, dpi=120)
     least, mean, greatest = (short_number(value, 4) for value in (column.least, column.mean, column.greatest))
     unit = " % of the frame" if column.column in SITE_COLUMNS else ""
-    ends = f"{least} to {greatest}{unit}, mean {mean}"
-    return Chart(column.column, MEANINGS[column.column], ends, data_uri(content.getvalue()))
-
-
-def _noise_check(folder: AnyPath, dark: DarkPlaces) -> dict[str, Any]:
-    """Return checks and photon transfer fits of a few evenly spaced pairs, or why pairs with dark frames have none."""
-    pairs = RawPairs(folder)
-    numbers = evenly_spaced(range(len(pairs)), PAIRS_FITTED)
-    fits: list[photon_transfer.NoiseFit] = []
-    failed: list[Alarm] = []
-    checked, missing, dark_pixels = 0, "", None
-    for number in with_bar(numbers, "pair checked"):
-        clean, noisy, row = pairs[number]
-        try:
-            dark_pixels = dark_pixels or _dark_frames_of(row, dark)
-            sums = pair_sums(clean, noisy, row, dark_pixels)
-        except (ConfigError, MachineError) as error:  # dark frames are no part of the dataset, whose page this is
-            missing = str(error)
-            break
-        if sums is None:
-            continue
-        checked += 1
-        fit = photon_transfer.fit_sums(str(row["key"]), sums)
-        fits += [] if fit is None else [fit]
-        failed += failed_checks(str(row["key"]), pair_scores(sums), threshold(len(numbers)))[:1]
-    figure = io.BytesIO()
-    if fits:
-        photon_transfer.draw_fits(fits, figure)
-    return {
-        "count": len(numbers),
-        "checked": checked,
-        "failed": failed,
-        "missing": missing,
-        "fits": fits,
-        "figure": data_uri(figure.getvalue()),
-    }
-
-
-def _dark_frames_of(row: Row, dark: DarkPlaces) -> DarkFolder | None:
-    """Return access to the dark frames that a row names; ConfigError if there is none."""
-    if not row["dark_frame"]:
-        return None
-    folder = dark.open()
-    if folder is None:
-        raise ConfigError("noise.dark_frames is missing; expected the folder of the dark frames")
-    return folder
+    caption = f"{MEANINGS[column.column]}: {least} to {greatest}{unit}, mean {mean}"
+    return Chart(column.column, caption, data_uri(content.getvalue()))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -65,37 +64,47 @@ def values_text(counts: Counter[str]) -> str:
     return ", ".join(f"{value} ({count:,})" for value, count in ranked)
 
 
-@dataclass
 class ManifestStatistics:
-    """Counts and ranges of a manifest's rows; ``first_pair`` is None without any pair."""
+    """Counts and ranges of a manifest's rows.
 
-    pairs: int
-    rows: int = 0
-    images: int = 0
-    first_pair: Row | None = None
-    failed: list[Row] = field(default_factory=list)
-    texts: dict[str, Counter[str]] = field(default_factory=lambda: {name: Counter() for name in TEXT_COLUMNS})
-    sizes: Counter[str] = field(default_factory=Counter)
-    effects: Counter[str] = field(default_factory=Counter)
-    omitted: Counter[str] = field(default_factory=Counter)
-    reasons: dict[str, Counter[str]] = field(default_factory=dict)
+    Attributes
+    ----------
+    rows, images : int
+        Number of rows, and of their images.
+    first_pair : Row or None
+        Row of the first pair.
+    failed : list of Row
+        The first failed rows.
+    sizes, effects, omitted : Counter of str
+        Pairs by size, and by effects that are simulated and omitted.
+    texts, reasons : dict of str to Counter of str
+        Values of text columns, and reasons of omitted effects.
+    """
 
-    def __post_init__(self) -> None:
-        self._step, self._added, self._image = max(1, -(-self.pairs // PAIRS_DRAWN)), 0, ""
-        self._least, self._greatest = np.full((2, len(ALL_NUMBERS)), np.nan)
-        self._total, self._count = np.zeros((2, len(ALL_NUMBERS)))
-        self._drawn = [np.empty((0, len(ALL_NUMBERS)))]
+    def __init__(self, pairs: int) -> None:
+        self.rows = self.images = 0
+        self.first_pair: Row | None = None
+        self.failed: list[Row] = []
+        self.sizes, self.effects, self.omitted = Counter[str](), Counter[str](), Counter[str]()
+        self.texts, self.reasons = (
+            {name: Counter[str]() for name in TEXT_COLUMNS},
+            defaultdict[str, Counter[str]](Counter),
+        )
+        self._step, self._image, columns = max(1, -(-pairs // PAIRS_DRAWN)), "", len(ALL_NUMBERS)
+        self._range, self._total = np.full((2, columns), np.nan), np.zeros((2, columns))
+        self._drawn, self._added = [np.empty((0, columns))], 0
 
     @property
     def numbers(self) -> dict[str, NumberSummary]:
         """The columns that are not empty."""
-        drawn, mean = np.concatenate(self._drawn).T, self._total / np.maximum(self._count, 1)
+        (total, count), drawn = self._total, np.concatenate(self._drawn).T
+        mean = total / np.maximum(count, 1)
         return {
-            name: NumberSummary(
-                name, float(self._least[i]), float(mean[i]), float(self._greatest[i]), drawn[i][~np.isnan(drawn[i])]
+            name: NumberSummary(name, least, average, greatest, values[~np.isnan(values)])
+            for name, least, average, greatest, values, number in zip(
+                ALL_NUMBERS, self._range[0].tolist(), mean.tolist(), self._range[1].tolist(), drawn, count, strict=True
             )
-            for i, name in enumerate(ALL_NUMBERS)
-            if self._count[i]
+            if number
         }
 
     def add(self, rows: Sequence[Row]) -> None:
@@ -116,9 +125,9 @@ class ManifestStatistics:
         values = np.array([[row[name] for name in ALL_NUMBERS] for row in rows], dtype=np.float64)  # NaN: empty
         sites = np.array([[float(row["width"] or 0) * float(row["height"] or 0)] for row in rows])
         values[:, len(NUMBER_COLUMNS) :] *= 100 / sites
-        self._least, self._greatest = np.fmin.reduce([self._least, *values]), np.fmax.reduce([self._greatest, *values])
-        self._total += np.nansum(values, axis=0)
-        self._count += (~np.isnan(values)).sum(axis=0)
+        least, greatest = self._range
+        self._range = np.stack([np.fmin.reduce([least, *values]), np.fmax.reduce([greatest, *values])])
+        self._total += np.nansum(values, axis=0), (~np.isnan(values)).sum(axis=0)
         self._drawn.append(values[-self._added % self._step :: self._step])
         self._added += len(rows)
 
@@ -130,7 +139,7 @@ class ManifestStatistics:
         for text in filter(None, str(row["skipped"]).split(";")):
             effect, _, reason = text.partition(": ")
             self.omitted[effect] += 1
-            add_value(self.reasons.setdefault(effect, Counter()), reason)
+            add_value(self.reasons[effect], reason)
 
 
 def read_statistics(rows: Iterable[Row], pairs: int) -> ManifestStatistics:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import DarkPixels, Frame, Plan, Row
@@ -125,18 +126,20 @@ def failed_checks(key: str, scores: Scores, limit: float) -> list[Alarm]:
 
 
 class Checker:
-    """Check the pairs of a dataset in a folder, one after the other.
+    """Check the pairs of a dataset, one after the other.
 
     Attributes
     ----------
     count, unchecked, wrong_pairs : int
         Pairs that were checked, those that cannot be, and those with wrong noise.
+    pair_alarms : list of Alarm
+        Alarms of the first pairs with wrong noise.
     """
 
-    def __init__(self, folder: AnyPath) -> None:
-        self._overlaps = np.array(list(overlaps(folder))).reshape(-1, 2)
-        self._limit = threshold(len(self._overlaps))
-        self._pool, self._alarms = Pool(), list[Alarm]()
+    def __init__(self, overlaps: NDArray[np.int64]) -> None:
+        self._overlaps = overlaps
+        self._limit = threshold(len(overlaps))
+        self._pool, self.pair_alarms = Pool(), list[Alarm]()
         self.count = self.unchecked = self.wrong_pairs = 0
 
     def add(self, row: Row, sums: Sums | None) -> None:
@@ -150,14 +153,14 @@ class Checker:
         self._pool.add(scores, in_rows if sums.planes[0].noise.row_variance else in_sites, curve_group(sums.plan))
         failed = failed_checks(str(row["key"]), scores, self._limit)
         self.wrong_pairs += bool(failed)
-        self._alarms += failed[:1] if self.wrong_pairs <= LISTED else []
+        self.pair_alarms += failed[:1] if self.wrong_pairs <= LISTED else []
 
     @property
     def alarms(self) -> list[Alarm]:
         """Alarm of each rank for all pairs together, because one rank finds the same faults, and of the first pairs."""
         failed = failed_checks("", self._pool.scores(), self._limit) if self.count > 1 else []
         ranks = itertools.groupby(failed, key=lambda alarm: CHECKS[alarm.check].rank)
-        return [*(next(alarms) for _, alarms in ranks), *self._alarms]
+        return [*(next(alarms) for _, alarms in ranks), *self.pair_alarms]
 
 
 class Pool:
