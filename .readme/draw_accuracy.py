@@ -18,7 +18,7 @@ from typing import Any
 
 from unprocess_gen.reports.benchmark.complete_runs import RunMeasurement
 from unprocess_gen.reports.benchmark.measure import Measurement
-from unprocess_gen.reports.benchmark.report import RECOMMENDATIONS, method_table, run_table
+from unprocess_gen.reports.benchmark.report import METHOD_COLUMNS, RECOMMENDATIONS, RUN_COLUMNS, table
 from unprocess_gen.reports.html_pages import PageTable
 
 HERE = Path(__file__).parent
@@ -66,12 +66,12 @@ def main() -> None:
     times = ("of exact", "ns per pixel", "decode", "simulate", "write")
     errors = ("noise", "changed", "max DN", "RMS DN", "max σ", "RMS σ")
     replace_part(TIMES, "conclusion", conclusion[0])
-    replace_part(TIMES, "runs", markdown(run_table(runs), errors))
+    replace_part(TIMES, "runs", markdown(table(RUN_COLUMNS, runs), errors))
     replace_part(ERRORS, "recommendations", markdown(RECOMMENDATIONS))
     with_errors = [run for run in runs if run.noisy_changed_share]
-    replace_part(ERRORS, "runs", markdown(run_table(with_errors), times))
+    replace_part(ERRORS, "runs", markdown(table(RUN_COLUMNS, with_errors), times))
     inexact = [method for method in methods if method.error_max]
-    replace_part(ERRORS, "methods", markdown(method_table(inexact), ("ns per pixel", "of reference")))
+    replace_part(ERRORS, "methods", markdown(table(METHOD_COLUMNS, inexact), ("ns per pixel", "of reference")))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from unprocess_gen.core.errors import ConfigError, MachineError
 from unprocess_gen.reports import report_files
 from unprocess_gen.reports.benchmark import complete_runs, figure, measure, methods, report, session
 from unprocess_gen.reports.benchmark.complete_runs import RunFiles, RunMeasurement, RunTimes
-from unprocess_gen.reports.benchmark.measure import TIER_CONFIGS, BenchmarkReport, Measurement
+from unprocess_gen.reports.benchmark.measure import TIER_STAGES, BenchmarkReport, Measurement
 from unprocess_gen.reports.benchmark.session import EXACT, REFERENCE, BenchmarkProfiles, SampleSizes
 from unprocess_gen.reports.benchmark.timing import measure_in_turns
 from unprocess_gen.reports.estimate import estimate_run
@@ -77,7 +77,7 @@ def test_measurements_take_turns() -> None:
 
 def test_every_method_and_tier_has_one_row_with_its_tiers(measured: BenchmarkReport) -> None:
     expected = [(method.stage, method.name) for method in METHODS]
-    expected += [(stage, tier) for stage in TIER_CONFIGS for tier in TIERS]
+    expected += [(stage, tier) for stage in TIER_STAGES for tier in TIERS]
 
     assert [(row.stage, row.method) for row in measured.rows] == expected
     curve = rows_of(measured, "curve")
@@ -122,7 +122,7 @@ def test_measured_errors_are_within_the_stated_limits(
 
 
 def test_exact_and_reference_have_no_errors(measured: BenchmarkReport) -> None:
-    for stage in TIER_CONFIGS:
+    for stage in TIER_STAGES:
         exact, reference = (rows_of(measured, stage)[name] for name in (EXACT, REFERENCE))
         assert (exact.error_max, exact.error_rms, exact.changed_share) == (0, 0, 0)
         assert reference.ratio_to_reference == 1
@@ -386,7 +386,7 @@ def test_any_config_can_be_measured(
     validate_config(config)
     measured = measure.measure_accuracy(config, profiles, SMALLEST)
 
-    assert all(rows_of(measured, stage)[EXACT].error_max == 0 for stage in TIER_CONFIGS)
+    assert all(rows_of(measured, stage)[EXACT].error_max == 0 for stage in TIER_STAGES)
     assert ("mine" in rows_of(measured, "tier")) == ("accuracy.name=mine" in overrides)
     assert measured.conditions["photographs"].startswith("001.png, of ")
 
@@ -431,7 +431,7 @@ def test_front_contains_points_that_no_other_dominates() -> None:
 def test_figure_can_be_drawn_for_any_errors_and_times(measured: BenchmarkReport) -> None:
     rows = [
         Measurement(stage, name, tier, error, error, "DN", 0.0, ns, 1.0)
-        for stage in (*STAGES, *TIER_CONFIGS)
+        for stage in (*STAGES, *TIER_STAGES)
         for name, tier, error, ns in (("a", "fast", 1e-3, 0.01), ("b", "mine", 2.0, 4000.0), ("c", "", None, None))
     ]
     runs = [run("fast", ratio) for ratio in (1e-3, 1.0, 400.0, None)]

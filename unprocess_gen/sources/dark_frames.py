@@ -18,19 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.config.interpretation import run_iso, shading_place, uses_dark_frames
-from unprocess_gen.config.schema import Config
+from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.types import DarkFrame, DarkFrames, DarkShading, Raw
-from unprocess_gen.sources import dark_shading
-from unprocess_gen.sources.mosaics import (
-    SUFFIXES,
-    Mosaic,
-    check_sha256,
-    even_sides,
-    map_mosaic,
-    mosaic_sha256,
-    read_mosaic,
-)
+from unprocess_gen.sources import dark_shading, mosaics
+from unprocess_gen.sources.mosaics import SUFFIXES, Mosaic, mosaic_sha256, read_mosaic
 
 KEY = "noise.dark_frames"
 
@@ -55,7 +47,7 @@ class DarkFolder:
     """
 
     folder: str
-    files: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(hash=False, default_factory=dict)
     shading_place: str | None = None
 
     @property
@@ -71,7 +63,9 @@ class DarkFolder:
                 f"noise.dark_frames={self.folder}: no file has the SHA-256 {sha256}; expected the dark frames of the "
                 "dataset; restore the file, or give their folder"
             )
-        return even_sides((_mapped if name.lower().endswith(".npy") else _decoded)(Path(self.folder) / name, sha256))
+        return mosaics.even_sides(
+            (_mapped if name.lower().endswith(".npy") else _decoded)(Path(self.folder) / name, sha256)
+        )
 
     def shading(self, sha256: str) -> NDArray[np.float32]:
         """Return the map that is subtracted from the frames, float32 [H, W] in DN of the frames.
@@ -79,7 +73,7 @@ class DarkFolder:
         ``sha256`` is that of the set for the mean of all frames, or that of the file of a map.
         """
         if sha256 == self.sha256:
-            return _mean(self.folder, tuple(sorted(self.files)), self)
+            return _mean(self)
         if self.shading_place is not None:
             return dark_shading.shading_map(dark_shading.find_map(self.shading_place, sha256), sha256)
         raise SourceChangedError(
@@ -87,9 +81,6 @@ class DarkFolder:
             "whose mean was subtracted; restore the files, or give their folder; if a map was subtracted, give "
             "noise.dark_shading=FILE"
         )
-
-    def __hash__(self) -> int:
-        return hash((self.folder, self.sha256, self.shading_place))
 
 
 def dark_folder(folder: str, shading_place: str | None = None) -> DarkFolder:
@@ -168,19 +159,8 @@ def open_dark_frames(config: Config) -> tuple[Config, DarkFrames | None, DarkFol
     shading_map = _shading_map(config)
     if shading_map is not None:
         folder = replace(folder, shading_place=str(shading_map[0]))
-    noise, sensor = config.noise, config.sensor
-    assert noise.white_level_dn is not None and noise.black_level_dn is not None and noise.bits is not None
-    rules = _Rules(
-        noise.bits,
-        noise.white_level_dn - noise.black_level_dn,
-        (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn),
-        sensor.pattern,
-        noise.dark_frames_black_dn,
-        noise.dark_shading == "remove",
-        shading_map,
-    )
-    dark_frames = _described(folder, rules)
-    noise = replace(noise, dark_frames_sha256=folder.sha256, dark_shading_sha256=shading_map and shading_map[1])
+    dark_frames = _described(folder, config.noise, config.sensor, shading_map)
+    noise = replace(config.noise, dark_frames_sha256=folder.sha256, dark_shading_sha256=shading_map and shading_map[1])
     return replace(config, noise=noise), dark_frames, folder
 
 
@@ -200,68 +180,52 @@ def _shading_map(config: Config) -> tuple[Path, str] | None:
         raise MachineError(f"noise.dark_shading={place}: cannot be read ({error.strerror})") from error
 
 
-@dataclass(frozen=True, slots=True)
-class _Rules:
-    """Hold what dark frames must fit: bits and range of the profile, DN of the sensor per DN, pattern, black level.
-
-    ``remove`` is true if their mean is subtracted; ``shading_map`` is the file and the SHA-256 of a map.
-    """
-
-    bits: int
-    span_dn: int
-    scale: float
-    pattern: str
-    black_dn: float | None
-    remove: bool
-    shading_map: tuple[Path, str] | None
-
-
 @functools.lru_cache(maxsize=8)
-def _described(folder: DarkFolder, rules: _Rules) -> DarkFrames:
+def _described(
+    folder: DarkFolder, noise: NoiseConfig, sensor: SensorConfig, shading_map: tuple[Path, str] | None
+) -> DarkFrames:
     """Decode and check every frame, and measure black level and variance."""
+    assert noise.white_level_dn is not None and noise.black_level_dn is not None and noise.bits is not None
+    span_dn = noise.white_level_dn - noise.black_level_dn
     frames: list[DarkFrame] = []
     counts = np.zeros(2**16, dtype=np.int64)
     blacks: set[float | None] = set()
     for sha256, name in sorted(folder.files.items()):
         mosaic = read_mosaic(Path(folder.folder) / name, KEY)
-        _check(folder, name, mosaic, rules)
+        _check(f"{KEY}={folder.folder}: {name}", mosaic, noise.bits, sensor.pattern)
         blacks.add(mosaic.black_dn)
         pixels = folder.frame(sha256)
         frames.append(DarkFrame(sha256, *pixels.shape))
         for rows in dark_shading.blocks(pixels.shape):
             counts += np.bincount(pixels[rows].reshape(-1), minlength=2**16)
     median_dn = dark_shading.median_of(counts)
-    stated_dn = rules.black_dn if rules.black_dn is not None else _black_level(folder, blacks)
+    stated_dn = noise.dark_frames_black_dn
+    stated_dn = _black_level(folder, blacks) if stated_dn is None else stated_dn
     black_dn = float(median_dn) if stated_dn is None else stated_dn
-    if abs(median_dn - black_dn) > BRIGHTEST_MEDIAN * rules.span_dn:
+    if abs(median_dn - black_dn) > BRIGHTEST_MEDIAN * span_dn:
         raise ConfigError(
             f"noise.dark_frames={folder.folder}: the median of the frames is {median_dn} DN, and black is {black_dn:g} "
             "DN; expected frames without light; noise.dark_frames_black_dn sets the black level"
         )
-    variance, shading = dark_shading.trimmed_variance(counts, 1), None
-    if rules.remove:
-        variance, shading = _around_mean(folder, frames)
-    elif rules.shading_map is not None:
-        variance, shading = _around_map(folder, frames, rules.shading_map, black_dn, stated_dn is not None)
+    variance_dn2, shading = dark_shading.trimmed_variance(counts, 1), None
+    if noise.dark_shading == "remove":
+        if len(frames) < 2:
+            raise ConfigError(
+                "noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several"
+            )
+        _, variance_dn2 = _around(folder, frames, folder.shading(folder.sha256), 0.0)
+        shading = DarkShading(folder.sha256)
+    elif shading_map is not None:
+        variance_dn2, shading = _around_map(folder, frames, shading_map, black_dn, stated_dn is not None)
         black_dn = shading.black_dn or black_dn
-    dither = 1 / 12
-    return DarkFrames(
-        tuple(frames), folder.sha256, black_dn, rules.scale, rules.scale**2 * (variance + dither), shading
-    )
-
-
-def _around_mean(folder: DarkFolder, frames: Sequence[DarkFrame]) -> tuple[float, DarkShading]:
-    """Return the variance of the frames around their mean, and that mean as a map."""
-    if len(frames) < 2:
-        raise ConfigError("noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several")
-    differences = _differences(folder, frames, folder.shading(folder.sha256), 0.0)
-    return differences.variance_dn2, DarkShading(folder.sha256)
+    scale, dither_dn2 = (sensor.white_level_dn - sensor.black_level_dn) / span_dn, 1 / 12
+    return DarkFrames(tuple(frames), folder.sha256, black_dn, scale, scale**2 * (variance_dn2 + dither_dn2), shading)
 
 
 def _around_map(
     folder: DarkFolder, frames: Sequence[DarkFrame], shading_map: tuple[Path, str], black_dn: float, is_stated: bool
 ) -> tuple[float, DarkShading]:
-    """Return the variance of the frames around a map, and the map; ConfigError if the map does not fit the frames.
+    """Measure the variance of the frames around a map; ConfigError if the map does not fit the frames.
 
     The median of the frames, ``black_dn`` without a stated black level, contains the median of the shading. For a map
     above black, the black level is then the median of the frames minus the map.
@@ -276,51 +240,43 @@ def _around_map(
             )
     is_above_black = dark_shading.is_above_black(values, black_dn)
     subtracted_dn = black_dn if is_above_black else 0.0
-    differences = _differences(folder, frames, values, subtracted_dn)
-    median_dn, variance_dn2 = differences.median_dn, differences.variance_dn2
+    median_dn, variance_dn2 = _around(folder, frames, values, subtracted_dn)
     if is_above_black and not is_stated and subtracted_dn + median_dn > 0:
         return variance_dn2, DarkShading(sha256, subtracted_dn + median_dn, path.name)
     dark_shading.check_residual(path, median_dn, variance_dn2)
     return variance_dn2, DarkShading(sha256, subtracted_dn, path.name, median_dn)
 
 
-def _differences(
+def _around(
     folder: DarkFolder, frames: Sequence[DarkFrame], values: NDArray[np.float32], black_dn: float
-) -> dark_shading.Differences:
-    differences = dark_shading.Differences(values, black_dn)
-    for frame in frames:
-        differences.add(folder.frame(frame.sha256))
-    return differences
+) -> tuple[float, float]:
+    """Median and variance of the frames minus a map and a black level, DN and DN² of the frames."""
+    return dark_shading.differences(values, black_dn, (folder.frame(frame.sha256) for frame in frames))
 
 
-def _check(folder: DarkFolder, name: str, mosaic: Mosaic, rules: _Rules) -> None:
-    """Raise ConfigError unless a file is a dark frame of the camera of the profile."""
-    pixels, start = mosaic.pixels, f"noise.dark_frames={folder.folder}: {name}"
-    if min(pixels.shape) < LEAST_SIDE:
-        height, width = pixels.shape
+def _check(start: str, mosaic: Mosaic, bits: int, pattern: str) -> None:
+    """Raise ConfigError unless a file is a dark frame of the camera of the profile; ``start`` names it."""
+    (height, width), highest = mosaic.pixels.shape, int(mosaic.pixels.max(initial=0))
+    if min(height, width) < LEAST_SIDE:
         raise ConfigError(f"{start} has {width} x {height} pixels; expected {LEAST_SIDE} x {LEAST_SIDE} or more")
-    highest = int(pixels.max())
-    if highest >= 2**rules.bits:
+    if highest >= 2**bits:
+        raise ConfigError(f"{start} has values up to {highest} DN; expected DN of the profile, which has {bits} bits")
+    if mosaic.pattern not in (None, pattern):
         raise ConfigError(
-            f"{start} has values up to {highest} DN; expected DN of the profile, which has {rules.bits} bits"
-        )
-    if mosaic.pattern not in (None, rules.pattern):
-        raise ConfigError(
-            f"{start} has the CFA pattern {mosaic.pattern}; expected sensor.pattern={rules.pattern}; set "
+            f"{start} has the CFA pattern {mosaic.pattern}; expected sensor.pattern={pattern}; set "
             f"sensor.pattern={mosaic.pattern}"
         )
 
 
 def _black_level(folder: DarkFolder, stated: set[float | None]) -> float | None:
-    """Return the black level that all files state; None if no file states one."""
+    """The black level that all files state; None if no file states one."""
     if len(stated) > 1:
         levels = ", ".join("none" if level is None else f"{level:g}" for level in sorted(stated, key=str))
         raise ConfigError(
             f"noise.dark_frames={folder.folder}: the files state several black levels ({levels} DN); expected one; "
             "set noise.dark_frames_black_dn"
         )
-    (level,) = stated
-    return level
+    return stated.pop()
 
 
 # ------------------------------------------------------------------------------------------------------------- pixels
@@ -329,33 +285,32 @@ def _black_level(folder: DarkFolder, stated: set[float | None]) -> float | None:
 @functools.lru_cache(maxsize=MAPPED)
 def _mapped(path: Path, sha256: str) -> Raw:
     """Return the array of an NPY file, mapped into memory."""
-    check_sha256(path, "dark frame", sha256)
-    return map_mosaic(path, KEY)
+    mosaics.check_sha256(path, "dark frame", sha256)
+    return mosaics.map_mosaic(path, KEY)
 
 
 @functools.lru_cache(maxsize=DECODED)
 def _decoded(path: Path, sha256: str) -> Raw:
     """Return the pixels of another file."""
-    check_sha256(path, "dark frame", sha256)
+    mosaics.check_sha256(path, "dark frame", sha256)
     return read_mosaic(path, KEY).pixels
 
 
 @functools.lru_cache(maxsize=1)
-def _mean(folder: str, digests: tuple[str, ...], frames: DarkFolder) -> NDArray[np.float32]:
-    """Return the mean of the frames with these digests: an exact sum, divided once."""
+def _mean(folder: DarkFolder) -> NDArray[np.float32]:
+    """The mean of all frames of a folder: an exact sum, divided once."""
     total: NDArray[np.uint32] | None = None
-    for sha256 in digests:
-        pixels = frames.frame(sha256)
-        if total is None:
-            total = np.zeros(pixels.shape, dtype=np.uint32)  # 65,537 frames fit
+    for sha256 in sorted(folder.files):
+        pixels = folder.frame(sha256)
+        total = np.zeros(pixels.shape, dtype=np.uint32) if total is None else total  # 65,537 frames fit
         if pixels.shape != total.shape:
             raise ConfigError(
-                f"noise.dark_shading=remove: the dark frames of {folder} have several sizes; expected one; set "
+                f"noise.dark_shading=remove: the dark frames of {folder.folder} have several sizes; expected one; set "
                 "noise.dark_shading=keep"
             )
         total += pixels
     assert total is not None
     mean = np.empty(total.shape, dtype=np.float32)
     for rows in dark_shading.blocks(total.shape):
-        mean[rows] = total[rows] / np.float64(len(digests))
+        mean[rows] = total[rows] / np.float64(len(folder.files))
     return mean

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
-from unprocess_gen.sources.mosaics import (
-    SUFFIXES,
-    even_sides,
-    map_mosaic,
-    mosaic_sha256,
-    read_mosaic,
-)
+from unprocess_gen.sources.mosaics import SUFFIXES, even_sides, map_mosaic, mosaic_sha256, read_mosaic
 
 KEY = "noise.dark_shading"
 
@@ -161,44 +155,25 @@ def trimmed_variance(counts: Counts, steps: int) -> float:
     return float(Fraction(count * second - first * first, count * count * steps * steps))
 
 
-class Differences:
-    """Count the differences of dark frames from a map, in steps of 1/16 DN.
+def differences(values: Map, black_dn: float, frames: Iterable[NDArray[Any]]) -> tuple[float, float]:
+    """Median and variance of dark frames minus a map and ``black_dn``, in steps of 1/16 DN; DN and DN² of the frames.
 
-    ``values`` is the map, float32 [H, W]; ``black_dn`` is subtracted too.
+    The variance is without the `FARTHEST` at both ends.
     """
-
-    def __init__(self, values: Map, black_dn: float) -> None:
-        self._values, self._black = values, np.float32(black_dn)
-        self._counts = np.zeros(2 * FARTHEST_STEPS + 1, dtype=np.int64)
-
-    def add(self, pixels: NDArray[Any]) -> None:
-        """Count the differences of a frame, which has the shape of the map."""
+    counts = np.zeros(2 * FARTHEST_STEPS + 1, dtype=np.int64)
+    for pixels in frames:
         for rows in blocks(pixels.shape):
-            difference = np.subtract(pixels[rows], self._values[rows], dtype=np.float32) - self._black
+            difference = np.subtract(pixels[rows], values[rows], dtype=np.float32) - np.float32(black_dn)
             steps = np.rint(difference * np.float32(STEPS_PER_DN)).astype(np.int64)
             places = np.clip(steps, -FARTHEST_STEPS, FARTHEST_STEPS) + FARTHEST_STEPS
-            self._counts += np.bincount(places.reshape(-1), minlength=self._counts.size)
-
-    @property
-    def median_dn(self) -> float:
-        """Median of the differences, DN of the frames."""
-        return (median_of(self._counts) - FARTHEST_STEPS) / STEPS_PER_DN
-
-    @property
-    def variance_dn2(self) -> float:
-        """Variance of the differences, without the `FARTHEST` at both ends, DN² of the frames."""
-        return trimmed_variance(self._counts, STEPS_PER_DN)
-
-
-def map_median(values: Map) -> float:
-    """Return the lower median of a map."""
-    flat = values.reshape(-1)
-    return float(np.partition(flat, (flat.size - 1) // 2)[(flat.size - 1) // 2])
+            counts += np.bincount(places.reshape(-1), minlength=counts.size)
+    return (median_of(counts) - FARTHEST_STEPS) / STEPS_PER_DN, trimmed_variance(counts, STEPS_PER_DN)
 
 
 def is_above_black(values: Map, black_dn: float) -> bool:
-    """Return whether a map is in DN above black: its median is nearer to 0 than to the black level."""
-    median_dn = map_median(values)
+    """Whether a map is in DN above black: its lower median is nearer to 0 than to the black level."""
+    middle = (values.size - 1) // 2
+    median_dn = float(np.partition(values.reshape(-1), middle)[middle])
     return abs(median_dn) < abs(median_dn - black_dn)
 
 

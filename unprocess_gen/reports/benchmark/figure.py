@@ -136,16 +136,11 @@ def _set_axes(axes: Axes, times: Sequence[float], errors: Sequence[float]) -> No
     axes.set(xscale="log", xlim=(middle / reach, middle * reach))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.xaxis.set_minor_formatter(lambda value, _: "")
-    positive = [error for error in errors if error > 0]
-    if not positive:
-        axes.set(ylim=(-1, 1), yticks=[0])
-    elif len(positive) == len(errors):
-        axes.set(yscale="log", ylim=(min(positive) / 20, max(positive) * 20))
-    else:
-        band = 10.0 ** math.floor(math.log10(min(positive)) - 0.5)
-        axes.set_yscale("symlog", linthresh=band)
-        axes.axhspan(-band, band / 2, color="#f3f3f3", zorder=0)
-        axes.set_ylim(-0.9 * band, max(positive) * 20)
+    positive = [error for error in errors if error > 0] or [1.0]
+    band = 10.0 ** math.floor(math.log10(min(positive)) - 0.5)
+    axes.set_yscale("symlog", linthresh=band)
+    axes.axhspan(-band, band / 2, color="#f3f3f3", zorder=0)
+    axes.set_ylim(-0.9 * band, max(positive) * 20)
     axes.minorticks_off()
     axes.grid(axis="both", color="#e6e6e6", zorder=0)
     axes.set_axisbelow(True)

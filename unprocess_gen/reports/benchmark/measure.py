@@ -1,18 +1,9 @@
 """Measure the error and the time of every method of every stage, and of complete tiers, on this machine.
 
-Errors are measured against the reference (`methods`), on photographs subsampled to a regular grid:
-
-========================================  =============================================================================
-stage                                     error
-========================================  =============================================================================
-curve, colour, mosaic, quantise           clean frame at 14 bits, DN; all methods in that precision together, because
-                                          one kernel computes them
-normal                                    σ, against the exact quantile of a fixed, dense set of random words
-shot                                      noisy frame at 14 bits, in σ of its noise
-effects                                   noisy frame without shot noise at 14 bits, DN
-tier, tier_own                            clean frame, DN: with two-parameter noise at 14 bits; with the given config
-tier_noisy, tier_electrons                noisy frame at 14 bits, in σ: two-parameter noise; physical noise
-========================================  =============================================================================
+Errors are measured against the reference, on photographs subsampled to a regular grid (`methods.STAGE_ERRORS`). Frames
+have 14 bits, except with the given config. The methods of curve, colour, mosaic and quantise are measured together in
+one precision, because one kernel computes them; normal is compared with the exact quantile of a fixed, dense set of
+random words.
 
 Rows of tiers also have the errors of the noisy frame in DN and in σ.
 
@@ -23,6 +14,7 @@ Complete runs are measured by `complete_runs`, and `report.conclude` states in w
 
 from __future__ import annotations
 
+import itertools
 import os
 import platform
 import statistics
@@ -82,8 +74,8 @@ class BenchmarkReport:
     conditions: dict[str, str]
 
 
-TIER_CONFIGS = {"tier": TWO_PARAMETER, "tier_noisy": TWO_PARAMETER, "tier_electrons": PHYSICAL, "tier_own": GIVEN}
-"""The config with which each end-to-end stage is measured."""
+TIER_STAGES = tuple(stage for stage in methods.STAGE_ERRORS if stage.startswith("tier"))
+"""The end-to-end stages."""
 
 
 def measure_accuracy(
@@ -158,30 +150,26 @@ def _tier_ns(
 
 
 def _method_rows(
-    session: BenchmarkSession,
-    errors: Mapping[RowKey, tuple[methods.Deviation, str]],
-    times: Mapping[RowKey, Sequence[float]],
+    session: BenchmarkSession, errors: Mapping[RowKey, methods.Deviation], times: Mapping[RowKey, Sequence[float]]
 ) -> Iterator[Measurement]:
     by_tier = {name: sessions.chosen_methods(tier) for name, tier in session.tiers.items()}
     for method in METHODS:
         tiers = " ".join(name for name, chosen in by_tier.items() if method.spelled in chosen)
-        error, unit = errors[method.stage, method.name]
-        columns = (tiers, error.max, error.rms, unit, error.changed_share)
-        ns = _median_times(times, (method.stage, method.name), (method.stage, methods_of_stage(method.stage)[-1].name))
-        yield Measurement(method.stage, method.name, *columns, *ns)
+        key, error = (method.stage, method.name), errors[method.stage, method.name]
+        unit = methods.STAGE_ERRORS[method.stage].unit if method.stage != "normal" else "σ"
+        ns = _median_times(times, key, (method.stage, methods_of_stage(method.stage)[-1].name))
+        yield Measurement(*key, tiers, error.max, error.rms, unit, error.changed_share, *ns)
 
 
 def _tier_rows(
     session: BenchmarkSession, frames: Mapping[RunKey, methods.FrameErrors], times: Mapping[RowKey, Sequence[float]]
 ) -> Iterator[Measurement]:
-    for stage, name in TIER_CONFIGS.items():
-        for tier in session.tiers:
-            errors = frames[name, tier]
-            is_noisy = stage in ("tier_noisy", "tier_electrons")
-            error, unit = (errors.noisy_std, "σ") if is_noisy else (errors.clean_dn, "DN")
-            columns = (tier, error.max, error.rms, unit, error.changed_share)
-            ns = _median_times(times, (name, tier), (name, sessions.REFERENCE))
-            yield Measurement(stage, tier, *columns, *ns, *errors.noisy_columns())
+    for stage, tier in itertools.product(TIER_STAGES, session.tiers):
+        config, _, name, unit = methods.STAGE_ERRORS[stage]
+        error: methods.Deviation = getattr(frames[config, tier], name)
+        ns = _median_times(times, (config, tier), (config, sessions.REFERENCE))
+        noisy = frames[config, tier].noisy_columns()
+        yield Measurement(stage, tier, tier, error.max, error.rms, unit, error.changed_share, *ns, *noisy)
 
 
 def _median_times(

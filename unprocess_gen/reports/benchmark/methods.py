@@ -27,15 +27,8 @@ from unprocess_gen.core.jit import kernel
 from unprocess_gen.core.random_streams import Words
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Pair, Plan
-from unprocess_gen.reports.benchmark.session import (
-    EXACT,
-    PHYSICAL,
-    REFERENCE,
-    TWO_PARAMETER,
-    BenchmarkImage,
-    BenchmarkSession,
-    budget_for,
-)
+from unprocess_gen.reports.benchmark import session as sessions
+from unprocess_gen.reports.benchmark.session import BenchmarkImage, BenchmarkSession
 from unprocess_gen.reports.benchmark.timing import thread_ns
 from unprocess_gen.simulation.effects.heteroscedastic import noise_variance
 from unprocess_gen.simulation.kernels.body import forget_bodies
@@ -71,16 +64,36 @@ class FrameErrors(NamedTuple):
         return in_dn.changed_share, in_dn.max, in_dn.rms, in_std.max, in_std.rms
 
 
-def method_error(session: BenchmarkSession, method: Method) -> tuple[Deviation, str]:
-    """The error of a method and its unit."""
+class StageError(NamedTuple):
+    """How a stage's error is measured: config and edit of the plans, field of `FrameErrors`, and its unit."""
+
+    config: str
+    edit: str
+    error: str
+    unit: str
+
+
+CLEAN_ERROR = StageError(sessions.TWO_PARAMETER, "unchanged", "clean_dn", "DN")
+STAGE_ERRORS = {
+    **dict.fromkeys(("curve", "colour", "mosaic", "quantise"), CLEAN_ERROR),
+    "shot": StageError(sessions.PHYSICAL, "with_shot", "noisy_std", "σ"),
+    "effects": StageError(sessions.PHYSICAL, "without_shot", "noisy_dn", "DN"),
+    "tier": CLEAN_ERROR,
+    "tier_noisy": CLEAN_ERROR._replace(error="noisy_std", unit="σ"),
+    "tier_electrons": StageError(sessions.PHYSICAL, "unchanged", "noisy_std", "σ"),
+    "tier_own": CLEAN_ERROR._replace(config=sessions.GIVEN),
+}
+"""Errors of the stages of methods, and of complete tiers; that of ``normal`` is `normal_error`, in σ."""
+
+
+def method_error(session: BenchmarkSession, method: Method) -> Deviation:
+    """The error of a method under the budget that chooses it."""
     if method.stage == "normal":
-        return normal_error(method.implementation), "σ"
-    budget = budget_for(method, session.tiers)
-    if method.stage == "shot":
-        return frame_errors(session, PHYSICAL, budget, "with_shot").noisy_std, "σ"
-    if method.stage == "effects":
-        return frame_errors(session, PHYSICAL, budget, "without_shot").noisy_dn, "DN"
-    return frame_errors(session, TWO_PARAMETER, budget).clean_dn, "DN"
+        return normal_error(method.implementation)
+    stage = STAGE_ERRORS[method.stage]
+    errors = frame_errors(session, stage.config, sessions.budget_for(method, session.tiers), stage.edit)
+    deviation: Deviation = getattr(errors, stage.error)
+    return deviation
 
 
 def frame_errors(
@@ -88,7 +101,7 @@ def frame_errors(
 ) -> FrameErrors:
     """Errors of all subsampled photographs under a budget."""
     pairs, reference = (
-        session.sampled_pairs(config_name, budget, edit) for budget in (accuracy, session.tiers[REFERENCE])
+        session.sampled_pairs(config_name, budget, edit) for budget in (accuracy, session.tiers[sessions.REFERENCE])
     )
     both = [(pair, other) for (pair, _), (other, _) in zip(pairs, reference, strict=True)]
     clean_dn = [pair.clean.astype(np.float64) - other.clean for pair, other in both]
@@ -173,17 +186,19 @@ def has_time(method: Method) -> bool:
 
 def method_ns(session: BenchmarkSession, method: Method, image: BenchmarkImage) -> float:
     """The time of a method on an image."""
-    accuracy = budget_for(method, session.tiers)
+    accuracy = sessions.budget_for(method, session.tiers)
     if method.stage in DIFFERENCES:
-        longer, shorter = (pair_ns(session, PHYSICAL, accuracy, image, edit) for edit in DIFFERENCES[method.stage])
+        longer, shorter = (
+            pair_ns(session, sessions.PHYSICAL, accuracy, image, edit) for edit in DIFFERENCES[method.stage]
+        )
         return max(longer - shorter, LEAST_NS)
     if method.readable:
         return numpy_ns(session, method.stage, image)
-    plan = session.plan(TWO_PARAMETER, accuracy, image, image.compiled)
+    plan = session.plan(sessions.TWO_PARAMETER, accuracy, image, image.compiled)
     clean_ns = thread_ns(lambda: render_clean(image.compiled, plan), image.compiled[..., 0].size)
     if method.stage != "normal":
         return clean_ns
-    return max(pair_ns(session, TWO_PARAMETER, accuracy, image) - clean_ns, LEAST_NS)
+    return max(pair_ns(session, sessions.TWO_PARAMETER, accuracy, image) - clean_ns, LEAST_NS)
 
 
 def pair_ns(
@@ -203,7 +218,7 @@ def pair_ns(
 def numpy_ns(session: BenchmarkSession, stage: str, image: BenchmarkImage) -> float:
     """The time of NumPy from the codes to the end of a stage; ``normal`` and ``quantise`` alone."""
     srgb = image.readable
-    plan = session.plan(TWO_PARAMETER, session.tiers[EXACT], image, srgb)
+    plan = session.plan(sessions.TWO_PARAMETER, session.tiers[sessions.EXACT], image, srgb)
     curve = linear_table(plan.isp.tone, plan.isp.gamma, int(np.iinfo(srgb.dtype).max) + 1)
     light = unprocess(srgb, plan, curve=curve)
     black_dn, white_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn

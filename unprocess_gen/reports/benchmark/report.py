@@ -25,8 +25,7 @@ COLUMNS = 120
 
 FILES = ("accuracy.csv", "accuracy_runs.csv", "accuracy.png", "accuracy.html")
 
-ratio_text = partial(short_number, digits=3)
-nanoseconds = partial(short_number, digits=3)
+three_digits = partial(short_number, digits=3)
 
 
 def report_text(report: BenchmarkReport) -> str:
@@ -34,10 +33,10 @@ def report_text(report: BenchmarkReport) -> str:
     advice = (f"{use}: {tier}; {reason}" for use, tier, reason in RECOMMENDATIONS.lines)
     return "\n".join(
         [
-            text_table(method_table(report.rows)),
+            text_table(table(METHOD_COLUMNS, report.rows)),
             "",
             "complete runs, from files to committed shards: processor time and its shares; errors of the noisy frames",
-            text_table(run_table(report.runs)),
+            text_table(table(RUN_COLUMNS, report.runs)),
             "",
             textwrap.fill(conclude(report), COLUMNS, break_on_hyphens=False),
             "",
@@ -62,9 +61,9 @@ def benchmark_page(report: BenchmarkReport, picture: bytes) -> str:
         title="Cost of accuracy",
         figure=data_uri(picture),
         conclusion=conclude(report),
-        runs=run_table(report.runs),
+        runs=table(RUN_COLUMNS, report.runs),
         recommendations=RECOMMENDATIONS,
-        measurements=method_table(report.rows),
+        measurements=table(METHOD_COLUMNS, report.rows),
         conditions=report.conditions,
     )
 
@@ -97,7 +96,7 @@ def time_clause(run: RunMeasurement) -> str:
     """The time that a tier saves; a difference counts only if both quartiles of the ratios agree with it."""
     if run.ratio_to_exact is None or run.lower_quartile_ratio is None or run.upper_quartile_ratio is None:
         return "was too slow to be timed"
-    ratio = ratio_text(run.ratio_to_exact)
+    ratio = three_digits(run.ratio_to_exact)
     ratios = (run.ratio_to_exact, run.lower_quartile_ratio, run.upper_quartile_ratio)
     if min(ratios) <= 1 <= max(ratios) or ratio == "1":
         return f"takes about as long as {EXACT} (ratio {ratio}, no clear difference)"
@@ -139,7 +138,7 @@ METHOD_COLUMNS: Columns = {
     "RMS error": ("error_rms", short_number),
     "unit": ("error_unit", None),
     "changed": ("changed_share", percentage),
-    "ns per pixel": ("ns_per_pixel", nanoseconds),
+    "ns per pixel": ("ns_per_pixel", three_digits),
     "of reference": ("ratio_to_reference", percentage),
 }
 
@@ -147,8 +146,8 @@ RUN_COLUMNS: Columns = {
     "settings": ("setting", None),
     "noise": ("noise", None),
     "tier": ("tier", None),
-    "of exact": ("ratio_to_exact", ratio_text),
-    "ns per pixel": ("ns_per_pixel", nanoseconds),
+    "of exact": ("ratio_to_exact", three_digits),
+    "ns per pixel": ("ns_per_pixel", three_digits),
     "decode": ("decode_share", percentage),
     "simulate": ("simulate_share", percentage),
     "write": ("write_share", percentage),
@@ -160,18 +159,8 @@ RUN_COLUMNS: Columns = {
 }
 
 
-def method_table(rows: Sequence[Measurement]) -> PageTable:
-    """The table of methods and tiers, grouped by stage."""
-    return _table(METHOD_COLUMNS, rows)
-
-
-def run_table(runs: Sequence[RunMeasurement]) -> PageTable:
-    """The table of complete runs, grouped by setting: time and its shares, then errors of the noisy frames."""
-    return _table(RUN_COLUMNS, runs)
-
-
-def _table(columns: Columns, rows: Sequence[Measurement] | Sequence[RunMeasurement]) -> PageTable:
-    """A table that is grouped by its first column."""
+def table(columns: Columns, rows: Sequence[Measurement] | Sequence[RunMeasurement]) -> PageTable:
+    """A table of methods and tiers, or of complete runs, grouped by its first column."""
     lines = [
         [getattr(row, field) if text is None else text(getattr(row, field)) for field, text in columns.values()]
         for row in rows

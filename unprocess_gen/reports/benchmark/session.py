@@ -8,17 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
+from unprocess_gen.config import schema
 from unprocess_gen.config.accuracy import METHODS, Method, choose_methods
 from unprocess_gen.config.interpretation import is_physical
-from unprocess_gen.config.schema import (
-    AccuracyConfig,
-    CleanConfig,
-    Config,
-    EffectsConfig,
-    NoiseConfig,
-    SceneConfig,
-    SensorConfig,
-)
+from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SceneConfig, SensorConfig
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, SourceError
 from unprocess_gen.core.sequences import evenly_spaced
@@ -176,17 +169,12 @@ def _numbers(accuracy: AccuracyConfig) -> object:
 
 def open_session(config: Config, profiles: BenchmarkProfiles, sizes: SampleSizes) -> BenchmarkSession:
     """Session for a config; ConfigError if no photograph can be read or the config cannot be compared."""
-    mosaics = as_mosaics(config)
+    mosaics = replace(config, output=replace(config.output, layout=MOSAIC))  # packing changes no value
     runs, at_14_bits = run_settings(config, profiles), configs_at_14_bits(mosaics, profiles)
     for compared in (*runs.values(), *at_14_bits.values()):
         validate_config(compared)
     images, tiers = load_images(mosaics, sizes), compared_tiers(config, profiles)
     return BenchmarkSession({**at_14_bits, GIVEN: mosaics}, tiers, images, sizes, runs)
-
-
-def as_mosaics(config: Config) -> Config:
-    """The config with unpacked frames; packing moves values but changes none."""
-    return replace(config, output=replace(config.output, layout=MOSAIC))
 
 
 def run_settings(config: Config, profiles: BenchmarkProfiles) -> dict[str, Config]:
@@ -213,8 +201,8 @@ def _kinds_of_noise(config: Config, profiles: BenchmarkProfiles) -> tuple[Config
 
 def _with_other_noise(config: Config, noise: NoiseConfig) -> Config:
     """Replace a noise profile by one of the other kind, and drop effects that do not apply to it."""
-    effects = EffectsConfig(tolerance=config.effects.tolerance, assumed=config.effects.assumed)
-    return replace(config, noise=noise, effects=effects, clean=CleanConfig())
+    effects = schema.EffectsConfig(tolerance=config.effects.tolerance, assumed=config.effects.assumed)
+    return replace(config, noise=noise, effects=effects, clean=schema.CleanConfig())
 
 
 def _at_calibrated_iso(config: Config) -> Config:
