@@ -24,7 +24,8 @@ from unprocess_gen.dataset.reader import RawPairs
 from unprocess_gen.pipeline.replay import PairRegenerator
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_pairs
-from unprocess_gen.reports.noise_check.checks import failed_checks, pair_scores, pair_sums, threshold
+from unprocess_gen.reports.noise_check.checks import failed_checks, pair_sums, threshold
+from unprocess_gen.reports.noise_check.scores import scores_of
 from unprocess_gen.sources.dark_frames import DarkPlaces, open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "sensor=generic_14bit", "camera=identity", "gains=unity")
@@ -353,7 +354,7 @@ def test_sums_of_dark_frames_raise_no_alarm(overrides: tuple[str, ...], shading:
         sums = pair_sums(pair.clean, pair.noisy, pair.row, access)
         assert sums is not None
         assert sums.sites > 0.3 * pair.clean.size
-        assert failed_checks("", pair_scores(sums), threshold(1)) == []
+        assert failed_checks("", scores_of(sums), threshold(1)) == []
         assert pair_sums(pair.clean, pair.noisy, pair.row) is None
 
 

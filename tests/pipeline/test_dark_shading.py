@@ -22,7 +22,8 @@ from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.types import DarkFrames
 from unprocess_gen.dataset.manifest import read_rows
 from unprocess_gen.dataset.reader import RawPairs
-from unprocess_gen.reports.noise_check.checks import failed_checks, pair_scores, pair_sums, threshold
+from unprocess_gen.reports.noise_check.checks import failed_checks, pair_sums, threshold
+from unprocess_gen.reports.noise_check.scores import scores_of
 from unprocess_gen.sources.dark_frames import open_dark_frames
 
 NOISE = ("noise=sony_a7s2", "noise.iso=1600", "camera=identity", "gains=unity", "sensor.bits=14",
@@ -183,7 +184,7 @@ def test_noise_check_raises_no_alarm(overrides: tuple[str, ...], darks: Path, ra
     pair = ug.make_pair(pixels(3, 200, 300), config)
     sums = pair_sums(pair.clean, pair.noisy, pair.row, access)
     assert sums is not None and sums.sites > 0.3 * pair.clean.size
-    assert failed_checks("", pair_scores(sums), threshold(1)) == []
+    assert failed_checks("", scores_of(sums), threshold(1)) == []
 
 
 # Files and choice -----------------------------------------------------------------------------------------------------

@@ -36,12 +36,11 @@ from unprocess_gen.reports.noise_check.checks import (
     curve_group,
     failed_checks,
     overlaps,
-    pair_scores,
     pair_sums,
     threshold,
 )
 from unprocess_gen.reports.noise_check.expectation import PlaneNoise
-from unprocess_gen.reports.noise_check.scores import Score, Scores
+from unprocess_gen.reports.noise_check.scores import Score, Scores, scores_of
 from unprocess_gen.simulation.effects import BY_NAME, order
 from unprocess_gen.simulation.effects.expectation import RARE, Site, tukey_distribution
 from unprocess_gen.sources.scenes import synthetic
@@ -97,7 +96,7 @@ def checked(
     for fault in faults:
         noisy = fault(srgb, pair.noisy, plan, np.random.default_rng(number))
         sums = pair_sums(pair.clean, noisy, pair.row)
-        results.append((plan, {} if sums is None else pair_scores(sums)))
+        results.append((plan, {} if sums is None else scores_of(sums)))
     return results
 
 

@@ -133,6 +133,8 @@ def _row_variances(sums: Sums, planes: list[Plane], influence: Float) -> Float:
     and m the sums of the influences of a row's sites, the changes add to Σ l·(r² - σ²) + m·r over the rows.
     """
     offsets, ends = row_offsets(planes[0].noise), np.cumsum([len(plane.bins) for plane in planes])
+    if not offsets.variance:
+        return np.zeros(2)
     by_square, by_offset = np.zeros((2, 2, 2, sums.height // 2))  # slope and intercept, even and odd rows
     for plane, of_plane in zip(planes, np.split(influence, ends[:-1], axis=1), strict=True):
         y, expected = plane.noise.site.place[0], plane.expected

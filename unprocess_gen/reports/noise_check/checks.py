@@ -11,7 +11,6 @@ import math
 import zlib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +37,7 @@ LISTED = 20
 class Check(NamedTuple):
     """Text of a check: estimated quantity, unit, what it is compared with, causes of a value too low and too high.
 
-    Failed checks are named by ``rank``, equal ranks by significance. Estimates are multiplied by ``scale``.
+    Failed checks are named by ``rank``, equal ranks by significance.
     """
 
     rank: int
@@ -47,23 +46,21 @@ class Check(NamedTuple):
     expected: str
     low: str
     high: str
-    scale: float = 1.0
 
 
-_OFFSET, _GAIN, _SWAPPED = "wrong black level or plane offset", "wrong exposure or gain", "swapped sites or CFA pattern"
+_OFFSET, _GAIN = "wrong black level or plane offset", "wrong exposure or gain, or swapped sites"
 _WEAK, _STRONG = "weaker noise than recorded, or another distribution", "stronger noise, or another distribution"
 _ROWS, _COLUMNS = ("row noise is missing", "row noise is too strong"), ("column offsets are missing", "column stripes")
 CHECKS = {
-    "diagonal sites": Check(0, "share of the diagonal site's light", "%", "0", _SWAPPED, _SWAPPED, 100),
     "mean": Check(0, "mean", "DN", "black_level_dn", _OFFSET, _OFFSET),
-    "mean against signal": Check(0, "signal", "%", "that of the clean frame", _GAIN, _GAIN, 100),
+    "mean against signal": Check(0, "signal", "%", "that of the clean frame", _GAIN, _GAIN),
     "row means": Check(1, "variance of row offsets", "DN²", "row_std_dn²", *_ROWS),
     "row differences": Check(1, "variance of differences of rows", "DN²", "that by row_std_dn", *_ROWS),
     "column means": Check(1, "variance of column offsets", "DN²", "the recorded one", *_COLUMNS),
     "column differences": Check(1, "variance of differences of columns", "DN²", "the recorded one", *_COLUMNS),
     "variance": Check(2, "variance", "DN²", "the recorded one", _WEAK, _STRONG),
     "variance against signal": Check(2, "variance per signal", "DN", "a_dn", "smaller gain", "larger gain"),
-    "neighbours": Check(3, "correlation of neighbours", "%", "0", "sharpened frames", "smoothed frames", 100),
+    "neighbours": Check(3, "correlation of neighbours", "%", "0", "sharpened frames", "smoothed frames"),
 }
 """Checks by name."""
 
@@ -71,8 +68,7 @@ TESTS = len(CHECKS) + 8
 """Scores of one pair: those of the mean and of the variance against the signal have one for each plane too."""
 
 
-@dataclass(frozen=True, slots=True)
-class Alarm:
+class Alarm(NamedTuple):
     """Score that contradicts the manifest; ``key`` is empty for all pairs together, ``plane`` for all planes."""
 
     key: str
@@ -82,7 +78,8 @@ class Alarm:
 
     def __str__(self) -> str:
         check, score = CHECKS[self.check], self.score
-        size, error = (check.scale * value / score.information for value in (abs(score.total), 1.96 * score.std))
+        scale = (100 if check.unit == "%" else 1) / score.information
+        size, error = (scale * value for value in (abs(score.total), 1.96 * score.std))
         decimals = max(0, -math.floor(math.log10(error)))
         side, cause = ("above", check.high) if score.excess > 0 else ("below", check.low)
         return (
@@ -92,6 +89,7 @@ class Alarm:
         )
 
 
+@np.errstate(under="ignore")
 def pair_sums(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | None = None) -> Sums | None:
     """Sum the statistics of a pair with its manifest row.
 
@@ -100,18 +98,11 @@ def pair_sums(clean: Frame, noisy: Frame, row: Row, dark_pixels: DarkPixels | No
     plan = plan_from_row(row)
     if not BY_NAME.keys() >= set(plan.noise.effects) or (plan.noise.dark.sha256 and dark_pixels is None):
         return None
-    with np.errstate(under="ignore"):
-        sums = Sums(plan, patch_from_row(row), mosaic_dn(clean, row), mosaic_dn(noisy, row), dark_pixels)
-        if sums.sites < LEAST_SITES:
-            return None
-        sums.fill()
+    sums = Sums(plan, patch_from_row(row), mosaic_dn(clean, row), mosaic_dn(noisy, row), dark_pixels)
+    if sums.sites < LEAST_SITES:
+        return None
+    sums.fill()
     return sums
-
-
-def pair_scores(sums: Sums) -> Scores:
-    """Scores of a pair, without floating-point warnings of tiny values."""
-    with np.errstate(under="ignore"):
-        return scores_of(sums)
 
 
 def threshold(pairs: int) -> float:
@@ -149,7 +140,7 @@ class Checker:
             self.unchecked += 1
             return
         self.count += 1
-        scores = pair_scores(sums)
+        scores = scores_of(sums)
         self._pool.add(scores, in_rows if sums.planes[0].noise.row_variance else in_sites, curve_group(sums.plan))
         failed = failed_checks(str(row["key"]), scores, self._limit)
         self.wrong_pairs += bool(failed)

@@ -13,7 +13,7 @@ import numpy as np
 
 from unprocess_gen.core.types import Float
 from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, PlaneNoise
-from unprocess_gen.reports.noise_check.sums import LARGEST_DIFFERENCE, Plane, Sums
+from unprocess_gen.reports.noise_check.sums import Plane, Sums
 
 LEAST_SITES = 64
 """Fewest sites of a pair that is checked."""
@@ -81,6 +81,7 @@ Scores = dict[tuple[str, str], Score]
 """Scores by the names of check and plane; the plane is empty if all planes are summed."""
 
 
+@np.errstate(under="ignore")
 def scores_of(sums: Sums) -> Scores:
     """Compute the scores of all checks for which a pair with filled sums has sites."""
     names = plane_names(sums.plan.sensor.pattern)
@@ -92,7 +93,7 @@ def scores_of(sums: Sums) -> Scores:
     scores |= {("variance against signal", name): points.score(points.signal) for name, points in variances.items()}
     scores["mean", ""], scores["mean against signal", ""] = mean.score(), mean.score(mean.signal)
     scores["variance", ""], scores["variance against signal", ""] = variance.score(), variance.score(variance.signal)
-    return scores | _line_scores(sums) | _site_scores(sums)
+    return scores | _line_scores(sums) | {("neighbours", ""): _neighbour_score(sums)}
 
 
 def plane_names(pattern: str) -> list[str]:
@@ -290,13 +291,13 @@ def _quadratic_score(lines: Float, apart: int, offsets: LineOffsets, rounding_dn
     )
 
 
-# ------------------------------------------------------------------------------------------------------------- sites
+# ---------------------------------------------------------------------------------------------------------- neighbours
 
 
-def _site_scores(sums: Sums) -> Scores:
-    """Scores of the correlation of neighbours of a plane, and of the agreement of noisy with diagonal clean sites."""
+def _neighbour_score(sums: Sums) -> Score:
+    """Score of the correlation of horizontal and vertical neighbours of a plane."""
     product, pairs, inverse = sums.neighbours.tolist()
-    neighbours = Score(
+    return Score(
         total=product,
         information=pairs,
         variance=pairs * sums.variance**2,
@@ -305,15 +306,3 @@ def _site_scores(sums: Sums) -> Scores:
         # rounding errors of neighbours are equal in a smooth frame
         high=0.0 if sums.plan.output.clean_normalised else inverse / 12,
     )
-    total, squares, rounding, information, scaled = sums.diagonal.tolist()
-    rows = row_offsets(sums.planes[0].noise)
-    diagonal = Score(
-        total=total,
-        information=information,
-        variance=squares * sums.variance + rows.variance * rows.magnitudes * scaled * sums.width,
-        fixed=math.sqrt(sums.fixed * squares),
-        step=LARGEST_DIFFERENCE * LARGEST_Z,
-        low=-rounding,
-        high=rounding,
-    )
-    return {("neighbours", ""): neighbours, ("diagonal sites", ""): diagonal}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,23 +16,9 @@ Single = NDArray[np.float32]
 
 TILE = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Places of the CFA tile; a plane is the set of all sites at one of them."""
-DIAGONAL = ((0, 3), (1, 2))
-"""Planes whose sites are compared."""
 
 SEGMENTS = 8
 """Parts into which lines are divided."""
-LEAST_DIFFERENCE_DN = 2.0
-"""Least difference of two rounded clean values at which their sites are compared, DN."""
-LARGEST_DIFFERENCE = 3.0
-"""Bound of the difference in standard deviations of the noise."""
-
-
-class Strip(NamedTuple):
-    """Sites of a plane in some rows: clean value (DN), z minus its mean, and 1 / std, which is 0 for unused sites."""
-
-    clean: Any
-    z: Single
-    weight: Single
 
 
 class Plane:
@@ -75,8 +61,8 @@ class Plane:
         """Sum values of the checked bins over the sites of each row, [H/2]."""
         return np.asarray(self._table(values)[self._bins_of_sites(np.s_[:])].sum(axis=1, dtype=np.float64))
 
-    def add_strip(self, rows: slice) -> Strip:
-        """Add the sites of some rows to the sums."""
+    def add_strip(self, rows: slice) -> tuple[Single, Single]:
+        """Add the sites of some rows to the sums; their z minus its mean, and 1 / std, which is 0 for unused sites."""
         bins, clean = self._bins_of_sites(rows), self._clean[rows]
         weight, offset_dn = self._weight[bins], self._offset_dn(rows)
         noise = np.subtract(self._noisy[rows], clean, dtype=np.float32) - offset_dn
@@ -86,7 +72,7 @@ class Plane:
             values.append(clean - bins * self._bin_dn)
         for total, value in zip(self._sums, values, strict=False):
             total += np.bincount(bins.ravel(), value.ravel(), len(total))
-        return Strip(clean, z - self._mean[bins], weight)
+        return z - self._mean[bins], weight
 
     def _offset_dn(self, rows: slice) -> Any:
         offset_dn = self.noise.offset_dn
@@ -136,9 +122,6 @@ class Sums:
     neighbours : ndarray of float64, [3]
         For horizontal and vertical neighbours of a plane: sum of the products of z, without the weighted mean of each
         row, number of products, and sum of the products of 1 / std.
-    diagonal : ndarray of float64, [5]
-        With n the difference of the noise of diagonal sites, s its standard deviation, and d the difference of their
-        clean values over s, limited: sums of d·n/s, d², |d|/s, 2d times the difference over s without limit, (d/s)².
     """
 
     def __init__(self, plan: Plan, patch: Patch, clean: Any, noisy: Any, dark_pixels: DarkPixels | None) -> None:
@@ -164,18 +147,14 @@ class Sums:
         row_starts, column_starts = (_segment_starts(length // 2) for length in (self.height, self.width))
         self.rows = np.zeros((3, 2, self.height // 2, len(column_starts)))
         self.columns = np.zeros((3, 2, self.width // 2, len(row_starts)))
-        self.neighbours, self.diagonal = np.zeros(3), np.zeros(5)
+        self.neighbours = np.zeros(3)
         for part, (top, bottom) in enumerate(itertools.pairwise([*row_starts, self.height // 2])):
-            strips = [plane.add_strip(np.s_[top:bottom]) for plane in self.planes]
-            for strip, plane, (y, x) in zip(strips, self.planes, TILE, strict=True):
-                row_sums, column_sums, products = _line_sums(strip, plane.noise.row_variance, column_starts)
+            for plane, (y, x) in zip(self.planes, TILE, strict=True):
+                z, weight = plane.add_strip(np.s_[top:bottom])
+                row_sums, column_sums, products = _line_sums(z, weight, plane.noise.row_variance, column_starts)
                 self.rows[:, y, top:bottom] += row_sums
                 self.columns[:, x, :, part] += column_sums
                 self.neighbours += products
-            for first, second in DIAGONAL:
-                self.diagonal += _agreement(
-                    strips[first], strips[second], is_rounded=not self.plan.output.clean_normalised
-                )
 
 
 def _segment_starts(length: int) -> list[int]:
@@ -184,33 +163,18 @@ def _segment_starts(length: int) -> list[int]:
     return [number * length // count for number in range(count)]
 
 
-def _line_sums(strip: Strip, row_variance: float, starts: list[int]) -> tuple[Float, Float, Float]:
+def _line_sums(z: Single, weight: Single, row_variance: float, starts: list[int]) -> tuple[Float, Float, Float]:
     """Sums of a strip for `Sums.rows`, [3, H, segments], for `Sums.columns`, [3, W], and for `Sums.neighbours`, [3]."""
-    square = strip.weight * strip.weight
+    square = weight * weight
     own = square - np.float32(row_variance) * square * square
-    rows = np.stack([np.add.reduceat(values, starts, axis=1) for values in (strip.z * strip.weight, square, own)])
+    rows = np.stack([np.add.reduceat(values, starts, axis=1) for values in (z * weight, square, own)])
     score, information, spread = rows.sum(axis=2, dtype=np.float64)
     information = np.maximum(information, np.finfo(np.float32).tiny)
-    residual = strip.z - (score / information).astype(np.float32)[:, None] * strip.weight
-    columns = np.stack([values.sum(axis=0) for values in (residual * strip.weight, square, own)])
-    across, down = (weight[:, 1:] * weight[:, :-1] for weight in (strip.weight, strip.weight.T))
-    products = [(z[:, 1:] * z[:, :-1]).sum(dtype=np.float64) for z in (residual, residual.T)]
+    residual = z - (score / information).astype(np.float32)[:, None] * weight
+    columns = np.stack([values.sum(axis=0) for values in (residual * weight, square, own)])
+    across, down = (side[:, 1:] * side[:, :-1] for side in (weight, weight.T))
+    products = [(side[:, 1:] * side[:, :-1]).sum(dtype=np.float64) for side in (residual, residual.T)]
     # removing the mean of a row makes its sites correlated
     removed = spread / information @ (across.sum(axis=1) / information)
     pairs = np.count_nonzero(across) + np.count_nonzero(down)
     return rows, columns, np.array([sum(products) + removed, pairs, across.sum() + down.sum()])
-
-
-def _agreement(first: Strip, second: Strip, is_rounded: bool) -> Float:
-    """Sums of two strips for `Sums.diagonal`; sites that are not used get an infinite standard deviation."""
-    difference = np.subtract(second.clean, first.clean, dtype=np.float32)
-    if is_rounded:
-        difference[np.abs(difference) < LEAST_DIFFERENCE_DN] = 0
-    std, other_std = (1 / np.maximum(strip.weight, np.float32(1e-30)) for strip in (first, second))
-    scale = 1 / np.hypot(std, other_std)
-    step = difference * scale
-    limited = np.clip(step, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
-    scaled = limited * scale
-    noise = first.z * std - second.z * other_std
-    products = scaled * noise, limited * limited, np.abs(scaled) * is_rounded, 2 * limited * step, scaled * scaled
-    return np.array([values.sum(dtype=np.float64) for values in products])
