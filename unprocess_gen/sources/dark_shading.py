@@ -171,7 +171,7 @@ def differences(values: Map, black_dn: float, frames: Iterable[NDArray[Any]]) ->
 
 
 def is_above_black(values: Map, black_dn: float) -> bool:
-    """Whether a map is in DN above black: its lower median is nearer to 0 than to the black level."""
+    """Decide if a map is in DN above black: its lower median is nearer to 0 than to the black level."""
     middle = (values.size - 1) // 2
     median_dn = float(np.partition(values.reshape(-1), middle)[middle])
     return abs(median_dn) < abs(median_dn - black_dn)

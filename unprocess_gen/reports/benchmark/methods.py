@@ -65,7 +65,7 @@ class FrameErrors(NamedTuple):
 
 
 class StageError(NamedTuple):
-    """How a stage's error is measured: config and edit of the plans, field of `FrameErrors`, and its unit."""
+    """Measurement of a stage's error: config and edit of the plans, field of `FrameErrors`, and its unit."""
 
     config: str
     edit: str
