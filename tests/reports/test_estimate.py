@@ -245,3 +245,14 @@ def test_plan_states_source_and_uncertainty_of_numbers_at_its_isos(run_main: Run
         assert f"row_std_dn: ELD, {profile}, row line; uncertainty: " in text
         assert "black_error_dn: ELD, color_bias of its dark frames; uncertainty: " in text
         assert max(map(len, done.out.splitlines())) <= 160
+
+
+def test_plan_states_how_much_rests_on_assumed_numbers(run_main: RunMain) -> None:
+    """At white in daylight the variance is (p·u)² + K·u + read² + 1/12, of which PRNU is assumed."""
+    overrides = ("noise=sony_a7s2", "scene=daylight", "sensor=generic_14bit")
+    plan = plan_image(load_config(overrides), np.full((8, 8, 3), 255, np.uint8))
+    light_dn, physics = float(plan.sensor.span_dn), plan.noise.physics
+    assert physics is not None
+    assumed = (physics.prnu_std * light_dn) ** 2
+    share = assumed / (assumed + physics.dn_per_e * light_dn + physics.read_std_dn**2 + 1 / 12)
+    assert f"0% at black and {share:.0%} at white rest on assumed numbers" in run_main("plan", *overrides).out

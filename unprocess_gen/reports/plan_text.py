@@ -6,7 +6,10 @@ import math
 import textwrap
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from unprocess_gen.config.interpretation import (
+    assumed_numbers,
     is_physical,
     missing_number,
     noise_levels,
@@ -16,7 +19,7 @@ from unprocess_gen.config.interpretation import (
 )
 from unprocess_gen.config.schema import BRANCH_FIELDS, AccuracyConfig, Config, NoiseConfig
 from unprocess_gen.config.values import value_range, value_text
-from unprocess_gen.core.types import DarkFrames, Plan
+from unprocess_gen.core.types import DarkFrames, Patch, Plan
 from unprocess_gen.pipeline.sizes import shards_warning
 from unprocess_gen.planning.dark_scene import dark_scene_warning
 from unprocess_gen.planning.effect_selection import MIN_OUTLIERS, Prediction
@@ -25,6 +28,7 @@ from unprocess_gen.reports.empty_bands import highlight_sentence
 from unprocess_gen.reports.estimate import RunEstimate, SourceEstimate
 from unprocess_gen.reports.formatting import byte_size, counted
 from unprocess_gen.simulation.effects import BY_NAME
+from unprocess_gen.simulation.effects.expectation import Site
 from unprocess_gen.sources.listing import unmatched_sentence
 
 
@@ -193,10 +197,25 @@ def _physical_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
         f"on this sensor (black {sensor.black_level_dn}, white {sensor.white_level_dn}) times {scale:.6g}",
         f"          system gain {value_range(gains, 4)} DN per electron, read noise {value_range(stds, 4)} DN standard "
         f"deviation ({distribution})",
-        *_labelled("", [assumed and f"assumed, without a source: {assumed}"]),
+        *_labelled("", [assumed and f"assumed, without a source: {assumed}", _assumed_sentence(config, plans)]),
         *_labelled("numbers", provenance, indent="  "),
         *_labelled("effects", [f"{', '.join(name for name in BY_NAME if name in simulated)}; reasons below"]),
     ]
+
+
+def _assumed_sentence(config: Config, plans: Sequence[Plan]) -> str | None:
+    """The largest shares of the variance of a pixel, at black and at white of the scene, due to assumed numbers."""
+    if not config.noise.assumed or uses_dark_frames(config.noise):
+        return None
+    shares = []
+    for plan in plans:
+        signals_dn = np.array([0.0, plan.sensor.span_dn * min(plan.scene.exposure, 1.0)])
+        site = Site(plan, Patch(0, 0, 0, 2, 2), (0, 0))
+        variances = {name: BY_NAME[name].expected(site).variance(signals_dn) for name in plan.noise.effects}
+        assumed = [variance for name, variance in variances.items() if assumed_numbers(config.noise, name)]
+        shares.append(np.sum(assumed, axis=0) / np.sum(list(variances.values()), axis=0) * np.ones(2))
+    black, white = np.max(shares, axis=0)
+    return f"of the variance of a pixel, {black:.0%} at black and {white:.0%} at white rest on assumed numbers"
 
 
 LONGEST_VALUE = 20
