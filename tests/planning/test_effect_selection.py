@@ -290,6 +290,18 @@ def test_omitted_effects_are_masked_if_bodies_decide(settings: Settings, picture
     assert held > 0
 
 
+@pytest.mark.parametrize(
+    ("overrides", "simulated"),
+    [((), False), (("effects.dead_pixels=on",), True), (("effects.all=on",), True), (("noise.unsourced=[]",), True)],
+)
+def test_a_number_without_any_source_is_used_only_where_switched_on(
+    settings: Settings, overrides: tuple[str, ...], simulated: bool
+) -> None:
+    config = settings("noise=sony_a7s2", "scene=daylight", *overrides)
+    plan = plan_image(config, "0" * 64, 0, facts_of(flat(128, 128, 128)))
+    assert ("dead_pixels" in plan.noise.effects) == simulated
+
+
 @pytest.mark.parametrize(("electrons", "simulated"), [(60_000, False), (16_000, False), (15_000, True), (5_000, True)])
 def test_a_full_well_is_simulated_only_below_the_end_of_the_converter(
     settings: Settings, electrons: float, simulated: bool

@@ -13,6 +13,7 @@ from helpers.commands import RunMain
 from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 
+import unprocess_gen as ug
 from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import AccuracyConfig
 from unprocess_gen.config.serialization import read_option
@@ -250,7 +251,7 @@ def test_plan_states_source_and_uncertainty_of_numbers_at_its_isos(run_main: Run
 def test_plan_states_how_much_rests_on_assumed_numbers(run_main: RunMain) -> None:
     """At white in daylight the variance is (p·u)² + K·u + read² + 1/12, of which PRNU is assumed."""
     overrides = ("noise=sony_a7s2", "scene=daylight", "sensor=generic_14bit")
-    plan = plan_image(load_config(overrides), np.full((8, 8, 3), 255, np.uint8))
+    plan = ug.plan_image(np.full((8, 8, 3), 255, np.uint8), ug.load_config(overrides))
     light_dn, physics = float(plan.sensor.span_dn), plan.noise.physics
     assert physics is not None
     assumed = (physics.prnu_std * light_dn) ** 2

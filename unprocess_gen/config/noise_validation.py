@@ -106,8 +106,9 @@ def _check_physical(noise: NoiseConfig, scene: SceneConfig) -> None:
         _check_branch(f"noise.branches[{number}]", branch, _span(noise))
     if noise.lens_shading is not None:
         _check_shading(noise.lens_shading)
-    for name in noise.assumed:
-        one_of("noise.assumed", name, ASSUMABLE)
+    for key, names in (("noise.assumed", noise.assumed), ("noise.unsourced", noise.unsourced)):
+        for name in names:
+            one_of(key, name, ASSUMABLE)
     for number, statement in enumerate(noise.provenance):
         _check_provenance(f"noise.provenance[{number}]", statement)
     _check_iso(noise, scene)

@@ -381,6 +381,9 @@ class NoiseConfig(EffectGroup):
         numbers that depend on ISO, for one or more ranges of ISO; a profile without branches has two parameters
     assumed
         keys whose numbers no source gives for this camera; effects.assumed controls their effects
+    unsourced
+        assumed keys whose numbers no source gives for any camera; their effects are simulated only if they are
+        switched on
     provenance
         source and uncertainty of the numbers, which plan prints
     """
@@ -442,6 +445,7 @@ class NoiseConfig(EffectGroup):
         (), Limit("a list of mappings with the keys of a branch"), section=PHYSICAL
     )
     assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), section=PHYSICAL)
+    unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), section=PHYSICAL, since="0.3")
     provenance: tuple[ProvenanceConfig, ...] = key(
         (),
         Limit("a list of mappings with the keys numbers, iso, source and uncertainty"),
