@@ -143,7 +143,7 @@ def _forced_decision(config: Config, name: str) -> ForcedDecision | None:
             False,
             f"{assumed} is assumed, no source gives it: on only where switched on",
         ),
-        (assumed in config.noise.unsourced, False, f"no source gives {assumed}: on only where switched on"),
+        (assumed in config.noise.unsourced, False, "no source gives its number: on if switched on"),
     )
     return next((ForcedDecision(on, reason) for holds, on, reason in rules if holds), None)
 
