@@ -9,7 +9,7 @@ arithmetic is exact, and Python rounds the quotient of two integers correctly.
 A number x is the integer next to x · 2**128; one unit is 2**-128. An error is a number of units, at least the distance
 from the exact value. A product or quotient that is rounded down adds one unit. Each docstring derives its error.
 
-Without this module, planning an image takes up to 0.8 ms longer. Measurements: ``docs/design/planning.md``.
+Without this module, planning an image takes up to 0.8 ms longer. Design: ``docs/design/planning.md``.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ folder and a URL. A missing object raises FileNotFoundError, like a missing file
 
 obstore reads credentials and endpoints from the environment (``AWS_ACCESS_KEY_ID``, ``AWS_ENDPOINT_URL``,
 ``GOOGLE_SERVICE_ACCOUNT``, ``AZURE_STORAGE_ACCOUNT_NAME``, …). It repeats requests that fail to connect, time out or
-get a 5xx or 429 answer, with a growing delay, until `RETRY_TIMEOUT_S`. Measurements: ``docs/design/object_stores.md``.
+get a 5xx or 429 answer, with a growing delay, until `RETRY_TIMEOUT_S`. Design: ``docs/design/object_stores.md``.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 
     word 3   frame
 
 Pixel x takes output word x % 64 // 16. The layout does not depend on the image width, and 16 neighbouring pixels use 16
-consecutive counters, which vectorises. Alternatives and timings: ``docs/design/random_numbers.md``.
+consecutive counters, which vectorises. Alternatives: ``docs/design/random_numbers.md``.
 
 This module is the NumPy reference; `simulation.kernels.philox` contains the compiled form.
 """

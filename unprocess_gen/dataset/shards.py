@@ -6,7 +6,7 @@ or packed planes [4, H / 2, W / 2]. Headers are USTAR with fixed time, owner and
 members.
 
 Arrays are written without a copy, and SHA-256 is computed on the way. Reading maps one array into memory; its offset
-comes from the tar headers. Timings: ``docs/design/dataset_format.md``.
+comes from the tar headers. Timings: ``docs/performance.md``.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ TIMED_PX = (384, 512)
 """Height and width of the crop whose pairs are timed."""
 
 COMMIT_SECONDS = 0.045
-"""Time to sync and rename a shard (``docs/design/dataset_format.md``)."""
+"""Time to sync and rename a shard (``docs/performance.md``)."""
 
 IMPORT_SECONDS = min(time.process_time(), 3.0)
 """Time that a process needs for its imports and settings: what this one took so far, unless it did something else."""

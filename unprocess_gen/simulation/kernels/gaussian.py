@@ -5,7 +5,7 @@ time, with an error bound; the read-out asks for the exact value of sites whose 
 1 % at a standard deviation of 100 DN. `Gaussian32`, for accuracy budgets that allow errors, has shorter polynomials and
 asks for none; its DN count from the black level.
 
-Timings and rejected alternatives: ``docs/design/kernels.md``.
+Design: ``docs/design/kernels.md``.
 """
 
 from __future__ import annotations

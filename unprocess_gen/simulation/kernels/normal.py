@@ -14,7 +14,7 @@ Polynomials
     The quantile is a polynomial in the depth √(-log2 p), for all p at once, and so is the logarithm's mantissa. No
     loads. Two separate loops, because a single one is a chain of forty dependent operations.
 
-Timings: ``docs/design/kernels.md``.
+Design: ``docs/design/kernels.md``.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ Counts are those of `reference.poisson`, for rates up to 1e9. They are computed 
    the reference's order of operations. That is the complete expansion from rate 64 up; below, comparisons with the
    distribution function next to an estimate.
 
-Timings and rejected alternatives: ``docs/design/kernels.md``.
+Design: ``docs/design/kernels.md``.
 """
 
 from __future__ import annotations
