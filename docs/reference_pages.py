@@ -9,7 +9,7 @@ from scene_page import scenes_page
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.cli.help import spelled, synopsis
+from unprocess_gen.cli.help import synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_options, default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
@@ -260,7 +260,7 @@ def _summary(verb: Verb) -> str:
 
 
 def _argument(argument: Argument) -> list[str]:
-    return [code(spelled(argument)), argument.help + (" (required)" if argument.required else "")]
+    return [code(argument.spelled), argument.help + (" (required)" if argument.required else "")]
 
 
 PAGES = {

@@ -545,12 +545,16 @@ def test_keys_take_indices_ranges_and_keys_in_every_verb(verb: str, keys: str, m
     assert ("; 1 failed row skipped" in done.out) == ("-" in keys)
 
 
+REQUIRED = {"preview": ("--to", "to"), "dng": ("--keys", "0", "--to", "to"), "again": ("out=new",)}
+"""Arguments without which a verb refuses every folder."""
+
+
 def test_folder_of_a_sweep_is_refused_instead_of_a_dataset(moved: Path, run_main: RunMain, tmp_path: Path) -> None:
     (tmp_path / "sweep").mkdir()
     (tmp_path / "ds").rename(tmp_path / "sweep/seed=1")
     (tmp_path / "sweep/sweep.csv").touch()
-    for verb in ("replay", "report", "preview", "dng", "again"):
-        done = run_main(verb, "sweep", *(["out=new"] if verb == "again" else []))
+    for verb in ("replay", "report", *REQUIRED):
+        done = run_main(verb, "sweep", *REQUIRED.get(verb, ()))
         expected = (
             f"gen-dataset: {verb}: sweep: is the folder of a sweep; expected one of its datasets, such as sweep/seed=1"
         )
@@ -689,7 +693,7 @@ def test_folder_without_a_dataset_is_refused(
     verb: str, folder: str, sentence: str, run_main: RunMain, tmp_path: Path
 ) -> None:
     (tmp_path / "empty").mkdir()
-    done = run_main(verb, folder)
+    done = run_main(verb, folder, *REQUIRED.get(verb, ()))
     code = 4 if folder == "empty" and verb != "again" else 2
     assert (done.code, done.out, done.err.count("\n")) == (code, "", 1)
     assert done.err.startswith(f"gen-dataset: {verb}: {folder}: {sentence}")

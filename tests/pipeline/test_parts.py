@@ -290,7 +290,7 @@ def test_ranges_are_written_as_batch_systems_read_them(numbers: list[int], text:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("prepare", ROOT, ONE, "out=ds"), "prepare: parts is missing; expected the number of parts; give parts=…"),
+        (("prepare", ROOT, ONE, "out=ds"), "prepare: parts is missing; give parts=N: number of parts"),
         (("prepare", "parts=0", ROOT, ONE, "out=ds"), "prepare: parts=0: expected an integer of 1 or more"),
         (("prepare", "parts=5", ROOT, ONE, "n_jobs=1", "out=ds"),
          "parts=5: ds was prepared with parts=6; expected that number; choose another out"),

@@ -15,7 +15,7 @@ from helpers.datasets import Settings
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD
 from unprocess_gen.cli.exit_codes import EXIT_CODES
-from unprocess_gen.cli.help import global_help, spelled, synopsis
+from unprocess_gen.cli.help import global_help, synopsis
 from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.config.defaults import default_values
 from unprocess_gen.config.forms import DISTRIBUTION_FORMS, ISO_FORMS
@@ -161,10 +161,10 @@ def test_every_verb_and_flag_is_explained() -> None:
         assert f"gen-dataset {verb.name}" in HELP
         text = page.split(f"\n## {verb.name}\n")[1].split("\n## ")[0]
         for argument in verb.arguments:
-            assert argument.help and f"| `{spelled(argument)}` | {argument.help}" in text, spelled(argument)
+            assert argument.help and f"| `{argument.spelled}` | {argument.help}" in text, argument.spelled
         assert verb.place is None or f"| `{verb.place.metavar}` | {verb.place.expected} |" in text
     for argument in (*STANDARD, *HYDRA_FLAGS):
-        assert argument.help and f"| `{spelled(argument)}` | {argument.help} |" in page
+        assert argument.help and f"| `{argument.spelled}` | {argument.help} |" in page
 
 
 def test_columns_allow_every_value_that_settings_allow() -> None:

@@ -416,7 +416,7 @@ def test_changed_photograph_is_named_and_its_panel_omitted(
         ("DS --to file/sheets", "--to file/sheets: cannot be written (Not a directory)"),
         ("DS --to DS/sheets", "--to DS/sheets: is inside the dataset "),
         ("DS --to sheets --draw 1", "preview: --draw: no such flag; expected --keys, --to, --source"),
-        ("DS", "preview: --to is missing; expected the folder to write to; give --to FOLDER"),
+        ("DS", "preview: --to is missing; give --to FOLDER"),
         ("--to sheets", "preview: expected the folder of a dataset"),
     ],
 )

@@ -28,8 +28,7 @@ class Argument:
 
     Its names are spellings: ``--flag`` is followed by its value, ``key`` means ``key=value``. A switch has no metavar.
     ``read`` converts the text of the value and raises ValueError unless it is as ``expected`` says. Shells complete
-    the value as ``folders`` or ``files``, or as one of its ``choices``. The verb itself checks that a required argument
-    is given.
+    the value as ``folders`` or ``files``, or as one of its ``choices``.
     """
 
     names: tuple[str, ...]
@@ -56,6 +55,12 @@ class Argument:
     def settings(self) -> tuple[str, ...]:
         """Spellings of the form ``key=value``."""
         return tuple(name for name in self.names if not name.startswith("-"))
+
+    @property
+    def spelled(self) -> str:
+        """Spellings with the name of the value, such as ``--source ROOT, source.root=ROOT``."""
+        flags = [f"{', '.join(self.flags)} {self.metavar}".rstrip()] if self.flags else []
+        return ", ".join([*flags, *(f"{key}={self.metavar}" for key in self.settings)])
 
 
 STANDARD = (
@@ -135,6 +140,7 @@ class Call:
     ``values`` are by `Argument.key`, ``hydra`` by the long spelling of Hydra's flags, overrides as the user wrote them.
     """
 
+    verb: Verb
     values: Mapping[str, Any] = field(default_factory=dict)
     path: AnyPath | None = None
     overrides: list[str] = field(default_factory=list)
@@ -181,11 +187,8 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
 
     Everything after ``--`` is a word, even with a leading hyphen.
     """
-    before, after = list(arguments), []
-    if "--" in before:
-        cut = before.index("--")
-        before, after = before[:cut], before[cut + 1 :]
-    parsed, rest = flag_parser(verb).parse_known_args(before)
+    cut = arguments.index("--") if "--" in arguments else len(arguments)
+    parsed, rest = flag_parser(verb).parse_known_args(arguments[:cut])
     for word in rest:
         if word.startswith("-") and word != "-" and not (verb.extra and word[1:].isdecimal()):
             raise ConfigError(f"{verb.name}: {word}: no such flag; {_expected(verb, word)}{_setting_hint(verb, word)}")
@@ -195,19 +198,23 @@ def parse(verb: Verb, arguments: Sequence[str]) -> Call:
         for key, text in vars(parsed).items()
         if text is not None
     }
-    words = [*rest, *after]
+    words = [*rest, *arguments[cut + 1 :]]
     path = _take_place(verb, words)
     if verb.extra is not None and words and "=" not in words[0]:
         values[verb.extra.key] = _read(verb.extra, f"{verb.name}: ", words.pop(0))
     others = _take_settings(verb, words, values)
+    for argument in verb.arguments:
+        if argument.required and argument.key not in values:
+            problem = f"{argument.names[0]} is missing; give {argument.spelled}: {argument.help}"
+            raise ConfigError(f"{verb.name}: {problem}")
     if verb.composes:
         hydra = {flag.flags[-1]: values.pop(flag.key) for flag in HYDRA_FLAGS if flag.key in values}
-        return Call(values, overrides=_with_source(others, values.get("source")), hydra=hydra)
+        return Call(verb, values, overrides=_with_source(others, values.get("source")), hydra=hydra)
     if path is None:
-        return Call(values, words=others)
+        return Call(verb, values, words=others)
     from unprocess_gen.core.paths import any_path  # imports NumPy, too slow for --help
 
-    return Call(values, any_path(path), words=others)
+    return Call(verb, values, any_path(path), words=others)
 
 
 def _read(argument: Argument, spelling: str, text: Any) -> Any:

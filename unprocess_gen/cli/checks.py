@@ -25,7 +25,7 @@ from unprocess_gen.reports.formatting import counted
 
 def verify(call: Call) -> int:
     """Verify a dataset, or every dataset of a sweep; a sweep's exit code is the worst of its datasets."""
-    folder = dataset_folder("verify", call, sweeps=True)
+    folder = dataset_folder(call, sweeps=True)
     given_root(call)
     if "to" in call.values:
         if "noise" not in call.values:
@@ -143,7 +143,7 @@ def replay(call: Call) -> int:
     """Regenerate rows of a manifest, and compare or write their arrays."""
     if {"rows", "keys"} <= call.values.keys():
         raise ConfigError("replay: --rows and --keys exclude each other; expected one of them")
-    manifest = dataset_folder("replay", call, files=True)
+    manifest = dataset_folder(call, files=True)
     manifest = manifest / "manifest.csv" if manifest.is_dir() else manifest
     to = Path(call.values["to"]) if "to" in call.values else None
     failed: list[Row] = []

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Argument, Verb
+from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
 from unprocess_gen.config.option_files import ADDED_GROUPS, group_options, option_summary
 from unprocess_gen.config.settings import Setting, settings_of
@@ -71,7 +71,7 @@ def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
     blocks = [INTRODUCTION + "\n".join(lines), SETTINGS + "\n".join(groups), "\nKeys at the top level:", *keys]
     shown = [*(flag for flag in HYDRA_FLAGS if flag.key in SHOWN_HYDRA_FLAGS), *STANDARD]
     flags = [
-        *((spelled(argument), argument.help) for argument in shown),
+        *((argument.spelled, argument.help) for argument in shown),
         ("-h, --help [VERB or GROUP]", "show this help, or that of a verb or group"),
         ("--version", "show the version"),
         ("--", "everything after it is a file or folder, even with a leading hyphen"),
@@ -144,11 +144,11 @@ def verb_help(verb: Verb) -> str:
             *([(verb.extra.metavar, verb.extra.help)] if verb.extra else []),
         ],
         "Flags and settings": [
-            (spelled(argument), argument.help + (" (required)" if argument.required else ""))
+            (argument.spelled, argument.help + (" (required)" if argument.required else ""))
             for argument in (*verb.arguments, *STANDARD)
         ]
         + [("-h, --help", "show this help")],
-        "Hydra's flags": [(spelled(flag), flag.help) for flag in HYDRA_FLAGS if verb.composes],
+        "Hydra's flags": [(flag.spelled, flag.help) for flag in HYDRA_FLAGS if verb.composes],
     }
     parts = [f"usage: {synopsis(verb)}", textwrap.fill(_sentence(verb), WIDTH)]
     for title, lines in sections.items():
@@ -164,15 +164,9 @@ def synopsis(verb: Verb) -> str:
     words = [verb.place.metavar] if verb.place else []
     words += [f"[{verb.extra.metavar}]"] if verb.extra else []
     words += ["{" + ",".join(verb.words) + "}"] if verb.words else []
-    words += [spelled(argument) for argument in verb.arguments if argument.required]
+    words += [argument.spelled for argument in verb.arguments if argument.required]
     words += ["[key=value ...]"] if verb.composes else []
     return " ".join(["gen-dataset", verb.name, *words, "[flags]"])
-
-
-def spelled(argument: Argument) -> str:
-    """Return the spellings of an argument with the name of its value, such as ``--source ROOT, source.root=ROOT``."""
-    flags = [", ".join(argument.flags) + (f" {argument.metavar}" if argument.metavar else "")] if argument.flags else []
-    return ", ".join([*flags, *(f"{key}={argument.metavar}" for key in argument.settings)])
 
 
 def _sentence(verb: Verb) -> str:

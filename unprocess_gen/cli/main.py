@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 
 from unprocess_gen import __version__
-from unprocess_gen.cli.arguments import Call, Verb, flag_parser, parse, path_hint
+from unprocess_gen.cli.arguments import Verb, flag_parser, parse, path_hint
 from unprocess_gen.cli.exit_codes import BROKEN_PIPE
 from unprocess_gen.cli.help import global_help, group_help, verb_help
 from unprocess_gen.cli.messages import LOGGER, RESULTS, checked_streams, logging_to, report, report_error
@@ -60,16 +60,10 @@ def run(arguments: Sequence[str]) -> int:
     values = call.values
     with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):
         LOGGER.debug("unprocess_gen %s, Python %s: %s", __version__, sys.version.split()[0], list(arguments))
-        code = _exit_code(lambda: _run(verb, call), arguments)
+        module, name = verb.run.split(".")
+        code = _exit_code(lambda: getattr(import_module(f"unprocess_gen.cli.{module}"), name)(call), arguments)
         RESULTS.info("exit code %d", code)
         return code
-
-
-def _run(verb: Verb, call: Call) -> int:
-    """Import the function of a verb, which for some takes a second, and run it."""
-    module, name = verb.run.split(".")
-    function: Callable[[Call], int] = getattr(import_module(f"unprocess_gen.cli.{module}"), name)
-    return function(call)
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:

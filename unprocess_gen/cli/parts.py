@@ -25,8 +25,6 @@ PART_VARIABLES = ("SLURM_ARRAY_TASK_ID", "PBS_ARRAY_INDEX", "JOB_COMPLETION_INDE
 
 def prepare(call: Call) -> int:
     """List the sources of a run and split it into parts."""
-    if "parts" not in call.values:
-        raise ConfigError("prepare: parts is missing; expected the number of parts; give parts=…")
     return compose(call, partial(_prepare, parts=call.values["parts"]))
 
 

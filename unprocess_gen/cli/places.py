@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unprocess_gen.cli.arguments import Call
-from unprocess_gen.cli.verbs import VERBS
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.output_paths import DATASET_ENTRIES
 from unprocess_gen.core.paths import AnyPath, any_path
@@ -15,12 +13,12 @@ if TYPE_CHECKING:
     from unprocess_gen.sources.dark_frames import DarkPlaces
 
 
-def dataset_folder(verb: str, call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
+def dataset_folder(call: Call, *, files: bool = False, sweeps: bool = False) -> AnyPath:
     """Return the verb's dataset; refuse anything else, and for a sweep name one of its datasets.
 
     ``files`` accepts the file of a manifest too, ``sweeps`` the folder of a sweep.
     """
-    path, place = call.path, VERBS[verb].place
+    verb, path, place = call.verb.name, call.path, call.verb.place
     assert path is not None and place is not None
     if not any_path(path).is_listed():
         kind = "file or folder" if files else "folder"
@@ -56,10 +54,3 @@ def dark_frames_of(manifest: AnyPath, call: Call) -> DarkPlaces:
     from unprocess_gen.pipeline.replay import dark_places
 
     return dark_places(manifest, call.values.get("dark_frames"), call.values.get("dark_shading"))
-
-
-def folder_to(verb: str, call: Call) -> Path:
-    """Return the folder of ``--to``, which the verb requires."""
-    if "to" not in call.values:
-        raise ConfigError(f"{verb}: --to is missing; expected the folder to write to; give --to FOLDER")
-    return Path(call.values["to"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from unprocess_gen.cli.arguments import Call
 from unprocess_gen.cli.hydra_app import compose
 from unprocess_gen.cli.messages import print_result
 from unprocess_gen.cli.messages import report as report_message
-from unprocess_gen.cli.places import dark_frames_of, dataset_folder, folder_to, given_root
+from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals
 from unprocess_gen.config.option_files import conf_dir, group_options
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
@@ -46,14 +46,12 @@ def _plan(config: Config, label: str = "", *, read_all: bool) -> tuple[int, RunE
 
 def accuracy(call: Call) -> int:
     """Measure error and time of every method and tier, and write a report."""
-    call = _with_out(call, "accuracy")
-    return compose(call, partial(_accuracy, command=_command("accuracy", call)))
+    return _compose_report(call, _accuracy)
 
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.config.interpretation import uses_dark_frames
     from unprocess_gen.config.schema import NoiseConfig, SceneConfig, SensorConfig
-    from unprocess_gen.reports import report_files
     from unprocess_gen.reports.benchmark import measure
     from unprocess_gen.reports.benchmark import report as benchmark_report
 
@@ -62,8 +60,7 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
             f"accuracy: noise.dark_frames={config.noise.dark_frames}: tiers are measured with the noise of a profile; "
             "expected null; leave it out"
         )
-    out = _local_out(config)
-    report_files.check_report_folder(out, "accuracy")
+    out = _report_folder(config, "accuracy")
     profiles = measure.BenchmarkProfiles(
         _tiers(),
         _option("noise", "imx385_iso3200", NoiseConfig),
@@ -100,44 +97,41 @@ def figures(call: Call) -> int:
     for override in call.overrides:
         if re.split(r"[.=]", override)[0] not in FIGURE_KEYS:
             raise ConfigError(f"figures: {override}: the article sets it; expected {', '.join(FIGURE_KEYS)}")
-    call = _with_out(call, "figures")
-    return compose(call, partial(_figures, command=_command("figures", call)))
+    return _compose_report(call, _figures)
 
 
 def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.config.schema import GainsConfig, NoiseConfig
-    from unprocess_gen.reports import report_files
     from unprocess_gen.reports.paper import figures as paper_figures
 
-    out = _local_out(config)
-    report_files.check_report_folder(out, "figures")
+    out = _report_folder(config, "figures")
     gains = {name: _option("gains", name, GainsConfig) for name in paper_figures.GAINS}
     authors = _option("noise", paper_figures.AUTHORS_NOISE, NoiseConfig)
     drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
     return 0, None, [f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}"]
 
 
-def _local_out(config: Config) -> Path:
-    return local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
+def _compose_report(call: Call, task: Callable[..., tuple[int, None, list[str]]]) -> int:
+    """Run a task that writes a report; its default ``out`` is the verb, so that no report goes into a dataset."""
+    if not any(override.startswith("out=") for override in call.overrides):
+        call = replace(call, overrides=[*call.overrides, f"out={call.verb.name}"])
+    command = shlex.join(["gen-dataset", call.verb.name, *call.hydra_arguments, *call.overrides])
+    return compose(call, partial(task, command=command))
 
 
-def _with_out(call: Call, out: str) -> Call:
-    """Add a verb's own default of ``out``, so that a report never goes into a dataset's folder."""
-    if any(override.startswith("out=") for override in call.overrides):
-        return call
-    return replace(call, overrides=[*call.overrides, f"out={out}"])
+def _report_folder(config: Config, verb: str) -> Path:
+    from unprocess_gen.reports.report_files import check_report_folder
 
-
-def _command(verb: str, call: Call) -> str:
-    """Return the command line of a call, for its report."""
-    return shlex.join(["gen-dataset", verb, *call.hydra_arguments, *call.overrides])
+    out = local_path(config.out, f"out={config.out}: a report is written to a local folder; expected a path")
+    check_report_folder(out, verb)
+    return out
 
 
 def report(call: Call) -> int:
     """Write the HTML page of a dataset."""
     from unprocess_gen.reports.dataset_page.page import write_dataset_report
 
-    folder = dataset_folder("report", call)
+    folder = dataset_folder(call)
     to, root = call.values.get("to"), given_root(call)
     dark = dark_frames_of(folder / "manifest.csv", call)
     if {"dark_frames", "dark_shading"} & call.values.keys():
@@ -158,8 +152,8 @@ def preview(call: Call) -> int:
     from unprocess_gen.pipeline.replay import source_root
     from unprocess_gen.reports.sheets.contact_sheet import write_sheets
 
-    folder = dataset_folder("preview", call)
-    to, root, with_stages = folder_to("preview", call), given_root(call), "stages" in call.values
+    folder = dataset_folder(call)
+    to, root, with_stages = Path(call.values["to"]), given_root(call), "stages" in call.values
     keys: Sequence[str] = []
     failed = files = code = 0
     if "keys" in call.values:
@@ -195,10 +189,8 @@ def dng(call: Call) -> int:
     from unprocess_gen.dataset.dng import FRAMES, export
     from unprocess_gen.dataset.selection import select_pairs
 
-    folder = dataset_folder("dng", call)
-    if "keys" not in call.values:
-        raise ConfigError("dng: --keys is missing; expected the keys of the rows to write; give --keys K,…")
-    to = folder_to("dng", call)
+    folder = dataset_folder(call)
+    to = Path(call.values["to"])
     frames = [frame for frame in FRAMES if frame in call.values] or FRAMES
     exported = export(folder, call.values["keys"], frames, to)
     failed = select_pairs(folder / "manifest.csv", call.values["keys"]).failed

@@ -10,7 +10,6 @@ from unprocess_gen.cli.hydra_app import compose
 from unprocess_gen.cli.messages import print_result, print_results
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.config.option_files import conf_dir, group_options
-from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.paths import any_path
 
 if TYPE_CHECKING:
@@ -40,9 +39,7 @@ def again(call: Call) -> int:
     """Generate a dataset again from its ``config.yaml``, and compare the manifests."""
     from unprocess_gen.pipeline.again import check_sources, compare, recorded_config
 
-    folder = dataset_folder("again", call)
-    if "out" not in call.values:
-        raise ConfigError("again: out is missing; expected the folder of the new dataset; give out=…")
+    folder = dataset_folder(call)
     changes = {"out": call.values["out"], "executor": _executor(call)}
     changes |= {"n_jobs": call.values["n_jobs"]} if "n_jobs" in call.values else {}
     changes |= {"source.max_failed": call.values["max_failed"]} if "max_failed" in call.values else {}
