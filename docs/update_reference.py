@@ -15,7 +15,10 @@ from pathlib import Path
 
 import grimp
 
-from unprocess_gen.cli.help import described_keys
+from unprocess_gen.cli.help import description
+from unprocess_gen.config.schema import GROUPS, Config
+from unprocess_gen.config.settings import settings_of
+from unprocess_gen.config.values import value_text
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
@@ -105,7 +108,12 @@ def _reachable(package: str) -> set[str]:
 
 def keys_of_help() -> str:
     """Return the JSON text of the keys that ``gen-dataset --help`` lists."""
-    return json.dumps(described_keys(), indent=1) + "\n"
+    top = {
+        f"{name}={value_text(getattr(Config, name))}": description(setting)
+        for name, setting in settings_of(Config).items()
+    }
+    groups = {group: list(settings_of(kind)) for group, kind in GROUPS.items()}
+    return json.dumps({"groups": groups, "top": top}, indent=1) + "\n"
 
 
 def purpose(package: str) -> str:

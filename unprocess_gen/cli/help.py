@@ -6,7 +6,6 @@ import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from unprocess_gen.cli.arguments import HYDRA_FLAGS, STANDARD, Verb
 from unprocess_gen.cli.exit_codes import EXIT_CODES
@@ -45,21 +44,10 @@ Tab completion: eval "$(gen-dataset completion bash)", or zsh.
 """
 
 KEYS = "keys.json"
-"""File of ``conf/`` with `described_keys`, written by ``docs/update_reference.py``.
+"""File of ``conf/`` with the keys of each group, and the top-level keys, written by ``docs/update_reference.py``.
 
 ``config.schema`` imports NumPy, which is too slow for --help.
 """
-
-
-def described_keys() -> dict[str, Any]:
-    """Keys of each group, and keys at the top level with their defaults and descriptions."""
-    from unprocess_gen.config.schema import GROUPS, Config
-
-    top = {
-        f"{name}={value_text(getattr(Config, name))}": _description(setting)
-        for name, setting in settings_of(Config).items()
-    }
-    return {"groups": {group: list(settings_of(kind)) for group, kind in GROUPS.items()}, "top": top}
 
 
 def global_help(verbs: Mapping[str, Verb], conf: Path) -> str:
@@ -116,14 +104,14 @@ def group_help(group: str, conf: Path) -> str:
         chosen = f" with {group}={option}" if option != "default" else ""
         title = f"Keys of {group} ({group}.KEY=VALUE), and their defaults{chosen}:"
         lines = [
-            _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], _description(setting))
+            _two_columns(f"{name}={value_text(values[name])}"[: WIDTH - 2], description(setting))
             for name, setting in settings_of(GROUPS[group]).items()
         ]
         parts.append("\n".join([title, *lines]))
     return "\n\n".join(parts) + "\n"
 
 
-def _description(setting: Setting) -> str:
+def description(setting: Setting) -> str:
     """Return meaning, unit, allowed values and the meaning of null in one line."""
     unit = f", in {setting.unit}" if setting.unit else ""
     null = f"; null: {setting.null}" if setting.null else ""

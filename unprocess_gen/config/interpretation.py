@@ -19,6 +19,7 @@ from unprocess_gen.config.schema import (
     NoiseConfig,
     ProvenanceConfig,
     SourceConfig,
+    replaced,
 )
 from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.types import FLOAT32, Distribution, PatchRule
@@ -27,6 +28,11 @@ from unprocess_gen.simulation.effects.dark_current import HEAT
 
 SHADING_WORDS = ("keep", "remove")
 """Values of ``noise.dark_shading`` that are no path of a map."""
+
+ONLY_WITH_DARK_FRAMES = {"dark_shading": "keep", "dark_shading_sha256": None, "dark_frames_black_dn": None}
+"""Keys of the noise that need dark frames, with their values without dark frames."""
+
+NO_DARK_FRAMES = {"dark_frames": None, "dark_frames_sha256": None, **ONLY_WITH_DARK_FRAMES}
 
 # ---------------------------------------------------------------------------------------------------- distributions
 
@@ -148,15 +154,7 @@ def run_iso(config: Config) -> float:
 
 def without_dark_frames(config: Config) -> Config:
     """Return a copy of a configuration with the noise of the profile in place of dark frames."""
-    noise = dataclasses.replace(
-        config.noise,
-        dark_frames=None,
-        dark_frames_sha256=None,
-        dark_frames_black_dn=None,
-        dark_shading="keep",
-        dark_shading_sha256=None,
-    )
-    return dataclasses.replace(config, noise=noise)
+    return replaced(config, {f"noise.{key}": value for key, value in NO_DARK_FRAMES.items()})
 
 
 def uses_assumed(config: Config) -> bool:

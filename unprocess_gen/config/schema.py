@@ -208,7 +208,7 @@ class SensorConfig(Group):
 
 
 CHOSEN, PROFILE = "Chosen for a run", "Every profile"
-TWO_PARAMETERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
+TWO_NUMBERS, PHYSICAL = "Two-parameter profiles", "Physical profiles"
 """Sections of the keys of `NoiseConfig`."""
 
 Body = TypeVar("Body")
@@ -221,11 +221,10 @@ def with_fields(added: Fields, before: str = "") -> Callable[[type[Body]], type[
     """Add fields to the body of a dataclass, at its end or before one of its fields."""
 
     def add(group: type[Body]) -> type[Body]:
-        types: dict[str, Any] = {}
-        following: dict[str, Any] = {}
-        for name, kind in group.__annotations__.items():
-            (following if following or name == before else types)[name] = kind
-        group.__annotations__ = {**types, **{name: kind for name, (kind, _) in added.items()}, **following}
+        types = list(group.__annotations__.items())
+        place = list(group.__annotations__).index(before) if before else len(types)
+        types[place:place] = [(name, kind) for name, (kind, _) in added.items()]
+        group.__annotations__ = dict(types)
         for name, (_, default) in added.items():
             setattr(group, name, default)
         return group
@@ -269,12 +268,13 @@ def _limit(number: Number) -> Limit:
     return numbers if number.count == 1 else NumberList(number.count, numbers)
 
 
-BRANCH_FIELDS: Fields = {
-    name: _number_field(effect, number) for name, (effect, number) in profile_keys().items() if number.in_branch
-}
-PROFILE_FIELDS: Fields = {
-    name: _number_field(effect, number) for name, (effect, number) in profile_keys().items() if not number.in_branch
-}
+def _number_fields(in_branch: bool) -> Fields:
+    """Return the keys of the numbers of a branch, or of the profile."""
+    declared = profile_keys().items()
+    return {name: _number_field(*number) for name, number in declared if number[1].in_branch == in_branch}
+
+
+BRANCH_FIELDS = _number_fields(in_branch=True)
 SWITCH_FIELDS: Fields = {
     effect.name: (
         Optional[str],
@@ -327,7 +327,7 @@ class ProvenanceConfig(Group):
 
 @documented
 @dataclass(frozen=True)
-@with_fields(PROFILE_FIELDS, before="assumed")
+@with_fields(_number_fields(in_branch=False), before="assumed")
 class NoiseConfig(EffectGroup):
     """Define the noise: two numbers (variance a·x + b), or a physical profile with ``branches`` by ISO.
 
@@ -403,16 +403,16 @@ class NoiseConfig(EffectGroup):
         limits.VARIANCE_SLOPE,
         unit="DN, or 1 with units=normalized",
         null="a physical profile",
-        section=TWO_PARAMETERS,
+        section=TWO_NUMBERS,
     )
     b: Any = key(
         None,
         limits.VARIANCE_OFFSET,
         unit="DN², or 1 with units=normalized",
         null="a physical profile",
-        section=TWO_PARAMETERS,
+        section=TWO_NUMBERS,
     )
-    negative_variance: str = key("refuse", Choice("refuse", "clip"), section=TWO_PARAMETERS)
+    negative_variance: str = key("refuse", Choice("refuse", "clip"), section=TWO_NUMBERS)
     law: str = key("gaussian", Choice("gaussian", "poisson"), section=CHOSEN)
     iso: Any = key(None, limits.ISO, null="the ISO of the scene", section=CHOSEN)
     scatter: str = key("image", limits.SCATTER, section=CHOSEN, since="0.2")

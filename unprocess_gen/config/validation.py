@@ -15,6 +15,7 @@ from unprocess_gen.config.accuracy import choose_methods
 from unprocess_gen.config.distributions import parse_drawn
 from unprocess_gen.config.interpretation import (
     NO_CLIP,
+    ONLY_WITH_DARK_FRAMES,
     effect_switch,
     has_float_clean,
     is_normalised,
@@ -194,14 +195,10 @@ def _check_levels(config: Config) -> None:
         raise refusal("clean.includes_fixed_pattern", "true", problem)
 
 
-NEED_DARK_FRAMES = {"dark_shading": "keep", "dark_shading_sha256": None, "dark_frames_black_dn": None}
-"""Keys of the noise that dark frames need, with their values without dark frames."""
-
-
 def _check_dark_frames(config: Config) -> None:
     noise = config.noise
     if not uses_dark_frames(noise):
-        for key, default in NEED_DARK_FRAMES.items():
+        for key, default in ONLY_WITH_DARK_FRAMES.items():
             if (value := getattr(noise, key)) != default:
                 raise refusal(f"noise.{key}", value, "there are no dark frames; give noise.dark_frames=FOLDER")
         return
