@@ -27,12 +27,8 @@ PRINTING = {"--hydra-help", "--shell-completion", "--info"}
 """Flags with which Hydra prints something that is independent of the config."""
 
 HYDRA_SETTINGS = (
-    "hydra.searchpath",
-    "hydra.mode",
-    "hydra.sweeper",
-    "hydra.launcher",
-    "hydra/sweeper",
-    "hydra/launcher",
+    *("hydra.searchpath", "hydra.mode", "hydra.sweeper", "hydra.launcher"),
+    *("hydra/sweeper", "hydra/launcher"),
 )
 """Settings of Hydra that an override may set."""
 
@@ -47,7 +43,7 @@ def compose(
     """
     _check_overrides(call.overrides)
     if PRINTING & call.hydra.keys():
-        return _print_with_hydra(call, call.overrides)
+        return run_hydra(call, call.overrides)
     prints_config = "--cfg" in call.hydra
     if "--resolve" in call.hydra and not prints_config:
         raise ConfigError("--resolve: --cfg is missing; expected both; add --cfg job")
@@ -58,7 +54,7 @@ def compose(
     expansion = expand(call.overrides, folders, "--multirun" in call.hydra, sweep_csv and not prints_config)
     if prints_config:
         jobs = [call.overrides] if expansion.node is not None else [job.overrides for job in expansion.jobs]
-        return worst(_print_with_hydra(call, overrides) for overrides in jobs)
+        return worst(run_hydra(call, overrides) for overrides in jobs)
     if expansion.node is not None:
         code, _, texts = task(validated_config(expansion.node, call.overrides), "")
         print_results(texts)
@@ -120,9 +116,3 @@ def _run_sweep(
     if totals is not None and results:
         print_result(totals(results))
     return worst(job.row.exit for job in done)
-
-
-def _print_with_hydra(call: Call, overrides: Sequence[str]) -> int:
-    """Let Hydra print what its flags ask for, and return 0."""
-    run_hydra(call, overrides, lambda node: None)
-    return 0

@@ -59,8 +59,13 @@ def run_job(job: SweepJob, task: Task, place: str, composed: Callable[[], DictCo
     return JobResult(JobRow.from_summary(folder, ",".join(named), job.swept, code, result), out, result, texts)
 
 
-def run_hydra(call: Call, overrides: Sequence[str], job: Callable[[Any], Any], multirun: bool = False) -> None:
-    """Run a Hydra application, whose task function is ``job``; ConfigError if Hydra refuses overrides or files."""
+def run_hydra(
+    call: Call, overrides: Sequence[str], job: Callable[[Any], Any] = lambda node: None, multirun: bool = False
+) -> int:
+    """Run a Hydra application, whose task function is ``job``, and return 0.
+
+    ConfigError if Hydra refuses overrides or files.
+    """
     flags = [word for word in call.hydra_arguments if word not in ("--multirun", "--run")]
     flags += ["--multirun"] if multirun else []
     os.environ["HYDRA_FULL_ERROR"] = "1"  # documented switch: Hydra raises instead of printing several lines
@@ -79,3 +84,4 @@ def run_hydra(call: Call, overrides: Sequence[str], job: Callable[[Any], Any], m
         application(job)()
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(explain(error, overrides)) from error
+    return 0

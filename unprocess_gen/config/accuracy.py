@@ -13,12 +13,11 @@ How the error statements were obtained: ``docs/design/accuracy.md``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from unprocess_gen.config.schema import AccuracyConfig
-from unprocess_gen.core.errors import ConfigError
+from unprocess_gen.config.values import refusal
 from unprocess_gen.core.types import CameraPlan
 
 
@@ -171,7 +170,9 @@ def choose_methods(
         ]
         if None not in chosen:
             return tuple(method.spelled for method in chosen if method is not None)
-    raise ConfigError(_smallest_error(stages, budget))
+    best = min(method.normal_error for method in methods_of_stage("normal"))  # the others have an exact method
+    problem = f"no method is that accurate; expected at least {best:g}"
+    raise refusal("accuracy.normal_error", budget.normal_error, problem)
 
 
 def methods_of_stage(stage: str) -> tuple[Method, ...]:
@@ -183,16 +184,3 @@ def _first(stage: str, implementation: str, budget: AccuracyConfig) -> Method | 
     """Return the cheapest method of a stage and implementation within a budget."""
     candidates = (method for method in methods_of_stage(stage) if method.implementation == implementation)
     return next((method for method in candidates if method.fits(budget)), None)
-
-
-def _smallest_error(stages: Sequence[str], budget: AccuracyConfig) -> str:
-    """Return a message about the first limit that no method keeps, with the smallest error possible."""
-    for key in ("clean_dn", "clean_changed_share", "normal_error"):
-        for stage in stages:
-            best = min(methods_of_stage(stage), key=lambda method: float(getattr(method, key)))
-            if getattr(best, key) > getattr(budget, key):
-                return (
-                    f"accuracy.{key}={getattr(budget, key):g}: no method is that accurate; expected at least "
-                    f"{getattr(best, key):g} ({best.spelled})"
-                )
-    raise AssertionError(f"no implementation fits {budget}")

@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from hydra.errors import MissingConfigException, OverrideParseException
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from unprocess_gen.config.option_files import ADDED_GROUPS, file_hint, group_options
 from unprocess_gen.config.schema import BranchConfig, Config, ProvenanceConfig, all_settings
@@ -45,8 +45,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
                 return _in_item(link.object_type, key)
             if isinstance(link, ConfigAttributeError | ConfigKeyError):
                 return unknown_key(key, overrides)
-            message = str(link.msg or link).splitlines()[0]
-            return f"{assignment(key, overrides)}: {_wrong_value(key, message, overrides)}"
+            return f"{assignment(key, overrides)}: {_wrong_value(link, key, overrides)}"
     text = error_in_one_line(error)
     ambiguous = next((one for one in overrides if text.startswith(f"Ambiguous value for argument '{one}'")), None)
     if ambiguous:
@@ -106,33 +105,16 @@ def assignment(key: str, overrides: Sequence[str]) -> str:
     return next((one for ones in (exact, below) for one in ones), key)
 
 
-EXPECTED = {
-    "could not be converted to Integer": "expected an integer",
-    "could not be converted to Float": "expected a number",
-    "is not a valid bool": "expected true or false",
-    "is not Optional": "expected a value other than null",
-}
-"""What is allowed, by a part of OmegaConf's message."""
-
-
-WRONG_KIND = ("Cannot merge", "Invalid type assigned")
-"""Parts of OmegaConf's messages about a mapping, a list or a value in place of one another."""
-
-
-def _wrong_value(key: str, message: str, overrides: Sequence[str]) -> str:
+def _wrong_value(error: OmegaConfBaseException, key: str, overrides: Sequence[str]) -> str:
     """Return what is expected where OmegaConf refuses the type of a value, else its message."""
-    message = re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)
+    message = str(error.msg or error).splitlines()[0]
+    if isinstance(error, InterpolationResolutionError):
+        return re.sub(r'^\w+ raised while resolving interpolation: "?(.*?)"?$', r"\1", message)
     if "is not a ListConfig, list or tuple" in message:
         value = assignment(key, overrides).partition("=")[2]
         return f"expected a list{f', such as [{value}]' if value and value[0] not in '[{' else ''}"
-    if any(part in message for part in WRONG_KIND) and (setting := _setting(key.partition("[")[0])) is not None:
-        return f"expected {setting.allowed}"
-    expected = next((expected for part, expected in EXPECTED.items() if part in message), None)
-    setting = _setting(key)
-    if expected is None or setting is None:
-        return expected or message
-    allowed = f"expected {setting.allowed}"
-    return allowed if allowed.startswith(expected) else f"{expected}: {setting.allowed}"
+    setting = _setting(key) or _setting(key.partition("[")[0])
+    return message if setting is None else f"expected {setting.allowed}"
 
 
 def _setting(key: str) -> Setting | None:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from unprocess_gen.config.values import in_range, is_integer, is_number, value_text
+from unprocess_gen.config.values import is_integer, is_number, refusal, value_text
 from unprocess_gen.core.object_store import is_url
 
 Test = Callable[[Any], bool]
@@ -119,7 +119,9 @@ class LevelRange(Limit):
 
     def check_in(self, key: str, value: int, group: Any) -> None:
         """Raise ConfigError unless the value is in the range that the group, whose ``bits`` are valid, gives."""
-        in_range(key, value, *self._ends(group), self._remark)
+        low, high = self._ends(group)
+        if not low <= value <= high:
+            raise refusal(key, value, f"expected {low} to {high}{self._remark}")
 
 
 class Drawn(Limit):

@@ -24,12 +24,6 @@ def one_of(key: str, value: Any, allowed: Collection[str]) -> None:
         raise refusal(key, value, f"expected one of {', '.join(allowed)}")
 
 
-def in_range(key: str, value: int, low: int, high: int, remark: str = "") -> None:
-    """Raise ConfigError unless ``low <= value <= high``; the message ends with ``remark``."""
-    if not low <= value <= high:
-        raise refusal(key, value, f"expected {low} to {high}{remark}")
-
-
 def is_integer(value: Any) -> bool:
     """Return whether a value is an integer other than a bool."""
     return isinstance(value, int) and not isinstance(value, bool)
