@@ -31,13 +31,14 @@ def prepare(call: Call) -> int:
 def _prepare(config: Config, label: str = "", *, parts: int) -> tuple[int, None, list[str]]:
     from unprocess_gen.pipeline.parts import prepare
 
-    prepared = prepare(config, parts)
-    for warning in prepared.warnings:
-        report(warning, logging.WARNING)
-    if prepared.complete:
+    run = prepare(config, parts)
+    if run is None:
         return DONE, None, [f"{config.out} is complete; nothing to do"]
+    for warning in run.warnings():
+        report(warning, logging.WARNING)
     out = shlex.quote(config.out)
-    counts = f"{counted(prepared.sources, 'source')}, {counted(prepared.shards, 'shard')}, {counted(parts, 'part')}"
+    shards = counted(len(run.tasks()), "shard")
+    counts = f"{counted(len(run.sources), 'source')}, {shards}, {counted(parts, 'part')}"
     how = f"run gen-dataset part {out} K for K = 0 to {parts - 1}, then gen-dataset merge {out}"
     return DONE, None, [f"{config.out}: {counts}; {how}"]
 

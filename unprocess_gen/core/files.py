@@ -7,7 +7,8 @@ import hashlib
 import os
 import shutil
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,15 @@ def machine_error(error: OSError, path: Path | ObjectPath, advice: str = "") -> 
     if error.errno == errno.ENOENT and not path.exists():
         reason += f" ({path} was deleted or moved)"
     return MachineError(f"{error.filename or path}: {reason}" + (f"; {advice}" if advice else ""))
+
+
+@contextmanager
+def machine_errors(path: Path | ObjectPath, advice: str = "") -> Iterator[None]:
+    """Raise each OSError of the body as MachineError; arguments as in `machine_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise machine_error(error, path, advice) from error
 
 
 def free_bytes(path: Path) -> int:

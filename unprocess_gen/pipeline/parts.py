@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,39 +21,18 @@ from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
 from unprocess_gen.config.settings import settings_of
 from unprocess_gen.core.errors import RESUME, ConfigError, MachineError
-from unprocess_gen.core.files import machine_error
+from unprocess_gen.core.files import machine_errors
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.pipeline.executors.local import effective_jobs, own_cores, run_tasks
 from unprocess_gen.pipeline.frozen_run import FrozenPlan, FrozenRun, freeze, read_plan, recorded_plan
 from unprocess_gen.pipeline.generate import Summary, begin, dataset_json_facts, follow, images_in
 from unprocess_gen.pipeline.pairs import PairSettings
 from unprocess_gen.pipeline.progress import COMPILING, LOGGER, Progress
-from unprocess_gen.pipeline.run import resolve
+from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.run_records import ShardRecords
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
-
-
-@dataclass(frozen=True, slots=True)
-class Prepared:
-    """Describe a prepared run.
-
-    Attributes
-    ----------
-    parts, shards, sources : int
-        Their numbers.
-    complete : bool
-        Whether the dataset was finished before.
-    warnings : tuple of str
-        Sentences that a user should read.
-    """
-
-    parts: int
-    shards: int
-    sources: int
-    complete: bool = False
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +41,8 @@ class PartMade:
 
     Attributes
     ----------
-    part, parts : int
-        Number of the part, and of all parts.
+    parts : int
+        Number of all parts.
     shards, made : int
         Shards of the part, and those that this call made.
     rows : int
@@ -72,7 +51,6 @@ class PartMade:
         Time that it took.
     """
 
-    part: int
     parts: int
     shards: int
     made: int
@@ -108,14 +86,14 @@ def shards_of_part(part: int, parts: int, shards: int) -> range:
     return range(part * shards // parts, (part + 1) * shards // parts)
 
 
-def prepare(config: Config, parts: int) -> Prepared:
-    """Freeze a run in parts; a second call with the same settings changes nothing.
+def prepare(config: Config, parts: int) -> Run | None:
+    """Freeze a run in parts, None if the dataset is finished; a second call with the same settings changes nothing.
 
     Raises ConfigError as `generate`; if there are fewer shards than parts; if the run was prepared with another number
     of parts, or begun by another version; LockedError, DamageError, MachineError as `generate`.
     """
     run = resolve(config)
-    shards, sources = len(run.tasks()), len(run.sources)
+    shards = len(run.tasks())
     if parts > shards:
         raise ConfigError(
             f"parts={parts}: this dataset has {shards} shard{'s' * (shards != 1)}; expected 1 to {shards}; "
@@ -125,7 +103,7 @@ def prepare(config: Config, parts: int) -> Prepared:
         workspace.open()
         if workspace.is_complete():
             workspace.check_complete(run.sources)
-            return Prepared(parts, shards, sources, complete=True)
+            return None
         plan = recorded_plan(workspace.storage)
         if plan is not None and plan.parts not in (None, parts):
             raise ConfigError(
@@ -134,7 +112,7 @@ def prepare(config: Config, parts: int) -> Prepared:
             )
         begin(workspace, run)
         freeze(workspace, run, partial(LOGGER.info, COMPILING), parts)
-    return Prepared(parts, shards, sources, warnings=run.warnings())
+    return run
 
 
 def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None = None) -> PartMade | None:
@@ -154,7 +132,7 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
     if not 0 <= part < parts:
         raise ConfigError(f"part {part}: {out} has {parts} parts; expected 0 to {parts - 1}")
     wanted = shards_of_part(part, parts, run.plan.shards)
-    try:
+    with closing(run.storage), machine_errors(any_path(out), RESUME):
         done = run.records.committed(wanted)
         todo = [run.task(shard) for shard in wanted if shard not in done]
         jobs = effective_jobs(run.plan.n_jobs if n_jobs is None else n_jobs, len(todo))
@@ -164,11 +142,7 @@ def make_part(out: str, part: int, n_jobs: int | None = None, root: str | None =
             context = RunContext(run.settings, scratch, os.getpid(), core_to_spare=spare, counts_deaths=True)
             progress.watch(context)
             rows = follow(run_tasks(context, todo, jobs), progress).rows
-    except OSError as error:
-        raise machine_error(error, any_path(out), RESUME) from error
-    finally:
-        run.storage.close()
-    return PartMade(part, parts, len(wanted), len(todo), rows, time.monotonic() - started)
+    return PartMade(parts, len(wanted), len(todo), rows, time.monotonic() - started)
 
 
 def parts_status(out: str) -> PartsStatus:

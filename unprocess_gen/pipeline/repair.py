@@ -19,6 +19,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from unprocess_gen.config.schema import Config, replaced
 from unprocess_gen.config.serialization import dataset_yaml, read_dataset_yaml, source_kind
 from unprocess_gen.config.validation import check_parquet
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, UnprocessGenError
-from unprocess_gen.core.files import commit_file, file_sha256, machine_error
+from unprocess_gen.core.files import commit_file, file_sha256, machine_errors
 from unprocess_gen.core.records import parse_json
 from unprocess_gen.core.types import Frame, Row
 from unprocess_gen.dataset import parquet
@@ -94,14 +95,9 @@ def repair(folder: Path, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) ->
     cannot be restored, ConfigError if sources are needed and ``root`` is None, SourceChangedError if the manifest must
     be regenerated and a source was changed or deleted, MachineError if a file cannot be read or written.
     """
-    storage = Storage(folder)
-    try:
+    with closing(Storage(folder)) as storage, machine_errors(folder):
         storage.hold()
         yield from _Repair(folder, root, dark, storage.scratch).steps()
-    except OSError as error:
-        raise machine_error(error, folder) from error
-    finally:
-        storage.close()
 
 
 class _Repair:

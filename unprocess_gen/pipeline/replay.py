@@ -15,7 +15,7 @@ import numpy as np
 
 from unprocess_gen.config.schema import SourceConfig
 from unprocess_gen.core.errors import ConfigError, DamageError, MachineError, SourceChangedError, SourceError
-from unprocess_gen.core.files import array_xxh3, machine_error
+from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.object_store import ObjectPath
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath, any_path
@@ -139,8 +139,8 @@ def check_source_digests(old: AnyPath, new: AnyPath) -> None:
 
 
 def evenly_spaced_rows(manifest: AnyPath, count: int) -> Iterator[Row]:
-    """Return rows of pairs, evenly spaced over a manifest."""
-    pairs = (at for at, row in rows_with_offsets(manifest) if row["status"] == "ok")
+    """Yield rows of pairs, evenly spaced over a manifest."""
+    pairs = (offset for offset, row in rows_with_offsets(manifest) if row["status"] == "ok")
     places = np.fromiter(pairs, dtype=np.int64)  # 8 bytes a row; a list takes 40
     return (read_row(manifest, int(places[number])) for number in evenly_spaced(range(len(places)), count))
 
@@ -159,10 +159,6 @@ def replay(
     for row in rows:
         if row["status"] == "ok":
             yield _replay(row, regenerator, to)
-
-
-def _is_scene(row: Row) -> bool:
-    return row["source_bytes"] == 0
 
 
 def _replay(row: Row, regenerator: PairRegenerator, to: Path | None) -> ReplayResult:
@@ -195,7 +191,7 @@ class PairRegenerator:
         Raises SourceChangedError if the source was changed or deleted, DamageError if the row has no valid plan,
         ConfigError if the row was made from a file and there is no root, MachineError if the self-test fails.
         """
-        if self._root is None and not _is_scene(row):
+        if self._root is None and row["source_bytes"] != 0:
             raise ConfigError(
                 f"source.root is missing: row {row['key']} was generated from the file {row['source']}; "
                 "expected its folder; give source.root=…"
@@ -251,7 +247,7 @@ class PairRegenerator:
             raise SourceChangedError(f"{str(error).partition(';')[0]}; {ADVICE}") from error
 
     def _load(self, row: Row) -> tuple[str, Photograph]:
-        root = None if _is_scene(row) else self._root
+        root = None if row["source_bytes"] == 0 else self._root  # built-in scenes have no bytes
         config = SourceConfig(root=root, max_pixels=NO_LIMIT, downscale=int(row["downscale"] or 1))
         source = source_of(row)
         if self._kept is None or self._kept[:2] != (config, source):
@@ -273,12 +269,10 @@ def _changed(sha256: str, row: Row) -> str:
 
 
 def _save(pair: Pair, to: Path, key: str) -> None:
-    try:
+    with machine_errors(to):
         to.mkdir(parents=True, exist_ok=True)
         np.save(to / f"{key}.clean.npy", pair.clean)
         np.save(to / f"{key}.noisy.npy", pair.noisy)
-    except OSError as error:
-        raise machine_error(error, to) from error
 
 
 def source_of(row: Row) -> Source:

@@ -16,12 +16,11 @@ import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
-from unprocess_gen.core.files import file_sha256, machine_error
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path, open_text
 from unprocess_gen.core.types import Row
 from unprocess_gen.dataset import parquet
@@ -69,10 +68,8 @@ def verify(folder: AnyPath) -> list[Damage]:
 
     Raises DamageError if the folder contains no finished dataset; MachineError if a file exists but cannot be read.
     """
-    try:
+    with machine_errors(folder):
         return _verify(folder)
-    except OSError as error:
-        raise machine_error(error, folder) from error
 
 
 def _verify(folder: AnyPath) -> list[Damage]:
@@ -184,22 +181,17 @@ def shard_rows(manifest: AnyPath) -> Iterator[ShardRows]:
     Raises DamageError if the manifest cannot be read, or its shards are not in ascending order.
     """
     last = -1
-    for number, rows in itertools.groupby(read_rows(manifest), key=_shard_of):
-        some = list(rows)
+    for number, group in itertools.groupby(read_rows(manifest), key=operator.itemgetter("shard")):
+        rows = list(group)
         if number is None:
-            raise DamageError(f"{manifest}: row {some[0]['key']} names no shard")
+            raise DamageError(f"{manifest}: row {rows[0]['key']} names no shard")
         if number <= last:
             raise DamageError(
-                f"{manifest}: row {some[0]['key']} of shard {number} follows rows of shard {last}; expected shards in "
+                f"{manifest}: row {rows[0]['key']} of shard {number} follows rows of shard {last}; expected shards in "
                 "ascending order"
             )
         last = number
-        yield number, some
-
-
-def _shard_of(row: Row) -> int | None:
-    shard = row["shard"]
-    return shard if isinstance(shard, int) else None
+        yield number, rows
 
 
 def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifest: Iterator[ShardRows]) -> list[Damage]:
@@ -222,8 +214,11 @@ def _check_shards(folder: AnyPath, listed: dict[int, dict[str, Any]], of_manifes
             damages.append(Damage(f"shards/{path.name}", "is missing"))
             continue
         with any_path(path).local_copy() as file:
-            found = [] if first is None else list(_check_members(file, pairs))
-            damages += found or _check_sha256(file, listed.get(number))
+            problems = [] if first is None else list(check_members(file, expected_samples(pairs)))
+            entry = listed.get(number)
+            if not problems and entry is not None and (found := file_sha256(file)) != entry["sha256"]:
+                problems = [("", "", f"its SHA-256 is {found}, dataset.json records {entry['sha256']}")]
+            damages += [Damage(f"shards/{path.name}", what, key, member) for key, member, what in problems]
     return [Damage(f"shards/{name}", "is not part of this dataset") for name in sorted(foreign)] + damages
 
 
@@ -235,18 +230,8 @@ def _merged(listed: Iterable[int], of_manifest: Iterable[ShardRows]) -> Iterator
         yield number, [row for _, rows in parts for row in rows]
 
 
-def _check_members(path: Path, rows: Iterable[Row]) -> Iterator[Damage]:
-    for key, member, what in check_members(path, expected_samples(rows)):
-        yield Damage(f"shards/{path.name}", what, key, member)
-
-
-def _check_sha256(path: Path, entry: dict[str, Any] | None) -> Iterator[Damage]:
-    if entry is not None and (found := file_sha256(path)) != entry["sha256"]:
-        yield Damage(f"shards/{path.name}", f"its SHA-256 is {found}, dataset.json records {entry['sha256']}")
-
-
 def expected_samples(rows: Iterable[Row]) -> list[ExpectedSample]:
-    """Return the members that a shard must contain for some rows; raise DamageError if a row lacks a value."""
+    """List the members that a shard must contain for rows; raise DamageError if a row lacks a value."""
     return [_expected_sample(sample) for sample in group_by_sample(row for row in rows if row["status"] == "ok")]
 
 

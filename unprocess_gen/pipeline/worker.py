@@ -20,7 +20,7 @@ from pathlib import Path
 from unprocess_gen.config.interpretation import patch_rule
 from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import RESUME, MachineError, SourceError
-from unprocess_gen.core.files import array_xxh3, machine_error
+from unprocess_gen.core.files import array_xxh3, machine_error, machine_errors
 from unprocess_gen.core.paths import any_path
 from unprocess_gen.core.types import Plan, Row, Source
 from unprocess_gen.dataset.keys import pair_key, patch_key
@@ -53,7 +53,7 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
     If deaths are counted and `run_records.LIMIT` workers have died at the shard, commit provisional rows.
     """
     storage = Storage(context.config.out)
-    try:
+    with machine_errors(any_path(context.config.out), RESUME):
         if not context.counts_deaths:
             return commit_shard(storage, make_shard(context, task))
         deaths = Deaths(storage, task.shard)
@@ -63,9 +63,7 @@ def make_and_commit(context: RunContext, task: ShardTask) -> ShardReport:
             with deaths.marked() as mark:
                 report = commit_shard(storage, make_shard(context, task, mark))
         deaths.forget()
-    except OSError as error:
-        raise machine_error(error, any_path(context.config.out), RESUME) from error
-    return report
+        return report
 
 
 DEATHS = {2: ("two workers died", "its worker died twice"), 4: ("four workers died", "its worker died four times")}
@@ -79,10 +77,8 @@ def commit_provisional(context: RunContext, task: ShardTask, source: Source, dea
     seed = context.config.seed
     rows = tuple(failed_row(lost, None, task.shard, seed, "worker_died", detail) for lost in task.sources)
     result = ShardResult(task.shard, None, 0, None, rows, killer=f"{source.name}: {in_progress}")
-    try:
+    with machine_errors(any_path(context.config.out), RESUME):
         return commit_shard(Storage(context.config.out), result)
-    except OSError as error:
-        raise machine_error(error, any_path(context.config.out), RESUME) from error
 
 
 def make_shard(context: RunContext, task: ShardTask, mark: Mark = lambda source: None) -> ShardResult:

@@ -34,7 +34,7 @@ from yaml import YAMLError
 from unprocess_gen.config.serialization import differences
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, DamageError
-from unprocess_gen.core.files import file_sha256, machine_error
+from unprocess_gen.core.files import file_sha256, machine_errors
 from unprocess_gen.core.paths import AnyPath, any_path
 from unprocess_gen.core.records import MAX_BYTES, parse_json
 from unprocess_gen.core.types import Source
@@ -165,22 +165,17 @@ class Workspace:
         self._check_same_sources(known, sources, lambda source, _: source.sha256)
         facts = self.facts()
         assert facts is not None
-        sizes = self.storage.names("shards")
+        sizes = {f"shards/{name}": size for name, size in self.storage.names("shards").items()}
         for entry in facts["shards"]:
-            self._check_size(entry, sizes)
+            size = sizes.get(entry["file"])
+            if entry["file"] is not None and size != entry["bytes"]:
+                found = "is missing" if size is None else f"has {size} bytes"
+                raise DamageError(
+                    f"{self.out}/{entry['file']}: {found}, expected {entry['bytes']} bytes; gen-dataset verify "
+                    f"{self.out} --repair restores it"
+                )
         self.storage.remove_work(keep_records=False)
         return facts
-
-    def _check_size(self, entry: dict[str, Any], sizes: dict[str, int]) -> None:
-        if entry["file"] is None:
-            return
-        size = sizes.get(Path(entry["file"]).name)
-        if size != entry["bytes"]:
-            found = "is missing" if size is None else f"has {size} bytes"
-            raise DamageError(
-                f"{self.out}/{entry['file']}: {found}, expected {entry['bytes']} bytes; gen-dataset verify {self.out} "
-                "--repair restores it"
-            )
 
     def _check_same_settings(self, root: str | None = None) -> None:
         if self.storage.size("config.yaml") is None:
@@ -230,7 +225,7 @@ class Workspace:
         """
         entries: list[dict[str, Any]] = []
         tally = Tally()
-        try:
+        with machine_errors(any_path(self.out), RESUME):
             manifest = self.storage.scratch / "manifest.csv"
             digest = hashlib.sha256()
             with manifest.open("wb", buffering=2**20) as stream:
@@ -243,8 +238,6 @@ class Workspace:
             dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, derived | facts_of(tally))
             self.storage.write("dataset.json", dataset_text(dataset))
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
-        except OSError as error:
-            raise machine_error(error, any_path(self.out), RESUME) from error
         return dataset
 
     def _write_parquet(self, manifest: Path) -> dict[str, Any]:
