@@ -32,7 +32,7 @@ from unprocess_gen.pipeline import generate as runner
 from unprocess_gen.pipeline import worker
 from unprocess_gen.pipeline.executors import local
 from unprocess_gen.pipeline.run import shard_tasks
-from unprocess_gen.pipeline.tally import COUNTS
+from unprocess_gen.pipeline.tasks import COUNTS
 
 SHARDS_OF_5 = "output.pairs_per_shard=5"
 

@@ -26,7 +26,6 @@ rows and frames give equal bytes. Decisions: ``docs/design/dataset_format.md``.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
@@ -39,7 +38,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.files import array_xxh3, commit_file, machine_error
+from unprocess_gen.core.files import array_xxh3, commit_file, machine_errors
 from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
@@ -171,20 +170,14 @@ def _content(pairs: RawPairs, file: _File) -> bytes:
 
 def _write(path: Path, content: bytes) -> None:
     """Write to a temporary file and rename it, so that no incomplete file is visible."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--to {path.parent}: cannot be written ({error.strerror})") from error
     aside = path.with_name(f".{path.name}.part")
-    try:
-        aside.write_bytes(content)
-        commit_file(aside, path)
-    except PermissionError as error:
-        raise ConfigError(f"--to {path.parent}: cannot be written ({error.strerror})") from error
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            aside.unlink()
-        raise machine_error(error, path) from error
+    with machine_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            aside.write_bytes(content)
+            commit_file(aside, path)
+        finally:
+            aside.unlink(missing_ok=True)
 
 
 # --------------------------------------------------------------------------------------------------------- one file

@@ -35,8 +35,7 @@ from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.pipeline.run import Run, resolve
 from unprocess_gen.pipeline.run_records import text_sha256
 from unprocess_gen.pipeline.sizes import check_free_space
-from unprocess_gen.pipeline.tally import Tally
-from unprocess_gen.pipeline.tasks import SHOWN, RunContext, ShardReport, ShardTask, StageTimes
+from unprocess_gen.pipeline.tasks import SHOWN, RunContext, ShardReport, ShardTask, StageTimes, Tally
 from unprocess_gen.pipeline.workspace import Workspace
 from unprocess_gen.sources.clips import ClipSizes
 from unprocess_gen.sources.video.decode import is_installed
@@ -61,7 +60,7 @@ class Summary:
     failed : dict of str to int
         Failed rows by reason.
     sites : dict of str to int
-        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`tally.COUNTS`).
+        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`tasks.COUNTS`).
     shards, bytes : int
         Number of shards and the sum of their sizes.
     seconds : float

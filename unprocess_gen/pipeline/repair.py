@@ -48,8 +48,7 @@ from unprocess_gen.dataset.shards import (
 from unprocess_gen.pipeline.replay import ADVICE, PairRegenerator
 from unprocess_gen.pipeline.run import resolve
 from unprocess_gen.pipeline.storage import Storage
-from unprocess_gen.pipeline.tally import Tally
-from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult
+from unprocess_gen.pipeline.tasks import RunContext, ShardLog, ShardResult, Tally
 from unprocess_gen.pipeline.verify import expected_samples, noisy_member_of, shard_rows
 from unprocess_gen.pipeline.worker import make_image
 from unprocess_gen.pipeline.workspace import dataset_facts, dataset_text, fingerprint, read_dataset
@@ -97,14 +96,15 @@ def repair(folder: Path, root: str | None, dark: DarkPlaces = NO_DARK_FRAMES) ->
     """
     with closing(Storage(folder)) as storage, machine_errors(folder):
         storage.hold()
-        yield from _Repair(folder, root, dark, storage.scratch).steps()
+        yield from _Repair(folder, root, dark, storage).steps()
 
 
 class _Repair:
     """Hold a dataset under repair: its folder, the intact content of ``dataset.json`` (or {}), and its config."""
 
-    def __init__(self, folder: Path, root: str | None, dark: DarkPlaces, temporary: Path) -> None:
-        self._folder, self._root, self._dark, self._temporary = folder, root, dark, temporary
+    def __init__(self, folder: Path, root: str | None, dark: DarkPlaces, storage: Storage) -> None:
+        self._folder, self._root, self._dark = folder, root, dark
+        self._storage, self._temporary = storage, storage.scratch
         self._config_file, self._manifest_file = folder / "config.yaml", folder / "manifest.csv"
         self._regenerator = PairRegenerator(root, dark)
         try:
@@ -122,8 +122,7 @@ class _Repair:
             if pairs := [row for row in rows if row["status"] == "ok"]:
                 names.add(shard_name(number))
                 yield from self._restore_shard(self._folder / "shards" / shard_name(number), pairs)
-        present = os.listdir(self._folder / "shards") if (self._folder / "shards").is_dir() else ()
-        for name in sorted(set(present) - names):
+        for name in sorted(self._storage.names("shards").keys() - names):
             yield RepairStep(f"shards/{name}", f"moved to {self._move_aside(self._folder / 'shards' / name)}")
         if config.output.parquet:
             yield from self._restore_parquet(config)
@@ -134,10 +133,6 @@ class _Repair:
         """Rename a finished file to its final name; create its folder if that was deleted."""
         path.parent.mkdir(exist_ok=True)
         commit_file(temporary, path)
-
-    def _write(self, name: str, text: str) -> None:
-        (self._temporary / name).write_bytes(text.encode("utf-8"))
-        self._place(self._temporary / name, self._folder / name)
 
     def _fingerprint(self) -> str:
         """Text that proves ``config.yaml`` and ``manifest.csv`` intact, but no other file."""
@@ -167,7 +162,7 @@ class _Repair:
             kept = str(self._facts.get("config", ""))
             if hashlib.sha256(kept.encode()).hexdigest() != self._facts["config_sha256"]:
                 raise DamageError(f"{self._config_file}: dataset.json holds no copy of it; {AGAIN}")
-            self._write("config.yaml", kept)
+            self._storage.write("config.yaml", kept)
             yield RepairStep("config.yaml", "restored from dataset.json")
             return
         proofs = digest, self._fingerprint()
@@ -322,7 +317,7 @@ class _Repair:
         self._place(part, self._folder / parquet.NAME)
         yield RepairStep(parquet.NAME, "written from manifest.csv")
         if self._facts and new[PARQUET_SHA256] != recorded:
-            self._write("dataset.json", dataset_text(self._facts | new))
+            self._storage.write("dataset.json", dataset_text(self._facts | new))
             yield RepairStep("dataset.json", f"has the SHA-256 of the new {parquet.NAME}")
 
     def _restore_dataset_json(self, config: Config) -> RepairStep:
@@ -340,11 +335,11 @@ class _Repair:
         digest = old.pop("dataset_sha256", None)
         same = dataset_text(old | known)
         if json.loads(same)["dataset_sha256"] == digest:
-            self._write("dataset.json", same)
+            self._storage.write("dataset.json", same)
             return RepairStep("dataset.json", "restored, to the same bytes")
         source = {"kind": source_kind(config), "root": config.source.root or None}
         lost = dict.fromkeys(("not_matched", "skipped_links", "run", "versions"))
-        self._write("dataset.json", dataset_text(known | lost | {"source": source}))
+        self._storage.write("dataset.json", dataset_text(known | lost | {"source": source}))
         return RepairStep("dataset.json", "rebuilt from the other files; host, time and versions of the run are lost")
 
     def _entry(self, number: int, rows: Sequence[Row], old: Facts) -> Facts:

@@ -38,8 +38,7 @@ from unprocess_gen.dataset.dataset_json import ShardFacts, check_shard
 from unprocess_gen.dataset.manifest import current_lines, row_of_values, rows_text
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.storage import WORK, Storage
-from unprocess_gen.pipeline.tally import Tally
-from unprocess_gen.pipeline.tasks import ShardReport, ShardResult
+from unprocess_gen.pipeline.tasks import ShardReport, ShardResult, Tally
 
 # ------------------------------------------------------------------------------------------------------------- sources
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -90,18 +91,15 @@ def estimate_shards(config: Config, tasks: Sequence[ShardTask], headers: int = S
     sources = [source for task in tasks for source in task.sources]
     if not sources:
         return SizeEstimate(0, 0)
-    film: dict[str, int] = {}
-    sample = evenly_spaced(sources, headers)
-    with reading_ahead(config.source.root, read_bytes, sample) as read:
-        sizes = [_header_bytes(config, source, film, read) for source in sample]
+    sizes = _sampled_bytes(config, sources, headers)
     if len(sizes) < len(sources):
         mean = sum(sizes) // len(sizes)
         largest = max(len(task.sources) for task in tasks)
         total = mean * len(sources) + len(tasks) * shard_bytes([0])
         return SizeEstimate(total, shard_bytes([mean] * largest))
     by_index = {source.index: size for source, size in zip(sources, sizes, strict=True)}
-    of_shards = [shard_bytes([by_index[source.index] for source in task.sources if by_index[source.index]])
-                 for task in tasks]  # fmt: skip
+    in_shards = ([by_index[source.index] for source in task.sources] for task in tasks)
+    of_shards = [shard_bytes(list(filter(None, shard))) for shard in in_shards]
     return SizeEstimate(sum(of_shards), max(of_shards))
 
 
@@ -142,10 +140,7 @@ def fitting_pairs_per_shard(config: Config, sources: Sequence[Source]) -> int:
         From the mean size of those sources, among `SAMPLE` of them, that can be read; 1 if a single one takes more. The
         default if none can be read.
     """
-    film: dict[str, int] = {}
-    sample = evenly_spaced(sources, SAMPLE)
-    with reading_ahead(config.source.root, read_bytes, sample) as read:
-        sizes = [size for source in sample if (size := _header_bytes(config, source, film, read))]
+    sizes = list(filter(None, _sampled_bytes(config, sources, SAMPLE)))
     if not sizes:
         return int(OutputConfig().pairs_per_shard)
     return min(max(1, SHARD_BYTES * len(sizes) // sum(sizes)), MAX_PAIRS_PER_SHARD)
@@ -200,19 +195,24 @@ def _check_temporary_space(needed: int, out: ObjectPath) -> None:
         )
 
 
-def _header_bytes(config: Config, source: Source, film: dict[str, int], read: Read) -> int:
-    """Return the bytes of a source in its shard, 0 if it will fail; ``film`` keeps the size of a video's frames.
+def _sampled_bytes(config: Config, sources: Sequence[Source], count: int) -> list[int]:
+    """Bytes of at most ``count`` evenly spaced sources in their shards, 0 for sources that will fail.
 
     Frames of all videos are taken to be as large as those of the first one, because opening a video reads all of it.
     """
-    try:
-        if not source.is_video:
-            return _size_in_shard(config, source, read)
-        if not film:
-            film[""] = _size_in_shard(config, replace(source, frame=0), read)
-        return film[""]
-    except (SourceError, MachineError):
-        return 0
+    sizes: list[int] = []
+    frame_size = None
+    sample = evenly_spaced(sources, count)
+    with reading_ahead(config.source.root, read_bytes, sample) as read:
+        for source in sample:
+            size = frame_size if source.is_video else None
+            if size is None:
+                with suppress(SourceError, MachineError):
+                    size = _size_in_shard(config, source, read)
+            if source.is_video:
+                frame_size = size
+            sizes.append(size or 0)
+    return sizes
 
 
 def _size_in_shard(config: Config, source: Source, read: Read) -> int:
@@ -220,7 +220,7 @@ def _size_in_shard(config: Config, source: Source, read: Read) -> int:
     if config.source.root is None:
         height, width = synthetic.SIZES.get(source.path, synthetic.DEFAULT_SIZE)
     elif source.is_video:
-        height, width = load_source(config.source, source)[1].srgb.shape[:2]
+        height, width = load_source(config.source, replace(source, frame=0))[1].srgb.shape[:2]
         side = 1
     else:
         header = probe(read(config.source.root, source))

@@ -1,16 +1,16 @@
-"""Define what a coordinator and its workers exchange: the context of a run, and task, result and report of a shard."""
+"""Define what a coordinator and its workers exchange: context of a run; task, result, report and counts of a shard."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from unprocess_gen.config.schema import Config
-from unprocess_gen.core.types import NO_CLIP, Row, Source, Value
+from unprocess_gen.core.types import NO_CLIP, Counts, Row, Source, Value
 from unprocess_gen.dataset.keys import group_by_image
 from unprocess_gen.dataset.shards import shard_name
 from unprocess_gen.pipeline.pairs import PairSettings
@@ -244,3 +244,55 @@ class ShardReport:
     killer: str | None = None
     log: ShardLog = field(default_factory=ShardLog)
     failures: tuple[str, ...] = ()
+
+
+COUNTS = tuple(field.name for field in fields(Counts))
+"""Columns of the manifest that count sites."""
+
+
+@dataclass(slots=True)
+class Tally:
+    """Count the rows of a dataset.
+
+    Attributes
+    ----------
+    pairs : int
+        Rows with status ``ok``.
+    failed : dict of str to int
+        Failed rows by reason.
+    sites : dict of str to int
+        Sum over all pairs of width x height (``all``) and of each of the manifest's counts (`COUNTS`).
+    """
+
+    pairs: int = 0
+    failed: dict[str, int] = field(default_factory=dict)
+    sites: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("all", *COUNTS), 0))
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> Tally:
+        """Count rows."""
+        tally = cls()
+        for row in rows:
+            tally.add_row(row)
+        return tally
+
+    def add_row(self, row: Row) -> None:
+        """Count one row."""
+        if row["status"] != "ok":
+            self.failed[str(row["reason"])] = self.failed.get(str(row["reason"]), 0) + 1
+            return
+        self.pairs += 1
+        self.sites["all"] += int(row["width"] or 0) * int(row["height"] or 0)
+        for name in COUNTS:
+            self.sites[name] += int(row[name] or 0)
+
+    def add(self, other: Tally) -> None:
+        """Add the counts of other rows."""
+        self.pairs += other.pairs
+        for mine, others in ((self.failed, other.failed), (self.sites, other.sites)):
+            for name, count in others.items():
+                mine[name] = mine.get(name, 0) + count
+
+    def facts(self) -> dict[str, Any]:
+        """Counts as ``dataset.json`` holds them."""
+        return {"pairs": self.pairs, "failed": dict(sorted(self.failed.items())), "sites": dict(self.sites)}

@@ -43,7 +43,7 @@ from unprocess_gen.dataset.dataset_json import PARQUET_SHA256, check_dataset_jso
 from unprocess_gen.dataset.manifest import header_text, read_rows
 from unprocess_gen.pipeline.run_records import INDEX, ShardRecords, recorded_sources, write_listing
 from unprocess_gen.pipeline.storage import WORK, Storage, cannot_write
-from unprocess_gen.pipeline.tally import Tally
+from unprocess_gen.pipeline.tasks import Tally
 from unprocess_gen.sources.reading import content_sha256
 
 REPORT = "report.html"
