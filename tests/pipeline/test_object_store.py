@@ -306,7 +306,7 @@ def test_provisional_rows_keep_the_records(twelve: Path, bucket: ObjectPath) -> 
     storage.remove_work(keep_records=True)
     assert storage.read(".work/rows/00000.json") == "{}"
     storage.remove_work(keep_records=False)
-    assert storage.names("") == {}
+    assert storage.path.entries() == {}
     with pytest.raises(FileNotFoundError):
         storage.read(".work/rows/00000.json")
 

@@ -130,7 +130,7 @@ def freeze(
 
 
 def _new_plan(workspace: Workspace, run: Run, on_compiling: OnCompiling | None, parts: int | None) -> FrozenPlan:
-    if workspace.storage.size(INDEX) is None:  # version 0.1 began the dataset
+    if (workspace.storage / INDEX).size() is None:  # version 0.1 began the dataset
         write_listing(workspace.storage, run.sources)
     smallest_first = sorted(run.sources[:TRIED], key=lambda source: source.size_bytes or 0)
     index, sha256 = _make_canary(run.settings, smallest_first, on_compiling)
@@ -176,7 +176,7 @@ def _make_canary(
 
 def recorded_plan(storage: Storage) -> FrozenPlan | None:
     """Read the plan of a run, None if there is none; raise ConfigError if another version recorded it."""
-    if not storage.has(PLAN):
+    if not (storage / PLAN).is_listed():
         return None
     plan = storage.record(PLAN, lambda content: parse_record(content, FrozenPlan))
     if plan.version != version(PACKAGE):

@@ -122,7 +122,7 @@ class _Repair:
             if pairs := [row for row in rows if row["status"] == "ok"]:
                 names.add(shard_name(number))
                 yield from self._restore_shard(self._folder / "shards" / shard_name(number), pairs)
-        for name in sorted(self._storage.names("shards").keys() - names):
+        for name in sorted((self._storage / "shards").entries().keys() - names):
             yield RepairStep(f"shards/{name}", f"moved to {self._move_aside(self._folder / 'shards' / name)}")
         if config.output.parquet:
             yield from self._restore_parquet(config)

@@ -125,10 +125,10 @@ class RecordedListing:
 
 def recorded_sources(storage: Storage) -> Iterator[Source]:
     """Yield every recorded source, those of version 0.1 with name, size and digest only; nothing without a record."""
-    if storage.has(INDEX):
+    if (storage / INDEX).is_listed():
         listing = RecordedListing(storage)
         yield from listing.sources(0, listing.count)
-    elif storage.has(OLD_LISTING):
+    elif (storage / OLD_LISTING).is_listed():
         rows = storage.record(OLD_LISTING, lambda content: parse_record(content, list[_OldSource]))
         yield from (Source(index, name, name, size, sha256=sha256) for index, (name, size, sha256) in enumerate(rows))
 
@@ -142,7 +142,7 @@ ROWS = f"{WORK}/rows"
 def commit_shard(storage: Storage, result: ShardResult) -> ShardReport:
     """Put a finished shard in place, then its record, and describe it; raise OSError if the storage fails."""
     if result.path is not None:
-        storage.commit(Path(result.path), f"shards/{shard_name(result.shard)}")
+        (storage / f"shards/{shard_name(result.shard)}").commit(Path(result.path))
     report = result.report()
     csv = rows_text(result.rows)
     facts = {
@@ -224,21 +224,21 @@ class ShardRecords:
 
     def committed(self, shards: Iterable[int]) -> set[int]:
         """Find the committed ones among shards: their record is readable, not provisional, and fits the file."""
-        sizes = self._storage.names("shards")
+        sizes = (self._storage / "shards").entries()
         candidates = sorted(self.recorded(shards))
-        are_committed = self._storage.each(
+        are_committed = self._storage.path.each(
             lambda shard: self._is_committed(shard, sizes.get(shard_name(shard))), candidates
         )
         return {shard for shard, is_committed in zip(candidates, are_committed, strict=True) if is_committed}
 
     def recorded(self, shards: Iterable[int]) -> set[int]:
         """Find the shards that have a record, provisional ones included."""
-        names = self._storage.names(ROWS)
+        names = (self._storage / ROWS).entries()
         return {shard for shard in shards if Path(record_name(shard)).name in names}
 
     def is_committed(self, shard: int) -> bool:
         """Check whether a shard is committed."""
-        return self._is_committed(shard, self._storage.size(f"shards/{shard_name(shard)}"))
+        return self._is_committed(shard, (self._storage / f"shards/{shard_name(shard)}").size())
 
     def _is_committed(self, shard: int, size: int | None) -> bool:
         try:
@@ -265,7 +265,7 @@ class Deaths:
 
     def __init__(self, storage: Storage, shard: int) -> None:
         self._storage, self._prefix = storage, f"{DEATHS}/{shard:05d}-"
-        names = (f"{DEATHS}/{name}" for name in storage.names(DEATHS))
+        names = (f"{DEATHS}/{name}" for name in (storage / DEATHS).entries())
         self._names = [name for name in names if name.startswith(self._prefix)]
 
     @property
@@ -294,15 +294,15 @@ class Deaths:
         try:
             yield mark
         finally:
-            self._storage.remove(name)
+            (self._storage / name).delete()
 
     def forget(self) -> None:
         """Remove the files of earlier attempts."""
         for name in self._names:
-            self._storage.remove(name)
+            (self._storage / name).delete()
 
 
 def forget_deaths(storage: Storage) -> None:
     """Remove the files of all shards."""
-    for name in storage.names(DEATHS):
-        storage.remove(f"{DEATHS}/{name}")
+    for name in (storage / DEATHS).entries():
+        (storage / f"{DEATHS}/{name}").delete()

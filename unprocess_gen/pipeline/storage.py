@@ -15,14 +15,14 @@ import platform
 import re
 import shutil
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, LockedError, MachineError, UnprocessGenError
 from unprocess_gen.core.files import machine_error
 from unprocess_gen.core.locks import LockFile, has_ended, is_held
-from unprocess_gen.core.object_store import Item, ObjectPath, Result, StoreAccessError
+from unprocess_gen.core.object_store import ObjectPath, Result, StoreAccessError
 from unprocess_gen.core.output_paths import is_dataset
 from unprocess_gen.core.paths import LocalPath, any_path
 from unprocess_gen.core.records import MAX_BYTES
@@ -49,28 +49,33 @@ class Storage:
     ----------
     out : str or path
         Folder or URL of the dataset.
+
+    Attributes
+    ----------
+    path : LocalPath or ObjectPath
+        The place; ``storage / name`` is the path of a file below it.
     """
 
     def __init__(self, out: str | os.PathLike[str] | ObjectPath) -> None:
         self.out = str(out)
-        self._out = any_path(out)
-        self._lock = None if isinstance(self._out, ObjectPath) else LockFile(self._out / WORK / LOCK)
+        self.path = any_path(out)
+        self._lock = None if isinstance(self.path, ObjectPath) else LockFile(self.path / WORK / LOCK)
         self._owner: LockFile | None = None
 
     def open(self) -> None:
         """Create the place; raise ConfigError if it is inside a dataset or cannot be created."""
         try:
-            dataset = next((folder for folder in self._out.resolve().parents if is_dataset(folder)), None)
+            dataset = next((folder for folder in self.path.resolve().parents if is_dataset(folder)), None)
             if dataset is not None:
                 raise ConfigError(
-                    f"out={self._out}: is inside the dataset {dataset}; expected a folder outside of it; choose "
+                    f"out={self.path}: is inside the dataset {dataset}; expected a folder outside of it; choose "
                     "another out"
                 )
-            self._out.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
         except StoreAccessError as error:
             raise ConfigError(f"out={error}") from None
         except OSError as error:
-            raise cannot_write(error, str(self._out)) from error
+            raise cannot_write(error, str(self.path)) from error
 
     def hold(self) -> None:
         """Lock a folder; raise LockedError if another process holds it, ConfigError if it cannot be written."""
@@ -81,10 +86,10 @@ class Storage:
             self._lock.acquire(wait=False)
         except BlockingIOError:
             raise LockedError(
-                f"out={self._out}: another run is writing to it; wait for that run, or choose another out"
+                f"out={self.path}: another run is writing to it; wait for that run, or choose another out"
             ) from None
         except OSError as error:
-            raise cannot_write(error, str(self._out)) from error
+            raise cannot_write(error, str(self.path)) from error
 
     def close(self) -> None:
         """Delete the unfinished files of this process, and release the lock."""
@@ -95,17 +100,8 @@ class Storage:
                 with contextlib.suppress(OSError):  # contains files of an unfinished run, or was deleted
                     folder.rmdir()
 
-    def names(self, folder: str) -> dict[str, int]:
-        """Entries of a folder: bytes of files, -1 for others; empty if the folder does not exist."""
-        return self._path(folder).entries()
-
-    def size(self, name: str) -> int | None:
-        """Size of a file in bytes, None if there is no such file."""
-        return self._path(name).size()
-
-    def has(self, name: str) -> bool:
-        """Check whether there is a file, folder or anything else of this name."""
-        return self._path(name).is_listed()
+    def __truediv__(self, name: str) -> LocalPath | ObjectPath:
+        return self.path / name
 
     def read(self, name: str) -> str:
         """Return the text of a file; raise FileNotFoundError if there is none."""
@@ -113,7 +109,7 @@ class Storage:
 
     def read_bytes(self, name: str) -> bytes:
         """Return the content of a regular file of at most `MAX_BYTES`; raise FileNotFoundError if there is none."""
-        path = self._path(name)
+        path = self / name
         if isinstance(path, LocalPath) and (path.size() or 0) > MAX_BYTES:
             raise ValueError(f"more than {MAX_BYTES} bytes")
         return path.read_bytes()
@@ -123,7 +119,7 @@ class Storage:
         try:
             return parse(self.read_bytes(name))
         except (OSError, ValueError) as error:
-            if isinstance(error, FileNotFoundError) and not self._out.exists():
+            if isinstance(error, FileNotFoundError) and not self.path.exists():
                 raise  # out was deleted, which the caller reports
             raise self.unusable(name, error_in_one_line(error)) from error
 
@@ -133,29 +129,17 @@ class Storage:
 
     def write(self, name: str, text: str) -> None:
         """Write a file durably, or replace it."""
-        self._path(name).write(text.encode(), f"{self._out}/{WORK}")
+        (self / name).write(text.encode(), f"{self.path}/{WORK}")
 
     def create(self, name: str, text: str) -> bool:
         """Write a file durably unless it exists; return whether it was written."""
-        return self._path(name).create(text.encode(), f"{self._out}/{WORK}")
-
-    def commit(self, file: Path, name: str) -> None:
-        """Move a finished file of `scratch` to a name, durably; replace a file of that name."""
-        self._path(name).commit(file)
-
-    def remove(self, name: str) -> None:
-        """Remove a file; ignore one that does not exist."""
-        self._path(name).delete()
-
-    def each(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """Apply a function that reads files to items, in threads if a store is slow; yield the results in order."""
-        return self._out.each(function, items)
+        return (self / name).create(text.encode(), f"{self.path}/{WORK}")
 
     @property
     def scratch(self) -> Path:
         """Local folder for unfinished files of this process and its workers, named after host and process."""
         if self._owner is None:
-            place, prefix = self._out.scratch_place(TMP)
+            place, prefix = self.path.scratch_place(TMP)
             host = re.sub(r"[^A-Za-z0-9.]", "", platform.node())[:40]
             folder = place / f"{prefix}{host}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
             folder.mkdir(mode=0o700, parents=True)
@@ -172,10 +156,10 @@ class Storage:
 
     def begin(self) -> None:
         """Create the folder of shards; remove unfinished files of processes of this host that have ended."""
-        self._path("shards").mkdir(exist_ok=True)
-        for name, size in self.names(TMP).items():
+        (self / "shards").mkdir(exist_ok=True)
+        for name, size in (self / TMP).entries().items():
             if size >= 0:  # version 0.1 had no folders of writers
-                self.remove(f"{TMP}/{name}")
+                (self / f"{TMP}/{name}").delete()
         for folder in self._scratch_folders():
             if has_ended(folder / OWNER):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -186,17 +170,14 @@ class Storage:
         for folder in self._scratch_folders() if self._lock is not None else ():  # also those of other hosts
             if not is_held(folder / OWNER):
                 shutil.rmtree(folder, ignore_errors=True)
-        for name in self.names(WORK) if not keep_records else ():
+        for name in (self / WORK).entries() if not keep_records else ():
             if name not in (Path(TMP).name, LOCK):
-                self._path(f"{WORK}/{name}").delete_all()
+                (self / f"{WORK}/{name}").delete_all()
 
     def _scratch_folders(self) -> list[Path]:
         """List the folders of unfinished files of all writers that this process can see."""
-        place, prefix = self._out.scratch_place(TMP)
+        place, prefix = self.path.scratch_place(TMP)
         return [folder for folder in place.glob(f"{prefix}*") if folder.is_dir()]
-
-    def _path(self, name: str) -> LocalPath | ObjectPath:
-        return self._out / name if name else self._out
 
 
 def cannot_write(error: OSError, out: str) -> UnprocessGenError:

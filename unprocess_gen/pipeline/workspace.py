@@ -91,7 +91,7 @@ class Workspace:
 
     def _refuse_foreign_files(self) -> None:
         """Refuse a folder that contains files but no dataset, so that no file of the user is overwritten."""
-        found = self.storage.names("")
+        found = self.storage.path.entries()
         foreign = sorted(found.keys() - {WORK})
         if foreign and "config.yaml" not in found:
             raise ConfigError(
@@ -106,7 +106,7 @@ class Workspace:
 
     def facts(self) -> dict[str, Any] | None:
         """Return the contents of ``dataset.json``, None without one; raise DamageError if it is damaged."""
-        if self.storage.size("dataset.json") is None:
+        if (self.storage / "dataset.json").size() is None:
             return None
         try:
             return read_dataset(any_path(self.out) / "dataset.json")
@@ -131,7 +131,7 @@ class Workspace:
         """
         try:
             self._check_same_settings()  # another run may have begun since `check_begun`, where there are no locks
-            if self.storage.size(INDEX) is None:
+            if (self.storage / INDEX).size() is None:
                 write_listing(self.storage, sources)
             if not self.storage.create("config.yaml", self.config_yaml):
                 self._check_same_settings()
@@ -142,7 +142,7 @@ class Workspace:
             raise cannot_write(error, self.out) from error
 
     def _refuse_foreign_shards(self, shards: int) -> None:
-        for name in sorted(self.storage.names("shards")):
+        for name in sorted((self.storage / "shards").entries()):
             if not 0 <= _shard_number(name) < shards:
                 raise ConfigError(
                     f"out={self.out}: unexpected file {self.out}/shards/{name}; expected only committed shards; remove "
@@ -155,7 +155,7 @@ class Workspace:
         Raises ConfigError if it was made from other settings or sources, DamageError if a shard is missing or has
         another size.
         """
-        if self.storage.size("config.yaml") is None:
+        if (self.storage / "config.yaml").size() is None:
             raise DamageError(
                 f"{self.out}/config.yaml: is missing from a finished dataset; gen-dataset verify {self.out} "
                 "--repair restores it"
@@ -165,7 +165,7 @@ class Workspace:
         self._check_same_sources(known, sources, lambda source, _: source.sha256)
         facts = self.facts()
         assert facts is not None
-        sizes = {f"shards/{name}": size for name, size in self.storage.names("shards").items()}
+        sizes = {f"shards/{name}": size for name, size in (self.storage / "shards").entries().items()}
         for entry in facts["shards"]:
             size = sizes.get(entry["file"])
             if entry["file"] is not None and size != entry["bytes"]:
@@ -178,7 +178,7 @@ class Workspace:
         return facts
 
     def _check_same_settings(self, root: str | None = None) -> None:
-        if self.storage.size("config.yaml") is None:
+        if (self.storage / "config.yaml").size() is None:
             return
         try:
             differing = differences(self.config_yaml, self.storage.read("config.yaml"))
@@ -234,7 +234,7 @@ class Workspace:
                     stream.write(text)
             manifest_sha256 = digest.hexdigest()
             derived = self._write_parquet(manifest) if with_parquet else {}
-            self.storage.commit(manifest, "manifest.csv")
+            (self.storage / "manifest.csv").commit(manifest)
             dataset = dataset_facts(self.config_yaml, manifest_sha256, entries, derived | facts_of(tally))
             self.storage.write("dataset.json", dataset_text(dataset))
             self.storage.remove_work(keep_records=any(entry.get("provisional") for entry in entries))
@@ -245,13 +245,13 @@ class Workspace:
         path = self.storage.scratch / parquet.NAME
         parquet.write_parquet(manifest, path)
         sha256 = file_sha256(path)
-        self.storage.commit(path, parquet.NAME)
+        (self.storage / parquet.NAME).commit(path)
         return {PARQUET_SHA256: sha256}
 
     def _manifest(self, shards: int, entries: list[dict[str, Any]], tally: Tally) -> Iterator[bytes]:
         """Yield the text of the manifest; append the entry of each shard, and add its counts."""
         yield header_text().encode()
-        for record in self.storage.each(self.records.record, range(shards)):
+        for record in self.storage.path.each(self.records.record, range(shards)):
             entries.append(record.entry)
             tally.add(record.tally)
             yield record.csv

@@ -162,13 +162,13 @@ def make_shards(request: ChunkRequest) -> ChunkResult:
 
 def _is_planned(run: FrozenRun) -> bool:
     """Check whether the run has not ended, which another worker may have done meanwhile."""
-    return run.storage.size(PLAN) is not None
+    return (run.storage / PLAN).size() is not None
 
 
 def _leave(run: FrozenRun) -> None:
     """Delete the unfinished files of this process and, if the run has ended, records that were written after it."""
     with suppress(OSError):
-        if not _is_planned(run) and run.storage.size("dataset.json") is not None:
+        if not _is_planned(run) and (run.storage / "dataset.json").size() is not None:
             run.storage.remove_work(keep_records=False)
     run.storage.close()
 
