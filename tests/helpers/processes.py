@@ -8,7 +8,7 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -153,8 +153,20 @@ def session(leader: int) -> list[int]:
 
 
 def workers(leader: int) -> list[int]:
-    """Return the worker processes of a run."""
-    return [pid for pid in session(leader) if b"popen_loky_posix" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    """Return the worker processes of a run, which may be ending meanwhile."""
+    found = []
+    for pid in session(leader):
+        with suppress(OSError):
+            if b"popen_loky_posix" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                found.append(pid)
+    return found
+
+
+def stop(pids: Iterable[int]) -> None:
+    """Stop processes by SIGSTOP, and wait until they have stopped: the signal may reach them amid a system call."""
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+        wait_for(lambda pid=pid: Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
 
 
 def handles_signals(pid: int) -> bool:

@@ -40,6 +40,7 @@ from helpers.processes import (
     processes_per_core,
     running,
     session,
+    stop,
     unfinished,
     wait_for,
     workers,
@@ -105,17 +106,10 @@ def course(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Cours
         out = tmp_path_factory.mktemp("course")
         start = time.monotonic()
         with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=out) as process:
-            wait_for(lambda pid=process.pid: workers_of(pid))
+            wait_for(lambda pid=process.pid: workers(pid))
             worker = time.monotonic() - start
             assert process.wait(WAIT_S) == 0, i
     return Course(worker, time.monotonic() - start)
-
-
-def workers_of(leader: int) -> list[int]:
-    """Return the workers of a run that may be ending meanwhile."""
-    with suppress(OSError):
-        return workers(leader)
-    return []
 
 
 def moment_of(draw: random.Random, course: Course) -> float:
@@ -161,9 +155,9 @@ def test_run_continues_when_a_worker_is_killed_at_random_moments(
         out = tmp_path / str(kill) / "ds"
         out.parent.mkdir()
         with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=out.parent) as process:
-            found = wait_for(lambda pid=process.pid: workers_of(pid))
+            found = wait_for(lambda pid=process.pid: workers(pid))
             time.sleep(draw.uniform(0, 0.8 * (course.done - course.worker)))
-            found = workers_of(process.pid) or found
+            found = workers(process.pid) or found
             with suppress(ProcessLookupError):
                 os.kill(draw.choice(found), signal.SIGKILL)
                 hits += process.poll() is None
@@ -196,8 +190,7 @@ def test_orphaned_workers_do_not_disturb_the_next_run(
     with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path, **env) as process:
         wait_for(lambda: committed(out) >= 2)
         orphans = workers(process.pid)
-        for orphan in orphans:
-            os.kill(orphan, signal.SIGSTOP)
+        stop(orphans)
         os.kill(process.pid, signal.SIGKILL)
         process.wait(5)
         done = len(list((out / ".work/rows").glob("*.json")))  # a shard counts once its record exists
@@ -255,8 +248,9 @@ def test_killed_worker_is_noticed_within_five_seconds(
     """The killed worker was at the last photograph, so no other work would reveal its death."""
     env = acting_at(tmp_path, photographs / f"{COUNT - 1:03d}.png", "wait")
     with running(f"source.root={photographs}", ONE, "n_jobs=2", cwd=tmp_path, **env) as process:
-        wait_for(lambda: committed(tmp_path / "ds") == COUNT - 1 and (tmp_path / "note").exists())
-        idle = set(workers(process.pid)) - {asleep := int((tmp_path / "note").read_text())}
+        asleep = int(wait_for(lambda: (tmp_path / "note").exists() and (tmp_path / "note").read_text()))
+        wait_for(lambda: len(list((tmp_path / "ds/.work/rows").glob("*.json"))) == COUNT - 1)  # the records too
+        idle = set(workers(process.pid)) - {asleep}
         assert len(idle) == 1
         os.kill(asleep, signal.SIGKILL)
         killed = time.monotonic()

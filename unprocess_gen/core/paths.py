@@ -132,33 +132,37 @@ class LocalPath(_NativePath):
 
     def write(self, content: bytes, unfinished: str) -> None:
         """Write the file durably, or replace it; ``unfinished`` is a folder of the same file system."""
-        self.commit(self._written(content, unfinished))
+        with self._unfinished(content, unfinished) as temporary:
+            self.commit(temporary)
 
     def create(self, content: bytes, unfinished: str) -> bool:
         """Write the file durably unless it exists; return whether it was written."""
-        temporary = self._written(content, unfinished)
-        sync(temporary)
-        try:
-            os.link(temporary, self)
-        except FileExistsError:
-            return False
-        except OSError:  # a file system without hard links
+        with self._unfinished(content, unfinished) as temporary:
+            sync(temporary)
             try:
-                os.close(os.open(self, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+                os.link(temporary, self)
             except FileExistsError:
                 return False
-            os.replace(temporary, self)
-        finally:
-            temporary.unlink(missing_ok=True)
+            except OSError:  # a file system without hard links
+                try:
+                    os.close(os.open(self, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+                except FileExistsError:
+                    return False
+                os.replace(temporary, self)
         sync_folder(self.parent)
         return True
 
-    def _written(self, content: bytes, unfinished: str) -> Path:
-        temporary = Path(unfinished) / f"{self.name}.{uuid.uuid4().hex}.part"
-        for folder in (temporary.parent, self.parent):
-            folder.mkdir(exist_ok=True)
-        temporary.write_bytes(content)
-        return temporary
+    @contextmanager
+    def _unfinished(self, content: bytes, folder: str) -> Iterator[Path]:
+        """Write a temporary file, and delete it unless the body has renamed it."""
+        temporary = Path(folder) / f"{self.name}.{uuid.uuid4().hex}.part"
+        for place in (temporary.parent, self.parent):
+            place.mkdir(exist_ok=True)
+        try:
+            temporary.write_bytes(content)
+            yield temporary
+        finally:
+            temporary.unlink(missing_ok=True)
 
     def commit(self, file: Path) -> None:
         """Move a finished file of the same file system here, durably; replace a file of this name."""

@@ -38,9 +38,9 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from unprocess_gen.core.errors import ConfigError, DamageError
-from unprocess_gen.core.files import array_xxh3, commit_file, machine_errors
+from unprocess_gen.core.files import array_xxh3, machine_errors
 from unprocess_gen.core.output_paths import check_output_folder
-from unprocess_gen.core.paths import AnyPath
+from unprocess_gen.core.paths import AnyPath, LocalPath
 from unprocess_gen.core.types import UINT16, Float, Frame, Plan, Row
 from unprocess_gen.dataset.manifest import plan_from_row, without_empty
 from unprocess_gen.dataset.reader import RawPairs, mosaic_dn
@@ -169,15 +169,10 @@ def _content(pairs: RawPairs, file: _File) -> bytes:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write to a temporary file and rename it, so that no incomplete file is visible."""
-    aside = path.with_name(f".{path.name}.part")
+    """Write a file completely or not at all."""
     with machine_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            aside.write_bytes(content)
-            commit_file(aside, path)
-        finally:
-            aside.unlink(missing_ok=True)
+        LocalPath(path).write(content, str(path.parent))
 
 
 # --------------------------------------------------------------------------------------------------------- one file

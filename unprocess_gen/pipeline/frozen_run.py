@@ -15,6 +15,7 @@ import os
 import platform
 import threading
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from functools import cached_property, lru_cache
 from importlib.metadata import version
 from typing import Annotated
@@ -159,10 +160,9 @@ def _make_canary(
     settings: PairSettings, sources: Iterable[Source], on_compiling: OnCompiling | None
 ) -> tuple[int | None, str]:
     """Make the first usable source; return its index and the digest of its rows, None and "" without one."""
-    storage = Storage(settings.config.out)
-    context = RunContext(settings, str(storage.scratch), os.getpid(), on_compiling=on_compiling)
-    path = storage.scratch / "canary.tar"
-    try:
+    with closing(Storage(settings.config.out)) as storage:
+        context = RunContext(settings, str(storage.scratch), os.getpid(), on_compiling=on_compiling)
+        path = storage.scratch / "canary.tar"
         for source in sources:
             with ShardWriter(path) as writer:
                 rows = make_image(context, 0, source, writer, ShardLog())
@@ -170,8 +170,6 @@ def _make_canary(
             if rows[0]["status"] == "ok":
                 return source.index, hashlib.sha256(row_json(rows)).hexdigest()
         return None, ""
-    finally:
-        storage.close()
 
 
 def recorded_plan(storage: Storage) -> FrozenPlan | None:

@@ -279,22 +279,15 @@ def machine() -> dict[str, Any]:
 
 
 def _dark_facts(settings: PairSettings) -> dict[str, Any]:
-    """Place, number, sizes, noise and map of the dark frames; the place alone if they cannot be read here."""
+    """Place, number, sizes, noise and map of the dark frames; the places alone if they cannot be read here."""
     noise, dark_frames, folder = settings.config.noise, settings.dark_frames, settings.dark_folder
-    root, shading = absolute_text(noise.dark_frames), absolute_text(shading_place(noise))
-    if root is None:
+    if noise.dark_frames is None:
         return {}
-    if folder is not None and shading is not None:
-        shading = absolute_text(folder.shading_place)
-    places = {"root": root} | ({} if shading is None else {"shading": shading})
-    if dark_frames is None:
-        return {"dark_frames": places}
-    return {
-        "dark_frames": {
-            **places,
-            "count": len(dark_frames.frames),
-            "sizes": sorted({f"{frame.width}x{frame.height}" for frame in dark_frames.frames}),
-            "black_dn": dark_frames.black_dn,
-            "std_dn": math.sqrt(dark_frames.variance_dn2),
-        }
-    }
+    facts: dict[str, Any] = {"root": absolute_text(noise.dark_frames)}
+    if (shading := shading_place(noise)) is not None:
+        facts["shading"] = absolute_text(shading if folder is None else folder.shading_place)
+    if dark_frames is not None:
+        sizes = {f"{frame.width}x{frame.height}" for frame in dark_frames.frames}
+        facts |= {"count": len(dark_frames.frames), "sizes": sorted(sizes)}
+        facts |= {"black_dn": dark_frames.black_dn, "std_dn": math.sqrt(dark_frames.variance_dn2)}
+    return {"dark_frames": facts}
