@@ -28,6 +28,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from unprocess_gen import RawPairs
+from unprocess_gen.core import paths
 from unprocess_gen.core.errors import ConfigError, DamageError
 from unprocess_gen.core.types import Plan
 from unprocess_gen.dataset import dng
@@ -528,7 +529,7 @@ def test_full_disk_leaves_no_partial_file(
     def full(aside: Path, path: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(aside))
 
-    monkeypatch.setattr(dng, "commit_file", full)
+    monkeypatch.setattr(paths, "commit_file", full)
     done = run_main("dng", ds, "--keys", "00000000", "--to", "to")
     assert (done.code, done.err.count("\n")) == (5, 1)
     assert "No space left on device" in done.err

@@ -212,7 +212,7 @@ def test_record_of_sources_is_never_replaced(bucket: ObjectPath) -> None:
     storage = Storage(str(bucket / "ds"))
     sources = [Source(0, "a", "a", 1, etag="1")]
     assert write_listing(storage, sources) == write_listing(storage, sources)
-    with pytest.raises(ConfigError, match="out=ds: was begun with other sources"):
+    with pytest.raises(ConfigError, match=r"ds: was begun with other sources"):
         write_listing(storage, [replace(sources[0], etag="2")])
 
 
