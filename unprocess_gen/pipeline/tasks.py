@@ -127,9 +127,10 @@ class RunContext:
     def images_in_progress(self) -> int:
         """Count the images that workers have finished in shards that are not committed."""
         per_shard, count = self.config.output.pairs_per_shard, 0
-        for busy in Path(self.scratch).glob("*.busy"):
-            with suppress(OSError, ValueError):  # the shard was finished, or its file is being written
-                count += int(busy.read_text()) % per_shard
+        with suppress(OSError):  # the run has ended and deleted the folder
+            for busy in Path(self.scratch).glob("*.busy"):
+                with suppress(OSError, ValueError):  # the shard was finished, or its file is being written
+                    count += int(busy.read_text()) % per_shard
         return count
 
 
