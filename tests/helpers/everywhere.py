@@ -231,7 +231,7 @@ def code() -> dict[str, Any]:
 
 def compile_kernels() -> None:
     """Compile the outer kernels, and with them all others, for the arguments of their calls; execute none."""
-    for module, name in ((render, "_render"), (body, "_list_defects"), (body, "_fill_response")):
+    for module, name in ((render, "_render"), (body, "_fill_normals"), (body, "_fill_defects")):
         setattr(module, name, compiler(getattr(module, name)))
     for dtype in (np.uint8, np.uint16):
         for plan in plans():

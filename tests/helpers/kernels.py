@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from unprocess_gen.core.jit import inner, kernel
@@ -15,10 +13,8 @@ from unprocess_gen.simulation.kernels.normal import (
     coarse_normal,
     exact_value,
     fill_coarse_depths,
-    fill_depths,
     fill_rows,
     fill_values_by_lines,
-    fine_normal,
 )
 from unprocess_gen.simulation.kernels.normal import exact_values as kernel_exact_values
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks
@@ -87,13 +83,6 @@ def exact_values_by_vectors(words: Words, law: Quantiles) -> Float:
     return out[: words.size]
 
 
-def fine_normals(words: Words) -> Float32:
-    """Return the normals of words by the fine polynomials."""
-    depths, out = np.empty((2, _padded(words).size), dtype=np.float32)
-    _fill_fine(_padded(words), depths, out)
-    return out[: words.size]
-
-
 def coarse_normals(words: Words) -> Float32:
     """Return the normals of words by the coarse polynomials."""
     depths, out = np.empty((2, _padded(words).size), dtype=np.float32)
@@ -127,24 +116,13 @@ def _fill_by_vectors(words: Words, quadratics: Float, buffer: np.ndarray, out: F
         store(pointer_to(out, 0), x, kernel_exact_values(given, rows, x, table))
 
 
-def _polynomial_kernel(fill: Any, normal: Any) -> Any:
-    """Return a kernel that fills ``out`` with the normals of words by the polynomials of depth and quantile."""
-
-    @kernel
-    def fill_normals(words: Words, depths: Float32, out: Float32) -> None:
-        given, depth, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
-        fill(words.size, given, depth)
-        for n in range(words.size // VECTOR_WIDTH):
-            x = np.uint64(n) * _WIDTH
-            store(target, x, apply_signs(normal(load(depth, x)), load(given, x)))
-
-    return fill_normals
-
-
-_fill_fine, _fill_coarse = (
-    _polynomial_kernel(fill_depths, fine_normal),
-    _polynomial_kernel(fill_coarse_depths, coarse_normal),
-)
+@kernel
+def _fill_coarse(words: Words, depths: Float32, out: Float32) -> None:
+    given, depth, target = pointer_to(words, 0), pointer_to(depths, 0), pointer_to(out, 0)
+    fill_coarse_depths(words.size, given, depth)
+    for n in range(words.size // VECTOR_WIDTH):
+        x = np.uint64(n) * _WIDTH
+        store(target, x, apply_signs(coarse_normal(load(depth, x)), load(given, x)))
 
 
 # Frames ---------------------------------------------------------------------------------------------------------------

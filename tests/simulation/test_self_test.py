@@ -149,7 +149,7 @@ KERNEL_MODULES = (philox, strips, clean, normal, readout, gaussian, render)
 
 KERNELS = {
     "_fill_signal": "", "_fill_gray_mean_signal": "", "_fill_linear": "clean", "_recompute_bright": "clean",
-    "fill_word_blocks": "", "fill_depths": "", "approximate_gaussian": "noise_dn", "_round_and_list": "noisy",
+    "fill_word_blocks": "", "fill_values_by_lines": "", "approximate_gaussian": "noise_dn", "_round_and_list": "noisy",
     "exact_gaussian_site": "", "_replace": "noisy",
 }  # fmt: skip
 """Kernels of the set ``gaussian``, and the member of the workspace that each fills; "" for its last argument or its
@@ -190,6 +190,7 @@ def test_a_wrong_kernel_is_detected(kernel: str, monkeypatch: pytest.MonkeyPatch
     other = nudged(right, KERNELS[kernel])
     for module in holders:
         monkeypatch.setattr(module, kernel, other)
+    for module in KERNEL_MODULES:
         for value in vars(module).values():
             for kind, one in implementations(value).items():
                 if one is right:

@@ -5,11 +5,7 @@ from __future__ import annotations
 import functools
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-from unprocess_gen.core.types import DarkPixels, Plan
-from unprocess_gen.simulation.effects.dark_frame import dark_frame_offsets
+from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.order import effects_of
 from unprocess_gen.simulation.slots import Patterns, SiteNoise, Slots
 
@@ -32,17 +28,6 @@ def slots_of(plan: Plan) -> Slots:
 def fixed_patterns(plan: Plan) -> Patterns:
     """Return the fixed patterns of a plan; frames that share them can be simulated in one pass."""
     return slots_of(plan).patterns if plan.noise.physics is not None else Patterns()
-
-
-def fill_site_offsets(
-    plan: Plan,
-    dark_pixels: DarkPixels | None,
-    shape: tuple[int, int],
-    origin: tuple[int, int],
-    out: NDArray[np.float32],
-) -> None:
-    """Fill ``out`` with the frame's own offsets by site, DN."""
-    dark_frame_offsets(plan, dark_pixels, shape, origin, out=out)
 
 
 def _two_numbers(plan: Plan, black_dn: float) -> Slots:

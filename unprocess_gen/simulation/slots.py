@@ -141,7 +141,7 @@ class Slots(NamedTuple):
     planes_dn : tuple of four floats
         Offsets by plane, of the same sites as ``plane_gains``.
     has_site_offsets : bool
-        Whether the frame has offsets by site of its own (`plan_slots.fill_site_offsets`).
+        Whether the frame has offsets by site of its own (`dark_frame.dark_frame_offsets`).
     """
 
     black_dn: float

@@ -10,16 +10,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers.kernels import coarse_normals, exact_values, fine_normals, values_by_lines
+from helpers.kernels import coarse_normals, exact_values, values_by_lines
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import POLYNOMIAL_NORMAL
 from unprocess_gen.core.lookup_tables import LINES_PER_OCTAVE, normal_table, tukey_table
-from unprocess_gen.simulation.kernels.normal import (
-    FINE_ERROR,
-    build_quantiles,
-    normal_quantiles,
-)
+from unprocess_gen.simulation.kernels.normal import build_quantiles, normal_quantiles
 from unprocess_gen.simulation.reference import noise as effects
 
 SIGN = 2**31
@@ -88,40 +84,27 @@ def test_approximate_normals_are_within_their_error_for_every_word(figure: Figur
 
 # Polynomials ----------------------------------------------------------------------------------------------------------
 
-POLYNOMIALS = {
-    "fine": (fine_normals, FINE_ERROR),
-    "coarse": (coarse_normals, POLYNOMIAL_NORMAL),
-}
 
-
-def by_polynomial(words: np.ndarray, which: str) -> np.ndarray:
-    return POLYNOMIALS[which][0](words).astype(np.float64)
+@pytest.mark.parametrize("random_bits", RANDOM_BITS)
+def test_polynomial_normals_are_within_their_error(random_bits: int, figure: Figure) -> None:
+    off = np.abs(coarse_normals(telling_words(random_bits)).astype(np.float64) - reference("normal", random_bits))
+    assert 0.9 * POLYNOMIAL_NORMAL < off.max() <= POLYNOMIAL_NORMAL
+    figure("normal", f"coarse polynomial: at most {off.max():.2g} standard deviations off, {off.size} words")
 
 
 @pytest.mark.parametrize("random_bits", RANDOM_BITS)
-@pytest.mark.parametrize("which", POLYNOMIALS)
-def test_polynomial_normals_are_within_their_error(which: str, random_bits: int, figure: Figure) -> None:
-    error = POLYNOMIALS[which][1]
-    off = np.abs(by_polynomial(telling_words(random_bits), which) - reference("normal", random_bits))
-    assert 0.9 * error < off.max() <= error
-    figure("normal", f"{which} polynomial: at most {off.max():.2g} standard deviations off, {off.size} words")
-
-
-@pytest.mark.parametrize("random_bits", RANDOM_BITS)
-@pytest.mark.parametrize("which", POLYNOMIALS)
-def test_polynomial_normals_have_the_sign_of_their_word(which: str, random_bits: int) -> None:
+def test_polynomial_normals_have_the_sign_of_their_word(random_bits: int) -> None:
     words = telling_words(random_bits)
     half = words.size // 2
-    made = by_polynomial(words, which)
+    made = coarse_normals(words)
     assert (made[:half] == -made[half:]).all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", POLYNOMIALS)
-def test_polynomial_normals_are_within_their_error_for_every_word(which: str, figure: Figure) -> None:
+def test_polynomial_normals_are_within_their_error_for_every_word(figure: Figure) -> None:
     form, worst = normal_quantiles(), 0.0
     for start in range(0, SIGN, 2**24):
         words = np.arange(start, start + 2**24, dtype=np.uint32)
-        worst = max(worst, float(np.abs(by_polynomial(words, which) - exact_values(words, form)).max()))
-    assert worst <= POLYNOMIALS[which][1]
-    figure("normal", f"{which} polynomial: at most {worst:.2g} standard deviations off, all words")
+        worst = max(worst, float(np.abs(coarse_normals(words).astype(np.float64) - exact_values(words, form)).max()))
+    assert worst <= POLYNOMIAL_NORMAL
+    figure("normal", f"coarse polynomial: at most {worst:.2g} standard deviations off, all words")

@@ -239,11 +239,11 @@ def test_kernels_equal_the_reference_where_counts_change() -> None:
 def first_terms(words: np.ndarray, rate: float) -> np.ndarray:
     """Return x by the first terms as compiled: approximate normals, float32, without the integer part of the rate."""
     z, near, f = values_by_lines(words, normal_quantiles()), np.float32(rate), np.float32
-    c, reciprocal = kernels._TERMS32, f(1) / near
+    c, reciprocal = kernels._TERMS, f(1) / near
     s = z * (np.sqrt(near) * reciprocal)
     s2 = s * s
     terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * kernels._OF_RECIPROCAL32)
+    rest = np.sqrt(near) * z + ((z * z + f(2)) * terms + reciprocal * np.float32(kernels._OF_RECIPROCAL))
     assert rest.dtype == np.float32
     return np.asarray(np.float64(near) + rest.astype(np.float64))
 

@@ -1,9 +1,8 @@
-"""Prepare the fixed patterns of a camera body once for all of its frames: factors, offsets by site, and defects."""
+"""Prepare the fixed patterns of a camera body once for all of its frames: factors, offsets and defects by site."""
 
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,15 +13,16 @@ from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.random_streams import BLOCK, purpose
 from unprocess_gen.core.types import Float
 from unprocess_gen.simulation.effects.lens_shading import illumination
+from unprocess_gen.simulation.kernels import simd
 from unprocess_gen.simulation.kernels.normal import exact_values, fill_rows, normal_quantiles
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, philox_key
-from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, maximum, pointer_to, store, to_float32
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
 from unprocess_gen.simulation.kernels.strips import (
-    ONES,
     STRIP,
-    ZEROS,
     Float32,
     Scratch,
+    SiteMap,
+    equal_sites,
     locate,
     padded_width,
     scratch_of_thread,
@@ -33,56 +33,39 @@ from unprocess_gen.simulation.slots import BrightPixels, DeadPixels, NormalPatte
 SMALL_SITES, SMALL_PATTERNS, LARGE_PATTERNS = 2**16, 384, 5
 """So many patterns of crops of up to this many sites (0.3 MB each) are kept, and so many of larger crops."""
 
-RARE_STDS = 6.0
-"""Defects above their expected number, in standard deviations, for which lists rarely have no space."""
+DEAD, FIRST_STEP = 1, 2
+"""Numbers in the map of defects: a dead pixel, and the first step of the means of bright defects."""
 
 Shape = tuple[int, int]
 
 
-class SiteMap(NamedTuple):
-    """A value for each pixel: float32, whose columns are those of complete blocks; else `SIZE` equal numbers.
-
-    ``steps`` are the elements from row to row and from column to column, 0 if all are equal.
-    """
-
-    values: Float32
-    steps: tuple[int, int]
-
-
-class DefectLists(NamedTuple):
-    """List the defects of a crop of H rows in S strips each."""
-
-    strips: int  # S; 0 without defects
-    starts: NDArray[np.int64]  # [H * S + 1]: first defect of each strip
-    positions: NDArray[np.int64]  # index of each defect in the buffers of its strip
-    means_e: Float  # mean excess of a bright defect, electrons; negative for a pixel that reads 0
-
-
 class Body(NamedTuple):
-    """Hold the fixed patterns of a body for a crop: members of `SiteMap` and of `DefectLists`."""
+    """Hold the fixed patterns of a body for a crop."""
 
-    response: Float32  # factor on the electrons of light
-    response_steps: tuple[int, int]
-    sites_dn: Float32  # offsets by site
-    sites_steps: tuple[int, int]
-    strips: int
-    starts: NDArray[np.int64]
-    positions: NDArray[np.int64]
-    means_e: Float
+    response: SiteMap  # float32: factor on the electrons of light
+    sites_dn: SiteMap  # float32: offsets by site
+    defects: SiteMap  # uint16: 0, `DEAD`, or the step of a bright defect from `FIRST_STEP` on
+    means_e: Float  # by number in ``defects``: mean excess, electrons; 0 without a defect, negative for a dead pixel
 
 
-WITHOUT_FACTOR, WITHOUT_OFFSETS = SiteMap(ONES, (0, 0)), SiteMap(ZEROS, (0, 0))
-WITHOUT_DEFECTS = DefectLists(0, np.zeros(2, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS = equal_sites(1.0), equal_sites(0.0), equal_sites(0, np.uint16)
+WITHOUT_PATTERNS = Body(EQUAL_RESPONSE, NO_OFFSETS, NO_DEFECTS, np.zeros(1))
 
 
 def body_of(patterns: Patterns, shape: Shape, origin: Shape) -> Body:
     """Return the fixed patterns of a body for a crop of ``shape`` at ``origin``, without the factor on the light."""
-    electrons, sites, defects = patterns.electrons, patterns.sites_dn, (patterns.bright, patterns.dead)
+    electrons, sites, bright, dead = patterns.electrons, patterns.sites_dn, patterns.bright, patterns.dead
     return Body(
-        *(_kept(_normal_pattern, electrons, shape, origin) if electrons else WITHOUT_FACTOR),
-        *(_kept(_normal_pattern, sites, shape, origin) if sites else WITHOUT_OFFSETS),
-        *(_kept(_defect_lists, defects, shape, origin) if any(defects) else WITHOUT_DEFECTS),
+        _kept(_normal_pattern, electrons, shape, origin) if electrons else EQUAL_RESPONSE,
+        _kept(_normal_pattern, sites, shape, origin) if sites else NO_OFFSETS,
+        _kept(_defect_map, (bright, dead), shape, origin) if bright or dead else NO_DEFECTS,
+        _means_e(bright.mean_e if bright else 0.0),
     )
+
+
+@functools.lru_cache(maxsize=8)
+def _means_e(mean_e: float) -> Float:
+    return np.concatenate([[0.0, -1.0], mean_e * exponential_levels()])
 
 
 def light_factor(patterns: Patterns, body: Body, shape: Shape, origin: Shape, is_averaged: bool) -> SiteMap | None:
@@ -91,11 +74,11 @@ def light_factor(patterns: Patterns, body: Body, shape: Shape, origin: Shape, is
     ``is_averaged``: the clean frame contains the fixed patterns.
     """
     if patterns.light is None:
-        return SiteMap(body.response, body.response_steps) if is_averaged else None
+        return body.response if is_averaged else None
     light: SiteMap = _kept(_radial_factor, patterns.light, shape, origin)
-    if not is_averaged or not body.response_steps[0]:
+    if not is_averaged or not patterns.electrons:
         return light
-    return light._replace(values=(light.values * body.response.astype(np.float64)).astype(np.float32))
+    return light._replace(values=(light.values * body.response.values.astype(np.float64)).astype(np.float32))
 
 
 # A crop's pattern is computed once for all frames and patches at its place.
@@ -149,18 +132,18 @@ def _fill_normals(
     out: Float32,
 ) -> None:
     """Fill ``out`` with max(mean + std·n, least) for normal deviates n and ``numbers`` std, mean, least."""
-    workspace, target, normal = workspace_in(scratch), pointer_to(out, 0), pointer_to(quadratics, 0)
+    workspace, target, normal = workspace_in(scratch), simd.pointer_to(out, 0), simd.pointer_to(quadratics, 0)
     std, mean, least = numbers
     for y in range(out.shape[0]):
         for x in range(0, width, STRIP):
             strip = locate(origin, y, x, min(STRIP, width - x))
             fill_word_blocks(key, strip, stream, workspace.words)
-            row = pointer_to(target, y * out.shape[1] + x + strip.lead)
+            row = simd.pointer_to(target, y * out.shape[1] + x + strip.lead)
             fill_rows(strip.total, workspace.words, workspace.scratch)
             for v in range(strip.total // VECTOR_WIDTH):
                 n = np.uint64(v * VECTOR_WIDTH)
                 deviate = exact_values(workspace.words, workspace.scratch, n, normal)
-                store(row, n, to_float32(maximum(deviate * std + mean, least)))
+                simd.store(row, n, simd.to_float32(simd.maximum(deviate * std + mean, least)))
 
 
 # -------------------------------------------------------------------------------------------------------------- defects
@@ -171,64 +154,53 @@ def word_threshold(fraction: float) -> np.uint64:
     return np.uint64(int(fraction * 2**32))
 
 
-def _defect_lists(slots: tuple[BrightPixels | None, DeadPixels | None], shape: Shape, origin: Shape) -> DefectLists:
-    bright, dead = slots
-    if bright is None:
-        assert dead is not None
-        bright = BrightPixels(dead.body_key, dead.stream, 0.0, 0.0)
-    if dead is None:
-        dead = DeadPixels(bright.body_key, bright.stream, 0.0)
-    key, (height, width), scratch = philox_key(bright.body_key), shape, scratch_of_thread()
-    below, levels_e = (word_threshold(bright.share), word_threshold(dead.share)), bright.mean_e * exponential_levels()
-    if not any(below):
-        return WITHOUT_DEFECTS
-    purposes = purpose(bright.stream), purpose(bright.stream, draw=1), purpose(dead.stream)
-    streams = np.uint64(purposes[0]), np.uint64(purposes[1]), np.uint64(purposes[2])
-    strips = max(-(-width // STRIP), 1)
-    starts = np.zeros(height * strips + 1, dtype=np.int64)
-    mean = (bright.share + dead.share) * height * width
-    size, count = 0, max(int(mean + RARE_STDS * math.sqrt(mean)) + 8, 1)
-    while size < count:
-        size = count
-        positions, means_e = np.empty(size, dtype=np.int64), np.empty(size)
-        _list_defects(key, streams, below, levels_e, origin, width, scratch, starts, positions, means_e)
-        count = int(starts[-1])
-    return DefectLists(strips, starts, positions[:count], means_e[:count])
+def _defect_map(slots: tuple[BrightPixels | None, DeadPixels | None], shape: Shape, origin: Shape) -> SiteMap:
+    """Return the map of bright defects and of dead pixels; a missing slot has none."""
+    either = slots[0] or slots[1]
+    assert either is not None
+    bright, dead = (slot or DeadPixels(either.body_key, either.stream, 0.0) for slot in slots)
+    if not bright.share and not dead.share:
+        return NO_DEFECTS
+    streams = purpose(bright.stream), purpose(bright.stream, draw=1), purpose(dead.stream)
+    width = padded_width(origin[1], shape[1])
+    values = np.zeros((shape[0], width), dtype=np.uint16)
+    _fill_defects(
+        philox_key(either.body_key),
+        (np.uint64(streams[0]), np.uint64(streams[1]), np.uint64(streams[2])),
+        (word_threshold(bright.share), word_threshold(dead.share)),
+        origin,
+        shape[1],
+        scratch_of_thread(),
+        values,
+    )
+    return SiteMap(values.reshape(-1), (width, 1))
 
 
 @kernel
-def _list_defects(
+def _fill_defects(
     key: PhiloxKey,
     streams: tuple[np.uint64, np.uint64, np.uint64],
     below: tuple[np.uint64, np.uint64],
-    levels_e: Float,
     origin: Shape,
     width: int,
     scratch: Scratch,
-    starts: NDArray[np.int64],
-    positions: NDArray[np.int64],
-    means_e: Float,
+    out: NDArray[np.uint16],
 ) -> None:
-    """List bright defects and dead pixels, strip by strip: those whose words are below two thresholds.
-
-    ``starts`` counts all of them, also those for which the lists have no space.
-    """
-    workspace, count, strips = workspace_in(scratch), 0, max(-(-width // STRIP), 1)
+    """Fill ``out`` with the numbers of defects: pixels whose words of two streams are below a threshold."""
+    workspace, target = workspace_in(scratch), simd.pointer_to(out, 0)
     bright, dead, steps = workspace.words, workspace.site_words, workspace.dark_words
-    for n in range(starts.size - 1):
-        y, x = n // strips, n % strips * STRIP
-        strip, before = locate(origin, y, x, min(STRIP, width - x)), count
-        fill_word_blocks(key, strip, streams[0], bright)
-        fill_word_blocks(key, strip, streams[2], dead)
-        for site in range(strip.first, strip.after):
-            if np.uint64(bright[site]) < below[0] or np.uint64(dead[site]) < below[1]:
-                if count < positions.size:
-                    positions[count] = site
-                count += 1
-        if count > before:
-            fill_word_blocks(key, strip, streams[1], steps)
-            for d in range(before, min(count, positions.size)):
-                site = positions[d]
-                is_dead = np.uint64(dead[site]) < below[1]
-                means_e[d] = -1.0 if is_dead else levels_e[steps[site] >> np.uint32(22)]
-        starts[n + 1] = count
+    for y in range(out.shape[0]):
+        for x in range(0, width, STRIP):
+            strip = locate(origin, y, x, min(STRIP, width - x))
+            fill_word_blocks(key, strip, streams[0], bright)
+            fill_word_blocks(key, strip, streams[2], dead)
+            row = simd.pointer_to(target, y * out.shape[1] + x + strip.lead)
+            bright_count = np.int64(0)
+            for n in range(strip.first, strip.after):
+                bright_count += np.uint64(bright[n]) < below[0]
+                row[n] = np.uint16(np.uint64(dead[n]) < below[1]) * np.uint16(DEAD)
+            if bright_count > 0:
+                fill_word_blocks(key, strip, streams[1], steps)
+                for n in range(strip.first, strip.after):
+                    if row[n] == 0 and np.uint64(bright[n]) < below[0]:
+                        row[n] = np.uint16(FIRST_STEP + (steps[n] >> np.uint32(22)))

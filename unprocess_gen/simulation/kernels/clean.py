@@ -21,30 +21,15 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import Float, Plan
-from unprocess_gen.simulation.kernels.body import SiteMap
+from unprocess_gen.core.types import Plan
+from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.body import EQUAL_RESPONSE
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    Pointer,
-    Vector,
-    has_any_bit,
-    less_than,
-    load,
-    maximum,
-    minimum,
-    pointer_to,
-    store,
-    to_bits,
-    to_float32,
-    to_float64,
-    to_uint32,
-)
-from unprocess_gen.simulation.kernels.strips import ONES, Float32, Strip, Workspace, count_outside
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
+from unprocess_gen.simulation.kernels.strips import SiteMap, Strip, Workspace, count_outside, strip_values
 from unprocess_gen.simulation.reference.cfa import tile
 
 _0, _8 = np.uint64(0), np.uint64(8)
-_ZERO32, _ONE32 = np.float32(0), np.float32(1)
 _ROW_SITES = VECTOR_WIDTH + 2
 
 FLOAT32_MARGIN = 2.0**-18
@@ -56,25 +41,27 @@ FLOAT32_MARGIN = 2.0**-18
 class Scene(NamedTuple):
     """Hold the parameters of a clean frame in float64."""
 
-    products: Float  # [3, 3, codes]: matrix entry (c, j) times the curve at code k
+    products: NDArray[Any]  # [3, 3, codes]: matrix entry (c, j) times the curve at code k
     code_count: int
     site_channels: NDArray[np.int64]  # [2, VECTOR_WIDTH + 2]: channel of each CFA site
-    inverse_gains: Float  # [3]
+    inverse_gains: NDArray[Any]  # [3]
     gray_mean: bool
     highlight_threshold: float
-    steepness: float  # of the highlight term: 1 / (1 - threshold); used in float32 only
+    divisor: float  # of the highlight term, 1 - threshold; or 1, and ``steepness`` is its reciprocal
+    steepness: float
+    one: float  # 1 and 3 in the precision of the frame
+    three: float
     exposure: float
     brightest: float
     clipped: float  # light above it counts as clipped
     black_dn: Any  # float, or uint32 in Scene32
     span_dn: float
     dn_per_signal: float  # scale of the signal with gray_mean
-    limits: Float  # [2, VECTOR_WIDTH + 2]: signals up to it are neither highlights nor clipped nor saturated
-    signal_per_dn: Float  # [2, VECTOR_WIDTH + 2]; used in float32 only
-    gains: Float  # [2, VECTOR_WIDTH + 2]: of the sites of even and of odd rows; 1 with gray_mean
-    headroom: Float  # [2, VECTOR_WIDTH + 2]: factor of the per-channel highlight term, or 0
-    response: Float32  # [H * P], relative gain of each pixel; ones if the clean frame has no fixed pattern
-    response_steps: tuple[int, int]  # of a row and of a column; 0 if it has no fixed pattern
+    limits: NDArray[Any]  # [2, VECTOR_WIDTH + 2]: signals up to it are neither highlights nor clipped nor saturated
+    light_per_signal: NDArray[Any]  # [2, VECTOR_WIDTH + 2]: 1 in float64
+    gains: NDArray[Any]  # [2, VECTOR_WIDTH + 2]: of the sites of even and of odd rows; 1 with gray_mean
+    headroom: NDArray[Any]  # [2, VECTOR_WIDTH + 2]: factor of the per-channel highlight term, or 0
+    response: SiteMap  # relative gain of each pixel; in float64 only
 
 
 class Scene32(Scene):
@@ -84,68 +71,50 @@ class Scene32(Scene):
     """
 
 
+@functools.lru_cache(maxsize=4)
 def scene_of(plan: Plan, codes: int, origin: tuple[int, int], kind: type[Scene] = Scene) -> Scene:
     """Return the parameters of a plan for sources of ``codes`` codes; ``kind`` is `Scene` or `Scene32`."""
     in_float32, channels = kind is Scene32, _site_channels(plan.sensor.pattern, origin[0] % 2, origin[1] % 2)
     f: Any = np.float32 if in_float32 else np.float64
-    gray_mean, gains, limit = plan.camera.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
-    exposure, brightest, span_dn = (
-        plan.scene.exposure,
-        plan.brightest,
-        float(plan.sensor.white_level_dn - plan.sensor.black_level_dn),
-    )
+    camera, exposure, brightest = plan.camera, plan.scene.exposure, plan.brightest
+    black_dn, span_dn = plan.sensor.black_level_dn, float(plan.sensor.span_dn)
+    gray_mean, gains, limit = camera.highlight == "gray_mean", _site_gains(plan), _linear_limit(plan)
     scale = tuple(gain * exposure * span_dn if in_float32 else 1.0 for gain in gains)
     numbers = [limit * dn for dn in scale], [1 / dn for dn in scale], gains, _headroom(plan)
-    limits, signal_per_dn, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
-    products: Any = _products(plan.camera.rgb2cam, plan.isp.tone, plan.isp.gamma, codes)
-    if in_float32:
-        products = _products32(
-            plan.camera.rgb2cam, plan.isp.tone, plan.isp.gamma, codes, (1.0,) * 3 if gray_mean else scale
-        )
+    limits, light_per_signal, site_gains, headroom = np.array(numbers, dtype=f).take(channels, axis=1)
+    divisor = 1 - camera.highlight_threshold
+    products = np.array(camera.rgb2cam).reshape(3, 3, 1) * linear_table(plan.isp.tone, plan.isp.gamma, codes)
+    if in_float32 and not gray_mean:
+        products *= np.array(scale)[:, None, None]
     return kind(
-        products=products,
+        products=products.astype(f),
         code_count=codes,
         site_channels=channels,
-        inverse_gains=np.array(plan.camera.inverse_gains, dtype=f),
+        inverse_gains=np.array(camera.inverse_gains, dtype=f),
         gray_mean=gray_mean,
-        highlight_threshold=f(plan.camera.highlight_threshold),
-        steepness=f(1 / (1 - plan.camera.highlight_threshold)),
+        highlight_threshold=f(camera.highlight_threshold),
+        divisor=f(1 if in_float32 else divisor),
+        steepness=f(1 / divisor if in_float32 else 1),
+        one=f(1),
+        three=f(3),
         exposure=f(exposure),
         brightest=f(brightest),
         clipped=f(brightest * (1 + FLOAT32_MARGIN) if in_float32 else brightest),
-        black_dn=np.uint32(plan.sensor.black_level_dn) if in_float32 else float(plan.sensor.black_level_dn),
+        black_dn=np.uint32(black_dn) if in_float32 else float(black_dn),
         span_dn=f(span_dn),
         dn_per_signal=f(exposure * span_dn if in_float32 else 1.0),
         limits=limits,
-        signal_per_dn=signal_per_dn,
+        light_per_signal=light_per_signal,
         gains=site_gains,
         headroom=headroom,
-        response=ONES,
-        response_steps=(0, 0),
+        response=EQUAL_RESPONSE,
     )
 
 
 def with_response(scene: Scene, response: SiteMap) -> Scene:
     """Return the scene of a clean frame whose light is multiplied by a response."""
     # the second pass computes every vector, because only it applies the response
-    limits = np.full_like(scene.limits, -np.inf)
-    return scene._replace(response=response.values, response_steps=response.steps, limits=limits)
-
-
-@functools.lru_cache(maxsize=4)
-def _products(rgb2cam: tuple[float, ...], tone: str, gamma: float | str, codes: int) -> Float:
-    products = np.array(rgb2cam).reshape(3, 3, 1) * linear_table(tone, gamma, codes)
-    products.flags.writeable = False
-    return products
-
-
-@functools.lru_cache(maxsize=4)
-def _products32(
-    rgb2cam: tuple[float, ...], tone: str, gamma: float | str, codes: int, scale: tuple[float, ...]
-) -> Float32:
-    products = np.array(_products(rgb2cam, tone, gamma, codes) * np.array(scale)[:, None, None], dtype=np.float32)
-    products.flags.writeable = False
-    return products
+    return scene._replace(response=response, limits=np.full_like(scene.limits, -np.inf))
 
 
 def _site_gains(plan: Plan) -> tuple[float, float, float]:
@@ -155,17 +124,13 @@ def _site_gains(plan: Plan) -> tuple[float, float, float]:
 
 def _headroom(plan: Plan) -> list[float]:
     """Return the factor of the per-channel highlight term by channel; 0 without the term."""
-    return (
-        [max(1 - gain, 0.0) for gain in plan.camera.inverse_gains]
-        if plan.camera.highlight == "per_channel"
-        else [0.0] * 3
-    )
+    has_term = plan.camera.highlight == "per_channel"
+    return [max(1 - gain, 0.0) if has_term else 0.0 for gain in plan.camera.inverse_gains]
 
 
 def _linear_limit(plan: Plan) -> float:
     """Return a signal up to which no site is a highlight, clipped or saturated, with a margin for rounding errors."""
-    span_dn = plan.sensor.white_level_dn - plan.sensor.black_level_dn
-    light = min(plan.brightest * 0.999, 1 - 1 / span_dn)
+    light = min(plan.brightest * 0.999, 1 - 1 / plan.sensor.span_dn)
     unclipped = min(1.0, light / plan.scene.exposure) / max(_site_gains(plan)) * 0.999
     return min(unclipped, plan.camera.highlight_threshold) if any(_headroom(plan)) else unclipped
 
@@ -179,7 +144,7 @@ def _site_channels(pattern: str, top: int, left: int) -> NDArray[np.int64]:
 @inner
 def _load_sites(values: Pointer, strip: Strip) -> Vector:
     """Load the values of eight sites from column ``first`` of the strip's row on (`_site_channels`)."""
-    return load(values, np.uint64((strip.y & 1) * _ROW_SITES + (strip.first & 1)))
+    return simd.load(values, np.uint64((strip.y & 1) * _ROW_SITES + (strip.first & 1)))
 
 
 # --------------------------------------------------------------------------------------------------------------- signal
@@ -188,29 +153,13 @@ def _load_sites(values: Pointer, strip: Strip) -> Vector:
 @inner
 def _fill_signal(codes: Pointer, strip: Strip, scene: Any, signal: Pointer) -> None:
     """Linearise codes and apply the matrix, for the channel of each site: sum three products."""
-    channels, code_count = pointer_to(scene.site_channels, _ROW_SITES * (strip.y & 1)), scene.code_count
-    even = pointer_to(scene.products, 3 * code_count * channels[0])
-    odd = pointer_to(scene.products, 3 * code_count * channels[1])
+    channels, code_count = simd.pointer_to(scene.site_channels, _ROW_SITES * (strip.y & 1)), scene.code_count
+    even = simd.pointer_to(scene.products, 3 * code_count * channels[0])
+    odd = simd.pointer_to(scene.products, 3 * code_count * channels[1])
     for x in range(strip.length):
         of_site = odd if x & 1 else even
         r, g, b = np.int64(codes[3 * x]), np.int64(codes[3 * x + 1]), np.int64(codes[3 * x + 2])
         signal[x] = (of_site[r] + of_site[code_count + g]) + of_site[2 * code_count + b]
-
-
-@inner
-def _gray_mask64(scene: Scene, total: float) -> tuple[float, float]:
-    m = maximum(total / 3.0 - scene.highlight_threshold, 0.0) / (1.0 - scene.highlight_threshold)
-    return m * m, 1.0 - m * m
-
-
-@inner
-def _gray_mask32(scene: Scene32, total: np.float32) -> tuple[np.float32, np.float32]:
-    m = maximum(total / np.float32(3) - scene.highlight_threshold, _ZERO32) * scene.steepness
-    return m * m, _ONE32 - m * m
-
-
-_gray_mask = by_class({Scene: _gray_mask64, Scene32: _gray_mask32})
-"""Return the highlight mask of the sum of the channels, and 1 - mask."""
 
 
 @inner
@@ -224,47 +173,15 @@ def _fill_gray_mean_signal(codes: Pointer, strip: Strip, scene: Any, out: Pointe
         red = (products[r] + products[g]) + products[b]
         green = (products[channel + r] + products[channel + g]) + products[channel + b]
         blue = (products[2 * channel + r] + products[2 * channel + g]) + products[2 * channel + b]
-        mask, rest = _gray_mask(scene, (red + green) + blue)
+        gray = ((red + green) + blue) / scene.three - scene.highlight_threshold
+        m = simd.maximum(gray, 0.0) / scene.divisor * scene.steepness
+        mask, rest = m * m, scene.one - m * m
         c = scene.site_channels[_ROW_SITES * (strip.y & 1) + (x & 1)]
         i = red if c == 0 else green if c == 1 else blue
-        out[x] = i * maximum(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
+        out[x] = i * simd.maximum(mask + rest * gains[c], gains[c]) * scene.dn_per_signal
 
 
 # ------------------------------------------------------------------------------------------------- float64 and float32
-
-
-@inner
-def _linear_dn64(scene: Scene, signal: Vector, gains: Vector) -> Vector:
-    dn: Vector = maximum(signal * gains * scene.exposure, 0.0) * scene.span_dn
-    return dn
-
-
-@inner
-def _linear_dn32(scene: Scene32, signal: Vector, gains: Vector) -> Vector:
-    dn: Vector = maximum(signal, _ZERO32)
-    return dn
-
-
-@inner
-def _bright_light64(scene: Scene, signal: Vector, x: np.uint64, strip: Strip) -> Vector:
-    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
-    row, column = scene.response_steps
-    response = pointer_to(scene.response, strip.y * row + strip.x * column + strip.lead)
-    limit = np.inf if scene.exposure == 1.0 else 1.0  # otherwise light above white would reappear
-    m = maximum(signal - scene.highlight_threshold, 0.0) / (1.0 - scene.highlight_threshold)
-    light = minimum(signal * gains + signal * (m * m) * headroom, limit) * scene.exposure
-    with_pattern: Vector = light * to_float64(load(response, x))
-    return with_pattern
-
-
-@inner
-def _bright_light32(scene: Scene32, signal: Vector, x: np.uint64, strip: Strip) -> Vector:
-    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
-    limit = np.float32(np.inf) if scene.exposure == _ONE32 else _ONE32
-    i = signal * _load_sites(scene.signal_per_dn, strip)
-    m = maximum(i - scene.highlight_threshold, _ZERO32) * scene.steepness
-    light: Vector = minimum(i * gains + i * (m * m) * headroom, limit) * scene.exposure
-    return light
 
 
 @inner
@@ -272,26 +189,38 @@ def _store_clean64(scene: Scene, above_black: Vector, x: np.uint64, workspace: W
     """Store eight clean values: unrounded, rounded, their difference, and as uint16."""
     dn = above_black + scene.black_dn
     rounded = (dn + ROUND) - ROUND
-    rounded_dn = to_float32(rounded)
-    store(workspace.unrounded_dn, x, dn)
-    store(workspace.rounded_dn, x, rounded_dn)
-    store(workspace.residual_dn, x, to_float32(dn - rounded))
-    store(workspace.clean, x, to_uint32(rounded_dn))
+    rounded_dn = simd.to_float32(rounded)
+    simd.store(workspace.unrounded_dn, x, dn)
+    simd.store(workspace.rounded_dn, x, rounded_dn)
+    simd.store(workspace.residual_dn, x, simd.to_float32(dn - rounded))
+    simd.store(workspace.clean, x, simd.to_uint32(rounded_dn))
 
 
 @inner
 def _store_clean32(scene: Scene32, above_black: Vector, x: np.uint64, workspace: Workspace) -> None:
     """Store eight clean values: DN above black, and as uint16."""
-    store(workspace.unrounded_dn, x, above_black)
-    store(workspace.clean, x, to_bits(above_black + ROUND32) + scene.black_dn)
+    simd.store(workspace.unrounded_dn, x, above_black)
+    simd.store(workspace.clean, x, simd.to_bits(above_black + ROUND32) + scene.black_dn)
 
 
-_linear_dn = by_class({Scene: _linear_dn64, Scene32: _linear_dn32})
-"""Return DN above black of signals that are not bright."""
-_bright_light = by_class({Scene: _bright_light64, Scene32: _bright_light32})
-"""Return the normalised light of signals of any brightness."""
 _store_clean = by_class({Scene: _store_clean64, Scene32: _store_clean32})
 """Store eight clean values, given as DN above black."""
+_linear_dn = by_class(
+    {
+        Scene: lambda scene, signal, gains: simd.maximum(signal * gains * scene.exposure, 0.0) * scene.span_dn,
+        Scene32: lambda scene, signal, gains: simd.maximum(signal, 0.0),
+    }
+)
+"""Return DN above black of signals that are not bright."""
+_with_response = by_class(
+    {
+        Scene: lambda scene, light, x, strip: (
+            light * simd.to_float64(simd.load(strip_values(scene.response, strip), x))
+        ),
+        Scene32: lambda scene, light, x, strip: light,
+    }
+)
+"""Return eight values of light times the response."""
 
 
 # ---------------------------------------------------------------------------------------------------------- clean frame
@@ -303,7 +232,7 @@ def fill_clean(scene: Any, codes: Pointer, strip: Strip, workspace: Workspace, c
 
     Return whether any site can be saturated.
     """
-    signal = pointer_to(workspace.signal, strip.first)
+    signal = simd.pointer_to(workspace.signal, strip.first)
     if scene.gray_mean:
         _fill_gray_mean_signal(codes, strip, scene, signal)
     else:
@@ -313,7 +242,7 @@ def fill_clean(scene: Any, codes: Pointer, strip: Strip, workspace: Workspace, c
         _recompute_bright(scene, strip, workspace)
         counts[1] += count_outside(strip, workspace.bright_light, 0.0, scene.clipped)[1]
     if has_negative:
-        light = workspace.bright_light if scene.response_steps[1] else workspace.signal
+        light = workspace.bright_light if scene.response.steps[1] else workspace.signal
         counts[0] += count_outside(strip, light, 0.0, np.inf)[0]
     return bool(has_bright)
 
@@ -322,13 +251,13 @@ def fill_clean(scene: Any, codes: Pointer, strip: Strip, workspace: Workspace, c
 def _fill_linear(scene: Any, strip: Strip, workspace: Workspace) -> tuple[bool, bool]:
     """Compute the clean frame as if no signal were bright; return whether any is negative, whether any is bright."""
     gains, limits = _load_sites(scene.gains, strip), _load_sites(scene.limits, strip)
-    lowest = highest = load(workspace.signal, _0)
+    lowest = highest = simd.load(workspace.signal, _0)
     for n in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(n) * _8
-        signal = load(workspace.signal, x)
-        lowest, highest = minimum(lowest, signal), maximum(highest, signal)
+        signal = simd.load(workspace.signal, x)
+        lowest, highest = simd.minimum(lowest, signal), simd.maximum(highest, signal)
         _store_clean(scene, _linear_dn(scene, signal, gains), x, workspace)
-    return has_any_bit(less_than(lowest, _ZERO32)), has_any_bit(less_than(limits, highest))
+    return simd.has_any_bit(simd.less_than(lowest, 0.0)), simd.has_any_bit(simd.less_than(limits, highest))
 
 
 @inner
@@ -337,14 +266,18 @@ def _recompute_bright(scene: Any, strip: Strip, workspace: Workspace) -> None:
 
     ``bright_light`` receives their light, and 0 elsewhere.
     """
-    limits = _load_sites(scene.limits, strip)
+    limits, light_per_signal = _load_sites(scene.limits, strip), _load_sites(scene.light_per_signal, strip)
+    gains, headroom = _load_sites(scene.gains, strip), _load_sites(scene.headroom, strip)
+    most = np.inf if scene.exposure == 1.0 else 1.0  # otherwise light above white would reappear
     for n in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(n) * _8
-        signal = load(workspace.signal, x)
-        if not has_any_bit(less_than(limits, signal)):
-            store(workspace.bright_light, x, signal * _ZERO32)
+        signal = simd.load(workspace.signal, x)
+        if not simd.has_any_bit(simd.less_than(limits, signal)):
+            simd.store(workspace.bright_light, x, signal * 0.0)
             continue
-        light = _bright_light(scene, signal, x, strip)
-        store(workspace.bright_light, x, light)
-        above_black = minimum(maximum(light, _ZERO32), scene.brightest) * scene.span_dn
-        _store_clean(scene, above_black, x, workspace)
+        i = signal * light_per_signal
+        m = simd.maximum(i - scene.highlight_threshold, 0.0) / scene.divisor * scene.steepness
+        light = simd.minimum(i * gains + i * (m * m) * headroom, most) * scene.exposure
+        light = _with_response(scene, light, x, strip)
+        simd.store(workspace.bright_light, x, light)
+        _store_clean(scene, simd.minimum(simd.maximum(light, 0.0), scene.brightest) * scene.span_dn, x, workspace)

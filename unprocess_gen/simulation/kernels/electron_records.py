@@ -16,78 +16,83 @@ from numpy.typing import NDArray
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.random_streams import BLOCK, purpose, words
 from unprocess_gen.core.types import DarkPixels, Float, Plan
-from unprocess_gen.simulation.kernels.body import Body, body_of
+from unprocess_gen.simulation.effects.dark_frame import dark_frame_offsets
+from unprocess_gen.simulation.kernels.body import NO_OFFSETS, WITHOUT_PATTERNS, Body
 from unprocess_gen.simulation.kernels.electrons import FLOAT32_ERROR_DN, MAX_STEPS, Electrons, FrameNumbers
 from unprocess_gen.simulation.kernels.normal import Quantiles, build_quantiles, normal_quantiles
 from unprocess_gen.simulation.kernels.poisson import MAX_THRESHOLD_RATE, count_tables, count_thresholds
 from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH
-from unprocess_gen.simulation.kernels.strips import Float32, padded_width
-from unprocess_gen.simulation.plan_slots import fill_site_offsets, slots_of
+from unprocess_gen.simulation.kernels.strips import SiteMap, padded_width
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
-from unprocess_gen.simulation.slots import LineOffsets, Patterns, SiteNoise, Slots, UniformCounts, Words
+from unprocess_gen.simulation.slots import LineOffsets, SiteNoise, Slots, UniformCounts, Words
 
 FARTHEST_NORMAL = 6.4
 """Bound of the absolute value of a normal deviate of 32 bits."""
 
 _ERROR_DN = FrameNumbers._fields.index("error_dn")
-_NOTHING = np.zeros(1)
-_NO_RANKS = np.zeros(MAX_STEPS, dtype=np.uint32)
 
 
-def electron_noise(frames: tuple[Slots, ...], body: Body, shape: tuple[int, int], origin: tuple[int, int]) -> Electrons:
-    """Return the noise of frames of one body."""
-    has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
-    left = origin[1] // BLOCK * BLOCK if has_columns else 0
-    noise = _electron_noise(frames, padded_width(origin[1], shape[1]), (origin[0] % 2, left))._replace(body=body)
-    if any(map(_has_correlated_rows, frames)):
-        noise = noise._replace(rows_dn=_correlated_rows(frames, origin[0], shape[0]), rows_step=shape[0])
-    if body.sites_steps[0]:
-        noise = _with_offsets(noise, body.sites_dn, (0, noise.padded_width))
-    return noise
-
-
-def with_frame_offsets(
-    noise: Electrons,
+def electron_noise(
     plans: Sequence[Plan],
+    frames: tuple[Slots, ...],
+    body: Body,
     dark_pixels: DarkPixels | None,
     shape: tuple[int, int],
     origin: tuple[int, int],
 ) -> Electrons:
-    """Return the noise with the offsets by site that each frame has of its own, in addition to those of the body."""
-    first, pitch = origin[1] % BLOCK, noise.padded_width
-    sites_dn = np.zeros((len(plans), shape[0], pitch), dtype=np.float32)
-    for of_frame, plan in zip(sites_dn, plans, strict=True):
-        if slots_of(plan).has_site_offsets:
-            fill_site_offsets(plan, dark_pixels, shape, origin, of_frame[:, first : first + shape[1]])
-    if noise.body.sites_steps[0]:
-        sites_dn += noise.body.sites_dn.reshape(shape[0], pitch)
-    return _with_offsets(noise, sites_dn, (shape[0] * pitch, pitch))
-
-
-def _with_offsets(noise: Electrons, sites_dn: Float32, steps: tuple[int, int]) -> Electrons:
-    """Return the noise with these offsets by site, whose largest one adds to the error of approximate DN."""
-    numbers = noise.numbers.copy()
-    farthest_dn = max(float(sites_dn.max(initial=0.0)), -float(sites_dn.min(initial=0.0)))
+    """Return the noise of frames of one body."""
+    has_columns = any(slots.columns or slots.fixed_columns for slots in frames)
+    left = origin[1] // BLOCK * BLOCK if has_columns else 0
+    noise = _electron_noise(frames, padded_width(origin[1], shape[1]), (origin[0] % 2, left))._replace(body=body)
+    if any(slots.rows and slots.rows.correlation for slots in frames):
+        noise = noise._replace(rows_dn=_correlated_rows(frames, origin[0], shape[0]), rows_step=shape[0])
+    offsets, step = body.sites_dn, 0
+    if any(slots.has_site_offsets for slots in frames):
+        offsets = _frame_offsets(plans, frames, body, dark_pixels, shape, origin)
+        step = offsets.values.size // len(frames)
+    if not offsets.steps[0]:
+        return noise
+    numbers, values = noise.numbers.copy(), offsets.values
+    farthest_dn = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
     numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * farthest_dn
-    return noise._replace(numbers=numbers, sites_dn=sites_dn.reshape(-1), sites_steps=steps)
+    return noise._replace(numbers=numbers, sites_dn=offsets, sites_step=step)
+
+
+def _frame_offsets(
+    plans: Sequence[Plan],
+    frames: tuple[Slots, ...],
+    body: Body,
+    dark_pixels: DarkPixels | None,
+    shape: tuple[int, int],
+    origin: tuple[int, int],
+) -> SiteMap:
+    """Return the offsets by site that each frame has of its own, in addition to those of the body, [N, H, P]."""
+    first, pitch = origin[1] % BLOCK, padded_width(origin[1], shape[1])
+    sites_dn = np.zeros((len(plans), shape[0], pitch), dtype=np.float32)
+    for frame_dn, plan, slots in zip(sites_dn, plans, frames, strict=True):
+        if slots.has_site_offsets:
+            dark_frame_offsets(plan, dark_pixels, shape, origin, out=frame_dn[:, first : first + shape[1]])
+    if body.sites_dn.steps[0]:
+        sites_dn += body.sites_dn.values.reshape(shape[0], pitch)
+    return SiteMap(sites_dn.reshape(-1), (pitch, 1))
 
 
 @functools.lru_cache(maxsize=8)
 def _electron_noise(frames: tuple[Slots, ...], columns: int, origin: tuple[int, int]) -> Electrons:
     """Return the noise without the body; ``origin`` is that of the first block, as far as the noise depends on it."""
     first, members = frames[0], [_members(slots, origin, columns) for slots in frames]
-    stacked = {name: np.stack([of_frame[name] for of_frame in members]) for name in members[0]}
+    stacked = {name: np.stack([own[name] for own in members]) for name in members[0]}
     return Electrons(
         **stacked,
-        rows_dn=_NOTHING,
+        rows_dn=np.zeros(1),
         rows_step=0,
         fixed_columns_dn=_fixed_columns(first.fixed_columns, columns, origin[1]),
-        sites_dn=np.zeros(columns, dtype=np.float32),
-        sites_steps=(0, 0),
+        sites_dn=NO_OFFSETS,
+        sites_step=0,
         padded_width=columns,
         black_dn=first.black_dn,
         full_dn=first.full_well_e * first.dn_per_e + first.black_dn,
-        body=body_of(Patterns(), (0, 0), (0, 0)),
+        body=WITHOUT_PATTERNS,
         tables=count_tables(),
     )
 
@@ -102,15 +107,17 @@ def _members(slots: Slots, origin: tuple[int, int], columns: int) -> dict[str, N
     base_dn = slots.black_dn + (columns_dn + np.tile(planes_dn, columns // VECTOR_WIDTH))
     noise, uniform = slots.noise or SiteNoise("read", 0.0), slots.uniform or UniformCounts("shot", 0.0, 0.0)
     quantiles = _quantiles(noise.law, noise.shape)
-    fewest, ranks = count_thresholds(uniform.rate_e) if uniform.rate_e <= MAX_THRESHOLD_RATE else (0, None)
+    has_thresholds = uniform.rate_e <= MAX_THRESHOLD_RATE
+    fewest, ranks = count_thresholds(uniform.rate_e) if has_thresholds else (0, np.zeros(0, dtype=np.uint32))
     rows, bright = slots.rows or LineOffsets(Words(0, "row"), 0.0), slots.patterns.bright
     offset_dn = FARTHEST_NORMAL * rows.std_dn
     offset_dn += slots.black_dn + float(np.abs(columns_dn).max(initial=0.0) + np.abs(planes_dn).max())
-    most_dark_dn = float(dn_per_e.max()) * _most_counts(uniform.rate_e)
+    most_dark_e = uniform.rate_e + 8 * math.sqrt(uniform.rate_e) + 40 if uniform.rate_e else 0.0
+    summands_dn = 2 * noise.std_dn * quantiles.farthest + 2 * offset_dn + float(dn_per_e.max()) * most_dark_e + 0.5
     numbers = FrameNumbers(
         counts_light=bool(slots.light_stream),
         has_dark=uniform.rate_e > 0,
-        has_thresholds=ranks is not None,
+        has_thresholds=has_thresholds,
         light_stream=_purpose(slots.light_stream or "shot"),
         dark_stream=_purpose(uniform.stream),
         defect_stream=_purpose(bright.stream if bright else "shot"),
@@ -119,10 +126,10 @@ def _members(slots: Slots, origin: tuple[int, int], columns: int) -> dict[str, N
         dark_e=uniform.rate_e,
         removed_e=uniform.removed_e,
         fewest_dark=np.float32(fewest),
-        dark_steps=np.int64(0 if ranks is None else len(ranks)),
+        dark_steps=np.int64(len(ranks)),
         site_std_dn=noise.std_dn,
         row_std_dn=0.0 if rows.correlation else rows.std_dn,
-        error_dn=_error_dn(noise.std_dn, quantiles, offset_dn, most_dark_dn),
+        error_dn=noise.std_dn * quantiles.error + FLOAT32_ERROR_DN * summands_dn,
     )
     return {
         "numbers": np.array(numbers, dtype=np.float64),
@@ -133,24 +140,13 @@ def _members(slots: Slots, origin: tuple[int, int], columns: int) -> dict[str, N
         "planes_dn": planes_dn,
         "columns_dn": columns_dn,
         "base_dn": base_dn.astype(np.float32),
-        "dark_ranks": _NO_RANKS if ranks is None else np.resize(ranks, MAX_STEPS),
+        "dark_ranks": np.resize(ranks, MAX_STEPS),
     }
 
 
 def _by_site(of_tile: Sequence[float], top: int) -> Float:
     """Return the values of eight sites of an even and of an odd row, [2, 8], of a frame whose first row is ``top``."""
     return np.roll(np.tile(np.array(of_tile).reshape(2, 2), VECTOR_WIDTH // 2), -top, axis=0)
-
-
-def _most_counts(rate_e: float) -> float:
-    """Return a bound of the counts of a rate."""
-    return rate_e + 8 * math.sqrt(rate_e) + 40 if rate_e else 0.0
-
-
-def _error_dn(std_dn: float, quantiles: Quantiles, offset_dn: float, most_dark_dn: float) -> float:
-    """Return `FrameNumbers.error_dn`."""
-    summands_dn = 2 * std_dn * quantiles.farthest + 2 * offset_dn + most_dark_dn + 0.5
-    return std_dn * quantiles.error + FLOAT32_ERROR_DN * summands_dn
 
 
 def _purpose(stream: str) -> np.uint64:
@@ -165,17 +161,13 @@ def _quantiles(law: str, shape: float) -> Quantiles:
 # ----------------------------------------------------------------------------------------------------- rows and columns
 
 
-def _has_correlated_rows(slots: Slots) -> bool:
-    return slots.rows is not None and slots.rows.correlation != 0
-
-
 def _correlated_rows(frames: Sequence[Slots], top: int, height: int) -> Float:
     """Return the offsets of correlated rows, [N, H] DN; 0 in frames without them."""
     rows_dn = np.zeros((len(frames), height))
-    for of_frame, slots in zip(rows_dn, frames, strict=True):
-        if slots.rows is not None and _has_correlated_rows(slots):
+    for frame_dn, slots in zip(rows_dn, frames, strict=True):
+        if slots.rows and slots.rows.correlation:
             independent = _normals(slots.rows.words, 1, 0, top + height)
-            of_frame[:] = slots.rows.std_dn * autoregressive(independent, slots.rows.correlation)[top:]
+            frame_dn[:] = slots.rows.std_dn * autoregressive(independent, slots.rows.correlation)[top:]
     return rows_dn
 
 
@@ -187,15 +179,14 @@ def _fixed_columns(offsets: LineOffsets | None, columns: int, left: int) -> Floa
     """Return the offsets of ``columns`` columns of a body from column ``left`` on."""
     if offsets is None:
         return np.zeros(columns)
-    first, after = left // _COLUMNS, (left + columns - 1) // _COLUMNS + 1
-    deviates = np.concatenate([_kept_normals(offsets.words, part) for part in range(first, after)])
-    return np.asarray(offsets.std_dn * deviates[left - first * _COLUMNS :][:columns])
+    deviates = _first_normals(offsets.words, -(-(left + columns) // _COLUMNS) * _COLUMNS)
+    return np.asarray(offsets.std_dn * deviates[left : left + columns])
 
 
 @functools.lru_cache(maxsize=64)
-def _kept_normals(stream: Words, part: int) -> Float:
-    """Return the normals of the columns of a body from ``part * _COLUMNS`` on."""
-    return _normals(stream, _COLUMNS, part * _COLUMNS)
+def _first_normals(stream: Words, columns: int) -> Float:
+    """Return the normals of the first columns of a body."""
+    return _normals(stream, columns, 0)
 
 
 def _normals(stream: Words, columns: int, left: int, rows: int = 1) -> Float:

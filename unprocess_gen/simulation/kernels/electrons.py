@@ -8,7 +8,7 @@ The way of a strip of a noisy frame. Left, the function; right, the buffers of t
         _fill_rates               rates           mean electrons of light
         fill_counts               light_e         counts of light       + light_error_e   0: the count is certain
         _count_dark               dark_e          counts of one rate    + dark_error_e
-        _mark_defects             defects_e       counts of bright defects; negative: the pixel reads 0
+        _fill_defects             defects_e       counts of bright defects; negative: the pixel reads 0
               |                   row_dn          the offset of the strip's row
               |
               +--------------------------------------------+
@@ -39,8 +39,8 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import inner
 from unprocess_gen.core.types import Float
+from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.body import Body
-from unprocess_gen.simulation.kernels.normal import exact_value, exact_values, fill_rows, fill_values_by_lines
 from unprocess_gen.simulation.kernels.philox import PhiloxKey, fill_word_blocks, first_word
 from unprocess_gen.simulation.kernels.poisson import (
     FLOAT32_RATE,
@@ -49,19 +49,8 @@ from unprocess_gen.simulation.kernels.poisson import (
     fill_counts,
     fill_counts_of_one_rate,
 )
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    Pointer,
-    absolute,
-    less_than,
-    load,
-    minimum,
-    pointer_to,
-    store,
-    to_float32,
-    to_float64,
-)
-from unprocess_gen.simulation.kernels.strips import STRIP, Float32, Strip, Workspace, list_lanes
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
+from unprocess_gen.simulation.kernels.strips import Float32, SiteMap, Strip, Workspace, list_lanes, strip_values
 
 FLOAT32_ERROR_DN = 2.0**-21
 """Error that float32 adds to an approximate DN, relative to the DN and to its summands: eight roundings."""
@@ -69,7 +58,7 @@ FLOAT32_ERROR_DN = 2.0**-21
 MAX_STEPS = 64
 """Most thresholds of `poisson.count_thresholds`."""
 
-_8, _ZERO32, _FLOAT32_ERROR32 = np.uint64(8), np.float32(0), np.float32(FLOAT32_ERROR_DN)
+_8, _ZERO32, _INFINITE32 = np.uint64(8), np.float32(0), np.float32(np.inf)
 _RATE_ERROR32 = np.float32(FLOAT32_RATE)
 
 
@@ -87,8 +76,8 @@ class Electrons(NamedTuple):
     columns_dn: Float  # [N, P]: offsets by column
     fixed_columns_dn: Float  # [P]: without those that are new in every frame
     base_dn: Float32  # [N, 2, P]: black level, column and plane
-    sites_dn: Float32  # [N, H, P]: offsets by site; [P] zeros without them
-    sites_steps: tuple[int, int]  # elements from frame to frame and from row to row
+    sites_dn: SiteMap  # offsets by site: of the body, or [N, H, P] of all frames
+    sites_step: int  # elements from frame to frame
     dark_ranks: NDArray[np.uint32]  # [N, MAX_STEPS]: see `poisson.count_thresholds`
     padded_width: int  # P
     black_dn: float
@@ -147,8 +136,7 @@ def _first_column(strip: Strip) -> int:
 @inner
 def _sites_dn(noise: Electrons, n: int, strip: Strip) -> Pointer:
     """Return the offsets by site in a strip."""
-    frame_step, row_step = noise.sites_steps
-    return pointer_to(noise.sites_dn, n * frame_step + strip.y * row_step + _first_column(strip))
+    return pointer_to(strip_values(noise.sites_dn, strip), n * noise.sites_step)
 
 
 # -------------------------------------------------------------------------------------------------- counts of electrons
@@ -171,11 +159,11 @@ def count_electrons(noise: Electrons, n: int, key: PhiloxKey, strip: Strip, work
     if frame.has_dark:
         fill_word_blocks(key, strip, frame.dark_stream, workspace.dark_words)
         _count_dark(noise, n, frame, strip, workspace)
-    first, after = _mark_defects(noise.body, strip, workspace)
-    if first < after:
+    if _fill_defects(noise.body, strip, workspace):
         fill_word_blocks(key, strip, frame.defect_stream, workspace.defect_words)
-        _count_defects(noise, first, after, workspace)
-    row_dn = frame.row_std_dn * exact_value(first_word(key, strip.row, frame.row_stream), noise.tables.quadratics)
+        _count_defects(noise, strip, workspace)
+    row_word = first_word(key, strip.row, frame.row_stream)
+    row_dn = frame.row_std_dn * normal.exact_value(row_word, noise.tables.quadratics)
     workspace.row_dn[0] = row_dn + noise.rows_dn[n * noise.rows_step + min(strip.y, noise.rows_step)]
 
 
@@ -185,14 +173,12 @@ def _fill_rates(noise: Electrons, n: int, strip: Strip, workspace: Workspace) ->
 
     At most five roundings, as `poisson.FLOAT32_RATE` allows.
     """
-    black = np.float32(noise.black_dn)
-    e_per_dn = to_float32(1.0 / load(noise.dn_per_e, np.uint64(_first_site(n, strip))))
-    row, column = noise.body.response_steps
-    response = pointer_to(noise.body.response, strip.y * row + strip.x * column + strip.lead)
+    e_per_dn = simd.to_float32(1.0 / simd.load(noise.dn_per_e, np.uint64(_first_site(n, strip))))
+    response = strip_values(noise.body.response, strip)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        light_dn = (load(workspace.rounded_dn, x) - black) + load(workspace.residual_dn, x)
-        store(workspace.rates, x, light_dn * e_per_dn * load(response, x))
+        light_dn = (simd.load(workspace.rounded_dn, x) - noise.black_dn) + simd.load(workspace.residual_dn, x)
+        simd.store(workspace.rates, x, light_dn * e_per_dn * simd.load(response, x))
 
 
 @inner
@@ -220,45 +206,30 @@ def _dark_buffers(frame: FrameNumbers, workspace: Workspace) -> tuple[Pointer, P
 
 
 @inner
-def defects_of(body: Body, strip: Strip) -> tuple[int, int]:
-    """Return the range of a strip's defects in the lists of the body."""
-    if body.strips == 0:
-        return 0, 0
-    number = strip.y * body.strips + strip.x // STRIP
-    return body.starts[number], body.starts[number + 1]
+def _fill_defects(body: Body, strip: Strip, workspace: Workspace) -> bool:
+    """Fill ``defects_e`` with the means of bright defects, less than 0 at dead pixels; return whether there are any."""
+    if body.defects.steps[1] == 0:  # no strip has filled it
+        return False
+    numbers, any_number = strip_values(body.defects, strip), np.uint16(0)
+    for x in range(strip.total):
+        workspace.defects_e[x] = 0.0
+        any_number |= numbers[x]
+    if any_number == 0:
+        return False
+    for x in range(strip.total):
+        workspace.defects_e[x] = body.means_e[numbers[x]]
+    return True
 
 
 @inner
-def count_defects(noise: Electrons, strip: Strip) -> int:
-    """Return the number of sites that `count_electrons` has listed as uncertain: the defects."""
-    first, after = defects_of(noise.body, strip)
-    count: int = after - first
-    return count
-
-
-@inner
-def _mark_defects(body: Body, strip: Strip, workspace: Workspace) -> tuple[int, int]:
-    """Fill ``defects_e`` with the means of bright defects, less than 0 at dead pixels; list them as uncertain.
-
-    Return their range in the lists of the body.
-    """
-    if body.strips > 0:  # otherwise no strip has filled it
-        for x in range(strip.total):
-            workspace.defects_e[x] = 0.0
-    first, after = defects_of(body, strip)
-    for d in range(first, after):
-        workspace.defects_e[body.positions[d]] = body.means_e[d]
-        workspace.uncertain[d - first] = np.uint32(body.positions[d])
-    return first, after
-
-
-@inner
-def _count_defects(noise: Electrons, first: int, after: int, workspace: Workspace) -> None:
-    """Replace the means of bright defects with counts."""
-    for d in range(first, after):
-        x, mean_e = noise.body.positions[d], noise.body.means_e[d]
-        if mean_e >= 0.0:
-            workspace.defects_e[x] = exact_count(workspace.defect_words[x], mean_e, noise.tables)
+def _count_defects(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
+    """Replace the means of bright defects with counts; all defects are uncertain, so that they are computed exactly."""
+    for x in range(strip.total):
+        mean_e = workspace.defects_e[x]
+        if mean_e != 0.0:
+            workspace.light_error_e[x] = _INFINITE32
+            if mean_e > 0.0:
+                workspace.defects_e[x] = exact_count(workspace.defect_words[x], mean_e, noise.tables)
 
 
 # ------------------------------------------------------------------------------------------------------------------ DN
@@ -269,57 +240,56 @@ def _sum_dn(
     electrons: Any, full_well_e: Any, dn_per_e: Any, black_dn: Any, noise_dn: Any, offset_dn: Any, site_dn: Any
 ) -> Any:
     """Return DN in the order of `reference.noise.physical`: of one site, or of eight as vectors."""
-    dn = minimum(electrons, full_well_e) * dn_per_e + black_dn
+    dn = simd.minimum(electrons, full_well_e) * dn_per_e + black_dn
     return ((dn + noise_dn) + offset_dn) + site_dn
 
 
 @inner
-def approximate_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
-    """Fill ``noise_dn`` with the DN of all sites but defects, in float32, and bounds of the errors."""
+def approximate_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> Pointer:
+    """Fill ``noise_dn`` with the DN of all sites but defects, in float32, and bounds of the errors; return the base."""
     frame, f = load_frame(noise, n), np.float32
     lines = pointer_to(noise.site_lines, n * 4097)
-    fill_values_by_lines(strip.total, workspace.site_words, lines, workspace.lines, workspace.noise_dn)
+    normal.fill_values_by_lines(strip.total, workspace.site_words, lines, workspace.lines, workspace.noise_dn)
     first_site = np.uint64(_first_site(n, strip))
-    per_e, full_e = to_float32(load(noise.dn_per_e, first_site)), to_float32(load(noise.full_well_e, first_site))
+    per_e = simd.to_float32(simd.load(noise.dn_per_e, first_site))
+    full_e = simd.to_float32(simd.load(noise.full_well_e, first_site))
     std, margin, row_dn, removed_e = f(frame.site_std_dn), f(frame.error_dn), f(workspace.row_dn[0]), f(frame.removed_e)
     base = pointer_to(noise.base_dn, (2 * n + (strip.y & 1)) * noise.padded_width + _first_column(strip))
-    site_dn, light_e, light_error_e = _sites_dn(noise, n, strip), workspace.light_e, workspace.light_error_e
-    dark_e, dark_error_e = _dark_buffers(frame, workspace)
+    site_dn, (dark_e, dark_error_e) = _sites_dn(noise, n, strip), _dark_buffers(frame, workspace)
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        electrons = load(light_e, x) + (load(dark_e, x) - removed_e)
+        electrons = simd.load(workspace.light_e, x) + (simd.load(dark_e, x) - removed_e)
         # the base is the sum of black level, column and plane
-        noise_dn = load(workspace.noise_dn, x) * std
-        dn = _sum_dn(electrons, full_e, per_e, load(base, x), noise_dn, row_dn, load(site_dn, x))
-        error_e = load(light_error_e, x) + load(dark_error_e, x)
-        store(workspace.noise_dn, x, dn)
-        store(workspace.error_dn, x, absolute(dn) * _FLOAT32_ERROR32 + (error_e * per_e + margin))
+        noise_dn, base_dn = simd.load(workspace.noise_dn, x) * std, simd.load(base, x)
+        dn = _sum_dn(electrons, full_e, per_e, base_dn, noise_dn, row_dn, simd.load(site_dn, x))
+        error_e = simd.load(workspace.light_error_e, x) + simd.load(dark_error_e, x)
+        simd.store(workspace.noise_dn, x, dn)
+        simd.store(workspace.error_dn, x, simd.absolute(dn) * FLOAT32_ERROR_DN + (error_e * per_e + margin))
+    return workspace.zeros
 
 
 @inner
 def exact_electrons(noise: Electrons, n: int, strip: Strip, workspace: Workspace) -> None:
     """Fill ``exact_dn`` with the DN of all sites: of certain counts in vectors, then of the others one by one."""
     frame, quadratics = load_frame(noise, n), pointer_to(noise.site_quadratics, n * 4096)
-    fill_rows(strip.total, workspace.site_words, workspace.scratch)
+    normal.fill_rows(strip.total, workspace.site_words, workspace.scratch)
     first_site, row_dn = np.uint64(_first_site(n, strip)), workspace.row_dn[0]
-    per_e, full_e, plane_dn = (
-        load(noise.dn_per_e, first_site),
-        load(noise.full_well_e, first_site),
-        load(noise.planes_dn, first_site),
-    )
+    per_e, full_e = simd.load(noise.dn_per_e, first_site), simd.load(noise.full_well_e, first_site)
+    plane_dn = simd.load(noise.planes_dn, first_site)
     columns_dn = pointer_to(noise.columns_dn, n * noise.padded_width + _first_column(strip))
-    sites_dn, light_e, light_error_e = _sites_dn(noise, n, strip), workspace.light_e, workspace.light_error_e
-    dark_e, dark_error_e = _dark_buffers(frame, workspace)
-    listed = count_defects(noise, strip)
+    sites_dn, (dark_e, dark_error_e) = _sites_dn(noise, n, strip), _dark_buffers(frame, workspace)
+    listed = 0
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        electrons = to_float64(load(light_e, x)) + (to_float64(load(dark_e, x)) - frame.removed_e)
-        noise_dn = exact_values(workspace.site_words, workspace.scratch, x, quadratics) * frame.site_std_dn
-        offset_dn, site_dn = (load(columns_dn, x) + row_dn) + plane_dn, to_float64(load(sites_dn, x))
+        dark = simd.to_float64(simd.load(dark_e, x)) - frame.removed_e
+        electrons = simd.to_float64(simd.load(workspace.light_e, x)) + dark
+        deviate = normal.exact_values(workspace.site_words, workspace.scratch, x, quadratics)
+        noise_dn, offset_dn = deviate * frame.site_std_dn, (simd.load(columns_dn, x) + row_dn) + plane_dn
+        site_dn = simd.to_float64(simd.load(sites_dn, x))
         dn = _sum_dn(electrons, full_e, per_e, noise.black_dn, noise_dn, offset_dn, site_dn)
-        store(workspace.exact_dn, x, dn)
-        error_e = load(light_error_e, x) + load(dark_error_e, x)
-        listed = list_lanes(less_than(_ZERO32, error_e), x, listed, workspace)
+        simd.store(workspace.exact_dn, x, dn)
+        error_e = simd.load(workspace.light_error_e, x) + simd.load(dark_error_e, x)
+        listed = list_lanes(simd.less_than(_ZERO32, error_e), x, listed, workspace)
     for m in range(listed):
         site = np.int64(workspace.uncertain[m])
         workspace.exact_dn[site] = exact_electrons_site(noise, n, site, strip, workspace)
@@ -336,7 +306,7 @@ def exact_electrons_site(noise: Electrons, n: int, x: int, strip: Strip, workspa
     if frame.has_dark:
         electrons = electrons + (_exact_dark(noise, frame, x, workspace) - frame.removed_e)
     electrons = electrons + workspace.defects_e[x]
-    value = exact_value(workspace.site_words[x], pointer_to(noise.site_quadratics, n * 4096))
+    value = normal.exact_value(workspace.site_words[x], pointer_to(noise.site_quadratics, n * 4096))
     column_dn = noise.columns_dn[n * noise.padded_width + _first_column(strip) + x]
     offset_dn = (column_dn + workspace.row_dn[0]) + noise.planes_dn[site]
     site_dn = np.float64(_sites_dn(noise, n, strip)[x])
@@ -350,8 +320,7 @@ def _exact_light(
     """Return the electrons of light of one site: a count, or the mean."""
     if workspace.light_error_e[x] == _ZERO32:
         return float(workspace.light_e[x])
-    row, column = noise.body.response_steps
-    response = np.float64(noise.body.response[strip.y * row + (_first_column(strip) + x) * column])
+    response = np.float64(strip_values(noise.body.response, strip)[x])
     rate = (workspace.unrounded_dn[x] - noise.black_dn) / dn_per_e * response
     return float(exact_count(workspace.words[x], rate, noise.tables) if frame.counts_light else rate)
 
@@ -368,13 +337,12 @@ def _exact_dark(noise: Electrons, frame: FrameNumbers, x: int, workspace: Worksp
 def average_electrons(noise: Electrons, strip: Strip, workspace: Workspace) -> None:
     """Add the fixed patterns to the unrounded clean frame, as `reference.noise.average`."""
     frame, clean_dn, defects_e = load_frame(noise, np.int64(0)), workspace.unrounded_dn, workspace.defects_e
-    _mark_defects(noise.body, strip, workspace)
-    kept_e, (row, column) = frame.dark_e - frame.removed_e, noise.body.sites_steps
-    sites_dn = pointer_to(noise.body.sites_dn, strip.y * row + strip.x * column + strip.lead)
+    _fill_defects(noise.body, strip, workspace)
+    kept_e, sites_dn = frame.dark_e - frame.removed_e, strip_values(noise.body.sites_dn, strip)
     for x in range(strip.total):
         site = _first_site(np.int64(0), strip) + (x & 1)
         gain = noise.dn_per_e[site]
-        dn = minimum((clean_dn[x] + defects_e[x] * gain) + kept_e * gain, noise.full_dn)
+        dn = simd.minimum((clean_dn[x] + defects_e[x] * gain) + kept_e * gain, noise.full_dn)
         offset_dn = 0.0 + noise.fixed_columns_dn[_first_column(strip) + x]
         dn = (dn + (offset_dn + noise.planes_dn[site])) + np.float64(sites_dn[x])
         clean_dn[x] = dn if defects_e[x] >= 0.0 else 0.0

@@ -12,7 +12,7 @@ Lines
     quadratics need three). Valid for any symmetric distribution; computes eight values at a time.
 Polynomials
     The quantile is a polynomial in the depth √(-log2 p), for all p at once, and so is the logarithm's mantissa. No
-    loads. Two separate loops, because a single one is a chain of forty dependent operations.
+    loads. Two separate loops, because a single one is a long chain of dependent operations. Tier ``fast`` uses them.
 
 Design: ``docs/design/kernels.md``.
 """
@@ -28,21 +28,8 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import inner
 from unprocess_gen.core.lookup_tables import FIRST_LINE, LINE_SHIFT, SEGMENTS, normal_table, quantile_lines
 from unprocess_gen.core.types import Float
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    Pointer,
-    Vector,
-    from_bits,
-    load,
-    load_columns,
-    square_root,
-    store,
-    to_bits,
-    to_float32,
-    to_float64,
-    to_uint32,
-    to_uint64,
-)
+from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 
 # --------------------------------------------------------------------------------------------------------------- tables
 
@@ -100,11 +87,11 @@ def pack_lines(start: NDArray[np.float32], slope: NDArray[np.float32]) -> NDArra
 @inner
 def exact_value(word: np.uint32, quadratics: Pointer) -> float:
     """Return the quantile of one word, bit for bit as `reference.noise.by_inverse_cdf`."""
-    bits = to_bits(np.float64(np.int64(word & _LOW31)) + 0.5)
+    bits = simd.to_bits(np.float64(np.int64(word & _LOW31)) + 0.5)
     row = ((bits >> _POSITION_BITS) - _FIRST_ROW) << _2
-    t = from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
+    t = simd.from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
     z = quadratics[row] + t * (quadratics[row + _1] + t * quadratics[row + _2])
-    return float(from_bits(to_bits(z) ^ np.uint64(word & _SIGN) << _32))
+    return float(simd.from_bits(simd.to_bits(z) ^ np.uint64(word & _SIGN) << _32))
 
 
 @inner
@@ -112,19 +99,19 @@ def fill_rows(count: int, words: Pointer, rows: Pointer) -> None:
     """Fill ``rows`` (uint32) with the index at which the quadratic of each word begins, for `exact_values`."""
     for n in range(count // VECTOR_WIDTH):
         x = np.uint64(n) * _VECTOR_WIDTH
-        bits = to_bits(to_float64(load(words, x) & _LOW31) + 0.5)
-        store(rows, x, to_uint32(((bits >> _POSITION_BITS) - _FIRST_ROW) << _2))
+        bits = simd.to_bits(simd.to_float64(simd.load(words, x) & _LOW31) + 0.5)
+        simd.store(rows, x, simd.to_uint32(((bits >> _POSITION_BITS) - _FIRST_ROW) << _2))
 
 
 @inner
 def exact_values(words: Pointer, rows: Pointer, x: np.uint64, quadratics: Pointer) -> Vector:
     """Return the quantiles of eight words, the values of `exact_value`."""
-    of_words = load(words, x)
-    bits = to_bits(to_float64(of_words & _LOW31) + 0.5)
-    t = from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
-    start, slope, curvature = load_columns(quadratics, rows, x)
+    of_words = simd.load(words, x)
+    bits = simd.to_bits(simd.to_float64(of_words & _LOW31) + 0.5)
+    t = simd.from_bits((bits & _POSITION_MASK) | _ONE_BITS) - 1.0
+    start, slope, curvature = simd.load_columns(quadratics, rows, x)
     z = start + t * (slope + t * curvature)
-    signed: Vector = from_bits(to_bits(z) ^ (to_uint64(of_words & _SIGN) << _32))
+    signed: Vector = simd.from_bits(simd.to_bits(z) ^ (simd.to_uint64(of_words & _SIGN) << _32))
     return signed
 
 
@@ -134,37 +121,21 @@ def fill_values_by_lines(count: int, words: Pointer, lines: Pointer, buffer: Poi
     for n in range(count):
         out[n] = np.float32(np.int32(words[n] & _LOW31)) + _HALF
     for n in range(count):
-        buffer[n] = lines[np.uint64((to_bits(out[n]) >> _LINE_SHIFT) - _FIRST_LINE)]
+        buffer[n] = lines[np.uint64((simd.to_bits(out[n]) >> _LINE_SHIFT) - _FIRST_LINE)]
     for n in range(count):
-        start, slope = from_bits(np.uint32(buffer[n])), from_bits(np.uint32(buffer[n] >> _32))
+        start, slope = simd.from_bits(np.uint32(buffer[n])), simd.from_bits(np.uint32(buffer[n] >> _32))
         out[n] = start + slope * out[n]
     for n in range(count):
-        out[n] = from_bits(np.uint32(to_bits(out[n]) ^ (words[n] & _SIGN)))
+        out[n] = simd.from_bits(np.uint32(simd.to_bits(out[n]) ^ (words[n] & _SIGN)))
 
 
 # ------------------------------------------------------------------------------------------------------- by polynomials
 
-FINE_ERROR = 2.5e-5
-"""Largest error of a normal by the fine polynomials, in standard deviations, over all words."""
-
-DEPTH_CENTRE = np.float32(9775.0441)
-"""Subtracted from a depth in `fine_normal`, so that the terms stay small: 3.375 · 2**11.5."""
-
-
-def _float32s(*coefficients: float) -> tuple[np.float32, ...]:
-    return tuple(np.float32(coefficient) for coefficient in coefficients)
-
-
 # Minimax polynomials (Remez, by iterated weights on 4001 nodes) of log2(m) - (m - 1), times 2**23, for m in [1, 2], and
-# of the quantile for depths of 2**11.5 to √33 · 2**11.5. Errors before rounding to float32: fine 1.8e-6 in the
-# logarithm and 2.1e-5 standard deviations in the quantile; coarse 6.4e-4 and 1.6e-4.
-_FINE_LOG2 = _float32s(-17113098, 42890644, -44811848, 27569396, -10627677, 2308114.25, -215512.344)
-_FINE_QUANTILE = _float32s(
-    3.372473, 4.44874051e-04, -2.84176638e-09, 2.20292561e-13, -2.1180979e-17, 2.20518879e-21, -4.88991725e-27,
-    -1.15461396e-29, -3.53712128e-33, 4.32072602e-37,
-)  # fmt: skip
-_COARSE_LOG2 = _float32s(-9677272, 17178896, -8823765, 1327485.62)
-_COARSE_QUANTILE = _float32s(
+# of the quantile for depths of 2**11.5 to √33 · 2**11.5. Errors before rounding to float32: 6.4e-4 in the logarithm and
+# 1.6e-4 standard deviations in the quantile.
+_COARSE_LOG2 = (-9677272.0, 17178896.0, -8823765.0, 1327485.62)
+_COARSE_QUANTILE = (
     -2.24054217, 1.0469046e-03, -1.3891615e-07, 1.98390731e-11, -1.80084456e-15, 9.96128569e-20, -3.05291064e-24,
     3.96620536e-29,
 )  # fmt: skip
@@ -174,64 +145,19 @@ _BITS_OF_2_32 = np.uint32((32 + 127) << 23)
 
 
 @inner
-def fill_depths(count: int, words: Pointer, depths: Pointer) -> None:
-    """Fill ``depths`` (float32) with √(-log2 p)·2**11.5 for `fine_normal`; p is each word's tail probability.
-
-    ``count`` is a multiple of `VECTOR_WIDTH`. The error of log2 is at most 1.8e-6, before float32 rounding.
-    """
-    for n in range(count // VECTOR_WIDTH):
-        x = np.uint64(n) * _VECTOR_WIDTH
-        octaves, m = _split_words(load(words, x))
-        store(depths, x, square_root(octaves - _fine_log2(m)))
-
-
-@inner
 def fill_coarse_depths(count: int, words: Pointer, depths: Pointer) -> None:
     """Fill ``depths`` (float32) with √(-log2 p)·2**11.5 for `coarse_normal`; p is each word's tail probability.
 
-    ``count`` is a multiple of `VECTOR_WIDTH`. The error of log2 is at most 6.4e-4, before float32 rounding.
+    ``count`` is a multiple of `VECTOR_WIDTH`. For f = m · 2**e, m in [1, 2), the bits of f as a float32, read as an
+    integer, are (e + 127 + m - 1) · 2**23.
     """
+    c = _COARSE_LOG2
     for n in range(count // VECTOR_WIDTH):
         x = np.uint64(n) * _VECTOR_WIDTH
-        octaves, m = _split_words(load(words, x))
-        store(depths, x, square_root(octaves - _coarse_log2(m)))
-
-
-@inner
-def _split_words(words: Vector) -> tuple[Vector, Vector]:
-    """Return (32 - e - (m - 1)) · 2**23 and m in [1, 2) of each f = m · 2**e.
-
-    The bits of a float32, read as an integer, are (e + 127 + m - 1) · 2**23.
-    """
-    bits = to_bits(to_float32(words & _LOW31) + _HALF)
-    return to_float32(_BITS_OF_2_32 - bits), from_bits((bits & _MANTISSA) | _ONE_BITS32)
-
-
-@inner
-def _fine_log2(m: Vector) -> Vector:
-    c = _FINE_LOG2
-    m2 = m * m
-    log2: Vector = ((c[0] + c[1] * m) + (c[2] + c[3] * m) * m2) + ((c[4] + c[5] * m) + c[6] * m2) * (m2 * m2)
-    return log2
-
-
-@inner
-def _coarse_log2(m: Vector) -> Vector:
-    c = _COARSE_LOG2
-    log2: Vector = (c[0] + c[1] * m) + (c[2] + c[3] * m) * (m * m)
-    return log2
-
-
-@inner
-def fine_normal(depths: Vector) -> Vector:
-    """Return the absolute normal deviates of these depths, with errors up to `FINE_ERROR`."""
-    c = _FINE_QUANTILE
-    t = depths - DEPTH_CENTRE
-    t2 = t * t
-    t4 = t2 * t2
-    low = ((c[0] + c[1] * t) + (c[2] + c[3] * t) * t2) + ((c[4] + c[5] * t) + (c[6] + c[7] * t) * t2) * t4
-    normal: Vector = low + (c[8] + c[9] * t) * (t4 * t4)
-    return normal
+        bits = simd.to_bits(simd.to_float32(simd.load(words, x) & _LOW31) + _HALF)
+        m = simd.from_bits((bits & _MANTISSA) | _ONE_BITS32)
+        log2 = (c[0] + c[1] * m) + (c[2] + c[3] * m) * (m * m)
+        simd.store(depths, x, simd.square_root(simd.to_float32(_BITS_OF_2_32 - bits) - log2))
 
 
 @inner
@@ -247,5 +173,5 @@ def coarse_normal(depths: Vector) -> Vector:
 @inner
 def apply_signs(x: Vector, words: Vector) -> Vector:
     """Negate the float32 lanes whose word has its top bit set."""
-    signed: Vector = from_bits(to_bits(x) ^ (words & _SIGN))
+    signed: Vector = simd.from_bits(simd.to_bits(x) ^ (words & _SIGN))
     return signed

@@ -34,16 +34,8 @@ def philox_key(key: int, level: int = 0, draw: int = 0, frame: int = 0) -> Philo
 
 def philox_keys(plans: Sequence[Plan]) -> NDArray[np.uint64]:
     """Return the key and counter words of several plans, uint64 ``[N, 4]``; `load_key` reads one row."""
-    rows = [
-        (
-            plan.stream_key & 0xFFFFFFFF,
-            plan.stream_key >> 32,
-            plan.noise.level << 12 | plan.noise.draw,
-            plan.noise.frame,
-        )
-        for plan in plans
-    ]
-    return np.array(rows, dtype=np.uint64)
+    noises = [(plan.stream_key, plan.noise.level, plan.noise.draw, plan.noise.frame) for plan in plans]
+    return np.array([philox_key(*numbers) for numbers in noises], dtype=np.uint64)
 
 
 @inner

@@ -23,45 +23,12 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import inner
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.types import Float
-from unprocess_gen.simulation.kernels.normal import (
-    apply_signs,
-    exact_value,
-    fill_values_by_lines,
-    normal_quantiles,
-)
+from unprocess_gen.simulation.kernels import normal, simd
 from unprocess_gen.simulation.kernels.rounding import ROUND32
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    Pointer,
-    Vector,
-    absolute,
-    from_bits,
-    less_than,
-    load,
-    maximum,
-    minimum,
-    movemask,
-    pointer_to,
-    select,
-    square_root,
-    store,
-    to_bits,
-    to_float32,
-    uint32_zeros,
-)
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 from unprocess_gen.simulation.kernels.strips import Workspace
-from unprocess_gen.simulation.reference.poisson import (
-    LIMIT,
-    ORDER,
-    RATE_CELLS,
-    TAIL_CELLS,
-    A,
-    B,
-    C,
-    D,
-    E,
-    poisson_tables,
-)
+from unprocess_gen.simulation.reference import poisson as reference
+from unprocess_gen.simulation.reference.poisson import LIMIT, ORDER, RATE_CELLS, TAIL_CELLS, poisson_tables
 
 LOW_RATE = 5.0
 """Rate below which counts are found by comparison with the distribution function."""
@@ -74,8 +41,9 @@ FLOAT32_RATE = 5 * 2.0**-24
 
 _LOW31, _SIGN = np.uint64(0x7FFFFFFF), np.uint64(0x80000000)
 _1, _8, _31, _32 = (np.uint64(number) for number in (1, 8, 31, 32))
-_POWERS = len(A)
-_COEFFICIENTS = np.array([(*series, *(0.0,) * (_POWERS - len(series))) for series in (A, B, C, D, E)])
+_SERIES = reference.A, reference.B, reference.C, reference.D, reference.E
+_POWERS = len(reference.A)
+_COEFFICIENTS = np.array([(*series, *(0.0,) * (_POWERS - len(series))) for series in _SERIES])
 
 
 class CountTables(NamedTuple):
@@ -103,9 +71,9 @@ class CountTables(NamedTuple):
 @functools.lru_cache(maxsize=1)
 def count_tables() -> CountTables:
     """Return the tables, computed once per process."""
-    normal, exact = normal_quantiles(), poisson_tables()
+    normals, exact = normal.normal_quantiles(), poisson_tables()
     cells = np.stack([exact.first, exact.least, exact.most, exact.middle], axis=1)
-    return CountTables(normal.lines, normal.quadratics, exact.tails, exact.cdf, cells)
+    return CountTables(normals.lines, normals.quadratics, exact.tails, exact.cdf, cells)
 
 
 # -------------------------------------------------------------------------------------------------- one rate everywhere
@@ -147,18 +115,17 @@ def fill_counts_of_one_rate(
     """Fill ``out`` (float32) with the counts of ``words`` by the ``steps`` ranks of `count_thresholds`."""
     for n in range(count // VECTOR_WIDTH):
         x = np.uint64(n) * _8
-        word, above = load(words, x), uint32_zeros()
+        word, above = simd.load(words, x), simd.uint32_zeros()
         rank = word ^ (((word >> _TOP_BIT) - _ONE_BIT) | _SIGN32)
         for k in range(steps):
-            above = above - less_than(last_ranks[k], rank)
-        store(out, x, to_float32(above) + smallest)
+            above = above - simd.less_than(last_ranks[k], rank)
+        simd.store(out, x, simd.to_float32(above) + smallest)
 
 
 # ------------------------------------------------------------------------------------------------------------ all sites
 
 _TOP_BIT, _ONE_BIT, _SIGN32, _LOW31_32 = (np.uint32(bits) for bits in (31, 1, 0x80000000, 0x7FFFFFFF))
-_ONE_BITS32, _INFINITE_BITS32, _23 = np.uint32(0x3F800000), np.uint32(0x7F800000), np.uint32(23)
-_0F, _HALF, _1F, _LOW = np.float32(0), np.float32(0.5), np.float32(1), np.float32(LOW_RATE)
+_INFINITE_BITS32, _EVERY_BIT, _23, _0F = np.uint32(0x7F800000), np.uint32(0xFFFFFFFF), np.uint32(23), np.float32(0)
 
 
 @inner
@@ -170,30 +137,37 @@ def fill_counts(
     ``error`` (float32) receives 0 where the count is certain, else a bound of its error, which may be infinite.
     ``rates`` (float32) may differ from the true rates by `FLOAT32_RATE`.
     """
-    if _reaches_low_rate(rates, np.uint64(0), count // VECTOR_WIDTH):
-        fill_values_by_lines(count, words, tables.lines, workspace.lines, workspace.normals)
+    has_normals = False
     for start in range(0, count, BLOCK):
         first, vectors = np.uint64(start), min(BLOCK, count - start) // VECTOR_WIDTH
-        lowest = load(rates, first)
-        for n in range(1, vectors):
-            lowest = minimum(load(rates, first + np.uint64(n) * _8), lowest)
-        has_low = movemask(less_than(lowest, _LOW)) != 0
+        has_low, has_high, highest_low = _range_of_block(first, vectors, rates, workspace)
         if has_low:
-            _count_low_rates(first, vectors, words, rates, workspace, out, error)
-        if _reaches_low_rate(rates, first, vectors):
+            _count_low_rates(first, vectors, highest_low, words, rates, out, error)
+        if has_high:
+            if not has_normals:
+                normal.fill_values_by_lines(count, words, tables.lines, workspace.lines, workspace.normals)
+                has_normals = True
             _count_high_rates(first, vectors, has_low, rates, workspace.normals, out, error)
 
 
 @inner
-def _reaches_low_rate(rates: Pointer, first: np.uint64, vectors: int) -> bool:
-    """Return whether any rate is `LOW_RATE` or more."""
-    highest = load(rates, first)
-    for n in range(1, vectors):
-        highest = maximum(load(rates, first + np.uint64(n) * _8), highest)
-    return bool(movemask(less_than(highest, _LOW)) != _EVERY_LANE)
+def _range_of_block(
+    first: np.uint64, vectors: int, rates: Pointer, workspace: Workspace
+) -> tuple[bool, bool, np.float32]:
+    """Return whether any rate of a block is below `LOW_RATE`, whether any is not, and the highest one below it."""
+    any_low = any_high = simd.uint32_zeros()
+    low = simd.from_bits(any_low)
+    for n in range(vectors):
+        rate = simd.load(rates, first + np.uint64(n) * _8)
+        is_low = simd.less_than(rate, LOW_RATE)
+        any_low, any_high = any_low | is_low, any_high | (is_low ^ _EVERY_BIT)
+        low = simd.maximum(simd.from_bits(is_low & simd.to_bits(rate)), low)
+    simd.store(workspace.highest, 0, low)
+    highest = _0F
+    for lane in range(VECTOR_WIDTH):
+        highest = simd.maximum(workspace.highest[lane], highest)
+    return simd.has_any_bit(any_low), simd.has_any_bit(any_high), highest
 
-
-_EVERY_LANE = np.uint32(2**VECTOR_WIDTH - 1)
 
 CDF_ERROR = 2.0**-18
 """Bound of the error of a distribution function in float32 below rate 5.
@@ -202,55 +176,40 @@ The largest terms: rounding of the exponent 5e-7, the 13 terms of the recurrence
 rate 3e-7, exponential and rank 2e-7.
 """
 
-_LOG2E, _CDF_ERROR, _WORD = np.float32(1.4426950408889634), np.float32(CDF_ERROR), np.float32(2.0**-32)
 _RECIPROCALS = np.array([1 / k for k in range(1, 32)], dtype=np.float32)
-_EXP2 = tuple(np.float32(c) for c in (1.00000007, 0.693146967, 0.240221197, 0.0555071329, 9.67554206e-3, 1.32764676e-3))
+_LOG2E = 1.4426950408889634
+_EXP2 = (1.00000007, 0.693146967, 0.240221197, 0.0555071329, 9.67554206e-3, 1.32764676e-3)
 """Minimax polynomial of 2**f for f from -1/2 to 1/2, relative error 7.5e-8."""
 
 
 @inner
 def _count_low_rates(
-    first: np.uint64, vectors: int, words: Pointer, rates: Pointer, workspace: Workspace, out: Pointer, error: Pointer
+    first: np.uint64, vectors: int, highest: np.float32, words: Pointer, rates: Pointer, out: Pointer, error: Pointer
 ) -> None:
     """Fill up to a block with the counts of rates below `LOW_RATE`; errors are 0 or infinite.
 
     Terms are summed up to a count that at most 0.4 % of the words exceed. Ranks and the distribution function are
     reduced by ½, so that float32 is precise where they are compared most.
     """
-    pairs = (_terms_of_block(first, vectors, rates, workspace.errors) + 1) // 2
+    pairs = (np.int64(highest + 3.1 * np.sqrt(highest)) + 2) // 2
     for n in range(vectors):
         x = first + np.uint64(n) * _8
-        rate, word = load(rates, x), load(words, x)
-        rank = apply_signs(_HALF - to_float32(word & _LOW31_32) * _WORD, word)
-        low, high = rank - _CDF_ERROR, rank + _CDF_ERROR
+        rate, word = simd.load(rates, x), simd.load(words, x)
+        rank = normal.apply_signs(0.5 - simd.to_float32(word & _LOW31_32) * 2.0**-32, word)
+        low, high = rank - CDF_ERROR, rank + CDF_ERROR
         term = _exp_of_minus(rate)
-        cdf, certain, possible = term - _HALF, uint32_zeros(), uint32_zeros()
+        cdf, certain, possible = term - 0.5, simd.uint32_zeros(), simd.uint32_zeros()
         for pair in range(pairs):
             k = np.uint64(2 * pair)
-            certain, possible = certain - less_than(cdf, low), possible - less_than(cdf, high)
+            certain, possible = certain - simd.less_than(cdf, low), possible - simd.less_than(cdf, high)
             term = term * (rate * _RECIPROCALS[k])
             cdf = cdf + term
-            certain, possible = certain - less_than(cdf, low), possible - less_than(cdf, high)
+            certain, possible = certain - simd.less_than(cdf, low), possible - simd.less_than(cdf, high)
             term = term * (rate * _RECIPROCALS[k + _1])
             cdf = cdf + term
-        store(out, x, to_float32(certain))
-        is_open = less_than(certain, possible) | less_than(cdf, high)
-        store(error, x, from_bits(is_open & _INFINITE_BITS32))
-
-
-@inner
-def _terms_of_block(first: np.uint64, vectors: int, rates: Pointer, scratch: Pointer) -> np.int64:
-    """Return how many terms of the distribution function the rates below `LOW_RATE` need."""
-    rate = load(rates, first)
-    highest = from_bits(less_than(rate, _LOW) & to_bits(rate))
-    for n in range(1, vectors):
-        rate = load(rates, first + np.uint64(n) * _8)
-        highest = maximum(from_bits(less_than(rate, _LOW) & to_bits(rate)), highest)
-    store(scratch, 0, highest)
-    most = _0F
-    for lane in range(VECTOR_WIDTH):
-        most = maximum(scratch[lane], most)
-    return np.int64(most + np.float32(3.1) * np.sqrt(most)) + 1
+        simd.store(out, x, simd.to_float32(certain))
+        is_open = simd.less_than(certain, possible) | simd.less_than(cdf, high)
+        simd.store(error, x, simd.from_bits(is_open & _INFINITE_BITS32))
 
 
 @inner
@@ -261,7 +220,7 @@ def _exp_of_minus(x: Vector) -> Vector:
     f = t - (shifted - ROUND32)
     c, f2 = _EXP2, f * f
     power = (f * c[1] + c[0]) + f2 * ((f * c[3] + c[2]) + f2 * (f * c[5] + c[4]))
-    scaled: Vector = from_bits(to_bits(power) + (to_bits(shifted) << _23))
+    scaled: Vector = simd.from_bits(simd.to_bits(power) + (simd.to_bits(shifted) << _23))
     return scaled
 
 
@@ -283,10 +242,6 @@ _TERMS, _OF_RECIPROCAL = (1 / 6, -1 / 72, 3.74468638e-3, -1.52239065e-3, 6.95733
 
 The first two are those of the expansion; the others minimise the largest error times the rate.
 """
-_TERMS32, _OF_RECIPROCAL32 = tuple(np.float32(c) for c in _TERMS), np.float32(_OF_RECIPROCAL)
-_ERROR, _ERROR_OF_RATE, _ERROR_OF_RECIPROCAL = (np.float32(e) for e in EXPANSION_ERRORS)
-_2F, _1_HALF = np.float32(2), np.float32(1.5)
-_REACH, _REACH_OF_ROOT = np.float32(NORMAL_REACH2[0] - 1e-3), np.float32(NORMAL_REACH2[1])
 
 
 @inner
@@ -294,27 +249,26 @@ def _count_high_rates(
     first: np.uint64, vectors: int, has_low: bool, rates: Pointer, normals: Pointer, out: Pointer, error: Pointer
 ) -> None:
     """Fill up to a block with the counts of rates from `LOW_RATE` up; ``has_low`` keeps those of lower rates."""
-    c = _TERMS32
+    c, (error_of_1, error_of_rate, error_of_reciprocal) = _TERMS, EXPANSION_ERRORS
     for n in range(vectors):
         x = first + np.uint64(n) * _8
-        rate, z = load(rates, x), load(normals, x)
-        reciprocal, root = _1F / rate, square_root(rate)
+        rate, z = simd.load(rates, x), simd.load(normals, x)
+        reciprocal, root = 1.0 / rate, simd.square_root(rate)
         s, z2 = z * (root * reciprocal), z * z
         s2 = s * s
         terms = (s * c[1] + c[0]) + s2 * ((s * c[3] + c[2]) + s2 * c[4])
-        value = (rate - _HALF) + (root * z + ((z2 + _2F) * terms + reciprocal * _OF_RECIPROCAL32))
+        value = (rate - 0.5) + (root * z + ((z2 + 2.0) * terms + reciprocal * _OF_RECIPROCAL))
         counted = (value + ROUND32) - ROUND32
-        most = (rate * _ERROR_OF_RATE + reciprocal * _ERROR_OF_RECIPROCAL) + (_1F + _ERROR)
-        is_open, is_far = (
-            less_than(_1_HALF - most, absolute(value - counted)),
-            less_than(root * _REACH_OF_ROOT + _REACH, z2),
-        )
-        bound = maximum(from_bits(to_bits(most) & is_open), from_bits(is_far & _INFINITE_BITS32))
+        most = (rate * error_of_rate + reciprocal * error_of_reciprocal) + (1.0 + error_of_1)
+        is_open = simd.less_than(1.5 - most, simd.absolute(value - counted))
+        is_far = simd.less_than(root * NORMAL_REACH2[1] + (NORMAL_REACH2[0] - 1e-3), z2)
+        bound = simd.maximum(simd.from_bits(simd.to_bits(most) & is_open), simd.from_bits(is_far & _INFINITE_BITS32))
         if has_low:
-            is_low = less_than(rate, _LOW)
-            counted, bound = select(is_low, load(out, x), counted), select(is_low, load(error, x), bound)
-        store(out, x, counted)
-        store(error, x, bound)
+            is_low = simd.less_than(rate, LOW_RATE)
+            counted = simd.select(is_low, simd.load(out, x), counted)
+            bound = simd.select(is_low, simd.load(error, x), bound)
+        simd.store(out, x, counted)
+        simd.store(error, x, bound)
 
 
 # ------------------------------------------------------------------------------------------------------ uncertain sites
@@ -325,7 +279,7 @@ def exact_count(word: np.uint32, rate: float, tables: CountTables) -> float:
     """Return the count of a word, in the reference's order of operations."""
     if not rate > 0.0:
         return 0.0
-    z = exact_value(word, tables.quadratics)
+    z = normal.exact_value(word, tables.quadratics)
     if rate >= LOW_RATE:
         least, most = _bounds_by_first_terms(rate, z)
         if least == most:
@@ -387,12 +341,12 @@ def _power_sum(which: int, s: float) -> float:
 def _count_by_cdf(word: np.uint32, rate: float, z: float, tables: CountTables) -> float:
     """Return the least k with P(K <= k) >= u, from an estimate by the normal of the word up or down."""
     root = np.sqrt(rate)
-    of_cell = pointer_to(tables.cells, 4 * np.int64(root * RATE_CELLS))
+    of_cell = simd.pointer_to(tables.cells, 4 * np.int64(root * RATE_CELLS))
     first, least, most, offset = np.int64(of_cell[0]), of_cell[1], of_cell[2], rate - of_cell[3]
     # rank of the word by its normal: invert the top bit, and the other bits too if it was 0
     bits = np.uint64(word)
     uniform = (np.float64(bits ^ (_SIGN | (((bits >> _31) - _1) & _LOW31))) + 0.5) * 2.0**-32
-    k = np.int64(minimum(maximum(np.floor(rate + root * z + (z * z - 1.0) / 6.0), least), most))
+    k = np.int64(simd.minimum(simd.maximum(np.floor(rate + root * z + (z * z - 1.0) / 6.0), least), most))
     while k <= most and uniform > _cdf_at(tables.cdf, first + k, offset):
         k += 1
     while k > least and not uniform > _cdf_at(tables.cdf, first + k - 1, offset):

@@ -27,7 +27,6 @@ noise: `Gaussian`, `Gaussian32` or `Electrons`. Each function below that is made
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,50 +34,17 @@ from numpy.typing import NDArray
 
 from unprocess_gen.core.jit import by_class, inner
 from unprocess_gen.core.types import PACKED, Float, Plan
+from unprocess_gen.simulation.kernels import electrons, gaussian, simd
 from unprocess_gen.simulation.kernels.clean import FLOAT32_MARGIN
-from unprocess_gen.simulation.kernels.electrons import (
-    Electrons,
-    approximate_electrons,
-    average_electrons,
-    count_defects,
-    count_electrons,
-    exact_electrons,
-    exact_electrons_site,
-)
-from unprocess_gen.simulation.kernels.gaussian import (
-    Gaussian,
-    Gaussian32,
-    approximate_gaussian,
-    approximate_gaussian32,
-    draw_gaussian,
-    exact_gaussian,
-    exact_gaussian_site,
-    variance_lines,
-)
+from unprocess_gen.simulation.kernels.electrons import Electrons
+from unprocess_gen.simulation.kernels.gaussian import Gaussian, Gaussian32
 from unprocess_gen.simulation.kernels.rounding import ROUND, ROUND32
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    Pointer,
-    absolute,
-    has_any_bit,
-    less_than,
-    load,
-    maximum,
-    minimum,
-    pointer_to,
-    store,
-    to_bits,
-    to_float32,
-    to_uint32,
-    to_uint64,
-    uint32_zeros,
-)
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, pointer_to
 from unprocess_gen.simulation.kernels.strips import Strip, Workspace, count_outside, list_lanes
 from unprocess_gen.simulation.reference.cfa import plane_sites
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 
-_8, _HALF32 = np.uint64(8), np.float32(0.5)
-_DECREASED, _INCREASED = 1.0 - 2.0**-50, 1.0 + 2.0**-50
+_8 = np.uint64(8)
 
 
 class ReadOut(NamedTuple):
@@ -127,8 +93,9 @@ CLEAN_LOW, CLEAN_HIGH, NOISY_LOW, NOISY_HIGH, SATURATED, ZERO_VARIANCE = range(6
 """Places of the members of `Counts` in the counts of a frame."""
 
 
+@functools.lru_cache(maxsize=4)
 def readout_of(
-    plans: Sequence[Plan], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
+    plans: tuple[Plan, ...], shape: tuple[int, int], origin: tuple[int, int], counts_from_black: bool
 ) -> ReadOut:
     """Return the read-out of the plans' frames ``[H, W]``; the unrounded clean frame may count from black."""
     first = plans[0]
@@ -138,25 +105,18 @@ def readout_of(
         for plan in plans
     ]
     packed = first.output.layout == PACKED
-    planes = _planes(first.sensor.pattern, origin[0] % 2, origin[1] % 2)
+    planes = np.argsort([2 * y + x for y, x in plane_sites(first.sensor.pattern, origin)])
     kind = Normalised if first.output.normalised else FloatClean if first.output.clean_normalised else Integers
     return kind(
         limits_dn=np.array(limits_dn, dtype=np.float64),
-        variance_lines=variance_lines(plans, np.float32 if counts_from_black else np.float64),
+        variance_lines=gaussian.variance_lines(plans, np.float32 if counts_from_black else np.float64),
         averaged=first.noise.averaged,
         black_dn=np.float32(0) if counts_from_black else float(first.sensor.black_level_dn),
-        span_dn=float(first.sensor.white_level_dn - first.sensor.black_level_dn),
+        span_dn=float(first.sensor.span_dn),
         white=1.0 if first.output.clean_normalised else float(first.sensor.white_level_dn),
         packed=packed,
         planes=planes * ((shape[0] // 2) * (shape[1] // 2)) if packed else planes,
     )
-
-
-@functools.lru_cache(maxsize=16)
-def _planes(pattern: str, top: int, left: int) -> NDArray[np.int64]:
-    """Return the number of the plane of each site of a tile, [4]."""
-    sites = [2 * y + x for y, x in plane_sites(pattern, (top, left))]
-    return np.argsort(sites)
 
 
 def _pinned_dn(plan: Plan, counts_from_black: bool) -> tuple[float, float]:
@@ -179,41 +139,35 @@ def load_limits(readout: Any, n: int) -> Limits:
 # ------------------------------------------------------------------------------------------------------- noise by class
 
 
-draw_noise = by_class({Gaussian: draw_gaussian, Gaussian32: draw_gaussian, Electrons: count_electrons})
+draw_noise = by_class(
+    {Gaussian: gaussian.draw_gaussian, Gaussian32: gaussian.draw_gaussian, Electrons: electrons.count_electrons}
+)
 """Fill the random words and counts of a strip of frame n; arguments: noise, n, key, strip, workspace."""
 _approximate = by_class(
-    {Gaussian: approximate_gaussian, Gaussian32: approximate_gaussian32, Electrons: approximate_electrons}
-)
-"""Fill ``noise_dn``, which the read-out adds to the base, and ``error_dn``; arguments: noise, n, strip, workspace."""
-_base_of = by_class(
     {
-        Gaussian: lambda noise, workspace: workspace.rounded_dn,
-        Gaussian32: lambda noise, workspace: noise.black_dn,
-        Electrons: lambda noise, workspace: workspace.zeros,
+        Gaussian: gaussian.approximate_gaussian,
+        Gaussian32: gaussian.approximate_gaussian32,
+        Electrons: electrons.approximate_electrons,
     }
 )
-"""Return the integers to which ``noise_dn`` is added, DN; arguments: noise, workspace."""
-_has_errors = by_class({Gaussian: lambda noise: True, Gaussian32: lambda noise: False, Electrons: lambda noise: True})
-"""Return whether ``error_dn`` has bounds, so that sites can be uncertain; argument: noise."""
-_count_listed = by_class(
-    {Gaussian: lambda noise, strip: 0, Gaussian32: lambda noise, strip: 0, Electrons: count_defects}
-)
-"""Return the number of sites that are listed as uncertain already; arguments: noise, strip."""
+"""Fill ``noise_dn`` and ``error_dn``; return the base, integers in DN; arguments: noise, n, strip, workspace."""
 _exact_site = by_class(
     {
-        Gaussian: exact_gaussian_site,
+        Gaussian: gaussian.exact_gaussian_site,
         Gaussian32: lambda noise, n, x, strip, workspace: 0.0,  # it lists no site
-        Electrons: exact_electrons_site,
+        Electrons: electrons.exact_electrons_site,
     }
 )
 """Return the exact DN of a site; arguments: noise, n, x, strip, workspace."""
-_fill_exact = by_class({Gaussian: exact_gaussian, Electrons: exact_electrons})
+_has_errors = by_class({Gaussian: lambda noise: True, Gaussian32: lambda noise: False, Electrons: lambda noise: True})
+"""Return whether ``error_dn`` has bounds, so that sites can be uncertain; argument: noise."""
+_fill_exact = by_class({Gaussian: gaussian.exact_gaussian, Electrons: electrons.exact_electrons})
 """Fill ``exact_dn`` with the DN of all sites; arguments: noise, n, strip, workspace."""
 average_patterns = by_class(
     {
         Gaussian: lambda noise, strip, workspace: None,
         Gaussian32: lambda noise, strip, workspace: None,
-        Electrons: average_electrons,
+        Electrons: electrons.average_electrons,
     }
 )
 """Replace the unrounded clean frame of a strip with the average of many frames; arguments: noise, strip, workspace."""
@@ -226,8 +180,8 @@ average_patterns = by_class(
 def _read_integers(readout: Any, noise: Any, n: int, output: Output, strip: Strip, workspace: Workspace) -> None:
     limits = load_limits(readout, n)
     low, high = np.float32(limits.low), np.float32(limits.high)
-    _approximate(noise, n, strip, workspace)
-    listed, has_clipped = _round_and_list(noise, low, high, strip, workspace)
+    base = _approximate(noise, n, strip, workspace)
+    listed, has_clipped = _round_and_list(noise, base, low, high, strip, workspace)
     for m in range(listed):
         site = np.int64(workspace.uncertain[m])  # as below: Numba compiles a function for each type of index
         dn = np.float32((_exact_site(noise, n, site, strip, workspace) + ROUND) - ROUND)
@@ -251,34 +205,34 @@ def _count_clipped(output: Output, strip: Strip, values_dn: Pointer, low: Any, h
 
 @inner
 def _round_and_list(
-    noise: Any, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
+    noise: Any, base: Pointer, low: np.float32, high: np.float32, strip: Strip, workspace: Workspace
 ) -> tuple[int, bool]:
     """Round half to even, clip and cast to uint16; list sites whose error bound reaches a rounding boundary.
 
-    Return how many sites are listed then, and whether any was clipped.
+    Return how many sites are listed, and whether any was clipped.
     """
-    base, listed = _base_of(noise, workspace), _count_listed(noise, strip)
-    clipped_bits = uint32_zeros()
+    listed, clipped_bits = 0, simd.uint32_zeros()
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        noise_dn = load(workspace.noise_dn, x)
+        noise_dn = simd.load(workspace.noise_dn, x)
         rounded = (noise_dn + ROUND32) - ROUND32
-        dn = load(base, x) + rounded
-        clipped = minimum(maximum(dn, low), high)
-        store(workspace.noisy_dn, x, dn)
-        store(workspace.noisy, x, to_uint32(clipped))
-        clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
+        dn = simd.load(base, x) + rounded
+        clipped = simd.minimum(simd.maximum(dn, low), high)
+        simd.store(workspace.noisy_dn, x, dn)
+        simd.store(workspace.noisy, x, simd.to_uint32(clipped))
+        clipped_bits = clipped_bits | (simd.to_bits(clipped) ^ simd.to_bits(dn))
         if _has_errors(noise):
-            to_boundary = _HALF32 - absolute(noise_dn - rounded)
-            listed = list_lanes(less_than(to_boundary, load(workspace.error_dn, x)), x, listed, workspace)
-    return listed, has_any_bit(clipped_bits)
+            to_boundary = 0.5 - simd.absolute(noise_dn - rounded)
+            uncertain = simd.less_than(to_boundary, simd.load(workspace.error_dn, x))
+            listed = list_lanes(uncertain, x, listed, workspace)
+    return listed, simd.has_any_bit(clipped_bits)
 
 
 @inner
 def _replace(x: int, dn: np.float32, low: np.float32, high: np.float32, workspace: Workspace) -> bool:
     """Replace a noisy value with a rounded DN; return whether it is clipped."""
     workspace.noisy_dn[x] = dn
-    workspace.noisy[x] = np.uint16(np.int64(minimum(maximum(dn, low), high)))
+    workspace.noisy[x] = np.uint16(np.int64(simd.minimum(simd.maximum(dn, low), high)))
     return bool(dn < low or dn > high)
 
 
@@ -289,7 +243,7 @@ def _write_integers(readout: Integers, output: Output, strip: Strip, workspace: 
         limits = load_limits(readout, np.int64(0))
         for x in range(strip.total):
             dn = (workspace.unrounded_dn[x] + ROUND) - ROUND
-            clean[x] = np.uint16(np.int32(minimum(maximum(dn, limits.low), limits.high)))
+            clean[x] = np.uint16(np.int32(simd.minimum(simd.maximum(dn, limits.low), limits.high)))
     if output.may_saturate:
         output.counts[SATURATED] += _count_equal(strip, clean, np.uint16(readout.white))
     _write(readout, strip, clean, output.sites)
@@ -333,27 +287,15 @@ def _is_direct(readout: Any, strip: Strip) -> bool:
 
 @inner
 def _normalise(readout: Any, values_dn: Pointer, low: float, high: float, strip: Strip, out: Pointer) -> bool:
-    """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`; return whether any DN is clipped.
-
-    The product with 1/span takes a fifth of the time of a quotient. It differs from the quotient by three roundings,
-    at most 3·2**-53 of it. Rounding to float32 preserves order, so if the product rounds alike when it is decreased
-    and increased by 2**-50 of itself, the quotient rounds alike too. Otherwise, about once in 10**8 sites, the quotient
-    is computed.
-    """
-    per_dn = 1.0 / readout.span_dn
-    clipped_bits = to_uint64(uint32_zeros())
+    """Clip DN and map black to 0 and white to 1, as `reference.sensor.normalise`; return whether any DN is clipped."""
+    clipped_bits = simd.to_uint64(simd.uint32_zeros())
     for v in range(strip.total // VECTOR_WIDTH):
         x = np.uint64(v) * _8
-        dn = load(values_dn, x)
-        clipped = minimum(maximum(dn, low), high)
-        clipped_bits = clipped_bits | (to_bits(clipped) ^ to_bits(dn))
-        above_black = clipped - readout.black_dn
-        product = above_black * per_dn
-        nearer, farther = to_float32(product * _DECREASED), to_float32(product * _INCREASED)
-        if has_any_bit(to_bits(nearer) ^ to_bits(farther)):
-            farther = to_float32(above_black / readout.span_dn)
-        store(out, x, farther)
-    return has_any_bit(clipped_bits)
+        dn = simd.load(values_dn, x)
+        clipped = simd.minimum(simd.maximum(dn, low), high)
+        clipped_bits = clipped_bits | (simd.to_bits(clipped) ^ simd.to_bits(dn))
+        simd.store(out, x, simd.to_float32((clipped - readout.black_dn) / readout.span_dn))
+    return simd.has_any_bit(clipped_bits)
 
 
 @inner
@@ -391,7 +333,7 @@ def _write(readout: Any, strip: Strip, values: Pointer, out: Pointer) -> None:
 def count_zero_variance(readout: Any, n: int, output: Output, strip: Strip, workspace: Workspace) -> None:
     """Count sites with a·(clean - black) + b <= 0."""
     a, b = readout.variance_lines[2 * n], readout.variance_lines[2 * n + 1]
-    if minimum(a, b) <= 0.0:
+    if simd.minimum(a, b) <= 0.0:
         count = 0
         for x in range(strip.first, strip.after):
             count += a * (workspace.unrounded_dn[x] - readout.black_dn) + b <= 0.0

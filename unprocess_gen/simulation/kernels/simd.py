@@ -114,8 +114,8 @@ def _lanewise(
 ) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles a function of vectors as ``code(builder, LLVM type of the result, *operands)``.
 
-    ``result`` returns the type of the result from that of the operands. Operands without a vector are single numbers of
-    one type; Numba's own functions of numbers are compiled for each type, which takes 0.03 s.
+    ``result`` returns the type of the result from that of the operands. Operands without a vector are single numbers,
+    converted to the type of the first; Numba's own functions of numbers are compiled for each type, in 0.03 s.
     """
     return _compiled(lambda *operands: result(_vector_type(operands) or operands[0]), _per_lane(code))
 
@@ -130,12 +130,15 @@ def _per_lane(code: Callable[..., Any]) -> Callable[..., Any]:
 
     def build(context: Any, builder: Any, call: Any, arguments: Any) -> Any:
         vector_type = _vector_type(call.args)
-        operands = [
-            operand
-            if vector_type is None or isinstance(given, VectorType)
-            else _splat(builder, context.cast(builder, operand, given, vector_type.element), vector_type)
-            for given, operand in zip(call.args, arguments, strict=True)
-        ]
+
+        def convert(given: Any, operand: Any) -> Any:
+            if isinstance(given, VectorType):
+                return operand
+            if vector_type is None:
+                return context.cast(builder, operand, given, call.args[0])
+            return _splat(builder, context.cast(builder, operand, given, vector_type.element), vector_type)
+
+        operands = map(convert, call.args, arguments)
         return code(builder, context.get_value_type(call.return_type), *operands)
 
     return build

@@ -17,15 +17,8 @@ from numpy.typing import NDArray
 from unprocess_gen.core.jit import inner
 from unprocess_gen.core.random_streams import BLOCK
 from unprocess_gen.core.types import Float, Raw
-from unprocess_gen.simulation.kernels.simd import (
-    VECTOR_WIDTH,
-    Pointer,
-    Vector,
-    buffers_at,
-    load,
-    movemask,
-    store,
-)
+from unprocess_gen.simulation.kernels import simd
+from unprocess_gen.simulation.kernels.simd import VECTOR_WIDTH, Pointer, Vector
 
 STRIP = 512
 """Most pixels processed at a time."""
@@ -38,10 +31,6 @@ CACHE_LINE = 64
 Float32 = NDArray[np.float32]
 Indices = NDArray[np.uint32]
 Lines = NDArray[np.uint64]
-
-ONES = np.ones(SIZE, dtype=np.float32)
-ZEROS = np.zeros(SIZE, dtype=np.float32)
-"""Factors and offsets of pixels without fixed patterns."""
 
 _8 = np.uint64(8)
 _MASK_BITS = np.arange(2**VECTOR_WIDTH)[:, None] >> np.arange(VECTOR_WIDTH) & 1
@@ -80,6 +69,28 @@ def locate(origin: tuple[int, int], y: int, x: int, length: int) -> Strip:
     return Strip(y, x, length, first, first + length, total, lead, blocks, block, row)
 
 
+class SiteMap(NamedTuple):
+    """A value for each pixel, whose columns are those of complete blocks; else `SIZE` equal numbers.
+
+    ``steps`` are the elements from row to row and from column to column, 0 if all are equal.
+    """
+
+    values: NDArray[Any]
+    steps: tuple[int, int]
+
+
+def equal_sites(value: float, dtype: Any = np.float32) -> SiteMap:
+    """Return a map of equal values."""
+    return SiteMap(np.full(SIZE, value, dtype=dtype), (0, 0))
+
+
+@inner
+def strip_values(site_map: SiteMap, strip: Strip) -> Pointer:
+    """Return a pointer to the value of the strip's first site."""
+    row, column = site_map.steps
+    return simd.pointer_to(site_map.values, strip.y * row + strip.x * column + strip.lead)
+
+
 class Workspace(NamedTuple):
     """Point to the scratch memory of one strip. The first four are float64, or float32 for the tier ``fast``."""
 
@@ -95,9 +106,9 @@ class Workspace(NamedTuple):
     error_dn: Float32  # bound of the error of noise_dn
     noisy_dn: Float32  # rounded, not clipped
     normalised: Float32
-    depths: Float32  # see `normal.fill_depths`
+    depths: Float32  # see `normal.fill_coarse_depths`
     normals: Float32  # of the counts of light
-    errors: Float32
+    highest: Float32  # of a block
     rates: Float32  # mean electrons
     light_e: Float32  # counts of light
     light_error_e: Float32  # bound of their error; 0 where the count is certain
@@ -109,7 +120,7 @@ class Workspace(NamedTuple):
     dark_words: Indices
     defect_words: Indices
     scratch: Indices
-    uncertain: Indices  # [2 SIZE]: sites to recompute exactly
+    uncertain: Indices  # sites to recompute exactly
     lines: Lines  # scratch of look-ups
     clean: Raw
     noisy: Raw
@@ -118,7 +129,7 @@ class Workspace(NamedTuple):
 
 
 _DTYPES = {Float: np.float64, Float32: np.float32, Indices: np.uint32, Lines: np.uint64, Raw: np.uint16}
-_LENGTHS = {"uncertain": 2 * SIZE, "lanes_by_mask": _LANES_BY_MASK.size}
+_LENGTHS = {"lanes_by_mask": _LANES_BY_MASK.size}
 """Lengths of the buffers that are not `SIZE`."""
 
 
@@ -179,7 +190,7 @@ def allocate_scratch(dtype: Any = np.float64) -> Scratch:
     return scratch
 
 
-@buffers_at("Workspace", _places)
+@simd.buffers_at("Workspace", _places)
 def workspace_in(scratch: Scratch) -> Workspace:
     """Return pointers to the buffers of strips.
 
@@ -203,8 +214,8 @@ def list_lanes(lanes: Vector, x: np.uint64, found: int, workspace: Workspace) ->
     Every call writes all eight lanes, and the next one overwrites the others: a branch would be mispredicted about
     every second time.
     """
-    mask = movemask(lanes)
-    store(workspace.uncertain, found, load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
+    mask = simd.movemask(lanes)
+    simd.store(workspace.uncertain, found, simd.load(workspace.lanes_by_mask, np.uint64(mask) * _8) + np.uint32(x))
     length: int = found + workspace.count_by_mask[mask]
     return length
 
