@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import reduce
 from pathlib import Path
@@ -576,6 +578,11 @@ def test_choices_match_their_implementations() -> None:
     assert words["sensor.pattern"] == cfa.PATTERNS
     assert words["source.icc"] == ICC_CHOICES
     assert (words["output.dtype"], words["output.layout"]) == ((UINT16, FLOAT32), (MOSAIC, PACKED))
+
+
+def test_every_setting_has_a_meaning_and_none_is_needed_without_docstrings() -> None:
+    assert all(setting.meaning for _, _, setting in all_settings())
+    subprocess.run([sys.executable, "-OO", "-c", "import unprocess_gen.config.schema"], check=True)
 
 
 def test_forms_match_their_implementations() -> None:

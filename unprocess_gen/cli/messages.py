@@ -40,8 +40,9 @@ def print_results(texts: Iterable[object]) -> None:
 
 def report_error(error: BaseException, job: str = "") -> int:
     """Report an error on stderr, in one line unless it is a bug; return the exit code. ``job`` is a prefix."""
-    if isinstance(error, PermissionError) and error.filename is not None:
-        error = _no_permission(error)
+    if isinstance(error, PermissionError) and error.filename is not None:  # wherever the file was opened
+        path = os.fsdecode(error.filename)
+        error = MachineError(f"{path}: {error.strerror}; expected read and write permissions")
     if isinstance(error, UnprocessGenError):
         report(f"{job}{error}", logging.ERROR)
         return error.exit_code
@@ -49,11 +50,6 @@ def report_error(error: BaseException, job: str = "") -> int:
     if LOGGER.handlers:
         RESULTS.error("%sunexpected error", job, exc_info=error)
     return 1
-
-
-def _no_permission(error: PermissionError) -> MachineError:
-    """Return the error of a file or folder that the user may not read or write, wherever it was opened."""
-    return MachineError(f"{os.fsdecode(error.filename)}: {error.strerror}; expected read and write permissions")
 
 
 def report(message: str, level: int = logging.WARNING) -> None:

@@ -65,122 +65,121 @@ INPUTS = (
 )
 """Where the files are that pairs are regenerated from."""
 
-VERBS: dict[str, Verb] = {
-    verb.name: verb
-    for verb in (
-        _composing("generate", "generate a dataset; the default verb", "runs.generate", resumes=True),
-        _composing(
-            "prepare", "list the sources of a run and split it into parts, for separate jobs", "parts.prepare", PARTS
+_VERBS = (
+    _composing("generate", "generate a dataset; the default verb", "runs.generate", resumes=True),
+    _composing(
+        "prepare", "list the sources of a run and split it into parts, for separate jobs", "parts.prepare", PARTS
+    ),
+    Verb(
+        "part",
+        "generate part K (from 0) of a prepared run; default: that of the array job",
+        "parts.part",
+        (
+            _integer("n_jobs", "number of worker processes; -1: all cores; default: as prepared"),
+            replace(SOURCE, help="folder of the photographs on this host"),
         ),
-        Verb(
-            "part",
-            "generate part K (from 0) of a prepared run; default: that of the array job",
-            "parts.part",
-            (
-                _integer("n_jobs", "number of worker processes; -1: all cores; default: as prepared"),
-                replace(SOURCE, help="folder of the photographs on this host"),
-            ),
-            PREPARED,
-            extra=PART,
-            resumes=True,
+        PREPARED,
+        extra=PART,
+        resumes=True,
+    ),
+    Verb(
+        "status",
+        "show which parts of a prepared run are left",
+        "parts.status",
+        (Argument(("--left",), "print only the numbers of the parts that are left: 3,7-9"),),
+        PREPARED,
+    ),
+    Verb("merge", "write manifest.csv and dataset.json when all parts are finished", "parts.merge", place=PREPARED),
+    _composing(
+        "plan",
+        "estimate pairs, bytes and time, and explain the effects; write nothing",
+        "reports.plan",
+        Argument(("--all",), "read every photograph, for exact sizes"),
+    ),
+    _composing(
+        "accuracy", "measure error and time of each tier; write a report; default out: accuracy", "reports.accuracy"
+    ),
+    _composing(
+        "figures", "draw the article's figures for the first photograph; default out: figures", "reports.figures"
+    ),
+    Verb(
+        "verify",
+        "check every byte of a dataset or sweep; repair, regenerate, check noise",
+        "checks.verify",
+        (
+            *INPUTS,
+            REGENERATE,
+            _to("with --noise: draw the fits in FILE (PNG)", "FILE"),
+            Argument(("--repair",), "restore damaged files to the same bytes"),
+            Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
         ),
-        Verb(
-            "status",
-            "show which parts of a prepared run are left",
-            "parts.status",
-            (Argument(("--left",), "print only the numbers of the parts that are left: 3,7-9"),),
-            PREPARED,
+        Place("DIR", "the folder of a dataset or of a sweep"),
+    ),
+    Verb(
+        "replay",
+        "regenerate rows and compare them, or write their arrays",
+        "checks.replay",
+        (
+            *INPUTS,
+            Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
+            KEYS,
+            _to("write the arrays to FOLDER", "FOLDER"),
         ),
-        Verb("merge", "write manifest.csv and dataset.json when all parts are finished", "parts.merge", place=PREPARED),
-        _composing(
-            "plan",
-            "estimate pairs, bytes and time, and explain the effects; write nothing",
-            "reports.plan",
-            Argument(("--all",), "read every photograph, for exact sizes"),
+        Place("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
+    ),
+    Verb(
+        "report",
+        "write an HTML page about a dataset",
+        "reports.report",
+        (_to("write FILE instead of DIR/report.html", "FILE"), *INPUTS),
+        DATASET,
+    ),
+    Verb(
+        "preview",
+        "draw contact sheets of pairs, and of each processing step",
+        "reports.preview",
+        (
+            KEYS,
+            _to("write the pictures to FOLDER", "FOLDER", required=True),
+            SOURCE,
+            Argument(("--stages",), "draw each processing step too"),
         ),
-        _composing(
-            "accuracy", "measure error and time of each tier; write a report; default out: accuracy", "reports.accuracy"
+        DATASET,
+    ),
+    Verb(
+        "dng",
+        "write frames as DNG files, for raw converters",
+        "reports.dng",
+        (
+            replace(KEYS, required=True),
+            _to("write the files to FOLDER", "FOLDER", required=True),
+            Argument(("--noisy",), "only noisy frames"),
+            Argument(("--clean",), "only clean frames"),
         ),
-        _composing(
-            "figures", "draw the article's figures for the first photograph; default out: figures", "reports.figures"
+        DATASET,
+    ),
+    Verb(
+        "again",
+        "regenerate a dataset from its config.yaml in another folder, and compare",
+        "runs.again",
+        (
+            *INPUTS,
+            OUT,
+            _integer("n_jobs", "number of worker processes; -1: all cores"),
+            Argument(("executor",), "what runs the workers: local or dask", "NAME"),
+            Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
+            _integer("source.max_failed", "largest number of failed sources with exit code 0"),
         ),
-        Verb(
-            "verify",
-            "check every byte of a dataset or sweep; repair, regenerate, check noise",
-            "checks.verify",
-            (
-                *INPUTS,
-                REGENERATE,
-                _to("with --noise: draw the fits in FILE (PNG)", "FILE"),
-                Argument(("--repair",), "restore damaged files to the same bytes"),
-                Argument(("--noise",), "check whether the noise in the arrays is that of the manifest"),
-            ),
-            Place("DIR", "the folder of a dataset or of a sweep"),
-        ),
-        Verb(
-            "replay",
-            "regenerate rows and compare them, or write their arrays",
-            "checks.replay",
-            (
-                *INPUTS,
-                Argument(("--rows",), "rows A to B by position, from 0, B not included", "A:B"),
-                KEYS,
-                _to("write the arrays to FOLDER", "FOLDER"),
-            ),
-            Place("MANIFEST", "a manifest.csv, or the folder of a dataset", "files"),
-        ),
-        Verb(
-            "report",
-            "write an HTML page about a dataset",
-            "reports.report",
-            (_to("write FILE instead of DIR/report.html", "FILE"), *INPUTS),
-            DATASET,
-        ),
-        Verb(
-            "preview",
-            "draw contact sheets of pairs, and of each processing step",
-            "reports.preview",
-            (
-                KEYS,
-                _to("write the pictures to FOLDER", "FOLDER", required=True),
-                SOURCE,
-                Argument(("--stages",), "draw each processing step too"),
-            ),
-            DATASET,
-        ),
-        Verb(
-            "dng",
-            "write frames as DNG files, for raw converters",
-            "reports.dng",
-            (
-                replace(KEYS, required=True),
-                _to("write the files to FOLDER", "FOLDER", required=True),
-                Argument(("--noisy",), "only noisy frames"),
-                Argument(("--clean",), "only clean frames"),
-            ),
-            DATASET,
-        ),
-        Verb(
-            "again",
-            "regenerate a dataset from its config.yaml in another folder, and compare",
-            "runs.again",
-            (
-                *INPUTS,
-                OUT,
-                _integer("n_jobs", "number of worker processes; -1: all cores"),
-                Argument(("executor",), "what runs the workers: local or dask", "NAME"),
-                Argument(("executor.address",), "address of a Dask scheduler", "ADDRESS"),
-                _integer("source.max_failed", "largest number of failed sources with exit code 0"),
-            ),
-            DATASET,
-            resumes=True,
-        ),
-        Verb(
-            "completion",
-            'print a completion script: eval "$(gen-dataset completion bash)"',
-            "completion.completion",
-            words=("bash", "zsh"),
-        ),
-    )
-}
+        DATASET,
+        resumes=True,
+    ),
+    Verb(
+        "completion",
+        'print a completion script: eval "$(gen-dataset completion bash)"',
+        "completion.completion",
+        words=("bash", "zsh"),
+    ),
+)
+
+VERBS: dict[str, Verb] = {verb.name: verb for verb in _VERBS}
 """The verbs by name, in the order of the help."""

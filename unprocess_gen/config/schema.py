@@ -708,7 +708,6 @@ def replaced(config: Config, changes: Mapping[str, Any]) -> Config:
     for setting, value in changes.items():
         group, _, name = setting.rpartition(".")
         if group:
-            config = replace(config, **{group: replace(getattr(config, group), **{name: value})})
-        else:
-            config = replace(config, **{name: value})
+            name, value = group, replace(getattr(config, group), **{name: value})
+        config = replace(config, **{name: value})
     return config

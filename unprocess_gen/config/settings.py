@@ -71,8 +71,8 @@ def documented(group: Group) -> Group:
     The section Attributes has the name of each key and, indented, its meaning. Fields that are added to the group have
     a meaning already.
     """
-    if group.__doc__:  # python -OO removes docstrings
-        summary, _, section = inspect.cleandoc(group.__doc__).partition("\n\nAttributes\n----------\n")
+    summary, title, section = inspect.cleandoc(group.__doc__ or "").partition("\n\nAttributes\n----------\n")
+    if title:  # python -OO removes docstrings
         meanings = {name: " ".join(text.split()) for name, text in re.findall(r"^(\w+)\n((?: .+\n?)+)", section, re.M)}
         types = {field.name: str(field.type) for field in dataclasses.fields(group)}
         lines = [summary, "", "Attributes", "----------"]
