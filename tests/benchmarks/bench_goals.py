@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import argparse
 import functools
-import importlib.util
 import itertools
+import runpy
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -108,14 +108,11 @@ def own_yardstick(plan: Plan) -> Callable[[Srgb], object]:
 
 def other_yardstick(path: str) -> Callable[[Srgb], object]:
     """A function that simulates a pair by the module at ``path``."""
-    spec = importlib.util.spec_from_file_location("yardstick", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = runpy.run_path(path)
 
     def pair(rgb: Srgb) -> object:
-        raw = module.unprocess(rgb, np.float64)
-        return module.to_dn(raw), module.to_dn(module.add_noise(raw))
+        raw = module["unprocess"](rgb, np.float64)
+        return module["to_dn"](raw), module["to_dn"](module["add_noise"](raw))
 
     return pair
 
@@ -150,13 +147,13 @@ class Bench:
     def pair(self, settings: str, is_new_body: bool = True) -> Work:
         """A full frame."""
         (plan,) = self.plans(settings)
-        return warm(Work(lambda: make_pair(self.srgb, plan), self.sites, is_new_body))
+        return Work(lambda: make_pair(self.srgb, plan), self.sites, is_new_body)
 
     def levels(self, settings: str) -> Work:
         """All noise levels of a full frame; sites are those of one frame."""
         plans = self.plans(settings)
         assert len(plans) == LEVELS
-        return warm(Work(lambda: [None for _ in make_pairs(self.srgb, plans)], self.sites))
+        return Work(lambda: [None for _ in make_pairs(self.srgb, plans)], self.sites)
 
     def patches(self, settings: str, is_new_place: bool = False) -> Work:
         """16 patches; with ``is_new_place`` at other places of the sensor, whose fixed patterns no pair before had."""
@@ -164,24 +161,18 @@ class Bench:
         side = self.patch_side
         places = (np.linspace(0, full - side, 4).astype(int).tolist() for full in self.srgb.shape[:2])
         cut_outs = [(self.srgb[y : y + side, x : x + side], (y, x)) for y, x in itertools.product(*places)]
-        return warm(
-            Work(
-                lambda: [make_pair(patch, plan, place) for patch, place in cut_outs],
-                len(cut_outs) * side * side,
-                is_new_place,
-            )
-        )
+        sites = len(cut_outs) * side * side
+        return Work(lambda: [make_pair(patch, plan, place) for patch, place in cut_outs], sites, is_new_place)
 
     def planning(self, settings: str) -> Work:
         """Plan 20 images in the time per site of a patch."""
         config, images = config_of(settings), itertools.count()
         facts = facts_for(config, self.srgb)
-        return warm(
-            Work(
-                lambda: [plan_pairs(config, f"{next(images):064x}", facts=facts) for _ in range(20)],
-                20 * self.patch_side**2,
-            )
-        )
+
+        def plan() -> object:
+            return [plan_pairs(config, f"{next(images):064x}", facts=facts) for _ in range(20)]
+
+        return Work(plan, 20 * self.patch_side**2)
 
     def naive(self) -> Work:
         (plan,) = self.plans(TWO_NUMBERS)
@@ -212,18 +203,11 @@ class Bench:
             (f"{daylight} {GIVEN}", True, 2.0),
             (f"{daylight} {GIVEN}", False, 2.0),
         ):
-            what = (
-                f"patches of {self.patch_side}², {'new places' if is_new else 'places seen before'}, against the frame"
-            )
+            places = "new places" if is_new else "places seen before"
+            what = f"patches of {self.patch_side}², {places}, against the frame"
             yield Row(what, settings, self.patches(settings, is_new), self.pair(settings, is_new), goal)
         for settings in ("noise=brooks2019", "noise=sony_a7s2 scene=night", night):
             yield Row("planning, against a patch", settings, self.planning(settings), self.patches(TWO_NUMBERS), 4)
-
-
-def warm(work: Work) -> Work:
-    """Compile kernels and fill caches."""
-    work.ns_per_site(0)
-    return work
 
 
 def table(images: Sequence[Bench], rounds: int, least_ns: int = LEAST_NS) -> str:
@@ -231,6 +215,9 @@ def table(images: Sequence[Bench], rounds: int, least_ns: int = LEAST_NS) -> str
     lines: dict[tuple[str, str], tuple[Row, list[tuple[float, float]]]] = {}
     for bench in images:
         rows = {(row.what, row.settings): row for row in bench.rows()}
+        for row in rows.values():
+            for work in (row.work, row.against):
+                work.ns_per_site(0)  # compiles kernels and fills caches
         sides = {
             key: lambda _, row=row: (row.work.ns_per_site(least_ns), row.against.ns_per_site(least_ns))
             for key, row in rows.items()

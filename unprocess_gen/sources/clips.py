@@ -53,14 +53,13 @@ class ClipSizes:
 
         ``sizes`` are the name of a clip, and width and height of one of its frames.
         """
-        return tuple(text for size in sizes if (text := self._warning(*size)))
-
-    def _warning(self, clip: str, width: int, height: int) -> str:
-        known = self._sizes.setdefault(clip, (width, height))
-        if known is None or known == (width, height):
-            return ""
-        self._sizes[clip] = None  # one warning for each clip
-        return (
-            f"source.clips=true: clip {clip} has frames of {known[0]} x {known[1]} and of {width} x {height} pixels; "
-            "expected frames of one scene; set source.clips=false if they are different photographs"
-        )
+        texts = []
+        for clip, width, height in sizes:
+            known = self._sizes.setdefault(clip, (width, height))
+            if known is not None and known != (width, height):
+                self._sizes[clip] = None  # one warning for each clip
+                texts.append(
+                    f"source.clips=true: clip {clip} has frames of {known[0]} x {known[1]} and of {width} x {height} "
+                    "pixels; expected frames of one scene; set source.clips=false if they are different photographs"
+                )
+        return tuple(texts)

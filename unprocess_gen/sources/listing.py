@@ -101,21 +101,33 @@ def list_folder(
     single = _single_file(root)
     if single is not None:
         return Listing((_source(0, single),))
-    walk = _Walk(root, recursive, matcher(include), matcher(video))
-    unmatched = dict(sorted(walk.unmatched.items(), key=lambda item: (-item[1], item[0])))
-    if not walk.matched:
-        advice = "choose a folder of photographs or other globs"
-        if walk.has_video:
-            advice = "set source.clips=true to read videos as clips"
-        elif unmatched:
-            advice = f"{unmatched_sentence(unmatched)}; {advice}"
+    matches, is_video = matcher(include), matcher(video)
+    matched: list[Entry] = []
+    suffixes, skipped_links, has_video = Counter[str](), 0, False
+    try:
+        for entry in any_path(root).walk_entries(recursive):
+            if matches(entry.path):
+                matched.append(entry)
+            elif entry.kind is EntryKind.FILE:
+                suffixes[PurePosixPath(encode_name(entry.path)).suffix.lower()] += 1
+                has_video = has_video or is_video(entry.path)
+            elif entry.kind is EntryKind.UNREADABLE and recursive:  # may be a folder of photographs
+                raise _unreadable_folder(root, entry.path, entry.problem)
+            skipped_links += recursive and entry.kind is EntryKind.LOOP
+    except OSError as error:
+        raise _unreadable_folder(root, os.path.relpath(error.filename, root), error.strerror or str(error)) from None
+    unmatched = dict(sorted(suffixes.items(), key=lambda item: (-item[1], item[0])))
+    if not matched:
+        advice = f"{unmatched_sentence(unmatched)}; " if unmatched else ""
+        advice += "choose a folder of photographs or other globs"
         raise ConfigError(
             f"source.root={root}: no file matches source.include={list(include)} "
-            f"({'with' if recursive else 'without'} sub-folders); {advice}"
+            f"({'with' if recursive else 'without'} sub-folders); "
+            + ("set source.clips=true to read videos as clips" if has_video else advice)
         )
-    in_order = sorted(walk.matched, key=lambda entry: os.fsencode(entry.path))
+    in_order = sorted(matched, key=lambda entry: os.fsencode(entry.path))
     sources = tuple(_source(index, entry) for index, entry in enumerate(itertools.islice(in_order, limit)))
-    return Listing(sources, walk.skipped_links, unmatched, _video_warnings(sources, matcher(video)))
+    return Listing(sources, skipped_links, unmatched, _video_warnings(sources, is_video))
 
 
 def check_root(root: str) -> None:
@@ -143,41 +155,14 @@ def unmatched_sentence(unmatched: dict[str, int]) -> str:
 
 
 def matcher(include: Iterable[str]) -> Callable[[str], bool]:
-    """Return a function that says whether a relative path matches one of the globs of `list_folder`."""
-    globs = tuple(include)
-    of_path, of_name = (_one_of(glob for glob in globs if ("/" in glob) is full) for full in (True, False))
+    """Compile the globs of `list_folder` to a function that says whether a relative path matches one of them."""
+    patterns: dict[bool, list[str]] = {True: [], False: []}
+    for glob in include:
+        patterns["/" in glob].append(fnmatch.translate(glob))
+    of_path, of_name = (
+        re.compile("|".join(patterns[is_full]) or r"(?!)", re.IGNORECASE).match for is_full in (True, False)
+    )
     return lambda path: of_name(path.rpartition("/")[2]) is not None or of_path(path) is not None
-
-
-def _one_of(globs: Iterable[str]) -> Callable[[str], re.Match[str] | None]:
-    """Return the ``match`` of one regular expression for several globs, which matches nothing if there are none."""
-    return re.compile("|".join(map(fnmatch.translate, globs)) or r"(?!)", re.IGNORECASE).match
-
-
-class _Walk:
-    """Sort the entries of a folder into those that a glob matches, and counts of the others."""
-
-    def __init__(
-        self, root: str, recursive: bool, matches: Callable[[str], bool], is_video: Callable[[str], bool]
-    ) -> None:
-        self.matched: list[Entry] = []
-        self.unmatched: Counter[str] = Counter()
-        self.skipped_links = 0
-        self.has_video = False
-        try:
-            for entry in any_path(root).walk_entries(recursive):
-                if matches(entry.path):
-                    self.matched.append(entry)
-                elif entry.kind is EntryKind.FILE:
-                    self.unmatched[PurePosixPath(encode_name(entry.path)).suffix.lower()] += 1
-                    self.has_video = self.has_video or is_video(entry.path)
-                elif entry.kind is EntryKind.UNREADABLE and recursive:  # may be a folder of photographs
-                    raise _unreadable_folder(root, entry.path, entry.problem)
-                self.skipped_links += recursive and entry.kind is EntryKind.LOOP
-        except OSError as error:
-            raise _unreadable_folder(
-                root, os.path.relpath(error.filename, root), error.strerror or str(error)
-            ) from None
 
 
 def _unreadable_folder(root: str, folder: str, reason: str) -> ConfigError:

@@ -6,6 +6,7 @@ import hashlib
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -57,18 +58,14 @@ def _sharing_tails(root: str, groups: Iterable[Sequence[Source]]) -> Iterator[So
 
 def _tail_digest(root: str, source: Source) -> int | None:
     """Digest of a file's last `TAIL_BYTES`, None if it cannot be read."""
-    try:
-        with opened(root, source) as file:
-            file.seek(max(0, (source.size_bytes or 0) - TAIL_BYTES))
-            return xxhash.xxh3_64_intdigest(file.read(TAIL_BYTES))
-    except SourceError:
-        return None
+    with suppress(SourceError), opened(root, source) as file:
+        file.seek(max(0, (source.size_bytes or 0) - TAIL_BYTES))
+        return xxhash.xxh3_64_intdigest(file.read(TAIL_BYTES))
+    return None
 
 
 def _complete_digest(root: str, source: Source) -> str | None:
     """SHA-256 of a file, None if it cannot be read."""
-    try:
-        with opened(root, source) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
-    except SourceError:
-        return None
+    with suppress(SourceError), opened(root, source) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+    return None

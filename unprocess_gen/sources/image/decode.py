@@ -191,8 +191,8 @@ def _pixels(data: bytes, header: Header, name: str) -> Srgb:
     """Return the pixels as stored, ``[height, width, 3]``, R, G, B."""
     flags = _flags(header)
     decoded, messages = _imdecode(tiff_without_orientation(data) if header.format == "tiff" else data, flags)
-    if decoded is None:
-        _check_memory(header)
+    if decoded is None:  # codecs report a lack of memory in many ways, or not at all: MemoryError if there is one
+        np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
     text = " ".join(_LOG_PREFIX.sub("", messages.decode(errors="replace")).split())
     damage = _DAMAGE.search(messages)
     if decoded is None or damage:
@@ -227,11 +227,6 @@ def _imdecode(data: bytes | bytearray, flags: int) -> tuple[Srgb | None, bytes]:
     return decoded, messages.text
 
 
-def _check_memory(header: Header) -> None:
-    """Raise MemoryError if these pixels do not fit into memory; codecs report that in many ways, or not at all."""
-    np.empty((header.height, header.width, DECODE_PEAK), f"uint{header.bits}")
-
-
 def _check_array(decoded: Srgb, header: Header) -> None:
     expected = (header.height, header.width, f"uint{header.bits}")
     found = (*decoded.shape[:2], decoded.dtype.name)
@@ -243,13 +238,9 @@ def _check_opaque(decoded: Srgb, data: bytes, header: Header) -> None:
     if header.format == "png" and decoded.ndim == 2:
         transparent = bool((decoded == png_transparent_gray(data)).any())
     else:
-        transparent = decoded.ndim == 3 and decoded.shape[2] == 4 and bool(decoded[..., 3].min() < _white(header))
+        transparent = decoded.ndim == 3 and decoded.shape[2] == 4 and bool(decoded[..., 3].min() < 2**header.bits - 1)
     if transparent:
         raise SourceError("alpha", "some pixels are transparent; flatten the picture onto a background")
-
-
-def _white(header: Header) -> int:
-    return (1 << header.bits) - 1
 
 
 def _as_rgb(stored: Srgb) -> Srgb:

@@ -159,14 +159,9 @@ def _jpeg_frame(marker: int, payload: bytes) -> Header:
 
 # PNG ------------------------------------------------------------------------------------------------------------------
 
-_PNG_GRAY, _PNG_RGB, _PNG_PALETTE, _PNG_GRAY_ALPHA, _PNG_RGB_ALPHA = 0, 2, 3, 4, 6
-_PNG_MODES = {
-    _PNG_GRAY: "gray",
-    _PNG_RGB: "rgb",
-    _PNG_PALETTE: "palette",
-    _PNG_GRAY_ALPHA: "gray",
-    _PNG_RGB_ALPHA: "rgb",
-}
+_PNG_MODES = {0: "gray", 2: "rgb", 3: "palette", 4: "gray", 6: "rgb"}
+_PNG_ALPHA = (4, 6)
+"""Colour types with an alpha channel."""
 _PNG_HEAD = 8
 
 
@@ -200,7 +195,7 @@ def _png(data: bytes) -> Header:
         height,
         _PNG_MODES[colour],
         16 if bits == 16 else 8,
-        has_alpha=colour in (_PNG_GRAY_ALPHA, _PNG_RGB_ALPHA) or b"tRNS" in chunks,
+        has_alpha=colour in _PNG_ALPHA or b"tRNS" in chunks,
         orientation=_exif_orientation(exif or b""),
         frames=2 if b"acTL" in chunks else 1,
         icc=_png_profile(profile),
@@ -249,19 +244,10 @@ _TIFF_COMPRESSIONS = {_UNCOMPRESSED: "none", 5: "LZW", 7: "JPEG", 8: "deflate", 
 _TIFF_CMYK, _TIFF_SUBSAMPLED = 5, 6
 # (photometric, bits, samples) -> mode; OpenCV reads other kinds wrongly or not at all
 _TIFF_KINDS = {
-    (0, 1, 1): "white_is_zero",
-    (0, 8, 1): "white_is_zero",
-    (0, 16, 1): "white_is_zero",
-    (1, 1, 1): "gray",
-    (1, 8, 1): "gray",
-    (1, 16, 1): "gray",
-    (2, 8, 3): "rgb",
-    (2, 8, 4): "rgb",
-    (2, 16, 3): "rgb",
-    (2, 16, 4): "rgb",
-    (3, 1, 1): "palette",
-    (3, 4, 1): "palette",
-    (3, 8, 1): "palette",
+    **{(0, bits, 1): "white_is_zero" for bits in (1, 8, 16)},
+    **{(1, bits, 1): "gray" for bits in (1, 8, 16)},
+    **{(2, bits, samples): "rgb" for bits in (8, 16) for samples in (3, 4)},
+    **{(3, bits, 1): "palette" for bits in (1, 4, 8)},
     (6, 8, 3): "rgb",
 }
 _STRIP_PLACES = (_STRIP_OFFSETS, _STRIP_BYTES)
