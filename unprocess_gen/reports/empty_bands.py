@@ -49,11 +49,9 @@ def empty_bands(srgb: Srgb, plan: Plan) -> EmptyBands:
     edges = np.zeros((256, 3), dtype=bool)
     edges[:255] |= wide
     edges[1:255] |= wide[:-1]
-    counts = [np.bincount(srgb[..., channel].ravel(), minlength=256) for channel in range(3)]
-    shares = [count[edge].sum() / count.sum() for count, edge in zip(counts, edges.T, strict=True)]
-    share = np.dot(SITES, shares)
+    shares = [edge[srgb[..., channel]].mean() for channel, edge in enumerate(edges.T)]
     red, green, blue = np.where(wide, widths, 0).max(axis=0).tolist()
-    return EmptyBands(float(share), (red, green, blue))
+    return EmptyBands(float(np.dot(SITES, shares)), (red, green, blue))
 
 
 def highlight_sentence(bands: Sequence[EmptyBands]) -> str:

@@ -70,27 +70,24 @@ def load_source(
     MachineError
         If the file is not the one that was listed.
     """
-    digest, photograph = _full_frame(config, source, read)
-    height, width = photograph.srgb.shape[:2]
+    digest, photograph = _decoded(config, source, read)
+    if config.downscale > 1:
+        square = f"are less than one square of source.downscale={config.downscale}"
+        _check_side(photograph.srgb, config.downscale, square, digest)
+        photograph = replace(photograph, srgb=downscaled(photograph.srgb, config.downscale))
     rule = patch_rule(config)
-    if rule is not None and min(height, width) < rule.side:
-        text = f"{width} x {height} pixels contain no patch of {rule.side} x {rule.side} (source.patch)"
-        raise SourceError("too_small", text, digest)
-    if layout == PACKED and min(height, width) < 2:
-        text = f"{width} x {height} pixels contain no 2 x 2 tile (output.layout=packed)"
-        raise SourceError("too_small", text, digest)
+    if rule is not None:
+        patch = f"contain no patch of {rule.side} x {rule.side} (source.patch)"
+        _check_side(photograph.srgb, rule.side, patch, digest)
+    if layout == PACKED:
+        _check_side(photograph.srgb, 2, "contain no 2 x 2 tile (output.layout=packed)", digest)
     return digest, photograph
 
 
-def _full_frame(config: SourceConfig, source: Source, read: Read) -> tuple[str, Photograph]:
-    digest, photograph = _decoded(config, source, read)
-    if config.downscale == 1:
-        return digest, photograph
-    height, width = photograph.srgb.shape[:2]
-    if min(height, width) < config.downscale:
-        text = f"{width} x {height} pixels are less than one square of source.downscale={config.downscale}"
-        raise SourceError("too_small", text, digest)
-    return digest, replace(photograph, srgb=downscaled(photograph.srgb, config.downscale))
+def _check_side(srgb: Srgb, least: int, problem: str, digest: str) -> None:
+    height, width = srgb.shape[:2]
+    if min(height, width) < least:
+        raise SourceError("too_small", f"{width} x {height} pixels {problem}", digest)
 
 
 def downscaled(srgb: Srgb, side: int) -> Srgb:

@@ -111,8 +111,7 @@ def _read_raw(path: Path, key: str, content: bytes) -> Mosaic:
             f"{key}: {path} states the black levels {', '.join(map(str, sorted(blacks)))}; expected one; "
             "convert the frames to NPY, and set noise.dark_frames_black_dn"
         )
-    pattern = "".join("G" if names[colour] == "G" else names[colour] for colour in colours)
-    return Mosaic(pixels, float(blacks.pop()), pattern)
+    return Mosaic(pixels, float(blacks.pop()), "".join(names[colour] for colour in colours))
 
 
 # ------------------------------------------------------------------------------------------------------------ digests

@@ -123,30 +123,28 @@ def run_files(config: Config, sizes: SampleSizes) -> Iterator[RunFiles]:
 
 
 def _select(config: Config, sizes: SampleSizes, folder: Path) -> RunFiles:
-    scenes, pixels_of_sources = folder / "photographs", []
-    for source in list_photographs(config.source).sources:
-        pixels_of_sources.append(0)
+    source_config, scenes, pixels = config.source, folder / "photographs", list[int]()
+    for source in list_photographs(source_config).sources:
+        pixels.append(0)
         with suppress(SourceError):
-            _, photograph = load_source(config.source, source, config.output.layout)
-            pixels_of_sources[-1] = photograph.srgb[..., 0].size
-            if config.source.root is None:
-                _write_scene(config, source, scenes)
-        if sum(map(bool, pixels_of_sources)) >= sizes.run_files or sum(pixels_of_sources) >= sizes.run_pixels:
+            pixels[-1] = load_source(source_config, source, config.output.layout)[1].srgb[..., 0].size
+            if source_config.root is None:
+                _write_scene(source_config, source, scenes)
+        if sum(map(bool, pixels)) >= sizes.run_files or sum(pixels) >= sizes.run_pixels:
             break
-    if not any(pixels_of_sources):
+    if not any(pixels):
         raise ConfigError(
-            f"source.root={config.source.root}: none of {len(pixels_of_sources)} photographs can be read with "
+            f"source.root={source_config.root}: none of {len(pixels)} photographs can be read with "
             f"output.layout={config.output.layout}; expected at least one"
         )
-    source_config = config.source
     if source_config.root is None:
         source_config = replace(source_config, root=str(scenes), include=("*.jpg",), clips=False)
-    return RunFiles(source_config, tuple(pixels_of_sources), folder).at_most(sizes.run_pixels)
+    return RunFiles(source_config, tuple(pixels), folder).at_most(sizes.run_pixels)
 
 
-def _write_scene(config: Config, source: Source, folder: Path) -> None:
+def _write_scene(config: SourceConfig, source: Source, folder: Path) -> None:
     """Write a built-in scene, in full size, as a JPEG file."""
-    _, scene = load_source(replace(config.source, downscale=1), source)
+    _, scene = load_source(replace(config, downscale=1), source)
     _, content = cv2.imencode(".jpg", scene.srgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     write_files(folder, {f"{source.name}.jpg": content.tobytes()})
 

@@ -7,7 +7,6 @@ value c means that the unrounded x is within half a DN of it; unrounded values a
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,8 +91,10 @@ def bin_width(noise: PlaneNoise) -> float:
     return min(1.0, max(narrowest, 2.0 ** math.floor(math.log2(max(std, narrowest) / 2))))
 
 
-class Expectation(NamedTuple):
-    """Expectations for N clean values c in the middle of bins; x is the clean value before rounding.
+class Expectation:
+    """Expectations for N clean values c in the middle of bins that `PlaneNoise.is_usable` accepts.
+
+    x is the clean value before rounding.
 
     Attributes
     ----------
@@ -115,49 +116,29 @@ class Expectation(NamedTuple):
         Variance of cos z at one site.
     """
 
-    signal: Float
-    std: Float
-    rounding_mean: Float
-    rounding_std: Float
-    defect_mean: Float
-    variance: Float
-    fixed: Float
-    cosine: Float
-    slope: Float
-    unknown: Float
-    by_variance: Float
-    cosine_variance: Float
+    def __init__(self, noise: PlaneNoise, clean_dn: Float, bin_dn: float) -> None:
+        plan, signal = noise.site.plan, noise.signal(clean_dn)
+        std, is_rounded = np.sqrt(noise.variance(signal)), not plan.output.clean_normalised
+        low, high = np.full(len(signal), -bin_dn / 2), np.full(len(signal), bin_dn / 2)
+        if not plan.noise.averaged:  # the clean frame has no values below black
+            low[clean_dn == plan.sensor.black_level_dn] = 0.0
 
+        def mean_cosine(k: int, error: Float) -> Float:
+            """E[cos(k·(noisy - c) / std)] for x = c + error; without rounding, of noisy - x."""
+            shift = np.exp(1j * k / std * error) if is_rounded else 1.0
+            return np.real(noise.characteristic(np.maximum(signal + error, 0.0), k / std) * shift)
 
-def expectation(noise: PlaneNoise, clean_dn: Float, bin_dn: float) -> Expectation:
-    """Expectations for clean values that `PlaneNoise.is_usable` accepts."""
-    plan, signal = noise.site.plan, noise.signal(clean_dn)
-    std, is_rounded = np.sqrt(noise.variance(signal)), not plan.output.clean_normalised
-    low, high = np.full(len(signal), -bin_dn / 2), np.full(len(signal), bin_dn / 2)
-    if not plan.noise.averaged:  # the clean frame has no values below black
-        low[clean_dn == plan.sensor.black_level_dn] = 0.0
-
-    def mean_cosine(k: int, error: Float) -> Float:
-        """E[cos(k·(noisy - c) / std)] for x = c + error; without rounding, of noisy - x."""
-        shift = np.exp(1j * k / std * error) if is_rounded else 1.0
-        return np.real(noise.characteristic(np.maximum(signal + error, 0.0), k / std) * shift)
-
-    middle, width = (low + high) / 2, high - low
-    at_low, cosine, at_high = (mean_cosine(1, error) for error in (low, middle, high))
-    slope, bend = (at_high - at_low) / width, at_high + at_low - 2 * cosine
-    bounded = np.full(len(signal), noise.defects * LARGEST_Z**2)
-    return Expectation(
-        signal=signal,
-        std=std,
-        rounding_mean=middle * is_rounded,
-        rounding_std=width / math.sqrt(12) * is_rounded,
-        defect_mean=noise.defect_mean(signal, LARGEST_Z * std) / std,
-        variance=1 + bounded,
-        fixed=1 - noise.temporal_variance(signal) / noise.variance(signal) + bounded,
+        middle, width = (low + high) / 2, high - low
+        at_low, cosine, at_high = (mean_cosine(1, error) for error in (low, middle, high))
+        bend = at_high + at_low - 2 * cosine
+        bounded = np.full(len(signal), noise.defects * LARGEST_Z**2)
+        self.signal, self.std = signal, std
+        self.rounding_mean, self.rounding_std = middle * is_rounded, width / math.sqrt(12) * is_rounded
+        self.defect_mean, self.variance = noise.defect_mean(signal, LARGEST_Z * std) / std, 1 + bounded
+        self.fixed = 1 - noise.temporal_variance(signal) / noise.variance(signal) + bounded
+        self.slope = (at_high - at_low) / width
         # the parabola through the three has the coefficient 2 · bend / width²
-        cosine=cosine + bend / 6 - slope * middle,
-        slope=slope,
-        unknown=2 * np.abs(bend) * ROUNDING_SQUARE,
-        by_variance=-0.5 * cosine / std**2,
-        cosine_variance=(1 + mean_cosine(2, middle)) / 2 - cosine**2,
-    )
+        self.cosine = cosine + bend / 6 - self.slope * middle
+        self.unknown = 2 * np.abs(bend) * ROUNDING_SQUARE
+        self.by_variance = -0.5 * cosine / std**2
+        self.cosine_variance = (1 + mean_cosine(2, middle)) / 2 - cosine**2

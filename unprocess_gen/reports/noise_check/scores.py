@@ -36,8 +36,8 @@ class Score(NamedTuple):
         Standard deviation due to patterns that the frames of one body share.
     step : float
         Largest contribution of one site or line.
-    low, high : float
-        Smallest and largest expectation of the sum that the rounding of the clean frame can cause.
+    high : float
+        Largest expectation of the sum that the rounding of the clean frame can cause.
     """
 
     total: float
@@ -46,13 +46,12 @@ class Score(NamedTuple):
     rounding: float = 0.0
     fixed: float = 0.0
     step: float = 0.0
-    low: float = 0.0
     high: float = 0.0
 
     @property
     def excess(self) -> float:
         """Distance of the sum from the expectations that are possible."""
-        return self.total - min(max(self.total, self.low), self.high)
+        return self.total - min(max(self.total, 0.0), self.high)
 
     @property
     def std(self) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unprocess_gen.core.types import DarkPixels, Float, Patch, Plan
-from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, PlaneNoise, bin_width, expectation
+from unprocess_gen.reports.noise_check.expectation import LARGEST_Z, Expectation, PlaneNoise, bin_width
 from unprocess_gen.simulation.effects.expectation import Site
 
 Single = NDArray[np.float32]
@@ -42,7 +42,7 @@ class Plane:
         bins = np.flatnonzero(counts[:-1])
         self.bins = bins[noise.is_usable(np.float64(bin_dn) * bins, bin_dn)]
         self.count = counts[self.bins].astype(np.float64)
-        self.expected = expectation(noise, np.float64(bin_dn) * self.bins, bin_dn)
+        self.expected = Expectation(noise, np.float64(bin_dn) * self.bins, bin_dn)
         self._weight = self._table(1 / self.expected.std)
         self._mean = self._table(self.expected.rounding_mean / self.expected.std + self.expected.defect_mean)
         self._sums = np.zeros((3, self._unused + 1))
@@ -135,11 +135,8 @@ class Sums:
             )
             for y, x in TILE
         ]
-        sites, fixed = zip(
-            *((plane.count.sum(), plane.count @ plane.expected.fixed) for plane in self.planes), strict=True
-        )
-        self.sites = int(sum(sites))
-        self.fixed = float(sum(fixed)) / max(self.sites, 1)
+        self.sites = int(sum(plane.count.sum() for plane in self.planes))
+        self.fixed = sum(float(plane.count @ plane.expected.fixed) for plane in self.planes) / max(self.sites, 1)
         self.variance = max(float(plane.expected.variance.max(initial=1.0)) for plane in self.planes)
 
     def fill(self) -> None:
