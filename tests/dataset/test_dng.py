@@ -445,11 +445,8 @@ def test_another_file_of_the_name_is_refused_and_kept(ds: Path, run_main: RunMai
 
 REFUSED = [
     ([], "dng: expected the folder of a dataset"),
-    (["--keys", "00000000"], "dng: expected the folder of a dataset"),
     (["DS", "--to", "to"], r"dng: --keys is missing; give --keys KEYS: rows by source index"),
-    (["DS", "--keys=", "--to", "to"], r"dng: --keys: a value is missing"),
     (["DS", "--keys", "00000000"], "dng: --to is missing; give --to FOLDER: write the files to FOLDER"),
-    (["DS", "--keys", "00000000", "--to", "to", "--both"], "dng: --both: no such flag; expected --keys, --to"),
     (["DS", "--keys", "00000000,00000009", "--to", "to"], "--keys 00000009: .*has no such key"),
     (["DS", "--keys", "00000000,00000001", "--to", "to"], r"--keys 00000001: failed \(\w+\), so it has no frames"),
     (["DS", "--keys", "00000000,00000004", "--to", "to"], "--keys 00000004: is 21 x 40; LibRaw.* under 22 pixels"),

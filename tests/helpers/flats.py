@@ -15,19 +15,10 @@ import numpy as np
 
 from helpers.datasets import Settings
 from helpers.moments import bernstein
+from helpers.records import PLAN
 from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.core.types import (
-    AccuracyPlan,
-    CameraPlan,
-    IspPlan,
-    NoisePlan,
-    Plan,
-    ScenePlan,
-    SensorPlan,
-    SourcePlan,
-    Srgb,
-)
+from unprocess_gen.core.types import CameraPlan, IspPlan, Plan, SensorPlan, Srgb
 from unprocess_gen.planning.effect_selection import facts_of
 from unprocess_gen.planning.plan import plan_image
 from unprocess_gen.simulation.effects import Physics
@@ -107,19 +98,12 @@ SILENT = Physics(
 def plan_with(*on: str, frame: int = 0xF4A3E, **changes: Any) -> Plan:
     """Return a plan with only these effects, a 16-bit sensor, and light equal to the code divided by 65535."""
     physics = replace(SILENT, **changes)
-    return Plan(
-        seed=0,
+    return PLAN.replace(
         stream_key=frame,
-        source=SourcePlan(downscale=1, dequantize="off"),
-        scene=ScenePlan("flat", exposure_ratio=1.0),
         camera=CameraPlan("identity", (0.0,) * 4, IDENTITY, 1.0, 1.0, 1.0, "none", highlight_threshold=0.9),
         isp=IspPlan("none", gamma=1.0),
         sensor=SensorPlan("RGGB", bits=16, black_level_dn=BLACK, white_level_dn=WHITE),
-        noise=NoisePlan(
-            "flat", "gaussian", a_dn=physics.dn_per_e, b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"),
-            skipped=(), sensor_clip="sensor", saturated="noisy", physics=physics,
-        ),
-        accuracy=AccuracyPlan("exact", methods=()),
+        a_dn=physics.dn_per_e, b_dn2=physics.read_std_dn**2, effects=(*on, "quantise"), physics=physics, methods=(),
     )  # fmt: skip
 
 

@@ -115,11 +115,6 @@ def test_uniform_draw_is_linear_within_three_roundings(uniform: float, low: floa
     )
 
 
-@given(uniforms)
-def test_constant_ignores_the_uniform(uniform: float) -> None:
-    assert draw(Distribution("constant", (2.15,)), uniform) == 2.15
-
-
 @pytest.mark.parametrize("uniform", [FIRST, 0.5, LAST])
 @pytest.mark.parametrize(
     ("law", "low", "high"),
@@ -309,11 +304,6 @@ def test_heteroscedastic_numbers_are_in_dn_of_the_sensor(settings: Settings) -> 
 
 
 # Recorded values ------------------------------------------------------------------------------------------------------
-
-
-def test_simulated_noise_is_listed_among_effects(settings: Settings) -> None:
-    plan = plan_of(settings)
-    assert (plan.noise.effects, plan.noise.skipped) == (("heteroscedastic", "quantise"), ())
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.0), (0.0, -3.0), (0.001, -1e6)])

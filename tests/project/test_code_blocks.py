@@ -9,8 +9,6 @@ HTML comments directly before a block change this:
 * ``<!-- needs: module -->``: the block runs if the module can be imported.
 * ``<!-- exit code: 4 -->``: the last command of the block ends with this code instead of 0.
 * ``<!-- output -->`` before a ``text`` block: it is exactly what the block before it prints on stdout.
-
-``python tests/project/test_code_blocks.py`` lists the blocks that do not run, with their reasons.
 """
 
 from __future__ import annotations
@@ -210,10 +208,3 @@ def test_blocks_are_found_with_their_comments() -> None:
     assert (first.language, first.comments, first.runs) == ("bash", {"not run": "a, b"}, False)
     assert (second.language, commands_of(second), second.runs) == ("bash", ["gen-dataset x  # y"], True)
     assert (third.language, third.comments) == ("text", {"output": ""})
-
-
-if __name__ == "__main__":
-    for one in PAGES:
-        for part in blocks_of(one):
-            if reason := part.comments.get("not run"):
-                sys.stdout.write(f"{one.relative_to(ROOT)}:{part.line}: {reason}\n")

@@ -1,7 +1,4 @@
-"""Words and docstrings: plain technical English, and numpydoc where one package calls another.
-
-``python tests/project/test_style.py [PATH …]`` lists every violation below the given paths.
-"""
+"""Words and docstrings: plain technical English, and numpydoc where one package calls another."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import ast
 import importlib
 import io
 import re
-import sys
 import tokenize
 from collections.abc import Iterator
 from functools import cache
@@ -160,23 +156,3 @@ def test_public_functions_follow_numpydoc() -> None:
 
 def test_banned_words_are_found() -> None:
     assert banned_words(Path(__file__))
-
-
-if __name__ == "__main__":
-    below = [Path(one).resolve() for one in sys.argv[1:]] or [ROOT]
-    files = [
-        path
-        for path in [*python_files(), *texts()]
-        if any(path.is_relative_to(one) for one in below) and path != Path(__file__).resolve()
-    ]
-    for file in files:
-        print(
-            *banned_words(file),
-            *(bad_first_lines(file) if file.is_relative_to(PACKAGE) and file.suffix == ".py" else ()),
-            sep="\n",
-            end="\n" if banned_words(file) else "",
-        )
-    modules = tuple(module_of(file) for file in files if file.is_relative_to(PACKAGE) and file.suffix == ".py")
-    for function in public_functions():
-        if function.rpartition(".")[0] in modules:
-            print(*numpydoc_errors(function), sep="\n", end="\n" if numpydoc_errors(function) else "")

@@ -123,7 +123,6 @@ DEEP: dict[str, Callable[[np.ndarray], bytes]] = {
     "png": lambda pixels: cv2.imencode(".png", pixels[..., ::-1])[1].tobytes(),
     "tiff": lambda pixels: tiff(pixels),
     "tiff, big-endian": lambda pixels: tiff(pixels, byteorder=">"),
-    "tiff, BigTIFF": lambda pixels: tiff(pixels, bigtiff=True),
     "tiff, deflated": lambda pixels: tiff(pixels, compression="zlib", predictor=True),
     "tiff, LZW": lambda pixels: cv2.imencode(".tif", pixels[..., ::-1])[1].tobytes(),
     "tiff, tiles": lambda pixels: tiff(pixels, tile=(16, 16)),

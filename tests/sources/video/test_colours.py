@@ -9,14 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.promise_report import Figure
-from helpers.videos import (
-    film,
-    opened,
-    raw_frame,
-    rgb,
-    scene,
-    settings_of,
-)
+from helpers.videos import film, opened, raw_frame, rgb, scene, settings_of
 
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.sources.loader import list_photographs, load_source
