@@ -14,7 +14,8 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 
 from unprocess_gen import __version__
@@ -39,8 +40,11 @@ def main() -> int:
         os.environ.pop(f"OPENCV_IO_MAX_IMAGE_{limit}", None)  # before OpenCV is loaded, and for the workers
     arguments = sys.argv[1:]
     with checked_streams(), SIGNALS:
-        code = _exit_code(lambda: run(arguments), arguments)
-        return _exit_code(_flush_stdout, arguments) or code
+        with _reported(arguments) as done:
+            done.code = run(arguments)
+        with _reported(arguments) as flushed:
+            sys.stdout.flush()
+        return flushed.code or done.code
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -60,10 +64,11 @@ def run(arguments: Sequence[str]) -> int:
     values = call.values
     with logging_to("quiet" in values, "verbose" in values, values.get("log_file")):
         LOGGER.debug("unprocess_gen %s, Python %s: %s", __version__, sys.version.split()[0], list(arguments))
-        module, name = verb.run.split(".")
-        code = _exit_code(lambda: getattr(import_module(f"unprocess_gen.cli.{module}"), name)(call), arguments)
-        RESULTS.info("exit code %d", code)
-        return code
+        module, function = verb.run.split(".")
+        with _reported(arguments) as done:  # before the log file is closed
+            done.code = getattr(import_module(f"unprocess_gen.cli.{module}"), function)(call)
+        RESULTS.info("exit code %d", done.code)
+        return done.code
 
 
 def _help(verb: str, flags: Sequence[str]) -> str:
@@ -115,29 +120,33 @@ def _refuse_late_verb(arguments: Sequence[str]) -> None:
         raise ConfigError(f"{verb}: the verb must be the first word: {shlex.join(['gen-dataset', verb, *others])}")
 
 
-def _exit_code(step: Callable[[], int], arguments: Sequence[str]) -> int:
-    """Run a step; report what ends it in one line, and return the exit code. Bugs rise."""
+class _Outcome:
+    """Exit code of a step."""
+
+    code = 0
+
+
+@contextmanager
+def _reported(arguments: Sequence[str]) -> Iterator[_Outcome]:
+    """Report what ends a step in one line, and provide the exit code. Bugs rise."""
+    outcome = _Outcome()
     try:
-        return step()
+        yield outcome
     except BrokenPipeError:
-        return BROKEN_PIPE
+        outcome.code = BROKEN_PIPE
     except KeyboardInterrupt:
-        return _report_signal(signal.SIGINT, arguments)
+        outcome.code = _report_signal(signal.SIGINT, arguments)
     except TerminationSignal as error:
-        return _report_signal(error.number, arguments)
+        outcome.code = _report_signal(error.number, arguments)
     except Exception as error:
         if SIGNALS.received is not None:  # OmegaConf and LLVM may fail in their own way when they are interrupted
-            return _report_signal(SIGNALS.received, arguments)
-        if isinstance(error, UnprocessGenError | PermissionError):
-            return report_error(error)
-        if LOGGER.handlers:
-            RESULTS.error("unexpected error", exc_info=error)
-        raise
-
-
-def _flush_stdout() -> int:
-    sys.stdout.flush()
-    return 0
+            outcome.code = _report_signal(SIGNALS.received, arguments)
+        elif isinstance(error, UnprocessGenError | PermissionError):
+            outcome.code = report_error(error)
+        else:
+            if LOGGER.handlers:
+                RESULTS.error("unexpected error", exc_info=error)
+            raise
 
 
 def _report_signal(number: int, arguments: Sequence[str]) -> int:

@@ -6,8 +6,7 @@ import csv
 import hashlib
 import os
 import uuid
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -123,23 +122,16 @@ def write_table(out: Path, jobs: Sequence[JobRow]) -> None:
     if not out.is_dir() or enclosing_dataset(out) is not None:  # every job was refused
         return
     try:
-        with _locked(out):  # several processes may sweep into one folder
+        lock = LockFile(out / "sweep.csv.lock")
+        lock.acquire(wait=True)  # several processes may sweep into one folder
+        try:
             _update_table(out / "sweep.csv", jobs)
+        finally:
+            lock.release()
     except OSError as error:
         from unprocess_gen.core.files import machine_error  # imports NumPy, too slow for --help
 
         raise machine_error(error, out, RESUME) from error
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder's ``sweep.csv``."""
-    lock = LockFile(folder / "sweep.csv.lock")
-    lock.acquire(wait=True)
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _update_table(path: Path, jobs: Sequence[JobRow]) -> None:

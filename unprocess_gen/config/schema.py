@@ -249,13 +249,9 @@ def _number_field(effect: Effect, number: Number) -> tuple[Any, Any]:
         kind = Optional[float] if number.count == 1 else Optional[tuple[float, ...]]
     if number.in_branch:
         kind = str if number.words else Any
-    details = {
-        "meaning": number.key_meaning or number.meaning,
-        "unit": number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit),
-        "section": "" if number.in_branch else PHYSICAL,
-        "since": number.since,
-    }
-    return kind, key(number.key_default, limit, null=null, **details)
+    section, meaning = "" if number.in_branch else PHYSICAL, number.key_meaning or number.meaning
+    unit = number.key_unit or ("DN of the profile" if number.unit == "DN" else number.unit)
+    return kind, key(number.key_default, limit, section, meaning=meaning, unit=unit, null=null, since=number.since)
 
 
 def _limit(number: Number) -> Limit:
@@ -388,69 +384,59 @@ class NoiseConfig(EffectGroup):
         source and uncertainty of the numbers, which plan prints
     """
 
-    name: str = key("none", limits.NAME, section=PROFILE)
-    units: Optional[str] = key(None, Choice("dn", "normalized"), section=PROFILE)
-    black: Optional[str] = key(None, Choice("subtracted", "included"), section=PROFILE)
-    bits: Optional[int] = key(None, Integers(1, 32), null="with units=normalized", section=PROFILE)
+    name: str = key("none", limits.NAME, PROFILE)
+    units: Optional[str] = key(None, Choice("dn", "normalized"), PROFILE)
+    black: Optional[str] = key(None, Choice("subtracted", "included"), PROFILE)
+    bits: Optional[int] = key(None, Integers(1, 32), PROFILE, null="with units=normalized")
     black_level_dn: Optional[int] = key(
-        None, limits.BLACK_LEVEL, unit="DN of the profile", null="with units=normalized", section=PROFILE
+        None, limits.BLACK_LEVEL, PROFILE, unit="DN of the profile", null="with units=normalized"
     )
     white_level_dn: Optional[int] = key(
-        None, limits.WHITE_LEVEL, unit="DN of the profile", null="with units=normalized", section=PROFILE
+        None, limits.WHITE_LEVEL, PROFILE, unit="DN of the profile", null="with units=normalized"
     )
     a: Any = key(
-        None,
-        limits.VARIANCE_SLOPE,
-        unit="DN, or 1 with units=normalized",
-        null="a physical profile",
-        section=TWO_NUMBERS,
+        None, limits.VARIANCE_SLOPE, TWO_NUMBERS, unit="DN, or 1 with units=normalized", null="a physical profile"
     )
     b: Any = key(
-        None,
-        limits.VARIANCE_OFFSET,
-        unit="DN², or 1 with units=normalized",
-        null="a physical profile",
-        section=TWO_NUMBERS,
+        None, limits.VARIANCE_OFFSET, TWO_NUMBERS, unit="DN², or 1 with units=normalized", null="a physical profile"
     )
-    negative_variance: str = key("refuse", Choice("refuse", "clip"), section=TWO_NUMBERS)
-    law: str = key("gaussian", Choice("gaussian", "poisson"), section=CHOSEN)
-    iso: Any = key(None, limits.ISO, null="the ISO of the scene", section=CHOSEN)
-    scatter: str = key("image", limits.SCATTER, section=CHOSEN, since="0.2")
-    levels: Any = key(None, limits.LEVELS, null="one level, as the profile has it", section=CHOSEN)
-    draws: int = key(1, Integers(1, limits.MAX_LEVELS), section=CHOSEN)
+    negative_variance: str = key("refuse", Choice("refuse", "clip"), TWO_NUMBERS)
+    law: str = key("gaussian", Choice("gaussian", "poisson"), CHOSEN)
+    iso: Any = key(None, limits.ISO, CHOSEN, null="the ISO of the scene")
+    scatter: str = key("image", limits.SCATTER, CHOSEN, since="0.2")
+    levels: Any = key(None, limits.LEVELS, CHOSEN, null="one level, as the profile has it")
+    draws: int = key(1, Integers(1, limits.MAX_LEVELS), CHOSEN)
     dark_frames: Optional[str] = key(
         None,
         Limit("a folder of mosaics: NPY, 16-bit PNG or TIFF, or raw files (extra raw)"),
+        CHOSEN,
         null="the noise of the profile",
         decides_data=False,
-        section=CHOSEN,
     )
-    dark_frames_sha256: Optional[str] = key(None, limits.DIGEST, null="any frames", section=CHOSEN, since="0.2")
+    dark_frames_sha256: Optional[str] = key(None, limits.DIGEST, CHOSEN, null="any frames", since="0.2")
     dark_frames_black_dn: Optional[float] = key(
         None,
         Numbers(0, 65535),
+        CHOSEN,
         unit="DN of the profile",
         null="the black level in the raw files, else the median of all pixels, minus a map above black if there is one",
-        section=CHOSEN,
         since="0.2",
     )
     dark_shading: str = key(
         "keep",
         limits.text("keep, remove, a map (NPY, PNG, TIFF or raw), or a folder of maps with names such as iso1600.npy"),
-        section=CHOSEN,
+        CHOSEN,
         since="0.2",
     )
-    dark_shading_sha256: Optional[str] = key(None, limits.DIGEST, null="any map, or none", section=CHOSEN, since="0.2")
-    branches: tuple[BranchConfig, ...] = key(
-        (), Limit("a list of mappings with the keys of a branch"), section=PHYSICAL
-    )
-    assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), section=PHYSICAL)
-    unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), section=PHYSICAL, since="0.3")
+    dark_shading_sha256: Optional[str] = key(None, limits.DIGEST, CHOSEN, null="any map, or none", since="0.2")
+    branches: tuple[BranchConfig, ...] = key((), Limit("a list of mappings with the keys of a branch"), PHYSICAL)
+    assumed: tuple[str, ...] = key((), Limit("a list of keys of this section or of a branch"), PHYSICAL)
+    unsourced: tuple[str, ...] = key((), Limit("a list of keys of assumed"), PHYSICAL, since="0.3")
     provenance: tuple[ProvenanceConfig, ...] = key(
         (),
         Limit("a list of mappings with the keys numbers, iso, source and uncertainty"),
+        PHYSICAL,
         decides_data=False,
-        section=PHYSICAL,
         since="0.2",
     )
 

@@ -55,9 +55,9 @@ class Setting:
             raise ConfigError(f"{key}={self.limit.shown(value)}: expected {self.allowed}")
 
 
-def key(default: Any, limit: Limit, **details: Any) -> Any:
+def key(default: Any, limit: Limit, section: str = "", **details: Any) -> Any:
     """Return a field of the schema with its description; ``details`` are other fields of `Setting`."""
-    return dataclasses.field(default=default, metadata={METADATA: Setting(limit, **details)})
+    return dataclasses.field(default=default, metadata={METADATA: Setting(limit, section=section, **details)})
 
 
 def settings_of(group: Any) -> Mapping[str, Setting]:
