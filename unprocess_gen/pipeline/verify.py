@@ -10,23 +10,22 @@ at about 1.5 GB/s. The manifest is read once, in step with the shards, so that m
 
 from __future__ import annotations
 
-import csv
 import heapq
 import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
-from unprocess_gen.core.paths import AnyPath, any_path, open_text
-from unprocess_gen.core.types import Row
+from unprocess_gen.core.paths import AnyPath, any_path
+from unprocess_gen.core.types import Row, Value
 from unprocess_gen.dataset import parquet
 from unprocess_gen.dataset.dataset_json import PARQUET_SHA256
 from unprocess_gen.dataset.keys import group_by_sample, sample_key
-from unprocess_gen.dataset.manifest import read_rows, row_json
+from unprocess_gen.dataset.manifest import read_columns, read_rows, row_json
 from unprocess_gen.dataset.reader import SWEEP_TABLE, read_sweep_table
 from unprocess_gen.dataset.shards import (
     CLEAN,
@@ -125,28 +124,19 @@ def verify_sweep(folder: AnyPath) -> Iterator[SweepVerification]:
 def have_same_rows(old: AnyPath, new: AnyPath) -> bool:
     """Check whether a new manifest has the rows of an older one, in every column that the older one has.
 
-    The reason ``too_small`` was ``unsupported`` up to version 0.2.
+    The reason ``too_small`` was ``unsupported`` up to version 0.2. Raises DamageError if a manifest cannot be read.
     """
-    try:
-        return file_sha256(old) == file_sha256(new) or _have_equal_cells(old, new)
-    except (OSError, ValueError, csv.Error) as error:  # the new one was written just now
-        raise DamageError(f"{old}: cannot be read ({error_in_one_line(error)})") from error
-
-
-def _have_equal_cells(old: AnyPath, new: AnyPath) -> bool:
-    with open_text(old) as first, open_text(new) as second:
-        rows, others = csv.reader(first), csv.reader(second)
-        names, other_names = next(rows, []), next(others, [])
-        if not set(names) <= set(other_names):
+    with suppress(OSError):  # reported below
+        if file_sha256(old) == file_sha256(new):
+            return True
+    names, no_row = read_columns(old), dict[str, Value]()
+    if not set(names) <= set(read_columns(new)):
+        return False
+    for row, other in itertools.zip_longest(read_rows(old), read_rows(new), fillvalue=no_row):
+        reasons = row.get("reason"), other.get("reason")
+        same_reason = reasons[0] == reasons[1] or reasons == ("unsupported", "too_small")
+        if not same_reason or any(row.get(name) != other.get(name) for name in names if name != "reason"):
             return False
-        places = [other_names.index(name) for name in names]
-        no_cells: list[str] = []
-        for row, other in itertools.zip_longest(rows, others, fillvalue=no_cells):
-            if len(other) != len(other_names):
-                return False
-            cells = [other[place] for place in places]
-            if row != cells and row != ["unsupported" if cell == "too_small" else cell for cell in cells]:
-                return False
     return True
 
 

@@ -221,12 +221,7 @@ class DaskRun:
     """Make shards, ascending numbers, on the workers of a connected cluster; ``request`` is common to all tasks."""
 
     def __init__(
-        self,
-        client: Client,
-        executor: ExecutorConfig,
-        request: ChunkRequest,
-        records: ShardRecords,
-        shards: Iterable[int],
+        self, client: Client, executor: ExecutorConfig, request: ChunkRequest, records: ShardRecords, shards: list[int]
     ) -> None:
         self._client, self._executor, self._request, self._records = client, executor, request, records
         self._waiting = deque(shards)
