@@ -109,25 +109,13 @@ def test_failing_job_gives_one_line_and_decides_exit_code(run_main: RunMain, sou
     assert errors == ["gen-dataset: gains.red=0: gains.red=0: expected a gain above 0, from 0.001 to 1000"]
 
 
-def test_unknown_option_in_one_job_does_not_stop_others(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    done = run_main("source.root=p", "-m", "camera=sony_a7r,nosuch,nexus_6p", "out=sweep", "n_jobs=1")
+def test_unknown_option_in_a_job_does_not_stop_others(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+    done = run_main("source.root=p", "-m", "camera=sony_a7r,nosuch,nexus_6p,leica", "out=sweep", "n_jobs=1")
     assert done.code == 2
     assert "gen-dataset: camera=nosuch: camera=nosuch: no such option; expected one of choice, " in done.err
-    with (tmp_path / "sweep/sweep.csv").open(newline="") as stream:
-        assert [(row["folder"], row["exit"]) for row in csv.DictReader(stream)] == [
-            ("camera=sony_a7r", "0"),
-            ("camera=nosuch", "2"),
-            ("camera=nexus_6p", "0"),
-        ]
-
-
-def test_refused_last_job_has_a_row(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    done = run_main("-m", "camera=sony_a7r,leica", "source.root=p", "out=sweep", "n_jobs=1")
-    assert done.code == 2
     assert [(row["folder"], row["exit"]) for row in table(tmp_path / "sweep")] == [
-        ("camera=sony_a7r", "0"),
-        ("camera=leica", "2"),
-    ]
+        ("camera=sony_a7r", "0"), ("camera=nosuch", "2"), ("camera=nexus_6p", "0"), ("camera=leica", "2"),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("out", ["${nope}", "${oc.env:UG_NOT_SET}/x"])
@@ -150,14 +138,10 @@ def test_sweep_of_refused_jobs_writes_nothing(run_main: RunMain, source: Path, t
     assert sorted(os.listdir(tmp_path)) == ["p"]
 
 
-def test_failed_images_are_counted_and_exit_code_is_3(run_main: RunMain, source: Path, tmp_path: Path) -> None:
+def test_failed_images_are_counted_and_exit_code_is_the_worst(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     (source / "001.png").write_bytes(b"")
-    assert run_main("-m", "seed=1,2", "source.root=p", "out=sweep", "n_jobs=1").code == 3
+    assert run_main("-m", "gains.red=1,2", "source.root=p", "out=sweep", "n_jobs=1").code == 3
     assert [(row["rows"], row["failed"], row["exit"]) for row in table(tmp_path / "sweep")] == [("3", "1", "3")] * 2
-
-
-def test_config_error_is_worse_than_a_failed_image(run_main: RunMain, source: Path) -> None:
-    (source / "001.png").write_bytes(b"")
     assert run_main("-m", "gains.red=2,0", "source.root=p", "out=sweep", "n_jobs=1").code == 2
 
 
@@ -190,27 +174,6 @@ def test_folder_names_omit_keys_that_do_not_decide_data(run_main: RunMain, sourc
 def test_sweep_without_values_has_one_folder(run_main: RunMain, source: Path, tmp_path: Path) -> None:
     run_main("-m", "source.root=p", "out=sweep", "n_jobs=1")
     assert sorted(os.listdir(tmp_path / "sweep")) == ["default", "sweep.csv"]
-
-
-def test_slash_in_a_value_creates_no_nested_folder(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    (source / "sub").mkdir()
-    (source / "001.png").rename(source / "sub/001.png")
-    done = run_main("-m", "source.include=['sub/*.png'],['0*.png']", "source.root=p", "out=sweep", "n_jobs=1")
-    assert done.code == 0, done.err
-    folders = sorted(path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir())
-    assert len(folders) == 2
-    assert [name for name in folders if "%2F" in name]
-    assert all((tmp_path / "sweep" / name / "dataset.json").exists() for name in folders)
-
-
-def test_long_overrides_have_distinct_folder_names(run_main: RunMain, source: Path, tmp_path: Path) -> None:
-    numbers = ",".join(["0.123456789012345678"] * 12)
-    one, other = (f"['*.png','{numbers}{end}']" for end in "ab")
-    done = run_main("-m", f"source.include={one},{other}", "source.root=p", "out=sweep", "n_jobs=1")
-    assert done.code == 0, done.err
-    folders = [path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
-    assert len(folders) == 2
-    assert max(len(name) for name in folders) <= 255
 
 
 def test_plan_of_a_sweep_prints_every_job_and_totals(run_main: RunMain, source: Path, tmp_path: Path) -> None:
@@ -340,6 +303,7 @@ def test_shortened_name_begins_with_the_swept_keys(run_main: RunMain, source: Pa
     assert run_main(*run).code == 0
     row, other = table(tmp_path / "sweep")
     assert [row["folder"].partition(",")[0] for row in (row, other)] == ["source.limit=1", "source.limit=2"]
+    assert max(len(row["folder"]) for row in (row, other)) <= 200
 
     folder_of_0_2 = row["overrides"][:180] + row["folder"][-17:]
     (tmp_path / "sweep" / row["folder"]).rename(tmp_path / "sweep" / folder_of_0_2)

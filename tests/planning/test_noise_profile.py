@@ -503,6 +503,8 @@ def test_inconsistent_physical_profiles_are_refused(
         ({"row_std_dn": ["scale_line", 1, 2, 0]}, "branches[0].row_std_dn=[scale_line, 1, 2, 0]: expected a number"),
         ({"dn_per_e": ["per_iso", 1, 2, 3]}, "per_iso takes 1 to 2 finite numbers"),
         ({"dn_per_e": 0}, "branches[0].dn_per_e=0: expected a gain above 0"),
+        ({"dn_per_e": ["per_iso", 0.0]}, "branches[0].dn_per_e=[per_iso, 0.0]: expected a gain above 0"),
+        ({"black_error_dn": ["by_log_iso", None]}, "expected a number, four (the 2x2 sites)"),
         ({"read_shape": -0.5}, "branches[0].read_shape=-0.5: expected more than -0.5, where the Tukey-lambda"),
         ({"read_shape": ["choice", 0.1, -0.6]}, "expected more than -0.5, where the Tukey-lambda"),
         ({"read_law": "cauchy"}, "branches[0].read_law=cauchy: expected one of gaussian, tukey"),
