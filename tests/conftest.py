@@ -21,11 +21,10 @@ import hypothesis
 import numpy as np
 import pytest
 from helpers import object_store as servers
-from helpers.commands import COMMAND, Cli, Done, RunMain, environment
+from helpers.commands import COMMAND, Cli, Done, RunMain, run_process
 from helpers.configs import composed
 from helpers.datasets import MadeHash, Make, Settings, TreeHash
 from helpers.photographs import pixels
-from helpers.processes import WAIT_S
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 from PIL import Image
@@ -246,16 +245,7 @@ def cli(tmp_path: Path) -> Cli:
     """Return a function that runs ``gen-dataset`` in its own process, in ``tmp_path`` by default."""
 
     def called(*arguments: object, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
-        command = [str(COMMAND), *map(str, arguments)]
-        return subprocess.run(
-            command,
-            cwd=cwd or tmp_path,
-            env=environment(**env),
-            capture_output=True,
-            text=True,
-            timeout=WAIT_S,
-            check=False,
-        )
+        return run_process(COMMAND, *arguments, cwd=cwd or tmp_path, **env)
 
     return called
 

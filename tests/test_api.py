@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import pickle
 import signal
-import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
@@ -15,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.commands import run_process
 from helpers.datasets import Make
 from helpers.photographs import fill, pixels
 from PIL import Image
@@ -33,18 +32,6 @@ SRGB = pixels(3, 40, 50)
 @pytest.fixture(scope="module")
 def config() -> ug.Config:
     return ug.load_config(["camera=sony_a7r", "noise=imx385_iso3200"])
-
-
-def run_python(code: str, cwd: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *flags, "-c", textwrap.dedent(code)],
-        cwd=cwd,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
 
 
 # Exports --------------------------------------------------------------------------------------------------------------
@@ -80,7 +67,7 @@ def test_raw_pairs_needs_no_library_of_generation(dataset: Path, tmp_path: Path)
         pairs = RawPairs({str(dataset)!r})
         print(len(pairs), pairs[0].clean.dtype, pairs[1:3][1].row["key"])
     """
-    done = run_python(code, tmp_path)
+    done = run_process(sys.executable, "-c", textwrap.dedent(code), cwd=tmp_path, PYTHONPATH=str(ROOT))
     assert (done.stdout, done.stderr) == ("13 uint16 00000002\n", "")
 
 
@@ -312,14 +299,7 @@ def test_everything_works_inside_a_hydra_application(tmp_path: Path) -> None:
     (tmp_path / "conf" / "own.yaml").write_text("number: 6\nhydra:\n  run:\n    dir: .\n  output_subdir: null\n")
     script = tmp_path / "application.py"
     script.write_text(textwrap.dedent(APPLICATION))
-    done = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_process(sys.executable, script, cwd=tmp_path, PYTHONPATH=str(ROOT))
     assert done.stdout.splitlines()[-1:] == ["sony_a7r 6 1 own"], done.stderr
     assert [row["status"] for row in read_rows(tmp_path / "ds" / "manifest.csv")] == ["ok"]
 

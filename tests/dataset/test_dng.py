@@ -8,7 +8,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 import pytest
 import rawpy
 import tifffile
-from helpers.commands import RunMain
+from helpers.commands import RunMain, run_process
 from helpers.datasets import Make
 from helpers.photographs import pixels
 from helpers.promise_report import Figure
@@ -381,9 +380,7 @@ def test_file_contains_the_row(changed: dict[str, str], name: str, ds: Path) -> 
 def exiftool(*arguments: object) -> str:
     if shutil.which("exiftool") is None:
         pytest.skip("exiftool is not installed")
-    return subprocess.run(
-        ["exiftool", *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False
-    ).stdout
+    return run_process("exiftool", *arguments).stdout
 
 
 def test_exiftool_finds_nothing_wrong(ds: Path, tmp_path: Path) -> None:

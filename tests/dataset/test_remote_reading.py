@@ -92,14 +92,8 @@ def test_damage_of_a_url_is_found(dataset: Path, remote: ObjectPath, tmp_path: P
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
 def test_verbs_read_datasets_of_a_url(
-    arguments: tuple[str, ...],
-    result: str,
-    remote: ObjectPath,
-    run_main: RunMain,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...], result: str, remote: ObjectPath, run_main: RunMain
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     done = run_main(*(word.format(remote) for word in arguments))
     assert done.code == 0, done.err
     assert result.format(remote) in done.out

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
+
+from helpers.commands import run_process
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -22,6 +23,6 @@ def open_page(page: Path, size: tuple[int, int], profile: Path, *flags: str, tim
         pytest.skip("chromium is not installed")
     window = f"--window-size={size[0]},{size[1]}"
     command = [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", window, *flags, page.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, cwd=page.parent)
+    done = run_process(*command, timeout=timeout, cwd=page.parent)
     assert done.returncode == 0, done.stderr
     return done.stdout

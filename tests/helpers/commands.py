@@ -17,6 +17,17 @@ def environment(**changes: str) -> dict[str, str]:
     return os.environ | {"HYDRA_FULL_ERROR": ""} | changes
 
 
+def run_process(
+    *command: object, cwd: Path | None = None, timeout: float = 600, **env: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a command with changes of the environment, and capture what it prints."""
+    words = [*map(str, command)]
+    return subprocess.run(
+        words, cwd=cwd, env=environment(**env), capture_output=True, text=True, errors="replace", timeout=timeout,
+        check=False,
+    )  # fmt: skip
+
+
 class Done(NamedTuple):
     """Exit code, stdout and stderr of a call."""
 

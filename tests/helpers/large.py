@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from helpers.commands import run_process
 from unprocess_gen import RawPairs
 from unprocess_gen.core.files import file_sha256
 from unprocess_gen.core.types import Row
@@ -57,7 +57,6 @@ def _rows(sample: Sample, folder: Path, pairs: int, per_shard: int, shards: list
 
 def peak_megabytes(code: str, *arguments: object) -> float:
     """Run Python code in a process of its own, and return the most memory that it used, in units of 10^6 bytes."""
-    command = [sys.executable, "-c", PEAK.format(code=code), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_process(sys.executable, "-c", PEAK.format(code=code), *arguments, timeout=3600)
     assert done.returncode == 0, done.stderr
     return int(done.stdout.split()[-2]) * 1024 / 1e6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -117,9 +116,3 @@ def write_jpeg(path: Path) -> None:
     content = io.BytesIO()
     Image.fromarray(pixels(1, 16, 16)).save(content, "JPEG")
     path.write_bytes(content.getvalue())
-
-
-def text_rows(out: Path) -> list[dict[str, str]]:
-    """Return the rows of a manifest as Python's csv module reads them."""
-    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))

@@ -19,14 +19,13 @@ import io
 import os
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from helpers.commands import COMMAND, RunMain
+from helpers.commands import COMMAND, RunMain, run_process
 from helpers.photographs import pixels
 from PIL import Image
 
@@ -131,10 +130,8 @@ class Page:
         words = shlex.split(command, comments=True)
         if words[0] == "gen-dataset" and not any(sign in command.partition("#")[0] for sign in OPERATORS):
             return self.run_main(*words[1:])
-        environment = os.environ | {"PATH": f"{COMMAND.parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-        done = subprocess.run(
-            ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False, timeout=600
-        )
+        path = f"{COMMAND.parent}:{os.environ['PATH']}"
+        done = run_process("bash", "-c", command, timeout=600, PATH=path, PYTHONPATH=str(ROOT))
         return done.returncode, done.stdout, done.stderr
 
 
@@ -180,9 +177,8 @@ def test_blocks_run(path: Path, page_folder: Path, run_main: RunMain) -> None:
 @pytest.mark.slow
 def test_denoiser_example_trains_and_draws(tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, ROOT / "docs" / "examples" / "train_denoiser.py", "--scenes", "5", "--steps", "2"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    done = run_process(*command, cwd=tmp_path, PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr
     assert "4 pairs to train on, 1 held out" in done.stdout
     noisy, gaussian, bilateral, network = (float(line.split()[-2]) for line in done.stdout.splitlines()[-4:])

@@ -19,7 +19,6 @@ import json
 import platform
 import re
 import signal
-import subprocess
 import sys
 import tomllib
 import venv
@@ -31,7 +30,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import everywhere
-from helpers.commands import environment
+from helpers.commands import run_process
 from helpers.photographs import pixels
 from helpers.promise_report import Figure
 from packaging.requirements import Requirement
@@ -86,28 +85,13 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def make(photographs: Path, tree_hash: Callable[[Path], str], tmp_path_factory: pytest.TempPathFactory) -> Make:
-    """Return a function that makes the dataset in a new process: Python and its flags, n_jobs, environment."""
+    """Return a function that makes the dataset in a new process: Python and its flags, environment."""
 
-    def made(*python: str | Path, n_jobs: int = 1, **env: str) -> Made:
+    def made(*python: str | Path, **env: str) -> Made:
         folder = tmp_path_factory.mktemp("made")
-        settings = ("output.pairs_per_shard=1", "noise=brooks2019", "source.max_failed=2", f"n_jobs={n_jobs}")
-        command = [
-            *(python or (sys.executable,)),
-            SCRIPT,
-            "facts.json",
-            f"source.root={photographs}",
-            "out=ds",
-            *settings,
-        ]
-        done = subprocess.run(
-            [str(part) for part in command],
-            cwd=folder,
-            env=environment(**env),
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
+        settings = ("output.pairs_per_shard=1", "noise=brooks2019", "source.max_failed=2", "n_jobs=1")
+        command = [*(python or (sys.executable,)), SCRIPT, "facts.json", f"source.root={photographs}", "out=ds"]
+        done = run_process(*command, *settings, cwd=folder, **env)
         if done.returncode == -signal.SIGILL:
             pytest.skip("this processor lacks instructions of another")
         assert done.returncode == 0, done.stdout + done.stderr
@@ -237,7 +221,7 @@ def test_a_photograph_is_not_corrupt_when_memory_is_short(photographs: Path, tmp
     cv2.imwrite(str(tmp_path / "large.jpg"), np.full((4000, 4000, 3), 99, dtype=np.uint8))
 
     command = [sys.executable, "-c", SHORT_OF_MEMORY, photographs / "444.jpg", tmp_path / "large.jpg"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    done = run_process(*command)
 
     assert done.stdout.strip() in ("MachineError", "MemoryError")
 
@@ -256,7 +240,7 @@ def test_jpegs_have_the_same_pixels_without_vector_code(photographs: Path) -> No
     """OpenCV's libjpeg-turbo takes no orders from the environment, so Pillow's decodes without vector code."""
     jpegs = sorted(path for path in photographs.glob("*.jpg") if path.name != "torn.jpg")
     command = [sys.executable, "-c", WITHOUT_VECTOR_CODE, *jpegs]
-    done = subprocess.run(command, env=environment(JSIMD_FORCENONE="1"), capture_output=True, text=True, check=True)
+    done = run_process(*command, JSIMD_FORCENONE="1")
     digests, obeyed = done.stdout.splitlines()
     if obeyed != "True":
         pytest.skip("this Pillow's libjpeg takes no orders from the environment either")
@@ -301,13 +285,10 @@ def code(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Return facts about the kernels' machine code; on an x86-64 it is compiled for AVX-512."""
     folder = tmp_path_factory.mktemp("code")
     other = {"NUMBA_CPU_NAME": "znver4", "NUMBA_CPU_FEATURES": ""} if platform.machine() == "x86_64" else {}
-    subprocess.run(
-        [sys.executable, SCRIPT, "code.json", "--code"],
-        cwd=folder,
-        env=environment(NUMBA_CACHE_DIR=str(folder), **other),
-        timeout=600,
-        check=True,
+    done = run_process(
+        sys.executable, SCRIPT, "code.json", "--code", cwd=folder, timeout=600, NUMBA_CACHE_DIR=str(folder), **other
     )
+    assert done.returncode == 0, done.stderr
     return dict(json.loads((folder / "code.json").read_text(encoding="utf-8")))
 
 
@@ -339,8 +320,7 @@ def test_kernels_call_only_exact_functions_without_fast_math(code: dict[str, Any
 
 
 def pip(*arguments: str | Path) -> str:
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    done = run_process(sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments, timeout=900)
     if done.returncode:
         pytest.fail(f"pip {arguments[0]} failed; this test needs a package index:\n{done.stdout}{done.stderr}")
     return done.stdout

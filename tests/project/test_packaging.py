@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import sysconfig
 import tarfile
@@ -12,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from helpers.commands import run_process
 from helpers.photographs import pixels
 from PIL import Image
 
@@ -25,22 +24,11 @@ PROJECT_FILES = (
 OPTIONS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "conf").rglob("*.yaml"))
 
 
-def run(*command: str | Path, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(part) for part in command],
-        cwd=cwd,
-        env=os.environ | env,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder with the sdist and the wheel built from it."""
     folder = tmp_path_factory.mktemp("dist")
-    done = run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    done = run_process(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
 
@@ -52,7 +40,7 @@ def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder, with_pip=False, symlinks=True)
     python = folder / "bin" / "python"
     (wheel,) = built.glob("*.whl")
-    installing = run(
+    installing = run_process(
         *(sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python),
         *("install", "--no-deps", "--no-index", wheel),
         cwd=folder,
@@ -86,9 +74,9 @@ def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path
     """Without compiling: an installation has a cache of kernels of its own."""
     Image.fromarray(pixels(1, 8, 12)).save(tmp_path / "a.png")
     code = "import unprocess_gen; print(unprocess_gen.__file__)"
-    where = run(installed / "python", "-c", code, cwd=tmp_path, PYTHONPATH="")
+    where = run_process(installed / "python", "-c", code, cwd=tmp_path, PYTHONPATH="")
     arguments = ("source.root=a.png", "n_jobs=1", "accuracy=reference", "out=ds")
-    done = run(installed / "gen-dataset", *arguments, cwd=tmp_path, PYTHONPATH="", NUMBA_DISABLE_JIT="1")
+    done = run_process(installed / "gen-dataset", *arguments, cwd=tmp_path, PYTHONPATH="", NUMBA_DISABLE_JIT="1")
 
     assert Path(where.stdout.strip()).is_relative_to(installed.parent)
     assert done.returncode == 0, done.stderr
@@ -97,14 +85,14 @@ def test_the_installed_command_runs_from_its_own_files(installed: Path, tmp_path
 
 @pytest.mark.slow
 def test_the_installed_command_compiles_its_kernels(installed: Path, tmp_path: Path) -> None:
-    done = run(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path, PYTHONPATH="")
+    done = run_process(installed / "gen-dataset", "out=ds", "source.limit=1", cwd=tmp_path, PYTHONPATH="")
 
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ds"]
 
 
 def test_the_editable_installation_sees_the_source_tree(tmp_path: Path) -> None:
-    done = run(sys.executable, "-m", "unprocess_gen", "--cfg", "job", "camera=choice", cwd=tmp_path)
+    done = run_process(sys.executable, "-m", "unprocess_gen", "--cfg", "job", "camera=choice", cwd=tmp_path)
 
     assert done.returncode == 0, done.stderr
     assert "law: choice" in done.stdout

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import re
 import shutil
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -18,6 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from helpers.browser import open_page
+from helpers.commands import run_process
 from helpers.promise_report import Figure
 
 pytestmark = pytest.mark.slow
@@ -58,13 +57,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("myst_parser", reason="needs the extra docs")
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-d", folder / "doctrees"]
-    done = subprocess.run(
-        [*command, ROOT / "docs", folder / "html"],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_process(*command, ROOT / "docs", folder / "html", PYTHONPATH=str(ROOT))
     assert done.returncode == 0, done.stderr
     return folder / "html"
 

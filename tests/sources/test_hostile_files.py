@@ -9,7 +9,6 @@ process of its own, whose high-water mark of memory is set back before each.
 from __future__ import annotations
 
 import contextlib
-import csv
 import io
 import multiprocessing
 import os
@@ -31,9 +30,9 @@ import numpy as np
 import pytest
 from helpers import corpus as corpus_module
 from helpers.cases import slow_except
-from helpers.commands import COMMAND, environment
+from helpers.commands import COMMAND, run_process
 from helpers.corpus import DAMAGES, MATCHED, retagged
-from helpers.datasets import Settings
+from helpers.datasets import Settings, text_rows
 from helpers.photographs import pixels
 from helpers.promise_report import Figure
 from PIL import Image
@@ -53,39 +52,20 @@ MAX_PIXELS = 2**26
 MAX_SECONDS = 10
 MAX_BYTES = 1.5e9
 
-Done = subprocess.CompletedProcess[str]
 Rows = dict[str, dict[str, str]]
-
-
-def gen_dataset(*arguments: object, timeout_s: float = 120) -> Done:
-    return subprocess.run(
-        [str(COMMAND), *map(str, arguments)],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=timeout_s,
-        check=False,
-    )
-
-
-def rows_of(out: Path) -> Rows:
-    """The rows of a manifest by the path of their source, as Python's csv module reads them."""
-    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        return {decode_name(row["source"]): row for row in csv.DictReader(stream)}
 
 
 class Run(NamedTuple):
     """How a run over a folder ended, and the rows that it wrote."""
 
-    done: Done
+    done: subprocess.CompletedProcess[str]
     rows: Rows
 
 
 def run(root: Path, out: Path, *overrides: str, timeout_s: float = 120) -> Run:
-    done = gen_dataset(f"source.root={root}", f"out={out}", *overrides, timeout_s=timeout_s)
+    done = run_process(COMMAND, f"source.root={root}", f"out={out}", *overrides, timeout=timeout_s)
     assert (out / "manifest.csv").exists(), done.stderr
-    return Run(done, rows_of(out))
+    return Run(done, {decode_name(row["source"]): row for row in text_rows(out)})
 
 
 def no_trouble(made: Run) -> bool:

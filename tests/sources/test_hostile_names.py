@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from helpers.cases import slow_except
 from helpers.commands import RunMain
-from helpers.datasets import Make
+from helpers.datasets import Make, text_rows
 from helpers.promise_report import Figure
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -133,16 +133,11 @@ def cells(out: Path) -> list[list[str]]:
         return list(csv.reader(stream, strict=True))
 
 
-def table(out: Path) -> list[dict[str, str]]:
-    head, *rows = cells(out)
-    return [dict(zip(head, row, strict=True)) for row in rows]
-
-
 # In the manifest ------------------------------------------------------------------------------------------------------
 
 
 def test_every_name_gives_a_pair_and_is_restored(made: HostileDataset, figure: Figure) -> None:
-    rows = table(made.out)
+    rows = text_rows(made.out)
     assert (len(rows), {row["status"] for row in rows}) == (len(made.contents), {"ok"})
     digests = {os.fsencode(decode_name(row["source"])): row["source_sha256"] for row in rows}
     assert digests == {path: hashlib.sha256(content).hexdigest() for path, content in made.contents.items()}
@@ -189,7 +184,7 @@ def test_members_are_named_by_key_and_have_the_names_of_the_manifest(made: Hosti
             sources += [json.loads(row.read())["source"] for row in rows if row is not None]
     kinds = ("clean.npy", "noisy.npy", "json")
     assert names == [f"{number:08d}.{kind}" for number in range(len(made.contents)) for kind in kinds]
-    assert sources == [row["source"] for row in table(made.out)]
+    assert sources == [row["source"] for row in text_rows(made.out)]
 
 
 # Replay, verify, read -------------------------------------------------------------------------------------------------
@@ -202,7 +197,7 @@ def test_verify_regenerates_every_pair(made: HostileDataset, run_main: RunMain) 
 
 
 def test_raw_pairs_returns_every_name(made: HostileDataset) -> None:
-    assert [sample.row["source"] for sample in RawPairs(made.out)] == [row["source"] for row in table(made.out)]
+    assert [sample.row["source"] for sample in RawPairs(made.out)] == [row["source"] for row in text_rows(made.out)]
 
 
 def test_rerun_on_a_finished_dataset_does_nothing(made: HostileDataset, run_main: RunMain) -> None:
@@ -257,7 +252,7 @@ def test_folder_of_any_name_is_used_or_refused(name: str, run_main: RunMain, tmp
     escaped = [folder.name.replace("${", "\\${") for folder in (root, out)]  # "${" starts an interpolation
     done = run_main(f"source.root={escaped[0]}", f"out={escaped[1]}", "n_jobs=1")
     if done.code == 0:
-        assert [(row["source"], row["status"]) for row in table(out)] == [("a.png", "ok")]
+        assert [(row["source"], row["status"]) for row in text_rows(out)] == [("a.png", "ok")]
         assert paths_except(tmp_path, out) == before
     else:
         assert (done.code, done.out, len(done.err.strip("\n").split("\n"))) == (2, "", 1)
@@ -269,7 +264,7 @@ def test_quotes_around_a_folder_name_are_removed(mark: str, run_main: RunMain, t
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "a.png").write_bytes(photograph(0))
     done = run_main(f"source.root={mark}a b{mark}", f"out={mark}c d{mark}", "n_jobs=1")
-    assert (done.code, len(table(tmp_path / "c d"))) == (0, 1)
+    assert (done.code, len(text_rows(tmp_path / "c d"))) == (0, 1)
 
 
 VERB_ARGUMENTS = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 import yaml
 from helpers.commands import RunMain
 from helpers.datasets import Make, Settings, TreeHash
+from helpers.datasets import text_rows as rows
 from helpers.noise_fits import dataset_fits
 from helpers.photographs import fill, pixels
 from helpers.promise_report import Figure
@@ -60,11 +60,6 @@ def cut_up(sources: Path, make: Make) -> Path:
     """Random patches of two levels and two draws; a shard holds two photographs."""
     make(sources, sources.parent / "cut_up", *LEVELS, RANDOM, "output.pairs_per_shard=2")
     return sources.parent / "cut_up"
-
-
-def rows(out: Path) -> list[dict[str, str]]:
-    with (out / "manifest.csv").open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
 
 
 def pair_of(row: dict[str, Any]) -> tuple[Any, ...]:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import RunMain
-from helpers.datasets import Make, Settings
+from helpers.datasets import Make, Settings, text_rows
 from helpers.photographs import pixels
-from helpers.videos import encode, film, scene, settings_of, text_rows, write_jpeg
+from helpers.videos import encode, film, scene, settings_of, write_jpeg
 from PIL import Image
 
 from unprocess_gen.config.schema import replaced

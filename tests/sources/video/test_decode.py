@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.cases import slow_except
-from helpers.datasets import Make
+from helpers.datasets import Make, text_rows
 from helpers.promise_report import Figure
-from helpers.videos import ENCODED, encode, film, opened, rgb, scene, settings_of, text_rows, write_jpeg
+from helpers.videos import ENCODED, encode, film, opened, rgb, scene, settings_of, write_jpeg
 
 from unprocess_gen.core.errors import SourceError
 from unprocess_gen.pipeline.verify import verify
