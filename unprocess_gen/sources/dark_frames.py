@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -66,6 +66,10 @@ class DarkFolder:
         return mosaics.even_sides(
             (_mapped if name.lower().endswith(".npy") else _decoded)(Path(self.folder) / name, sha256)
         )
+
+    def frames(self) -> Iterator[Raw]:
+        """Yield the mosaics of all frames."""
+        return map(self.frame, sorted(self.files))
 
     def shading(self, sha256: str) -> NDArray[np.float32]:
         """Return the map that is subtracted from the frames, float32 [H, W] in DN of the frames.
@@ -213,7 +217,7 @@ def _described(
             raise ConfigError(
                 "noise.dark_shading=remove: the mean of one dark frame is the frame itself; expected several"
             )
-        _, variance_dn2 = _around(folder, frames, folder.shading(folder.sha256), 0.0)
+        _, variance_dn2 = dark_shading.differences(folder.shading(folder.sha256), 0.0, folder.frames())
         shading = DarkShading(folder.sha256)
     elif shading_map is not None:
         variance_dn2, shading = _around_map(folder, frames, shading_map, black_dn, stated_dn is not None)
@@ -240,18 +244,11 @@ def _around_map(
             )
     is_above_black = dark_shading.is_above_black(values, black_dn)
     subtracted_dn = black_dn if is_above_black else 0.0
-    median_dn, variance_dn2 = _around(folder, frames, values, subtracted_dn)
+    median_dn, variance_dn2 = dark_shading.differences(values, subtracted_dn, folder.frames())
     if is_above_black and not is_stated and subtracted_dn + median_dn > 0:
         return variance_dn2, DarkShading(sha256, subtracted_dn + median_dn, path.name)
     dark_shading.check_residual(path, median_dn, variance_dn2)
     return variance_dn2, DarkShading(sha256, subtracted_dn, path.name, median_dn)
-
-
-def _around(
-    folder: DarkFolder, frames: Sequence[DarkFrame], values: NDArray[np.float32], black_dn: float
-) -> tuple[float, float]:
-    """Median and variance of the frames minus a map and a black level, DN and DN² of the frames."""
-    return dark_shading.differences(values, black_dn, (folder.frame(frame.sha256) for frame in frames))
 
 
 def _check(start: str, mosaic: Mosaic, bits: int, pattern: str) -> None:
@@ -300,8 +297,7 @@ def _decoded(path: Path, sha256: str) -> Raw:
 def _mean(folder: DarkFolder) -> NDArray[np.float32]:
     """The mean of all frames of a folder: an exact sum, divided once."""
     total: NDArray[np.uint32] | None = None
-    for sha256 in sorted(folder.files):
-        pixels = folder.frame(sha256)
+    for pixels in folder.frames():
         total = np.zeros(pixels.shape, dtype=np.uint32) if total is None else total  # 65,537 frames fit
         if pixels.shape != total.shape:
             raise ConfigError(

@@ -37,6 +37,8 @@ class Plane:
     def __init__(self, noise: PlaneNoise, clean: Any, noisy: Any) -> None:
         self.noise, self._clean, self._noisy = noise, clean, noisy
         self._bin_dn = bin_dn = bin_width(noise)
+        self._offset_dn = np.broadcast_to(np.nan_to_num(noise.offset_dn), clean.shape)
+        self._gaps = np.isnan(noise.offset_dn) if np.isnan(noise.offset_dn).any() else None
         self._unused = round(max(float(clean.max(initial=0)), 0.0) / bin_dn) + 1
         counts = np.bincount(self._bins_of_sites(np.s_[:]).ravel(), minlength=self._unused + 1)
         bins = np.flatnonzero(counts[:-1])
@@ -58,25 +60,22 @@ class Plane:
         return np.asarray(self._sums[:, self.bins] / self.count)
 
     def row_sums(self, values: Float) -> Float:
-        """Sum values of the checked bins over the sites of each row, [H/2]."""
-        return np.asarray(self._table(values)[self._bins_of_sites(np.s_[:])].sum(axis=1, dtype=np.float64))
+        """Sum values of the checked bins, [K, N], over the sites of each row, [K, H/2]."""
+        bins = self._bins_of_sites(np.s_[:])
+        return np.stack([self._table(row).take(bins).sum(axis=1, dtype=np.float64) for row in values])
 
     def add_strip(self, rows: slice) -> tuple[Single, Single]:
         """Add the sites of some rows to the sums; their z minus its mean, and 1 / std, which is 0 for unused sites."""
         bins, clean = self._bins_of_sites(rows), self._clean[rows]
-        weight, offset_dn = self._weight[bins], self._offset_dn(rows)
-        noise = np.subtract(self._noisy[rows], clean, dtype=np.float32) - offset_dn
+        weight = self._weight.take(bins)
+        noise = np.subtract(self._noisy[rows], clean, dtype=np.float32) - self._offset_dn[rows]
         z = np.clip(noise * weight, -LARGEST_Z, LARGEST_Z)
         values = [z, np.cos(z)]
         if self.noise.site.plan.output.clean_normalised:
             values.append(clean - bins * self._bin_dn)
         for total, value in zip(self._sums, values, strict=False):
             total += np.bincount(bins.ravel(), value.ravel(), len(total))
-        return z - self._mean[bins], weight
-
-    def _offset_dn(self, rows: slice) -> Any:
-        offset_dn = self.noise.offset_dn
-        return np.nan_to_num(offset_dn[rows]) if offset_dn.ndim == 2 else offset_dn
+        return z - self._mean.take(bins), weight
 
     def _table(self, values: Float) -> Single:
         table = np.zeros(self._unused + 1, np.float32)
@@ -89,8 +88,8 @@ class Plane:
         if self.noise.site.plan.output.clean_normalised:
             clean = np.rint(np.maximum(clean, 0.0) / self._bin_dn)
         bins = clean.astype(np.intp)
-        if self.noise.offset_dn.ndim == 2:
-            bins[np.isnan(self.noise.offset_dn[rows])] = self._unused
+        if self._gaps is not None:
+            bins[self._gaps[rows]] = self._unused
         return np.asarray(bins)
 
 

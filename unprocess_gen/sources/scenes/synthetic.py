@@ -34,8 +34,6 @@ DEFAULT_COUNT = 10
 def listing(limit: int | None) -> tuple[str, ...]:
     """Return the names of the first ``limit`` scenes (None: ten); kinds alternate."""
     count = DEFAULT_COUNT if limit is None else limit
-    if count < 0:
-        raise ValueError(f"limit of synthetic scenes {limit!r}: expected None or an integer of 0 or more")
     return tuple(f"{KINDS[i % len(KINDS)]}-{i // len(KINDS)}" for i in range(count))
 
 
@@ -525,15 +523,13 @@ def _sources(canvas: Float, draws: _Draws, y: Float, x: Float, horizon: int) -> 
         for side in (-1.0, 1.0):
             at = vanish + side * 0.72 * width / far
             top, foot = horizon - 0.52 * height / far, horizon + 0.30 * height / far
-            _post(canvas, y, x, top, at, foot, 5.0 / far)
+            thick = 5.0 / far
+            post = _box(y, x, top, at - thick / 2, foot, at + thick / 2)
+            _cover(canvas, np.array([0.001, 0.001, 0.001]), post)
             _glow(canvas, streaks, y, x, (top, at, foot), 11.0 / far, colour * draws.one(0.85, 1.15), horizon)
     for light in SIGN_LIGHTS[draws.order(len(SIGN_LIGHTS))]:
         top, at = horizon - draws.one(0.04, 0.22) * height, draws.one(0.08, 0.92) * width
         _glow(canvas, streaks, y, x, (top, at, horizon + 0.5 * (horizon - top)), draws.one(1.6, 3.0), light, horizon)
-
-
-def _post(canvas: Float, y: Float, x: Float, top: float, at: float, foot: float, thick: float) -> None:
-    _cover(canvas, np.array([0.001, 0.001, 0.001]), _box(y, x, top, at - thick / 2, foot, at + thick / 2))
 
 
 def _glow(
