@@ -157,7 +157,6 @@ def check_figure_file(to: Path) -> None:
 
 def draw_fits(fits: list[NoiseFit], to: Path | BinaryIO) -> None:
     """Draw variance against signal with the expected lines, as PNG."""
-    require_libraries(f"--to {to}", ("matplotlib",))
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5), layout="constrained")
