@@ -84,7 +84,7 @@ class FrameModel(FrameFacts):
         """Return the variance of a pixel due to each of `MASKING` at a signal, DN²."""
         known = self._known_variances.get(level_dn)
         if known is None:
-            known = [(effect.name, effect.variance(self.physics, level_dn)) for effect in MASKING]
+            known = [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
             self._known_variances[level_dn] = known
         return known
 

@@ -151,21 +151,25 @@ LINES = ("line", "scale_line")
 def _number_of_iso(kind: str, iso: float, *numbers: float) -> float:
     """Evaluate a form that depends on the ISO only."""
     with localcontext(prec=DIGITS):
-        return float(FORMS[kind](Decimal(iso), Decimal(1), 0.5, 0.0, *map(Decimal, numbers)))
+        return float(ISO_FORMS[kind](Decimal(iso), *map(Decimal, numbers)))
 
 
 @functools.lru_cache(maxsize=256)
 def _number_of_line(
     kind: str, iso: float, gain: float, uniform: float, shape: float, slope: float, intercept: float, std: float
 ) -> float:
-    """Evaluate a form that depends on the gain and a uniform."""
+    """Return σ from ln σ = slope · ln K + intercept + std · n, where n is a standard normal deviate (ELD).
+
+    ``scale_line`` gives the scale of Tukey-λ noise, which is multiplied by its standard deviation at scale 1.
+    """
     scale = _fixed_tukey_std(shape) if kind == "scale_line" else fixed_point.ONE
     value = fixed_point.nearest_log_linear(uniform, gain, slope, intercept, std, scale)
     if value is not None:
         return value
     with localcontext(prec=DIGITS):
-        line = map(Decimal, (slope, intercept, std))
-        return float(FORMS[kind](Decimal(iso), Decimal(gain), uniform, shape, *line))
+        scatter = Decimal(std) * normal_quantile(Decimal(uniform)) if std else Decimal(0)
+        sigma = (Decimal(slope) * Decimal(gain).ln() + Decimal(intercept) + scatter).exp()
+        return float(sigma * _tukey_std(shape) if kind == "scale_line" else sigma)
 
 
 @functools.lru_cache(maxsize=256)
@@ -201,13 +205,11 @@ def _place(iso: float, low: float, high: float) -> Decimal:
         return (Decimal(iso) / Decimal(low)).ln() / (Decimal(high) / Decimal(low)).ln()
 
 
-def _per_iso(
-    iso: Decimal, gain: Decimal, u: float, shape: float, slope: Decimal, intercept: Decimal = Decimal(0)
-) -> Decimal:
+def _per_iso(iso: Decimal, slope: Decimal, intercept: Decimal = Decimal(0)) -> Decimal:
     return slope * iso + intercept
 
 
-def _root(iso: Decimal, gain: Decimal, u: float, shape: float, *coefficients: Decimal) -> Decimal:
+def _root(iso: Decimal, *coefficients: Decimal) -> Decimal:
     """Return √(c0 + c1·ISO + c2·ISO²): the standard deviation of a variance that is a polynomial in ISO."""
     total = Decimal(0)
     for coefficient in reversed(coefficients):
@@ -215,20 +217,7 @@ def _root(iso: Decimal, gain: Decimal, u: float, shape: float, *coefficients: De
     return total.sqrt()
 
 
-def _line(
-    iso: Decimal, gain: Decimal, u: float, shape: float, slope: Decimal, intercept: Decimal, std: Decimal
-) -> Decimal:
-    """Return σ from ln σ = slope · ln K + intercept + std · n, where n is a standard normal deviate (ELD)."""
-    scatter = std * normal_quantile(Decimal(u)) if std else Decimal(0)
-    return (slope * gain.ln() + intercept + scatter).exp()
-
-
-def _scale_line(iso: Decimal, gain: Decimal, u: float, shape: float, *line: Decimal) -> Decimal:
-    """Return the standard deviation of Tukey-λ noise: its scale by `_line`, times its standard deviation at scale 1."""
-    return _line(iso, gain, u, shape, *line) * _tukey_std(shape)
-
-
-def _by_iso(iso: Decimal, gain: Decimal, u: float, shape: float, *pairs: Decimal) -> Decimal:
+def _by_iso(iso: Decimal, *pairs: Decimal) -> Decimal:
     """Interpolate standard deviations: ln σ is linear in ln ISO between neighbours of a table of ISO, σ, …."""
     share, low, high = _neighbours(iso, pairs)
     return (low.ln() + share * (high.ln() - low.ln())).exp()
@@ -244,13 +233,8 @@ def _neighbours(iso: Decimal, pairs: Sequence[Decimal]) -> tuple[Decimal, Decima
     return (iso / low).ln() / (high / low).ln(), values[above - 1], values[above]
 
 
-FORMS: dict[str, Callable[..., Decimal]] = {
-    "per_iso": _per_iso,
-    "root": _root,
-    "line": _line,
-    "scale_line": _scale_line,
-    "by_iso": _by_iso,
-}
+ISO_FORMS: dict[str, Callable[..., Decimal]] = {"per_iso": _per_iso, "root": _root, "by_iso": _by_iso}
+FORMS = (*ISO_FORMS, *LINES)
 """Functions that a branch may contain instead of a number, as ``[form, number, …]``."""
 
 

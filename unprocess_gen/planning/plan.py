@@ -8,24 +8,12 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from unprocess_gen.config import interpretation
 from unprocess_gen.config.accuracy import choose_methods, is_steep
 from unprocess_gen.config.distributions import draw_parameter, parse_drawn
-from unprocess_gen.config.interpretation import (
-    dequantize_method,
-    effect_switch,
-    gain_distributions,
-    has_float_clean,
-    is_normalised,
-    is_physical,
-    noise_distributions,
-    noise_levels,
-    saturated_as,
-    uses_dark_frames,
-    uses_physics,
-)
 from unprocess_gen.config.limits import EXPOSURE_RATIO
 from unprocess_gen.config.schema import CameraConfig, Config
 from unprocess_gen.core.random_streams import dark_frame_words, parameter_uniforms, stream_key
@@ -69,8 +57,7 @@ def plan_image(
 
     All draws are functions of ``config.seed``, ``source_sha256`` and ``occurrence``.
     """
-    plan, _ = next(_planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames))
-    return plan if dark_frames is None or facts is None else with_dark_frame(plan, dark_frames, facts)
+    return plan_pairs(config, source_sha256, occurrence, facts, 0, dark_frames)[0]
 
 
 def plan_pairs(
@@ -81,34 +68,24 @@ def plan_pairs(
     frame: int = 0,
     dark_frames: DarkFrames | None = None,
 ) -> tuple[Plan, ...]:
-    """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level."""
-    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
-    plans = with_draws(config, (plan for plan, _ in levels), frame)
-    return plans if dark_frames is None or facts is None else with_dark_frames(plans, dark_frames, facts)
+    """Draw the parameters of all pairs of one image: each noise level, and each draw of the noise at that level.
 
-
-def with_draws(config: Config, levels: Iterable[Plan], frame: int = 0) -> tuple[Plan, ...]:
-    """Return a plan for each draw of the noise at each level."""
-    return tuple(
-        plan.replace(draw=draw, frame=frame) if draw or frame else plan
-        for plan in levels
-        for draw in range(config.noise.draws)
-    )
-
-
-def with_dark_frames(plans: Sequence[Plan], dark_frames: DarkFrames, facts: Facts) -> tuple[Plan, ...]:
-    """Choose the dark frame of each pair of an image.
-
-    The first is chosen at random for each image, and the frames of a clip, the levels and the draws take the next ones
-    in turn. All use the same part of the frames, so that the fixed pattern of the camera does not move.
+    The first dark frame is chosen at random for each image, and the frames of a clip, the levels and the draws take the
+    next ones in turn. All use the same part of the frames, so that the fixed pattern of the camera does not move.
     """
-    return tuple(
-        with_dark_frame(plan, dark_frames, facts, plan.noise.frame * len(plans) + number)
-        for number, plan in enumerate(plans)
-    )
+    levels = _planner(config).levels(config.seed, source_sha256, occurrence, facts, dark_frames)
+    plans = [
+        plan.replace(draw=draw, frame=frame) if draw or frame else plan
+        for plan, _ in levels
+        for draw in range(config.noise.draws)
+    ]
+    if dark_frames is not None and facts is not None:
+        first = frame * len(plans)
+        plans = [with_dark_frame(plan, dark_frames, facts, first + number) for number, plan in enumerate(plans)]
+    return tuple(plans)
 
 
-def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int = 0) -> Plan:
+def with_dark_frame(plan: Plan, dark_frames: DarkFrames, facts: Facts, number: int) -> Plan:
     """Choose the dark frame of one pair."""
     chosen, row, column = dark_frame_words(plan.stream_key)
     count = len(dark_frames.frames)
@@ -164,28 +141,35 @@ class Planner:
     """
 
     def __init__(self, config: Config) -> None:
-        self._camera, self._needs_dark_frames = config.camera, uses_dark_frames(config.noise)
-        self._red, self._blue, self._inverse_rgb = gain_distributions(config.gains)
+        self._camera, self._needs_dark_frames = config.camera, interpretation.uses_dark_frames(config.noise)
+        self._red, self._blue, self._inverse_rgb = interpretation.gain_distributions(config.gains)
         self._exposure_ratio = parse_drawn("scene.exposure_ratio", config.scene.exposure_ratio, EXPOSURE_RATIO)
-        levels = [replace(config, noise=noise) for noise in noise_levels(config.noise)]
-        self._is_physical = is_physical(config.noise)
+        levels = [replace(config, noise=noise) for noise in interpretation.noise_levels(config.noise)]
+        self._is_physical = interpretation.is_physical(config.noise)
         kind = PhysicalLevel if self._is_physical else TwoNumberLevel
         self._levels = [kind(level, number) for number, level in enumerate(levels)]
-        budget, counts_electrons = config.accuracy, uses_physics(config.noise)
+        budget, counts_electrons = config.accuracy, interpretation.uses_physics(config.noise)
         self._accuracy, self._steep_accuracy = (
             AccuracyPlan(
                 config.accuracy.name,
-                choose_methods(budget, counts_electrons, is_normalised(config), steep or has_float_clean(config)),
+                choose_methods(
+                    budget,
+                    counts_electrons,
+                    interpretation.is_normalised(config),
+                    steep or interpretation.has_float_clean(config),
+                ),
                 config.accuracy.law_distance,
             )
             for steep in (False, True)
         )
         self._scene_name, self._highlight = config.scene.name, (config.gains.highlight, config.gains.threshold)
-        self._source = SourcePlan(config.source.downscale, dequantize_method(config.source))
+        self._source = SourcePlan(config.source.downscale, interpretation.dequantize_method(config.source))
         self._isp = IspPlan(config.isp.tone, "srgb" if config.isp.gamma == "srgb" else float(config.isp.gamma))
         sensor = config.sensor
         self._sensor = SensorPlan(sensor.pattern, sensor.bits, sensor.black_level_dn, sensor.white_level_dn)
-        self._output = OutputPlan(config.output.dtype, config.output.layout, FLOAT32 if has_float_clean(config) else "")
+        self._output = OutputPlan(
+            config.output.dtype, config.output.layout, FLOAT32 if interpretation.has_float_clean(config) else ""
+        )
 
     def levels(
         self,
@@ -270,8 +254,8 @@ class TwoNumberLevel:
     """
 
     def __init__(self, config: Config, number: int) -> None:
-        self._config, self._number, self._saturated = config, number, saturated_as(config)
-        self._distributions = noise_distributions(config.noise)
+        self._config, self._number, self._saturated = config, number, interpretation.saturated_as(config)
+        self._distributions = interpretation.noise_distributions(config.noise)
         self._span_dn = config.sensor.white_level_dn - config.sensor.black_level_dn
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
@@ -312,7 +296,7 @@ class PhysicalLevel:
 
     def __init__(self, config: Config, number: int) -> None:
         self._noise, self._number = PhysicalNoise(config), number
-        self._clip, self._saturated = config.sensor.clip, saturated_as(config)
+        self._clip, self._saturated = config.sensor.clip, interpretation.saturated_as(config)
         self._rules = effect_rules(config)
 
     def draw(self, image: Image, uniforms: Sequence[float]) -> NoiseAndSelection:
@@ -379,10 +363,10 @@ def plan_effects(config: Config, a_dn: float, b_dn2: float, span_dn: int) -> tup
     simulated.
     """
     noise = config.noise.name
-    rounded = not is_normalised(config)
+    rounded = not interpretation.is_normalised(config)
     last = ("quantise",) if rounded else ()
     skipped = () if rounded else (f"quantise: {NOT_ROUNDED}",)  # recorded: decides bytes of datasets
-    if effect_switch(config.effects, "heteroscedastic") == "off":
+    if interpretation.effect_switch(config.effects, "heteroscedastic") == "off":
         return last, ("heteroscedastic: switched off", *skipped)  # recorded: decides bytes of datasets
     if a_dn * span_dn + b_dn2 <= 0:
         numbers = f"a_dn={a_dn!r}, b_dn2={b_dn2!r}"

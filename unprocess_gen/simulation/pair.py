@@ -5,7 +5,7 @@ frames with compiled kernels, much faster; datasets are made with it. Tests comp
 on every option.
 
 In both, a pair is computed in three steps: unprocess the image to the clean frame, add the effects of the sensor, then
-clip and round both frames (`_read_out`).
+clip and round both frames (`_reference_pair`).
 """
 
 from __future__ import annotations
@@ -104,8 +104,7 @@ def _pairs(
     for some in _passes(plans):
         if some[0].accuracy.uses_reference:
             for plan in some:
-                pair = _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
-                yield _arrange_pair(pair, plan, origin)
+                yield _reference_pair(srgb, plan, origin, _curve(srgb, plan), dark_pixels)
             continue
         for pair in render_pairs(srgb, some, origin, dark_pixels):
             clean = pair.clean if clean is None else clean
@@ -158,8 +157,7 @@ def reference_pair(
         As `make_pair`.
     """
     _check_image(srgb, plan, origin)
-    pair = _reference_pair(_dequantise(srgb, plan, origin), plan, origin, dark_pixels=dark_pixels)
-    return _arrange_pair(pair, plan, origin)
+    return _reference_pair(_dequantise(srgb, plan, origin), plan, origin, dark_pixels=dark_pixels)
 
 
 def _reference_pair(
@@ -169,9 +167,34 @@ def _reference_pair(
     curve: Float | None = None,
     dark_pixels: DarkPixels | None = None,
 ) -> Pair:
-    """Return the pair before packing; ``curve`` is the exact table of the tone curve, or None to use its formulas."""
+    """Return the pair in the plan's layout; ``curve`` is the exact table of the tone curve, or None for its formulas.
+
+    Noise is added to the clean frame before both are clipped, then rounded or normalised.
+    """
+    sensor, output = plan.sensor, plan.output
     light = _scene_light(srgb, plan, origin, curve)
-    return _read_out(_clean_dn(light, plan), _count_clipped(light, plan), plan, origin, dark_pixels)
+    clean_dn = to_dn(light, sensor.black_level_dn, sensor.white_level_dn, plan.brightest)
+    noisy_dn = order.noisy(clean_dn, plan, origin, dark_pixels)
+    if plan.noise.saturated == "pinned":
+        noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
+
+    limits_dn = noisy_limits(sensor.bits, sensor.black_level_dn, plan.noise.sensor_clip)
+    levels_dn = sensor.black_level_dn, sensor.white_level_dn
+    averaged_dn = order.average(clean_dn, plan, origin) if plan.noise.averaged else clean_dn
+    clean = _frame_of(averaged_dn, limits_dn if plan.noise.averaged else levels_dn, output.clean_normalised, levels_dn)
+    noisy = _frame_of(noisy_dn, limits_dn, output.normalised, levels_dn)
+    read_dn = noisy_dn if output.normalised else np.rint(noisy_dn)
+    counts = Counts(
+        clean_clipped_low=int((light < 0).sum()),
+        clean_clipped_high=int((light > plan.brightest).sum()),
+        noisy_clipped_low=int((read_dn < limits_dn[0]).sum()),
+        noisy_clipped_high=int((read_dn > limits_dn[1]).sum()),
+        saturated=int((clean == (1 if output.clean_normalised else sensor.white_level_dn)).sum()),
+        zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
+    )
+    if output.layout == PACKED:
+        clean, noisy = pack(clean, sensor.pattern, origin), pack(noisy, sensor.pattern, origin)
+    return Pair(clean, noisy, counts)
 
 
 def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float | None) -> Float:
@@ -183,66 +206,9 @@ def _scene_light(srgb: Srgb, plan: Plan, origin: tuple[int, int], curve: Float |
     return light if factor is None else light * factor
 
 
-def _clean_dn(light: Float, plan: Plan) -> Float:
-    """Return the clipped clean frame in DN, unrounded."""
-    return to_dn(light, plan.sensor.black_level_dn, plan.sensor.white_level_dn, plan.brightest)
-
-
-def _count_clipped(light: Float, plan: Plan) -> tuple[int, int]:
-    """Count the sites below black and above the brightest light."""
-    return int((light < 0).sum()), int((light > plan.brightest).sum())
-
-
-def _read_out(
-    clean_dn: Float,
-    clipped: tuple[int, int],
-    plan: Plan,
-    origin: tuple[int, int],
-    dark_pixels: DarkPixels | None = None,
-) -> Pair:
-    """Add noise to an unrounded clean frame, clip both frames, then round or normalise them.
-
-    ``clipped`` is the result of `_count_clipped` for the clean frame.
-    """
-    noisy_dn = order.noisy(clean_dn, plan, origin, dark_pixels)
-    if plan.noise.saturated == "pinned":
-        noisy_dn = np.where(clean_dn >= plan.brightest_dn, plan.brightest_dn, noisy_dn)
-    averaged_dn = order.average(clean_dn, plan, origin) if plan.noise.averaged else clean_dn
-
-    low, high = _limits_dn(plan)
-    levels_dn = plan.sensor.black_level_dn, plan.sensor.white_level_dn
-    lowest, highest = (low, high) if plan.noise.averaged else levels_dn
-    read_dn = noisy_dn if plan.output.normalised else np.rint(noisy_dn)
-    clean = _frame_of(averaged_dn, lowest, highest, plan.output.clean_normalised, levels_dn)
-    noisy = _frame_of(noisy_dn, low, high, plan.output.normalised, levels_dn)
-
-    counts = Counts(
-        clean_clipped_low=clipped[0],
-        clean_clipped_high=clipped[1],
-        noisy_clipped_low=int((read_dn < low).sum()),
-        noisy_clipped_high=int((read_dn > high).sum()),
-        saturated=int((clean == (1 if plan.output.clean_normalised else plan.sensor.white_level_dn)).sum()),
-        zero_variance=int((noise_variance(clean_dn, plan) == 0).sum()),
-    )
-    return Pair(clean, noisy, counts)
-
-
-def _frame_of(dn: Float, low: float, high: float, normalised: bool, levels_dn: tuple[int, int]) -> Frame:
+def _frame_of(dn: Float, limits_dn: tuple[float, float], normalised: bool, levels_dn: tuple[int, int]) -> Frame:
     """Clip unrounded DN, then normalise or round them."""
-    return normalise(dn, low, high, levels_dn) if normalised else quantise(dn, low, high)
-
-
-def _arrange_pair(pair: Pair, plan: Plan, origin: tuple[int, int]) -> Pair:
-    """Convert both mosaics to the plan's layout."""
-    clean, noisy, counts = pair.clean, pair.noisy, pair.counts
-    del pair  # so that each mosaic is freed as soon as it is packed
-    clean = _arrange(clean, plan, origin)
-    return Pair(clean, _arrange(noisy, plan, origin), counts)
-
-
-def _arrange(mosaic: Frame, plan: Plan, origin: tuple[int, int]) -> Frame:
-    """Convert a mosaic to the plan's layout."""
-    return pack(mosaic, plan.sensor.pattern, origin) if plan.output.layout == PACKED else mosaic
+    return normalise(dn, *limits_dn, levels_dn) if normalised else quantise(dn, *limits_dn)
 
 
 def _dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
@@ -255,11 +221,6 @@ def _dequantise(srgb: Srgb, plan: Plan, origin: tuple[int, int]) -> Srgb:
 def _curve(srgb: Srgb, plan: Plan) -> Float:
     """Return the exact curve from the image's codes to linear light."""
     return linear_table(plan.isp.tone, plan.isp.gamma, int(np.iinfo(srgb.dtype).max) + 1)
-
-
-def _limits_dn(plan: Plan) -> tuple[float, float]:
-    """Return the lowest and highest DN of the noisy frame."""
-    return noisy_limits(plan.sensor.bits, plan.sensor.black_level_dn, plan.noise.sensor_clip)
 
 
 _DTYPES = np.dtype(np.uint8), np.dtype(np.uint16)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.order import effects_of
@@ -19,10 +20,11 @@ def slots_of(plan: Plan) -> Slots:
     black_dn, physics = float(plan.sensor.black_level_dn), plan.noise.physics
     if physics is None:
         return _two_numbers(plan, black_dn)
-    slots = Slots(black_dn, physics.dn_per_e)
+    filled: dict[str, Any] = {}
     for effect in effects_of(plan):
-        slots = effect.slots(slots, plan)
-    return slots
+        filled |= effect.slots(plan)
+    patterns = Patterns(**{name: filled.pop(name) for name in Patterns._fields if name in filled})
+    return Slots(black_dn, physics.dn_per_e, patterns, **filled)
 
 
 def fixed_patterns(plan: Plan) -> Patterns:

@@ -19,28 +19,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from unprocess_gen.core import types
 from unprocess_gen.core.errors import MachineError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.jit import has_run, kernel, note_run
 from unprocess_gen.core.lookup_tables import normal_table
 from unprocess_gen.core.random_streams import philox4x32
 from unprocess_gen.core.tone_curves import linear_table
-from unprocess_gen.core.types import (
-    FLOAT32,
-    FLOAT32_METHOD,
-    NEAR_NORMAL,
-    REFERENCE_METHOD,
-    AccuracyPlan,
-    CameraPlan,
-    Float,
-    IspPlan,
-    NoisePlan,
-    Plan,
-    ScenePlan,
-    SensorPlan,
-    SourcePlan,
-    Srgb,
-)
+from unprocess_gen.core.types import Float, Plan, Srgb
 from unprocess_gen.simulation.effects import PHYSICAL_EFFECTS, Physics
 from unprocess_gen.simulation.kernels.render import uses_scene32
 from unprocess_gen.simulation.pair import make_pair
@@ -59,70 +45,43 @@ KNOWN_ANSWERS = (
 GOLDEN_PLAN = Plan(
     seed=0,
     stream_key=0x0123456789ABCDEF,
-    source=SourcePlan(downscale=1, dequantize="off"),
-    scene=ScenePlan("daylight", exposure_ratio=1.0),
-    camera=CameraPlan(
-        "custom",
-        weights=(0.0, 0.0, 0.0, 0.0),
+    source=types.SourcePlan(downscale=1, dequantize="off"),
+    scene=types.ScenePlan("daylight", exposure_ratio=1.0),
+    camera=types.CameraPlan(
+        "custom", weights=(0.0, 0.0, 0.0, 0.0), red_gain=2.15, blue_gain=1.7, inverse_rgb_gain=0.8,
         rgb2cam=(0.5625, 0.3125, 0.125, 0.125, 0.75, 0.125, 0.03125, 0.21875, 0.75),
-        red_gain=2.15,
-        blue_gain=1.7,
-        inverse_rgb_gain=0.8,
-        highlight="per_channel",
-        highlight_threshold=0.9,
+        highlight="per_channel", highlight_threshold=0.9,
     ),
-    isp=IspPlan("smoothstep", gamma=2.2),
-    sensor=SensorPlan("GRBG", bits=10, black_level_dn=64, white_level_dn=1023),
-    noise=NoisePlan(
-        "imx385_iso25600",
-        "gaussian",
-        a_dn=55.0,
-        b_dn2=2500.0,
-        effects=("heteroscedastic",),
-        skipped=(),
-        sensor_clip="sensor",
-        saturated="noisy",
+    isp=types.IspPlan("smoothstep", gamma=2.2),
+    sensor=types.SensorPlan("GRBG", bits=10, black_level_dn=64, white_level_dn=1023),
+    noise=types.NoisePlan(
+        "imx385_iso25600", "gaussian", a_dn=55.0, b_dn2=2500.0, effects=("heteroscedastic",), skipped=(),
+        sensor_clip="sensor", saturated="noisy",
     ),
-    accuracy=AccuracyPlan("exact", methods=()),
-)
+    accuracy=types.AccuracyPlan("exact", methods=()),
+)  # fmt: skip
 GOLDEN_PHYSICS = Physics(
-    iso=3200.0,
-    exposure_s=0.1,
-    temperature_c=30.0,
-    dn_per_e=4.0,
-    prnu_std=0.01,
-    dark_e=3.0,
-    dark_offset="removed",
-    hot_pixel_share=0.02,
-    hot_pixel_e=40.0,
-    full_well_e=300.0,
-    read_law="tukey",
-    read_shape=-0.1,
-    read_std_dn=6.0,
-    row_std_dn=2.0,
-    column_std_dn=1.0,
-    black_error_dn=(0.5, -0.25, 0.125, 1.0),
-    dead_pixel_share=0.01,
-    sensor_unit="0",
-    body_key=0xFEDCBA9876543210,
-    fixed_pattern_in_clean=False,
-    frame_size=(4096, 4096),
-)
+    iso=3200.0, exposure_s=0.1, temperature_c=30.0, frame_size=(4096, 4096), sensor_unit="0",
+    body_key=0xFEDCBA9876543210, fixed_pattern_in_clean=False,
+    dn_per_e=4.0, prnu_std=0.01, dark_e=3.0, dark_offset="removed", hot_pixel_share=0.02, hot_pixel_e=40.0,
+    full_well_e=300.0, read_law="tukey", read_shape=-0.1, read_std_dn=6.0, row_std_dn=2.0, column_std_dn=1.0,
+    black_error_dn=(0.5, -0.25, 0.125, 1.0), dead_pixel_share=0.01,
+)  # fmt: skip
 _COUNTS = GOLDEN_PLAN.replace(physics=GOLDEN_PHYSICS, effects=("shot", "read", "row", "black_error", "quantise"))
-_NEAR = _COUNTS.replace(effects=("shot", "read", "quantise"), law_distance=0.01, methods=(NEAR_NORMAL,))
+_NEAR = _COUNTS.replace(effects=("shot", "read", "quantise"), law_distance=0.01, methods=(types.NEAR_NORMAL,))
 _PHYSICAL = _COUNTS.replace(effects=PHYSICAL_EFFECTS, exposure_ratio=1.5, level=1, draw=2, frame=3)
 GOLDEN_PLANS = {
     "per_channel": GOLDEN_PLAN,
     "gray_mean": GOLDEN_PLAN.replace(highlight="gray_mean"),
-    "float32": GOLDEN_PLAN.replace(methods=(FLOAT32_METHOD,), bits=16, black_level_dn=4096, white_level_dn=65535),
-    "reference": GOLDEN_PLAN.replace(methods=(REFERENCE_METHOD,)),
+    "float32": GOLDEN_PLAN.replace(methods=(types.FLOAT32_METHOD,), bits=16, black_level_dn=4096, white_level_dn=65535),
+    "reference": GOLDEN_PLAN.replace(methods=(types.REFERENCE_METHOD,)),
     "plain": _COUNTS,
     "near": _NEAR.replace(highlight="gray_mean"),
     "physical": _PHYSICAL,
-    "normalised": GOLDEN_PLAN.replace(dtype=FLOAT32, sensor_clip="none"),
-    "normalised_counts": _PHYSICAL.replace(dtype=FLOAT32, sensor_clip="none"),
-    "float_clean": GOLDEN_PLAN.replace(clean_dtype=FLOAT32),
-    "float_clean_counts": _PHYSICAL.replace(clean_dtype=FLOAT32),
+    "normalised": GOLDEN_PLAN.replace(dtype=types.FLOAT32, sensor_clip="none"),
+    "normalised_counts": _PHYSICAL.replace(dtype=types.FLOAT32, sensor_clip="none"),
+    "float_clean": GOLDEN_PLAN.replace(clean_dtype=types.FLOAT32),
+    "float_clean_counts": _PHYSICAL.replace(clean_dtype=types.FLOAT32),
 }
 GOLDEN = {
     # XXH3-128 of the clean and of the noisy frame
@@ -187,11 +146,9 @@ def _failures(kernel_set: str) -> Iterator[str]:
         yield "a kernel uses a fused multiply-add"
     for name in (name for name, plan in GOLDEN_PLANS.items() if kernels(plan) == kernel_set):
         pair = make_pair(golden_image(), GOLDEN_PLANS[name], (1, 57))
-        for name_of_frame, frame, digest in zip(
-            ("clean", "noisy"), (pair.clean, pair.noisy), GOLDEN[name], strict=True
-        ):
-            if (found := array_xxh3(frame)) != digest:
-                yield f"the golden {name_of_frame} frame ({name}) is {found}, expected {digest}"
+        for member, digest in zip(("clean", "noisy"), GOLDEN[name], strict=True):
+            if (found := array_xxh3(getattr(pair, member))) != digest:
+                yield f"the golden {member} frame ({name}) is {found}, expected {digest}"
     note_run(kernel_set)  # also after a failure: nothing is left to compile
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
 from unprocess_gen.simulation.effects.numbers import LARGEST, SITES, number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.slots import Slots
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +49,9 @@ class BlackError(Effect):
         """Predict the largest error as an offset of all pixels."""
         return independent(frame, 0.0, max(abs(error) for error in frame.physics.black_error_dn))
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the offsets by plane."""
-        return slots._replace(planes_dn=plan.physics.black_error_dn)
+        return {"planes_dn": plan.physics.black_error_dn}
 
     def expected(self, site: Site) -> EffectNoise:
         """Error of the black level at this place of the tile."""

@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, known_offset
-from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.numbers import number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, fixed_in_clip, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import LineOffsets, Slots, Words
+from unprocess_gen.simulation.slots import LineOffsets, Words
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnNumbers:
     """Standard deviation of column offsets, DN."""
 
-    column_std_dn: float = number(
-        0.0,
-        "standard deviation of column offsets",
-        unit="DN",
-        kind=DN,
-        forms=("root", "line", "by_iso"),
-        counter=17,
-        scatter=3,
+    column_std_dn: float = number_in_dn(
+        "standard deviation of column offsets", forms=("root", "line", "by_iso"), counter=17, scatter=3
     )
 
 
@@ -48,10 +43,10 @@ class Column(Effect):
         """Predict independent offsets of columns, the same in all frames."""
         return fixed_in_clip(frame, offsets_of_columns(frame, frame.physics.column_std_dn))
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the offsets of columns of the body."""
         physics = plan.physics
-        return slots._replace(fixed_columns=LineOffsets(Words(physics.body_key, "column"), physics.column_std_dn))
+        return {"fixed_columns": LineOffsets(Words(physics.body_key, "column"), physics.column_std_dn)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Offset of each column of the body, which the row determines."""

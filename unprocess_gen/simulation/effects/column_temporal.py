@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, slot_words
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.numbers import number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame, offsets_of_columns
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import LineOffsets, Slots
+from unprocess_gen.simulation.slots import LineOffsets
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnTemporalNumbers:
     """Standard deviation of the temporal column offsets, DN."""
 
-    column_temporal_std_dn: float = number(
-        0.0,
+    column_temporal_std_dn: float = number_in_dn(
         "standard deviation of the part of column offsets that is new in every frame",
-        unit="DN",
-        kind=DN,
         forms=("root", "line"),
         counter=19,
         scatter=4,
@@ -50,10 +48,10 @@ class ColumnTemporal(Effect):
         """Predict independent offsets of columns, new in every frame."""
         return new_in_every_frame(frame, offsets_of_columns(frame, frame.physics.column_temporal_std_dn))
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the offsets of columns of the frame."""
-        columns = LineOffsets(slot_words(plan, "column_temporal"), plan.physics.column_temporal_std_dn)
-        return slots._replace(columns=columns)
+        std_dn = plan.physics.column_temporal_std_dn
+        return {"columns": LineOffsets(slot_words(plan, "column_temporal"), std_dn)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Offset of each column of the frame, which the row determines."""

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part
-from unprocess_gen.simulation.effects.expectation import (
-    ALWAYS_COUNTED,
-    EffectNoise,
-    Site,
-    constant,
-    known_offset,
-    poisson_noise,
-)
-from unprocess_gen.simulation.effects.numbers import RATE, Number, number
+from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, known_offset, poisson_noise
+from unprocess_gen.simulation.effects.numbers import Number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.poisson import poisson
-from unprocess_gen.simulation.slots import Slots, UniformCounts
-
-if TYPE_CHECKING:
-    from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.slots import UniformCounts
 
 HEAT = {
     "dark_reference_c": Number(
@@ -48,16 +38,10 @@ HEAT = {
 class DarkCurrentNumbers:
     """Mean dark signal of the exposure, electrons."""
 
-    dark_e: float = number(
-        0.0,
+    dark_e: float = rate(
         "mean dark current of the exposure",
-        unit="electrons",
-        kind=RATE,
         key="dark_e_per_s",
         key_meaning="mean dark current at dark_reference_c",
-        key_unit="electrons per second",
-        high=1e6,
-        highest=1e9,
     )
 
 
@@ -81,25 +65,25 @@ class DarkCurrent(Effect):
         """Return the mean if the camera keeps it."""
         return part.physics.dark_e if part.physics.dark_offset == "kept" else None
 
-    def variance(self, physics: Physics, level_dn: float) -> float:
+    def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return K² times the mean, DN²."""
-        return physics.dn_per_e * physics.dn_per_e * physics.dark_e
+        return frame.physics.dn_per_e * frame.physics.dn_per_e * frame.physics.dark_e
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the variance, and the mean if the camera keeps it."""
         physics = frame.physics
         offset_dn = physics.dn_per_e * physics.dark_e if physics.dark_offset == "kept" else 0.0
-        return independent(frame, self.variance(physics, level_dn), offset_dn)
+        return independent(frame, self.variance(frame, level_dn), offset_dn)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the counts of one rate."""
         physics = plan.physics
         removed_e = physics.dark_e if physics.dark_offset == "removed" else 0.0
-        return slots._replace(uniform=UniformCounts("dark_current", physics.dark_e, removed_e))
+        return {"uniform": UniformCounts("dark_current", physics.dark_e, removed_e)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Poisson counts with a constant mean, which the camera subtracts or keeps."""
         physics = site.physics
         kept_dn = physics.dark_e * site.gain_dn if physics.dark_offset == "kept" else 0.0
-        noise = poisson_noise(site.gain_dn, constant(physics.dark_e), ALWAYS_COUNTED)
+        noise = poisson_noise(site.gain_dn, constant(physics.dark_e))
         return known_offset(site, kept_dn)._replace(variance=noise.variance, factor=noise.factor)

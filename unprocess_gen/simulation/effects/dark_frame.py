@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
 from unprocess_gen.simulation.effects.expectation import NORMAL_DISTANCE, EffectNoise, Site, uniform
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
-from unprocess_gen.simulation.slots import SiteNoise, Slots
+from unprocess_gen.simulation.slots import SiteNoise
 
 DITHER_LAW, DITHER_SHAPE = "tukey_lambda", 1.0
 """Uniform distribution, as Tukey's lambda distribution of shape 1."""
@@ -106,10 +107,10 @@ class DarkFrame(Effect):
         """Return the dark frame."""
         return dark_frame_offsets(part.plan, part.dark_pixels, part.shape, part.origin)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the noise of a site with the dither, and the offsets by site."""
         dither = SiteNoise("dark_dither", dither_std_dn(plan), DITHER_LAW, DITHER_SHAPE)
-        return slots._replace(noise=dither, has_site_offsets=True)
+        return {"noise": dither, "has_site_offsets": True}
 
     def expected(self, site: Site) -> EffectNoise:
         """Known pixels with a uniform dither; sites far from black, such as hot pixels, cannot be checked."""

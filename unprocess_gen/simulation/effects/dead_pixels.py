@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.sensor import noisy_limits
 from unprocess_gen.simulation.slots import DeadPixels as DeadSlot
-from unprocess_gen.simulation.slots import Slots
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +47,10 @@ class DeadPixels(Effect):
         depth_dn = frame.black_level_dn + level_dn
         return frame.physics.dead_pixel_share if depth_dn * depth_dn > masking else 0.0
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the pixels that read 0."""
         physics = plan.physics
-        dead = DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share)
-        return slots._replace(patterns=slots.patterns._replace(dead=dead))
+        return {"dead": DeadSlot(physics.body_key, "dead_pixels", physics.dead_pixel_share)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Few sites that read 0."""

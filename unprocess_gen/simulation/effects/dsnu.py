@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, cons
 from unprocess_gen.simulation.effects.numbers import number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import NormalPattern, Slots
+from unprocess_gen.simulation.slots import NormalPattern
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,11 +51,10 @@ class Dsnu(Effect):
         std_dn = frame.physics.dsnu_std_e * frame.physics.dn_per_e
         return independent(frame, 0.0, fixed_variance=std_dn * std_dn)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the offsets by site of the body."""
         physics = plan.physics
-        offsets = NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)
-        return slots._replace(patterns=slots.patterns._replace(sites_dn=offsets))
+        return {"sites_dn": NormalPattern(physics.body_key, "dsnu", physics.dsnu_std_e * physics.dn_per_e)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Normal offsets; no site is checked if the clean frame contains them, as it does not state the light then."""

@@ -14,7 +14,6 @@ from unprocess_gen.core.types import DarkPixels, Float, Plan
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import Number, numbers_of
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.slots import Slots
 from unprocess_gen.simulation.slots import Words as SlotWords
 
 if TYPE_CHECKING:
@@ -172,21 +171,21 @@ class Effect:
     def mean_electrons(self, part: Part) -> Float | float | None:
         """Return the electrons that the effect adds to the average of many frames."""
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
-        """Add the effect to the slots that kernels simulate."""
-        return slots
+    def slots(self, plan: Plan) -> dict[str, Any]:
+        """Return what the effect fills, by the names of the members of `slots.Slots` and `slots.Patterns`."""
+        return {}
 
     def expected(self, site: Site) -> EffectNoise:
         """Return the noise that the noise check expects of the sites of a plane."""
         return EffectNoise()
 
-    def variance(self, physics: Physics, level_dn: float) -> float:
+    def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return the variance of a pixel, DN², at a signal in DN above black."""
         return 0.0
 
     def contribution(self, frame: FrameFacts, level_dn: float, masking: float) -> Contribution:
         """Predict the contribution at a signal in DN above black, where the other noise has a variance in DN²."""
-        return independent(frame, self.variance(frame.physics, level_dn))
+        return independent(frame, self.variance(frame, level_dn))
 
     def outliers(self, frame: FrameFacts, level_dn: float, masking: float) -> float:
         """Predict the fraction of pixels that the effect moves by more than one standard deviation."""

@@ -111,7 +111,12 @@ def uniform(width_dn: float) -> EffectNoise:
     return EffectNoise(variance, lambda signal, tau: np.sinc(width_dn * tau / (2 * np.pi)))
 
 
-def poisson_noise(gain_dn: float, rate_e: Callable[[Float], Float], normal: tuple[float, float]) -> EffectNoise:
+ALWAYS_COUNTED = (0.0, math.inf)
+
+
+def poisson_noise(
+    gain_dn: float, rate_e: Callable[[Float], Float], normal: tuple[float, float] = ALWAYS_COUNTED
+) -> EffectNoise:
     """Poisson counts minus their mean, times a gain; normal deviates up to and from the rates ``normal``."""
 
     def factor(signal: Float, tau: Float) -> Complex:
@@ -122,9 +127,6 @@ def poisson_noise(gain_dn: float, rate_e: Callable[[Float], Float], normal: tupl
         return np.asarray(np.exp(np.where(is_normal, -0.5 * rate * phase * phase, exponent)))
 
     return EffectNoise(lambda signal: gain_dn * gain_dn * rate_e(signal), factor)
-
-
-ALWAYS_COUNTED = (0.0, math.inf)
 
 
 def known_offset(site: Site, offset_dn: float | Float) -> EffectNoise:

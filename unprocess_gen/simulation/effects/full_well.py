@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from unprocess_gen.simulation.effects.effect import Effect, Part
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
 from unprocess_gen.simulation.effects.numbers import number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.slots import Slots
 
 FARTHEST_NORMAL, FARTHEST_HOT = 6.4, 7.7
 """Largest normal deviate in standard deviations, and largest hot-pixel current in means, of a 32-bit uniform."""
@@ -47,9 +47,9 @@ class FullWell(Effect):
         reach_e = _reach(signal_e) + _reach(physics.dark_e) + _reach(FARTHEST_HOT * physics.hot_pixel_e)
         return independent(frame, 0.0, max(reach_e - physics.full_well_e, 0.0) * physics.dn_per_e)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the limit of the well."""
-        return slots._replace(full_well_e=plan.physics.full_well_e)
+        return {"full_well_e": plan.physics.full_well_e}
 
     def expected(self, site: Site) -> EffectNoise:
         """Saturation of the pixel, which sites must not reach."""

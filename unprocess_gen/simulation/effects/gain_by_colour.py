@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from unprocess_gen.core.types import Plan
 from unprocess_gen.simulation.effects.effect import Effect
 from unprocess_gen.simulation.effects.numbers import number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.slots import Slots
 
 COLOURS = ("red", "green", "blue")
 
@@ -51,6 +51,6 @@ class GainByColour(Effect):
         most_dn = shot_dn * max(abs(math.sqrt(gain) - 1) for gain in frame.physics.gain_by_colour)
         return independent(frame, most_dn * most_dn)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the gains by plane."""
-        return slots._replace(plane_gains=self.plane_gains(plan))
+        return {"plane_gains": self.plane_gains(plan)}

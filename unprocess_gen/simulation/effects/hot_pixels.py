@@ -6,6 +6,7 @@ import functools
 import math
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,11 @@ from unprocess_gen.core.lookup_tables import exponential_levels
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site
-from unprocess_gen.simulation.effects.numbers import RATE, number
+from unprocess_gen.simulation.effects.numbers import number, rate
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, rare_pixels
 from unprocess_gen.simulation.reference.noise import is_among
 from unprocess_gen.simulation.reference.poisson import poisson
-from unprocess_gen.simulation.slots import BrightPixels, Slots
+from unprocess_gen.simulation.slots import BrightPixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,16 +26,10 @@ class HotPixelNumbers:
     """Fraction of hot pixels, and the mean of their exponentially distributed excess, electrons per exposure."""
 
     hot_pixel_share: float = number(0.0, "fraction of hot pixels", high=1.0, highest=1.0)
-    hot_pixel_e: float = number(
-        0.0,
+    hot_pixel_e: float = rate(
         "mean excess of a hot pixel in the exposure",
-        unit="electrons",
-        kind=RATE,
         key="hot_pixel_e_per_s",
         key_meaning="mean of the exponentially distributed current of hot pixels at dark_reference_c",
-        key_unit="electrons per second",
-        high=1e6,
-        highest=1e9,
     )
 
 
@@ -71,11 +66,10 @@ class HotPixels(Effect):
         least = math.floor(math.sqrt(masking) / physics.dn_per_e) + 1
         return _share_of_counts(physics.hot_pixel_share, physics.hot_pixel_e, least)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the bright defects."""
         physics = plan.physics
-        bright = BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)
-        return slots._replace(patterns=slots.patterns._replace(bright=bright))
+        return {"bright": BrightPixels(physics.body_key, "hot_pixels", physics.hot_pixel_share, physics.hot_pixel_e)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Few sites with additional electrons, whose means are exponentially distributed."""

@@ -7,6 +7,7 @@ or describe it with the centre at 1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, Shape
 from unprocess_gen.simulation.effects.numbers import number
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, independent
-from unprocess_gen.simulation.slots import RadialFactor, Slots
+from unprocess_gen.simulation.slots import RadialFactor
 
 PLACES = 64
 """Squares of the distance from the centre at which lens shading is predicted."""
@@ -112,8 +113,6 @@ class LensShading(Effect):
         places = illumination_at(np.arange(PLACES + 1) / PLACES, frame.physics.lens_shading)
         return independent(frame, 0.0, level_dn * float(1 - places.min()))
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the factor on the light."""
-        physics = plan.physics
-        light = RadialFactor(physics.lens_shading, physics.frame_size)
-        return slots._replace(patterns=slots.patterns._replace(light=light))
+        return {"light": RadialFactor(plan.physics.lens_shading, plan.physics.frame_size)}

@@ -115,6 +115,18 @@ def number(default: Any, meaning: str, **details: Any) -> Any:
     return field(default=default, metadata={METADATA: Number(meaning, **details)})
 
 
+def number_in_dn(meaning: str, **details: Any) -> Any:
+    """Declare a field of `Physics` that is converted to DN of the sensor; arguments as for `number`."""
+    return number(0.0, meaning, unit="DN", kind=DN, **details)
+
+
+def rate(meaning: str, **details: Any) -> Any:
+    """Declare a field of `Physics` that is a current times the exposure; arguments as for `number`."""
+    return number(
+        0.0, meaning, unit="electrons", kind=RATE, key_unit="electrons per second", high=1e6, highest=1e9, **details
+    )
+
+
 def numbers_of(record: type[Any]) -> dict[str, Number]:
     """Return the declared numbers of a dataclass by the names of its fields."""
     return {one.name: one.metadata[METADATA] for one in dataclasses.fields(record) if METADATA in one.metadata}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, gaus
 from unprocess_gen.simulation.effects.numbers import number
 from unprocess_gen.simulation.effects.prediction import MEAN_ABS_NORMAL, Contribution, FrameFacts, independent
 from unprocess_gen.simulation.reference.noise import normals
-from unprocess_gen.simulation.slots import NormalPattern, Slots
+from unprocess_gen.simulation.slots import NormalPattern
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,10 +21,7 @@ class PrnuNumbers:
     """Standard deviation of the pixels' relative gain."""
 
     prnu_std: float = number(
-        0.0,
-        "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1",
-        high=0.5,
-        highest=1.0,
+        0.0, "standard deviation of the photo response non-uniformity (PRNU), whose mean is 1", high=0.5, highest=1.0
     )
 
 
@@ -62,11 +60,10 @@ class Prnu(Effect):
         squared = physics.dn_per_e * physics.dn_per_e
         return independent(frame, squared * MEAN_ABS_NORMAL * change_e, fixed_variance=squared * change_e * change_e)
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the factor on the electrons."""
         physics = plan.physics
-        factor = NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)
-        return slots._replace(patterns=slots.patterns._replace(electrons=factor))
+        return {"electrons": NormalPattern(physics.body_key, "prnu", physics.prnu_std, mean=1.0, least=0.0)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Relative gain of each pixel with standard deviation p: variance (p·signal)²."""

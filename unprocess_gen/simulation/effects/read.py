@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 from unprocess_gen.core.lookup_tables import quantile_table
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian, tukey_noise
-from unprocess_gen.simulation.effects.numbers import DN, SHAPE, number
+from unprocess_gen.simulation.effects.numbers import SHAPE, number, number_in_dn
+from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.noise import by_inverse_cdf
-from unprocess_gen.simulation.slots import SiteNoise, Slots
-
-if TYPE_CHECKING:
-    from unprocess_gen.simulation.effects import Physics
+from unprocess_gen.simulation.slots import SiteNoise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +37,8 @@ class ReadNumbers:
         lowest=-0.5,
         highest=10.0,
     )
-    read_std_dn: float = number(
-        0.0,
+    read_std_dn: float = number_in_dn(
         "standard deviation of the read noise",
-        unit="DN",
-        kind=DN,
         forms=("root", "line", "scale_line", "by_iso"),
         required=True,
         counter=15,
@@ -66,15 +61,14 @@ class Read(Effect):
         table = quantile_table(physics.read_law, physics.read_shape)
         return physics.read_std_dn * by_inverse_cdf(part.frame_words("read"), table)
 
-    def variance(self, physics: Physics, level_dn: float) -> float:
+    def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return the square of the standard deviation, DN²."""
-        return physics.read_std_dn * physics.read_std_dn
+        return frame.physics.read_std_dn * frame.physics.read_std_dn
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the noise of a site."""
         physics = plan.physics
-        noise = SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)
-        return slots._replace(noise=noise)
+        return {"noise": SiteNoise("read", physics.read_std_dn, physics.read_law, physics.read_shape)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Normal noise, or Tukey's lambda distribution."""

@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from unprocess_gen.core.types import Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, slot_words
 from unprocess_gen.simulation.effects.expectation import EffectNoise, Site, constant, gaussian
-from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.numbers import number, number_in_dn
 from unprocess_gen.simulation.effects.prediction import Contribution, FrameFacts, new_in_every_frame
 from unprocess_gen.simulation.reference.noise import autoregressive, normals
-from unprocess_gen.simulation.slots import LineOffsets, Slots
+from unprocess_gen.simulation.slots import LineOffsets
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowNumbers:
     """Standard deviation of row offsets, DN, and correlation of the offsets of neighbouring rows."""
 
-    row_std_dn: float = number(
-        0.0,
-        "standard deviation of row offsets",
-        unit="DN",
-        kind=DN,
-        forms=("root", "line", "by_iso"),
-        counter=16,
-        scatter=2,
+    row_std_dn: float = number_in_dn(
+        "standard deviation of row offsets", forms=("root", "line", "by_iso"), counter=16, scatter=2
     )
     row_correlation: float = number(
         0.0,
@@ -72,11 +67,10 @@ class Row(Effect):
             rows, rows_of_plane = max(rows / together, 1.0), max(rows_of_plane / together, 1.0)
         return new_in_every_frame(frame, (variance, variance, variance / rows, variance / rows_of_plane))
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the offsets of rows."""
         physics = plan.physics
-        rows = LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)
-        return slots._replace(rows=rows)
+        return {"rows": LineOffsets(slot_words(plan, "row"), physics.row_std_dn, physics.row_correlation)}
 
     def expected(self, site: Site) -> EffectNoise:
         """Normal offset of each row, an autoregressive process of order 1."""

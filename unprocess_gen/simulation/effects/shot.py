@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 from unprocess_gen.core.types import NEAR_NORMAL, Float, Plan
 from unprocess_gen.simulation.effects.effect import Effect, Part, Shape, frame_words
 from unprocess_gen.simulation.effects.expectation import ALWAYS_COUNTED, EffectNoise, Site, poisson_noise
 from unprocess_gen.simulation.effects.numbers import DN, number
+from unprocess_gen.simulation.effects.prediction import FrameFacts
 from unprocess_gen.simulation.reference.near_normal import counts_or_normals, near_limits
 from unprocess_gen.simulation.reference.poisson import poisson
-from unprocess_gen.simulation.slots import Slots
-
-if TYPE_CHECKING:
-    from unprocess_gen.simulation.effects import Physics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,13 +51,13 @@ class Shot(Effect):
         """Draw a count for each pixel."""
         return counts(part.plan, electrons, part.origin)
 
-    def variance(self, physics: Physics, level_dn: float) -> float:
+    def variance(self, frame: FrameFacts, level_dn: float) -> float:
         """Return K times the signal, DN²."""
-        return physics.dn_per_e * level_dn
+        return frame.physics.dn_per_e * level_dn
 
-    def slots(self, slots: Slots, plan: Plan) -> Slots:
+    def slots(self, plan: Plan) -> dict[str, Any]:
         """Fill the counts of light."""
-        return slots._replace(light_stream="shot")
+        return {"light_stream": "shot"}
 
     def expected(self, site: Site) -> EffectNoise:
         """Poisson counts with the mean signal / K."""
