@@ -6,6 +6,7 @@ are the same on every machine and in every tier. Derivations: ``docs/design/effe
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -62,8 +63,7 @@ class FrameModel(FrameFacts):
         full_dn = physics.full_well_e * physics.dn_per_e
         self._levels = signals.dark_dn, signals.bright_dn
         self._levels_in_well = min(signals.dark_dn, full_dn), min(signals.bright_dn, full_dn)
-        self._known_ratios: dict[tuple[str, float, float], _Ratios] = {}
-        self._known_variances: dict[float, list[tuple[str, float]]] = {}
+        self._ratios, self._variances = functools.cache(self._compute_ratios), functools.cache(self._compute_variances)
 
     def levels(self, on: frozenset[str]) -> tuple[float, float]:
         """Return the two signals at which effects are predicted, DN above black; between them no ratio is larger."""
@@ -80,25 +80,18 @@ class FrameModel(FrameFacts):
                 variance += effect_dn2
         return rounding + variance
 
-    def _variances(self, level_dn: float) -> list[tuple[str, float]]:
+    def _compute_variances(self, level_dn: float) -> list[tuple[str, float]]:
         """Return the variance of a pixel due to each of `MASKING` at a signal, DN²."""
-        known = self._known_variances.get(level_dn)
-        if known is None:
-            known = [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
-            self._known_variances[level_dn] = known
-        return known
+        return [(effect.name, effect.variance(self, level_dn)) for effect in MASKING]
 
-    def _ratios(self, effect: str, level_dn: float, masking: float) -> _Ratios:
+    def _compute_ratios(self, effect: str, level_dn: float, masking: float) -> _Ratios:
         """Return the ratios of one effect to a masking noise at a signal."""
-        known = self._known_ratios.get((effect, level_dn, masking))
-        if known is None:
-            contribution = BY_NAME[effect].contribution(self, level_dn, masking)
-            squares = ratios_to_noise(map(mul, contribution.variances, self.counts), masking)
-            offset_dn, offsets = abs(contribution.offset_dn), None
-            if offset_dn:
-                offsets = ratios_to_noise([offset_dn * root for root in self._roots], math.sqrt(masking))
-            known = self._known_ratios[effect, level_dn, masking] = _Ratios(contribution, squares, offsets)
-        return known
+        contribution = BY_NAME[effect].contribution(self, level_dn, masking)
+        squares = ratios_to_noise(map(mul, contribution.variances, self.counts), masking)
+        offset_dn, offsets = abs(contribution.offset_dn), None
+        if offset_dn:
+            offsets = ratios_to_noise([offset_dn * root for root in self._roots], math.sqrt(masking))
+        return _Ratios(contribution, squares, offsets)
 
     def contribution(self, effect: str, level_dn: float, masking: float) -> Contribution:
         """Return the contribution of an effect at a signal, where the other noise has the variance ``masking``, DN²."""

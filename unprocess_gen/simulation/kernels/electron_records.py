@@ -48,33 +48,20 @@ def electron_noise(
         noise = noise._replace(rows_dn=_correlated_rows(frames, origin[0], shape[0]), rows_step=shape[0])
     offsets, step = body.sites_dn, 0
     if any(slots.has_site_offsets for slots in frames):
-        offsets = _frame_offsets(plans, frames, body, dark_pixels, shape, origin)
-        step = offsets.values.size // len(frames)
+        pitch, first, step = noise.padded_width, origin[1] % BLOCK, noise.padded_width * shape[0]
+        sites_dn = np.zeros((len(plans), shape[0], pitch), dtype=np.float32)
+        for frame_dn, plan, slots in zip(sites_dn, plans, frames, strict=True):
+            if slots.has_site_offsets:
+                dark_frame_offsets(plan, dark_pixels, shape, origin, out=frame_dn[:, first : first + shape[1]])
+        if offsets.steps[0]:
+            sites_dn += offsets.values.reshape(shape[0], pitch)
+        offsets = SiteMap(sites_dn.reshape(-1), (pitch, 1))
     if not offsets.steps[0]:
         return noise
     numbers, values = noise.numbers.copy(), offsets.values
     farthest_dn = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
     numbers[:, _ERROR_DN] += 2 * FLOAT32_ERROR_DN * farthest_dn
     return noise._replace(numbers=numbers, sites_dn=offsets, sites_step=step)
-
-
-def _frame_offsets(
-    plans: Sequence[Plan],
-    frames: tuple[Slots, ...],
-    body: Body,
-    dark_pixels: DarkPixels | None,
-    shape: tuple[int, int],
-    origin: tuple[int, int],
-) -> SiteMap:
-    """Return the offsets by site that each frame has of its own, in addition to those of the body, [N, H, P]."""
-    first, pitch = origin[1] % BLOCK, padded_width(origin[1], shape[1])
-    sites_dn = np.zeros((len(plans), shape[0], pitch), dtype=np.float32)
-    for frame_dn, plan, slots in zip(sites_dn, plans, frames, strict=True):
-        if slots.has_site_offsets:
-            dark_frame_offsets(plan, dark_pixels, shape, origin, out=frame_dn[:, first : first + shape[1]])
-    if body.sites_dn.steps[0]:
-        sites_dn += body.sites_dn.values.reshape(shape[0], pitch)
-    return SiteMap(sites_dn.reshape(-1), (pitch, 1))
 
 
 @functools.lru_cache(maxsize=8)

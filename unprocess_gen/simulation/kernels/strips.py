@@ -154,14 +154,7 @@ Python allocates it, since compiling the allocation takes half a second.
 """
 
 
-class _Threads(threading.local):
-    """Hold the scratch memory of each thread, by dtype."""
-
-    def __init__(self) -> None:
-        self.scratch: dict[Any, Scratch] = {}
-
-
-_threads = _Threads()
+_threads = threading.local()
 
 
 def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
@@ -170,9 +163,10 @@ def scratch_of_thread(dtype: Any = np.float64) -> Scratch:
     Its signal is zero: a bright number in the padding would slow down its block, and in float32 change the rounding of
     the sites in its vector. So are its defects, which only frames with defects fill. No result depends on the rest.
     """
-    scratch = _threads.scratch.get(dtype)
+    known = vars(_threads)  # of this thread
+    scratch: Scratch | None = known.get(dtype.__name__)
     if scratch is None:
-        scratch = _threads.scratch[dtype] = allocate_scratch(dtype)
+        scratch = known[dtype.__name__] = allocate_scratch(dtype)
     scratch[: 2 * (BLOCK + SIZE)].fill(0)
     return scratch
 
