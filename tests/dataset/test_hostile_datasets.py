@@ -24,7 +24,7 @@ from unprocess_gen.dataset.manifest import (
     MAX_LINE_BYTES,
     detail_text,
     plan_from_row,
-    read_header,
+    read_columns,
     read_row,
     read_rows,
     row_of_values,
@@ -266,7 +266,7 @@ def test_malformed_sweep_table_is_damage_or_empty(content: bytes, tmp_path: Path
 
 def test_dataset_of_0_1_is_read_verified_and_replayed(copy: Path, original: Path) -> None:
     old = as_version_0_1(copy)
-    assert read_header(old / "manifest.csv") == HEADERS[0]
+    assert read_columns(old / "manifest.csv") == HEADERS[0]
     assert verify(old) == []
     rows = list(read_rows(old / "manifest.csv"))
     assert [row["detail"] for row in rows] == [""] * 4

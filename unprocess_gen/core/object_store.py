@@ -240,9 +240,7 @@ class ObjectPath:
         """Return whether an object has this key or is below it."""
         return self.is_file() or self.is_dir()
 
-    def is_listed(self) -> bool:
-        """Return whether an object has this key or is below it."""
-        return self.exists()
+    is_listed = exists
 
     def entry(self) -> Entry:
         """Describe this prefix or object; raise FileNotFoundError if there is none."""

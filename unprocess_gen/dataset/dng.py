@@ -115,7 +115,8 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> Expor
     if find_spec("tifffile") is None:
         raise ConfigError("dng: tifffile is missing; in the source folder, run: pip install '.[dng]'")
     check_output_folder(to, f"--to {to}")
-    numbers = _numbers(folder / "manifest.csv", keys)
+    selected = select_pairs(folder / "manifest.csv", keys).rows
+    numbers = {str(_writable(row)["key"]): number for number, row in selected.items()}
     files = [_File(number, key, frame) for key, number in numbers.items() for frame in frames]
     pairs = RawPairs(folder)
     present = [file for file in files if (to / file.name).exists()]
@@ -129,11 +130,6 @@ def export(folder: AnyPath, keys: str, frames: Sequence[str], to: Path) -> Expor
         file.frame == "noisy" and noise_profile(plan_from_row(pairs[file.number].row)) is None for file in files
     )
     return ExportSummary(len(written), len(present), without)
-
-
-def _numbers(manifest: AnyPath, keys: str) -> dict[str, int]:
-    """Return the key and the number of every selected pair; ConfigError if a frame of one cannot be a DNG file."""
-    return {str(_writable(row)["key"]): number for number, row in select_pairs(manifest, keys).rows.items()}
 
 
 def _writable(row: Row) -> Row:

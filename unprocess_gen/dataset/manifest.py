@@ -378,7 +378,7 @@ def write_rows(stream: TextIO, rows: Iterable[Row], names: Sequence[str] = NAMES
     rows : iterable of Row
         Rows in source order.
     names : sequence of str
-        Header. `read_header` returns the one of an older manifest, whose bytes are thereby restored.
+        Header. `read_columns` returns the one of an older manifest, whose bytes are thereby restored.
     """
     stream.write(header_text(names))
     _write_lines(stream, rows, names)
@@ -454,29 +454,6 @@ def _cell(value: Value) -> str:
     return "" if value is None else repr(value) if isinstance(value, float) else str(value)
 
 
-def read_header(path: AnyPath) -> tuple[str, ...]:
-    """Return the columns that a manifest has.
-
-    Parameters
-    ----------
-    path : Path or ObjectPath
-        A ``manifest.csv``.
-
-    Returns
-    -------
-    tuple of str
-        Names of columns known to this version, in the order of `columns.NAMES`; a manifest of version 0.1 lacks those
-        added later.
-
-    Raises
-    ------
-    DamageError
-        If the file does not exist or is not a manifest.
-    """
-    with _opened(path) as manifest:
-        return tuple(name for name in NAMES if name in manifest.header)
-
-
 def read_rows(path: AnyPath) -> Iterator[Row]:
     """Read the typed rows of a manifest, one at a time.
 
@@ -548,7 +525,7 @@ def readable_rows(path: AnyPath) -> Iterator[Row]:
 
 
 def read_columns(path: AnyPath) -> tuple[str, ...]:
-    """Return the first line of a manifest, columns unknown to this version included; raise as `read_header`."""
+    """Columns of a manifest, those unknown to this version included; DamageError if the file is no manifest."""
     with _opened(path) as manifest:
         return manifest.header
 

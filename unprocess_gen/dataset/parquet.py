@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.dataset.columns import COLUMNS, TYPE_NAMES
-from unprocess_gen.dataset.manifest import read_header
+from unprocess_gen.dataset.manifest import read_columns
 
 if TYPE_CHECKING:
     import pyarrow
@@ -41,7 +41,7 @@ def write_parquet(manifest: Path, path: Path) -> None:
     """
     from pyarrow import ArrowInvalid, csv, parquet
 
-    schema = parquet_schema(read_header(manifest))
+    schema = parquet_schema(read_columns(manifest))
     types = {field.name: field.type for field in schema}
     try:
         batches = csv.open_csv(
@@ -62,7 +62,7 @@ def parquet_schema(names: tuple[str, ...]) -> pyarrow.Schema:
     Parameters
     ----------
     names : tuple of str
-        Columns of the manifest (`manifest.read_header`).
+        Columns of the manifest (`manifest.read_columns`); unknown ones are left out.
 
     Returns
     -------
@@ -73,4 +73,4 @@ def parquet_schema(names: tuple[str, ...]) -> pyarrow.Schema:
 
     types = {TYPE_NAMES[int]: pyarrow.int64(), TYPE_NAMES[float]: pyarrow.float64()}
     of_names = {column.name: types.get(column.type_name, pyarrow.string()) for column in COLUMNS}
-    return pyarrow.schema([pyarrow.field(name, of_names[name]) for name in names])
+    return pyarrow.schema([pyarrow.field(name, of_names[name]) for name in names if name in of_names])

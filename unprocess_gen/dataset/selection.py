@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from unprocess_gen.core.errors import ConfigError
@@ -25,8 +24,7 @@ _RANGE = re.compile(r"(\d{1,12})-(\d{1,12})")
 _INDEX = re.compile(r"\d{1,12}")
 
 
-@dataclass(frozen=True, slots=True)
-class KeySelection:
+class KeySelection(NamedTuple):
     """Hold what ``--keys`` names.
 
     Attributes

@@ -266,6 +266,10 @@ class FrozenRun:
         if (index := self.plan.canary_source) is not None:
             check_canary(self.plan, self.settings, [*self._listing.sources(index, index + 1)], on_compiling)
 
+    def has_ended(self) -> bool:
+        """Check whether another process has finished the run meanwhile, and deleted its plan."""
+        return (self.storage / PLAN).size() is None
+
     def task(self, shard: int) -> ShardTask:
         """Read the sources of a shard."""
         size = self.plan.pairs_per_shard

@@ -14,8 +14,9 @@ import os
 import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.serialization import dataset_yaml
@@ -35,8 +36,7 @@ from unprocess_gen.pipeline.tasks import RunContext
 from unprocess_gen.pipeline.workspace import Workspace
 
 
-@dataclass(frozen=True, slots=True)
-class PartMade:
+class PartMade(NamedTuple):
     """Describe what one call of `make_part` made.
 
     Attributes
@@ -58,8 +58,7 @@ class PartMade:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True)
-class PartsStatus:
+class PartsStatus(NamedTuple):
     """Hold which parts of a run are left.
 
     Attributes

@@ -23,10 +23,10 @@ import json
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -167,8 +167,7 @@ class _ShardFacts(msgspec.Struct, frozen=True):
     rows: list[list[str | int | float | None]] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ShardRecord:
+class ShardRecord(NamedTuple):
     """Hold the record of a committed shard.
 
     Attributes

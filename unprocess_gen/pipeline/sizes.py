@@ -9,8 +9,9 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from unprocess_gen.config.interpretation import noise_levels, patch_rule
 from unprocess_gen.config.schema import AUTO, Config, OutputConfig
@@ -45,8 +46,7 @@ MAX_SHARDS = 200_000
 """Shards above which a run warns. A million shards take 170 MB in ``dataset.json``, and one folder holds them all."""
 
 
-@dataclass(frozen=True, slots=True)
-class SizeEstimate:
+class SizeEstimate(NamedTuple):
     """Hold the bytes of some shards: in total, and of the largest one."""
 
     total: int

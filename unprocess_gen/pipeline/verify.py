@@ -16,7 +16,7 @@ import operator
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from unprocess_gen.core.errors import DamageError
 from unprocess_gen.core.files import file_sha256, machine_errors
@@ -54,8 +54,7 @@ class Damage:
         return ": ".join(part for part in (self.file, place, self.what) if part)
 
 
-@dataclass(frozen=True, slots=True)
-class SweepVerification:
+class SweepVerification(NamedTuple):
     """Hold the outcome for one dataset of a sweep: its folder's name in ``sweep.csv``, and its damage."""
 
     folder: str

@@ -318,7 +318,7 @@ def fingerprint(config_sha256: str, manifest_sha256: str) -> str:
 
 def dataset_text(facts: dict[str, Any]) -> str:
     """Return the text of ``dataset.json``: the facts and, as the last key, the SHA-256 of the text without it."""
-    text = _text(facts)
+    text = json.dumps(facts, indent=1) + "\n"
     return f'{text[: -len(_END)]},\n "dataset_sha256": "{hashlib.sha256(text.encode()).hexdigest()}"{_END}'
 
 
@@ -345,10 +345,6 @@ def read_dataset(path: AnyPath) -> dict[str, Any]:
 
 _END = "\n}\n"
 """End of the text of a mapping. A digest is inserted there: serializing twice takes a fifth of a merge."""
-
-
-def _text(facts: dict[str, Any]) -> str:
-    return json.dumps(facts, indent=1) + "\n"
 
 
 def _shard_number(name: str) -> int:

@@ -44,7 +44,7 @@ from unprocess_gen.config.schema import ExecutorConfig
 from unprocess_gen.config.values import error_in_one_line
 from unprocess_gen.core.errors import RESUME, ConfigError, MachineError, SourceChangedError, UnprocessGenError
 from unprocess_gen.pipeline.executors.local import interrupts_ignored
-from unprocess_gen.pipeline.frozen_run import PLAN, FrozenRun, open_run
+from unprocess_gen.pipeline.frozen_run import FrozenRun, open_run
 from unprocess_gen.pipeline.run_records import ShardRecords, forget_deaths
 from unprocess_gen.pipeline.storage import Storage
 from unprocess_gen.pipeline.tasks import ShardReport
@@ -143,7 +143,7 @@ def make_shards(request: ChunkRequest) -> ChunkResult:
         started = reported = time.monotonic()
         sent = 0
         try:
-            for shard in itertools.takewhile(lambda _: _is_planned(run), request.shards):
+            for shard in itertools.takewhile(lambda _: not run.has_ended(), request.shards):
                 report = run.make(shard)
                 reports += [report] if report else []
                 if report and report.killer is not None:
@@ -160,15 +160,10 @@ def make_shards(request: ChunkRequest) -> ChunkResult:
         return ChunkResult(place, tuple(reports), bug=traceback.format_exc())
 
 
-def _is_planned(run: FrozenRun) -> bool:
-    """Check whether the run has not ended, which another worker may have done meanwhile."""
-    return (run.storage / PLAN).size() is not None
-
-
 def _leave(run: FrozenRun) -> None:
     """Delete the unfinished files of this process and, if the run has ended, records that were written after it."""
     with suppress(OSError):
-        if not _is_planned(run) and (run.storage / "dataset.json").size() is not None:
+        if run.has_ended() and (run.storage / "dataset.json").size() is not None:
             run.storage.remove_work(keep_records=False)
     run.storage.close()
 

@@ -33,7 +33,7 @@ from unprocess_gen.core.output_paths import check_output_folder
 from unprocess_gen.core.paths import AnyPath
 from unprocess_gen.core.tone_curves import linear_table
 from unprocess_gen.core.types import Float, Plan, Srgb
-from unprocess_gen.dataset.manifest import patch_from_row, read_header
+from unprocess_gen.dataset.manifest import patch_from_row, read_columns
 from unprocess_gen.pipeline.progress import with_bar
 from unprocess_gen.reports.report_files import write_files
 from unprocess_gen.reports.sheets import panels
@@ -96,7 +96,7 @@ def contact_sheet(folder: AnyPath, keys: Sequence[str] = (), source: AnyPath | N
 def _mark(folder: AnyPath) -> bytes:
     """Text chunk of a PNG file (PNG specification, 11.3.3.2) that identifies a dataset."""
     manifest = folder / "manifest.csv"
-    read_header(manifest)  # DamageError if it cannot be read
+    read_columns(manifest)  # DamageError if it cannot be read
     body = f"tEXtunprocess_gen\0manifest_sha256={file_sha256(manifest)}".encode("ascii")
     return (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
 
