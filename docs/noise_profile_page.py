@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 
 from unprocess_gen.config.interpretation import branch_of, row_of_stop
-from unprocess_gen.config.option_files import conf_dir, option_summary
+from unprocess_gen.config.option_files import option_summary
 from unprocess_gen.config.schema import Config, NoiseConfig, SensorConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.exact_distributions import tukey_std
@@ -55,7 +55,7 @@ def published() -> dict[str, Any]:
 @cache
 def physical_profiles() -> dict[str, NoiseConfig]:
     """Return the physical profiles with published numbers by name."""
-    return {name: read_option(conf_dir() / "noise" / f"{name}.yaml", NoiseConfig) for name in published()["profiles"]}
+    return {name: read_option("noise", name) for name in published()["profiles"]}
 
 
 def profile_at(noise: NoiseConfig, iso: float) -> Physics | None:

@@ -8,8 +8,8 @@ from functools import cache
 
 import unprocess_gen as ug
 from unprocess_gen.config.interpretation import assumed_numbers, branch_of
-from unprocess_gen.config.option_files import conf_dir, group_options
-from unprocess_gen.config.schema import Config, NoiseConfig, SceneConfig, SensorConfig
+from unprocess_gen.config.option_files import group_options
+from unprocess_gen.config.schema import Config, NoiseConfig, SceneConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.types import Facts
 from unprocess_gen.planning.dark_scene import physical_profiles
@@ -66,13 +66,13 @@ def _base() -> Config:
 
 @cache
 def _profile(name: str) -> NoiseConfig:
-    return read_option(conf_dir() / "noise" / f"{name}.yaml", NoiseConfig)
+    return read_option("noise", name)
 
 
 @cache
 def _scene(name: str) -> SceneConfig:
     """Return a scene whose light is divided by the mean of its range."""
-    scene = read_option(conf_dir() / "scene" / f"{name}.yaml", SceneConfig)
+    scene = read_option("scene", name)
     ratio = scene.exposure_ratio
     return replace(scene, exposure_ratio=(ratio[1] + ratio[2]) / 2) if isinstance(ratio, tuple) else scene
 
@@ -83,7 +83,7 @@ def predictions_of(scene: str, profile: str) -> tuple[Prediction, ...] | None:
     if branch_of(noise, _scene(scene).iso) is None:
         return None
     assert noise.bits is not None
-    sensor = read_option(conf_dir() / "sensor" / f"{SENSORS[noise.bits]}.yaml", SensorConfig)
+    sensor = read_option("sensor", SENSORS[noise.bits])
     config = replace(_base(), noise=noise, scene=_scene(scene), sensor=sensor)
     ((_, predictions),) = plan_levels(config, "0" * 64, facts=FACTS)
     return predictions

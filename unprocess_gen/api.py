@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from unprocess_gen.config.interpretation import noise_levels
 from unprocess_gen.config.schema import Config
 from unprocess_gen.config.validation import validate_config
-from unprocess_gen.config.values import value_text
+from unprocess_gen.config.values import refusal
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.core.files import array_xxh3
 from unprocess_gen.core.paths import any_path
@@ -416,9 +416,9 @@ def _planned(pixels: Srgb, identity: str, config: Config, seed: int | None) -> P
     settings = PairSettings.read(_config_for_arrays(config, seed))
     for key, pairs in (("levels", len(noise_levels(config.noise))), ("draws", config.noise.draws)):
         if pairs > 1:
-            raise ConfigError(
-                f"noise.{key}={getattr(config.noise, key)}: {pairs} pairs of an image; expected one; call make_pair "
-                "once for each level or seed, or generate a dataset"
+            advice = "call make_pair once for each level or seed, or generate a dataset"
+            raise refusal(
+                f"noise.{key}", getattr(config.noise, key), f"{pairs} pairs of an image; expected one; {advice}"
             )
     recorded = _downscaled(pixels, config.source.downscale)
     _full_frame(recorded, config.output.layout)
@@ -442,10 +442,10 @@ def _config_for_arrays(config: Config, seed: int | None) -> Config:
     """Return a validated copy of a config without the keys that choose files; ConfigError for patches."""
     _check_complete(config)
     if config.source.patch is not None:
-        raise ConfigError(
-            f"source.patch={value_text(config.source.patch)}: make_pair returns complete frames; expected null; "
-            "cut the arrays of the pair at even rows and columns"
+        problem = (
+            "make_pair returns complete frames; expected null; cut the arrays of the pair at even rows and columns"
         )
+        raise refusal("source.patch", config.source.patch, problem)
     source = dataclasses.replace(config.source, root=None, limit=None, clips=False, include=("*",))
     config = dataclasses.replace(config, source=source, seed=config.seed if seed is None else seed)
     validate_config(config)
@@ -469,9 +469,8 @@ def _check_complete(config: Config) -> None:
 
 def _downscaled(pixels: Srgb, downscale: int) -> Srgb:
     if min(pixels.shape[:2]) < downscale:
-        raise ConfigError(
-            f"source.downscale={downscale}: srgb is {list(pixels.shape)}; expected at least {downscale} x {downscale}"
-        )
+        problem = f"srgb is {list(pixels.shape)}; expected at least {downscale} x {downscale}"
+        raise refusal("source.downscale", downscale, problem)
     return pixels if downscale == 1 else downscaled(pixels, downscale)
 
 

@@ -18,8 +18,7 @@ from helpers.photographs import fill
 from helpers.promise_report import Figure
 
 from unprocess_gen.config.accuracy import METHODS, STAGES, Method, choose_methods
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import AccuracyConfig, Config, NoiseConfig, SceneConfig, SensorConfig
+from unprocess_gen.config.schema import AccuracyConfig, Config
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.config.validation import validate_config
 from unprocess_gen.core.errors import ConfigError, MachineError
@@ -38,20 +37,14 @@ LITTLE = SampleSizes(photographs=3, rounds=2, sampled=(64, 96), readable=(24, 32
 SMALLEST = SampleSizes(2, 1, (16, 16), (8, 8), (8, 8), run_files=1)
 
 
-def option(group: str, name: str, schema: type) -> Any:
-    return read_option(conf_dir() / group / f"{name}.yaml", schema)
-
-
-TIERS: dict[str, AccuracyConfig] = {
-    name: option("accuracy", name, AccuracyConfig) for name in (REFERENCE, EXACT, "fast")
-}
+TIERS: dict[str, AccuracyConfig] = {name: read_option("accuracy", name) for name in (REFERENCE, EXACT, "fast")}
 
 
 @pytest.fixture(scope="session")
 def profiles() -> BenchmarkProfiles:
-    two_numbers, electrons = (option("noise", name, NoiseConfig) for name in ("imx385_iso3200", "sony_a7s2"))
-    scenes = {name: option("scene", name, SceneConfig) for name in ("daylight", "night")}
-    return BenchmarkProfiles(TIERS, two_numbers, electrons, option("sensor", "generic_14bit", SensorConfig), scenes)
+    two_numbers, electrons = (read_option("noise", name) for name in ("imx385_iso3200", "sony_a7s2"))
+    scenes = {name: read_option("scene", name) for name in ("daylight", "night")}
+    return BenchmarkProfiles(TIERS, two_numbers, electrons, read_option("sensor", "generic_14bit"), scenes)
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,6 @@ from helpers.datasets import Make, Settings
 from helpers.photographs import fill
 
 import unprocess_gen as ug
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import AccuracyConfig
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.pipeline.progress import COMPILING
@@ -62,7 +60,7 @@ def test_time_of_pairs_is_divided_by_the_workers_that_have_a_shard(
 
 
 def test_reference_is_not_timed_for_comparison(settings: Settings) -> None:
-    tiers = {name: read_option(conf_dir() / f"accuracy/{name}.yaml", AccuracyConfig) for name in ("reference", "fast")}
+    tiers = {name: read_option("accuracy", name) for name in ("reference", "fast")}
     assert estimate_run(settings("source.limit=1"), 1, True, tiers).tier_ns.keys() == {"exact", "fast"}
 
 
@@ -232,7 +230,7 @@ def test_second_plan_announces_no_compiling(
     self_test.failures.cache_clear()
     caplog.set_level("INFO", "unprocess_gen")
     config = settings("source.limit=1")
-    tiers = {"fast": read_option(conf_dir() / "accuracy/fast.yaml", AccuracyConfig)}
+    tiers = {"fast": read_option("accuracy", "fast")}
     for _ in range(2):
         estimate_run(config, 1, True, tiers)
     assert caplog.messages == [COMPILING]

@@ -16,8 +16,7 @@ from helpers.photographs import pixels
 from helpers.promise_report import Figure
 from PIL import Image
 
-from unprocess_gen.config.option_files import conf_dir
-from unprocess_gen.config.schema import GainsConfig, NoiseConfig, replaced
+from unprocess_gen.config.schema import replaced
 from unprocess_gen.config.serialization import read_option
 from unprocess_gen.reports import report_files
 from unprocess_gen.reports.paper import figures as paper_figures
@@ -33,8 +32,8 @@ FILES = [*(f"fig{number}.png" for number in range(2, 8)), "figures.html"]
 
 @pytest.fixture(scope="module")
 def options() -> PaperOptions:
-    gains = {name: read_option(conf_dir() / "gains" / f"{name}.yaml", GainsConfig) for name in paper_figures.GAINS}
-    return PaperOptions(gains, read_option(conf_dir() / "noise" / f"{paper_figures.AUTHORS_NOISE}.yaml", NoiseConfig))
+    gains = {name: read_option("gains", name) for name in paper_figures.GAINS}
+    return PaperOptions(gains, read_option("noise", paper_figures.AUTHORS_NOISE))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from unprocess_gen.cli.messages import print_result
 from unprocess_gen.cli.messages import report as report_message
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
 from unprocess_gen.cli.sweep import plan_totals
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import group_options
 from unprocess_gen.core.errors import ConfigError, MachineError, SourceChangedError
 from unprocess_gen.core.paths import any_path, local_path
 from unprocess_gen.reports.formatting import counted
@@ -51,7 +51,7 @@ def accuracy(call: Call) -> int:
 
 def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
     from unprocess_gen.config.interpretation import uses_dark_frames
-    from unprocess_gen.config.schema import NoiseConfig, SceneConfig, SensorConfig
+    from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports.benchmark import measure
     from unprocess_gen.reports.benchmark import report as benchmark_report
 
@@ -63,29 +63,22 @@ def _accuracy(config: Config, label: str = "", *, command: str) -> tuple[int, No
     out = _report_folder(config, "accuracy")
     profiles = measure.BenchmarkProfiles(
         _tiers(),
-        _option("noise", "imx385_iso3200", NoiseConfig),
-        _option("noise", "sony_a7s2", NoiseConfig),
-        _option("sensor", "generic_14bit", SensorConfig),
-        {name: _option("scene", name, SceneConfig) for name in ("daylight", "night")},
+        read_option("noise", "imx385_iso3200"),
+        read_option("noise", "sony_a7s2"),
+        read_option("sensor", "generic_14bit"),
+        {name: read_option("scene", name) for name in ("daylight", "night")},
     )
     benchmark = measure.measure_accuracy(config, profiles, command=command)
     benchmark_report.write_benchmark(benchmark, out)
     return 0, None, [benchmark_report.report_text(benchmark), f"{out}: {', '.join(benchmark_report.FILES)}"]
 
 
-def _option(group: str, name: str, kind: type[Option]) -> Option:
-    """Return one option of ``conf/``."""
-    from unprocess_gen.config.serialization import read_option
-
-    return read_option(conf_dir() / group / f"{name}.yaml", kind)
-
-
 def _tiers() -> dict[str, AccuracyConfig]:
     """Return every tier of ``conf/accuracy``, the reference first."""
-    from unprocess_gen.config.schema import AccuracyConfig
+    from unprocess_gen.config.serialization import read_option
 
     names = sorted(group_options("accuracy"), key=lambda name: name != "reference")
-    return {name: _option("accuracy", name, AccuracyConfig) for name in names}
+    return {name: read_option("accuracy", name) for name in names}
 
 
 FIGURE_KEYS = ("source", "camera", "sensor", "seed", "out")
@@ -101,12 +94,12 @@ def figures(call: Call) -> int:
 
 
 def _figures(config: Config, label: str = "", *, command: str) -> tuple[int, None, list[str]]:
-    from unprocess_gen.config.schema import GainsConfig, NoiseConfig
+    from unprocess_gen.config.serialization import read_option
     from unprocess_gen.reports.paper import figures as paper_figures
 
     out = _report_folder(config, "figures")
-    gains = {name: _option("gains", name, GainsConfig) for name in paper_figures.GAINS}
-    authors = _option("noise", paper_figures.AUTHORS_NOISE, NoiseConfig)
+    gains = {name: read_option("gains", name) for name in paper_figures.GAINS}
+    authors = read_option("noise", paper_figures.AUTHORS_NOISE)
     drawn = paper_figures.draw_figures(config, paper_figures.PaperOptions(gains, authors))
     return 0, None, [f"{out}: {', '.join(paper_figures.write_figures(drawn, out, command))}"]
 

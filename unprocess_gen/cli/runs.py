@@ -9,7 +9,7 @@ from unprocess_gen.cli.exit_codes import DONE, TOO_MANY_FAILED
 from unprocess_gen.cli.hydra_app import compose
 from unprocess_gen.cli.messages import print_result, print_results
 from unprocess_gen.cli.places import dark_frames_of, dataset_folder, given_root
-from unprocess_gen.config.option_files import conf_dir, group_options
+from unprocess_gen.config.option_files import group_options
 from unprocess_gen.core.paths import any_path
 
 if TYPE_CHECKING:
@@ -57,11 +57,10 @@ def _executor(call: Call) -> ExecutorConfig:
     """Return the settings of the executor that a call names, those of ``executor=local`` without one."""
     from dataclasses import replace
 
-    from unprocess_gen.config.schema import ExecutorConfig
     from unprocess_gen.config.serialization import read_option
     from unprocess_gen.config.values import one_of
 
     name = call.values.get("executor", "local")
     one_of("executor", name, tuple(group_options("executor")))
-    executor = read_option(conf_dir() / "executor" / f"{name}.yaml", ExecutorConfig)
+    executor: ExecutorConfig = read_option("executor", name)
     return replace(executor, address=call.values.get("address"))

@@ -63,9 +63,8 @@ def check_override(override: str) -> None:
     if max(override.count(bracket) for bracket in "[{(") > MAX_BRACKETS:
         raise ConfigError(f"{override[:60]}…: nested too deeply; expected at most {MAX_BRACKETS} brackets")
     if override.startswith("~"):
-        raise ConfigError(
-            f"{override}: a setting cannot be removed; expected key=value; choose another value or option"
-        )
+        problem = "a setting cannot be removed; expected key=value; choose another value or option"
+        raise ConfigError(f"{override}: {problem}")
     if not equals:
         raise ConfigError(f"{override}: expected a setting key=value; see gen-dataset --help")
     if len(key) > MAX_KEY_CHARACTERS:

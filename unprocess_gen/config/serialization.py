@@ -8,8 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -22,6 +21,7 @@ from unprocess_gen.config.interpretation import (
     uses_assumed,
     uses_physics,
 )
+from unprocess_gen.config.option_files import conf_dir
 from unprocess_gen.config.schema import GROUPS, Config, all_settings
 from unprocess_gen.config.settings import Setting, settings_of
 from unprocess_gen.config.validation import check_values
@@ -32,8 +32,6 @@ from unprocess_gen.core.paths import AnyPath
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
-
-Option = TypeVar("Option")
 
 
 def _keys(chosen: Callable[[Setting], bool]) -> dict[str, tuple[str, ...]]:
@@ -196,13 +194,12 @@ def writable_node(group: type[Any]) -> DictConfig:
     return node
 
 
-def read_option(path: Path, group: type[Option]) -> Option:
-    """Read an option file of ``conf/`` into its dataclass; keys that the file lacks have their defaults."""
+def read_option(group: str, name: str) -> Any:
+    """Read an option of ``conf/`` into the dataclass of its group; keys that the file lacks have their defaults."""
     from omegaconf import OmegaConf
 
-    option = OmegaConf.to_object(OmegaConf.merge(writable_node(group), OmegaConf.load(path)))
-    assert isinstance(option, group)
-    return option
+    loaded = OmegaConf.load(conf_dir() / group / f"{name}.yaml")
+    return OmegaConf.to_object(OmegaConf.merge(writable_node(GROUPS[group]), loaded))
 
 
 def differences(config_yaml: str, other_yaml: str) -> list[str]:

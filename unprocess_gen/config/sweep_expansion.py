@@ -165,10 +165,9 @@ def composed_job(job: SweepJob, folders: OptionFolders) -> DictConfig:
     given = {override.partition("=")[0].lstrip("+") for override in job.overrides}
     for key in _raw_params(node):
         if key.lstrip("+") not in given:
-            raise ConfigError(
-                f"hydra.sweeper.params.{key}: found in an option that the sweep itself selects; expected it in the "
-                "primary config or in an option added with +group=option"
-            )
+            problem = "found in an option that the sweep itself selects"
+            expected = "expected it in the primary config or in an option added with +group=option"
+            raise ConfigError(f"hydra.sweeper.params.{key}: {problem}; {expected}")
     _check_hydra_settings(node)
     return node
 
@@ -197,10 +196,8 @@ def _refuse_repetition(choice: _Choice, earlier: Iterable[_Choice]) -> None:
     """Refuse an added group, or the key of a sweep, that an earlier override sets: its values would be lost."""
     for other in earlier:
         if other.name == choice.name and (choice.adds_group or choice.swept or other.swept):
-            raise ConfigError(
-                f"{choice.text}: {other.text} sets {choice.name} too; expected one of them; remove the other, or "
-                "separate the values of a sweep by commas"
-            )
+            advice = "remove the other, or separate the values of a sweep by commas"
+            raise ConfigError(f"{choice.text}: {other.text} sets {choice.name} too; expected one of them; {advice}")
 
 
 def _combinations(choices: Sequence[_Choice]) -> Iterator[dict[str, str]]:
@@ -228,10 +225,8 @@ def _params(node: DictConfig, choices: Sequence[_Choice], folders: OptionFolders
     for override in overrides:
         check_override(override)
         if override.lstrip("+").startswith("hydra"):
-            raise ConfigError(
-                f"hydra.sweeper.params.{override}: a sweep over settings of Hydra is not supported; expected "
-                "keys of a dataset"
-            )
+            problem = "a sweep over settings of Hydra is not supported; expected keys of a dataset"
+            raise ConfigError(f"hydra.sweeper.params.{override}: {problem}")
     return [choice for choice in _parse(overrides, folders) if choice.name not in given]
 
 
@@ -282,12 +277,9 @@ def _refuse_values_without_sweep(choices: Sequence[_Choice], node: DictConfig) -
     for choice in choices:
         if choice.swept:
             raise ConfigError(several_values(choice.text, "; to sweep over them, add --multirun"))
-    params = _raw_params(node)
-    if params:
-        raise ConfigError(
-            f"hydra.sweeper.params.{next(iter(params))}: values of a sweep without hydra.mode: MULTIRUN; add it to the "
-            "file, or -m to the command line"
-        )
+    for key in _raw_params(node):
+        problem = "values of a sweep without hydra.mode: MULTIRUN; add it to the file, or -m to the command line"
+        raise ConfigError(f"hydra.sweeper.params.{key}: {problem}")
 
 
 class _GroupOptions:
