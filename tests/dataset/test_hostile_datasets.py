@@ -120,14 +120,12 @@ def test_value_outside_its_range_names_row_column_and_value(name: str, value: st
     assert "\n" not in sentence
 
 
-@pytest.mark.parametrize("name", ["width", "seed", "red_gain", "gamma"])
-def test_every_reader_of_a_hostile_manifest_reports_damage(name: str, copy: Path) -> None:
-    edit(copy, **{name: "-7"})
+def test_every_reader_of_a_hostile_manifest_reports_damage(copy: Path) -> None:
+    edit(copy, gamma="-7")
     assert [damage.file for damage in verify(copy)] == ["manifest.csv"]
-    with pytest.raises(DamageError, match=f"row {KEY}: {name}="):
-        RawPairs(copy)
-    with pytest.raises(DamageError, match=f"row {KEY}: {name}="):
-        list(select_rows(copy / "manifest.csv", None, "1"))
+    for read in (RawPairs, lambda folder: list(select_rows(folder / "manifest.csv", None, "1"))):
+        with pytest.raises(DamageError, match=f"row {KEY}: gamma="):
+            read(copy)
 
 
 def test_source_outside_the_root_is_never_looked_up(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:

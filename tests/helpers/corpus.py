@@ -21,7 +21,6 @@ import io
 import random
 import re
 import struct
-import subprocess
 import sys
 import tarfile
 import tempfile
@@ -32,6 +31,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a script
+from helpers.commands import run_process
 
 PIP_PACKAGES = ("pillow", "wand", "thumbor", "filetype", "puremagic")
 DEBIAN_SOURCES = (
@@ -71,32 +73,19 @@ def main() -> None:
 
 def fetched(scratch: Path) -> Iterator[tuple[str, list[Path]]]:
     """Yields each package with the archives of its source."""
-    for package in PIP_PACKAGES:
-        to = scratch / "pip" / package
-        yield package, download(to, ["-m", "pip", "download", "--no-binary", ":all:", "--no-deps", "--dest"], package)
     apt = apt_options(scratch)
-    subprocess.run(["apt-get", *apt, "update"], check=False, capture_output=True)
-    for package in DEBIAN_SOURCES:
-        to = scratch / "apt" / package
-        yield package, download(to, [], package, ["apt-get", *apt, "source", "--download-only", package])
-
-
-def download(to: Path, pip: list[str], package: str, command: list[str] | None = None) -> list[Path]:
-    """Runs a download into a folder and returns the archives it left there."""
-    to.mkdir(parents=True)
-    done = subprocess.run(
-        command or [sys.executable, *pip, str(to), package],
-        cwd=to,
-        check=False,
-        capture_output=True,
-        text=True,
-        errors="replace",
-    )
-    found = sorted(path for path in to.iterdir() if re.search(r"\.(tar\.\w+|tgz|zip)$", path.name))
-    if not found:
-        last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-        print(f"{package}: not fetched ({last[:120]})", file=sys.stderr)
-    return found
+    run_process("apt-get", *apt, "update")
+    pip = (sys.executable, "-m", "pip", "download", "--no-binary", ":all:", "--no-deps")
+    commands = {package: (*pip, package) for package in PIP_PACKAGES}
+    commands |= {package: ("apt-get", *apt, "source", "--download-only", package) for package in DEBIAN_SOURCES}
+    for package, command in commands.items():
+        (scratch / package).mkdir()
+        done = run_process(*command, cwd=scratch / package)
+        found = sorted(p for p in (scratch / package).iterdir() if re.search(r"\.(tar\.\w+|tgz|zip)$", p.name))
+        if not found:
+            last = (done.stderr.strip().splitlines() or ["no output"])[-1]
+            print(f"{package}: not fetched ({last[:120]})", file=sys.stderr)
+        yield package, found
 
 
 def apt_options(scratch: Path) -> list[str]:

@@ -31,7 +31,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from unprocess_gen import RawPairs
 from unprocess_gen.core.types import Source
 from unprocess_gen.sources.listing import list_folder
 from unprocess_gen.sources.names import decode_name, encode_name
@@ -168,12 +167,6 @@ def test_nothing_outside_the_dataset_is_written_or_changed(made: HostileDataset)
     assert paths_except(made.root.parent, made.out) == made.others
 
 
-def test_no_dataset_file_is_named_after_a_source(made: HostileDataset) -> None:
-    own = re.compile(r"(config\.yaml|dataset\.json|manifest\.csv|\.\w+|shards/shard-\d{5}\.tar)")
-    files = [str(path.relative_to(made.out)) for path in made.out.rglob("*") if path.is_file()]
-    assert [name for name in files if not own.fullmatch(name)] == []
-
-
 def test_members_are_named_by_key_and_have_the_names_of_the_manifest(made: HostileDataset) -> None:
     names: list[str] = []
     sources: list[str] = []
@@ -194,10 +187,6 @@ def test_verify_regenerates_every_pair(made: HostileDataset, run_main: RunMain) 
     count = len(made.contents)
     done = run_main("verify", made.out, "--regenerate", count)
     assert (done.code, done.out) == (0, f"{made.out} is intact; {count} pairs regenerated, bit for bit\n")
-
-
-def test_raw_pairs_returns_every_name(made: HostileDataset) -> None:
-    assert [sample.row["source"] for sample in RawPairs(made.out)] == [row["source"] for row in text_rows(made.out)]
 
 
 def test_rerun_on_a_finished_dataset_does_nothing(made: HostileDataset, run_main: RunMain) -> None:
