@@ -8,7 +8,7 @@ from helpers.datasets import Settings
 
 from unprocess_gen.core.types import Plan
 from unprocess_gen.planning.plan import plan_image
-from unprocess_gen.reports.empty_bands import NONE, WIDE, band_widths, empty_bands, highlight_sentence
+from unprocess_gen.reports.empty_bands import NO_BANDS, WIDE, band_widths, empty_bands, highlight_sentence
 from unprocess_gen.simulation.pair import make_pair
 
 
@@ -48,13 +48,13 @@ def test_share_counts_sites_next_to_bands_by_channel(plan: Plan) -> None:
 
 
 def test_dithered_highlights_and_16_bit_codes_have_no_bands(plan: Plan) -> None:
-    assert empty_bands(gray(254), plan.replace(dequantize="dither_all")) == NONE
-    assert empty_bands(gray(254).astype(np.uint16) * 257, plan) == NONE
+    assert empty_bands(gray(254), plan.replace(dequantize="dither_all")) == NO_BANDS
+    assert empty_bands(gray(254).astype(np.uint16) * 257, plan) == NO_BANDS
     assert empty_bands(gray(254), plan.replace(dequantize="dither")).share == 1
 
 
 def test_sentence_has_share_widths_and_remedy(plan: Plan) -> None:
-    sentence = highlight_sentence([empty_bands(gray(254), plan), NONE])
+    sentence = highlight_sentence([empty_bands(gray(254), plan), NO_BANDS])
     assert sentence.startswith("50 % of the sites are highlights where 8-bit codes are coarse")
     assert "up to 78 % (R), 53 % (G), 73 % (B) of the raw range apart; source.dequantize=dither_all" in sentence
-    assert highlight_sentence([NONE]) == highlight_sentence([]) == ""
+    assert highlight_sentence([NO_BANDS]) == highlight_sentence([]) == ""

@@ -34,16 +34,16 @@ class EmptyBands(NamedTuple):
     widest: tuple[float, float, float]
 
 
-NONE = EmptyBands(0.0, (0.0, 0.0, 0.0))
+NO_BANDS = EmptyBands(0.0, (0.0, 0.0, 0.0))
 
 
 def empty_bands(srgb: Srgb, plan: Plan) -> EmptyBands:
     """Find the empty bands of a photograph and count the sites next to them.
 
-    `NONE` for 16-bit codes and for dithered highlights. Their widest band is next to white: up to 6 % of the range.
+    `NO_BANDS` for 16-bit codes and for dithered highlights. Their widest band is next to white: up to 6 % of the range.
     """
     if srgb.dtype != np.uint8 or plan.source.dequantize == "dither_all":
-        return NONE
+        return NO_BANDS
     widths = band_widths(plan)
     wide = widths >= WIDE
     edges = np.zeros((256, 3), dtype=bool)

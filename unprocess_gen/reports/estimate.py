@@ -34,8 +34,7 @@ from unprocess_gen.planning.effect_selection import Prediction, facts_for
 from unprocess_gen.planning.plan import plan_levels, plan_pairs
 from unprocess_gen.planning.source_noise import noise_ratio
 from unprocess_gen.reports.benchmark.timing import measure_in_turns, thread_ns
-from unprocess_gen.reports.empty_bands import NONE as NO_BANDS
-from unprocess_gen.reports.empty_bands import EmptyBands, empty_bands
+from unprocess_gen.reports.empty_bands import NO_BANDS, EmptyBands, empty_bands
 from unprocess_gen.simulation import self_test
 from unprocess_gen.simulation.kernels.body import forget_bodies
 from unprocess_gen.simulation.pair import make_pairs

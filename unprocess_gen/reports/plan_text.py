@@ -8,15 +8,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from unprocess_gen.config.interpretation import (
-    assumed_numbers,
-    is_physical,
-    missing_number,
-    noise_levels,
-    patch_rule,
-    provenance_at,
-    uses_dark_frames,
-)
+from unprocess_gen.config import interpretation
 from unprocess_gen.config.schema import BRANCH_FIELDS, AccuracyConfig, Config, NoiseConfig
 from unprocess_gen.config.values import value_range, value_text
 from unprocess_gen.core.types import DarkFrames, Patch, Plan
@@ -74,7 +66,7 @@ def _labelled(label: str, sentences: Iterable[str | None], indent: str = "") -> 
 
 def _patch_lines(config: Config, estimates: Sequence[SourceEstimate]) -> list[str]:
     """State what is cut from each image, and the fraction of its pixels in no patch; nothing for complete images."""
-    rule, readable = patch_rule(config.source), [source for source in estimates if source.patches]
+    rule, readable = interpretation.patch_rule(config.source), [source for source in estimates if source.patches]
     cropped = sum(source.unused_pixels > 0 for source in readable)
     if not readable or (rule is None and not cropped):
         return []
@@ -127,7 +119,7 @@ def _noise_lines(config: Config, estimates: Sequence[SourceEstimate], dark_frame
     )
     return [
         *_labelled("scene", [_scene_sentence(config, plans)]),
-        *(_physical_lines if is_physical(config.noise) else _two_number_lines)(config, plans),
+        *(_physical_lines if interpretation.is_physical(config.noise) else _two_number_lines)(config, plans),
         *_labelled("dark", [_dark_frames_sentence(config, dark_frames)] if dark_frames else []),
         *_labelled("highlight", [highlight_sentence([source.bands for source in estimates])]),
         *_labelled("source", [source_noise_sentence(ratios, config.source.downscale)]),
@@ -146,7 +138,7 @@ def _scene_sentence(config: Config, plans: Sequence[Plan]) -> str:
             value_range([getattr(numbers, name) for numbers in physics])
             for name in ("iso", "exposure_s", "temperature_c")
         )
-        is_heated = any(missing_number(noise, name) is None for name in ("dark_current", "hot_pixels"))
+        is_heated = any(interpretation.missing_number(noise, name) is None for name in ("dark_current", "hot_pixels"))
         ignored += ["ISO (noise.iso is used)"] if noise.iso is not None else []
         ignored += [] if is_heated else ["time", "temperature"]
     else:
@@ -161,7 +153,7 @@ def _two_number_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     """The numbers and the effects of a profile with two numbers."""
     sensor, noise, first = config.sensor, config.noise, plans[0].noise
     profile_levels = (noise.black_level_dn, noise.white_level_dn) if noise.units == "dn" else (0, 1)
-    numbers = "; ".join(dict.fromkeys(f"a={level.a}, b={level.b}" for level in noise_levels(noise)))
+    numbers = "; ".join(dict.fromkeys(f"a={level.a}, b={level.b}" for level in interpretation.noise_levels(noise)))
     fitted = [plan.noise for plan in plans if "heteroscedastic" in plan.noise.effects and plan.noise.a_dn]
     zero_dn = max((-fit.b_dn2 / fit.a_dn for fit in fitted), default=0)
     below = f"no noise up to {zero_dn:.2f} DN above black, where the fitted variance is negative"
@@ -183,13 +175,13 @@ def _physical_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
     assert noise.white_level_dn is not None and noise.black_level_dn is not None
     physics = [plan.noise.physics for plan in plans if plan.noise.physics is not None]
     distributions = sorted({"Gaussian" if numbers.read_law == "gaussian" else "Tukey lambda" for numbers in physics})
-    distribution = "dark frames" if uses_dark_frames(noise) else ", ".join(distributions)
+    distribution = "dark frames" if interpretation.uses_dark_frames(noise) else ", ".join(distributions)
     gains, stds = zip(*((numbers.dn_per_e, numbers.read_std_dn) for numbers in physics), strict=True)
     scale = (sensor.white_level_dn - sensor.black_level_dn) / (noise.white_level_dn - noise.black_level_dn)
     assumed = ", ".join(f"{key}={_number_text(noise, key)}" for key in noise.assumed)
     provenance = (
         f"{', '.join(origin.numbers)}: {origin.source}; uncertainty: {origin.uncertainty}"
-        for origin in provenance_at(noise, [numbers.iso for numbers in physics])
+        for origin in interpretation.provenance_at(noise, [numbers.iso for numbers in physics])
     )
     simulated = {name for plan in plans for name in plan.noise.effects}
     return [
@@ -205,14 +197,16 @@ def _physical_lines(config: Config, plans: Sequence[Plan]) -> list[str]:
 
 def _assumed_sentence(config: Config, plans: Sequence[Plan]) -> str | None:
     """The largest shares of the variance of a pixel, at black and at white of the scene, due to assumed numbers."""
-    if not config.noise.assumed or uses_dark_frames(config.noise):
+    if not config.noise.assumed or interpretation.uses_dark_frames(config.noise):
         return None
     shares = []
     for plan in plans:
         signals_dn = np.array([0.0, plan.sensor.span_dn * min(plan.scene.exposure, 1.0)])
         site = Site(plan, Patch(0, 0, 0, 2, 2), (0, 0))
         variances = {name: BY_NAME[name].expected(site).variance(signals_dn) for name in plan.noise.effects}
-        assumed = [variance for name, variance in variances.items() if assumed_numbers(config.noise, name)]
+        assumed = [
+            variance for name, variance in variances.items() if interpretation.assumed_numbers(config.noise, name)
+        ]
         shares.append(np.sum(assumed, axis=0) / np.sum(list(variances.values()), axis=0) * np.ones(2))
     black, white = np.max(shares, axis=0)
     return f"of the variance of a pixel, {black:.0%} at black and {white:.0%} at white rest on assumed numbers"

@@ -26,9 +26,9 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
-from unprocess_gen.config.accuracy import METHODS, Method, methods_of_stage
+from unprocess_gen.config.accuracy import METHODS, methods_of_stage
 from unprocess_gen.config.interpretation import is_normalised, is_physical
-from unprocess_gen.config.schema import AccuracyConfig, Config
+from unprocess_gen.config.schema import Config
 from unprocess_gen.core.errors import ConfigError
 from unprocess_gen.pipeline.progress import Progress
 from unprocess_gen.reports.benchmark import complete_runs, methods
@@ -124,29 +124,21 @@ def measure_accuracy(
 RowKey = tuple[str, str]
 """Stage and name of a method; for tiers, config and name."""
 
-TimeCall = Callable[[int], float]
-"""A time measurement, ns per pixel; gets the number of its round."""
 
-
-def _time_calls(session: BenchmarkSession, images: Sequence[BenchmarkImage]) -> dict[RowKey, TimeCall]:
-    """Every time measurement; each round uses the next image."""
-
-    def time_method(method: Method, number: int) -> float:
-        return methods.method_ns(session, method, images[number % len(images)])
-
-    calls: dict[RowKey, TimeCall] = {
-        (method.stage, method.name): partial(time_method, method) for method in METHODS if methods.has_time(method)
+def _time_calls(session: BenchmarkSession, images: Sequence[BenchmarkImage]) -> dict[RowKey, Callable[[int], float]]:
+    """Every time measurement, ns per pixel; each round uses the next image."""
+    calls: dict[RowKey, Callable[[BenchmarkImage], float]] = {
+        (method.stage, method.name): partial(methods.method_ns, session, method)
+        for method in METHODS
+        if methods.has_time(method)
     }
-    for name in session.configs:
-        for tier, accuracy in session.tiers.items():
-            calls[name, tier] = partial(_tier_ns, session, name, accuracy, images)
-    return calls
+    for name, (tier, accuracy) in itertools.product(session.configs, session.tiers.items()):
+        calls[name, tier] = partial(methods.pair_ns, session, name, accuracy)
 
+    def measure(call: Callable[[BenchmarkImage], float], number: int) -> float:
+        return call(images[number % len(images)])
 
-def _tier_ns(
-    session: BenchmarkSession, name: str, accuracy: AccuracyConfig, images: Sequence[BenchmarkImage], number: int
-) -> float:
-    return methods.pair_ns(session, name, accuracy, images[number % len(images)])
+    return {key: partial(measure, call) for key, call in calls.items()}
 
 
 def _method_rows(

@@ -202,15 +202,11 @@ def method_ns(session: BenchmarkSession, method: Method, image: BenchmarkImage) 
 
 
 def pair_ns(
-    session: BenchmarkSession,
-    config_name: str,
-    accuracy: AccuracyConfig,
-    image: BenchmarkImage,
-    edit: str = "unchanged",
+    session: BenchmarkSession, name: str, accuracy: AccuracyConfig, image: BenchmarkImage, edit: str = "unchanged"
 ) -> float:
     """The time of a pair whose camera body was not simulated before."""
     srgb = image.readable if accuracy.readable or accuracy.normal_shot else image.compiled
-    plan = session.plan(config_name, accuracy, image, srgb, edit)
+    plan = session.plan(name, accuracy, image, srgb, edit)
     forget_bodies()
     return thread_ns(lambda: make_pair(srgb, plan), srgb[..., 0].size)
 

@@ -17,16 +17,10 @@ from contextlib import contextmanager
 _REDIRECTED = threading.Lock()
 
 
-class CodecMessages:
-    """Hold what codecs wrote, once `captured` has ended."""
-
-    text = b""
-
-
 @contextmanager
-def captured() -> Iterator[CodecMessages]:
-    """Redirect file descriptor 2 of the process; the yielded object has the text afterwards."""
-    messages = CodecMessages()
+def captured() -> Iterator[bytearray]:
+    """Redirect file descriptor 2 of the process; what codecs wrote is in the yielded array afterwards."""
+    messages = bytearray()
     with _REDIRECTED, tempfile.TemporaryFile(buffering=0) as spool:
         stderr = os.dup(2)
         os.dup2(spool.fileno(), 2)
@@ -36,4 +30,4 @@ def captured() -> Iterator[CodecMessages]:
             os.dup2(stderr, 2)
             os.close(stderr)
             spool.seek(0)
-            messages.text = spool.read()
+            messages += spool.read()

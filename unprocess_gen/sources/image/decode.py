@@ -26,6 +26,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+from contextlib import suppress
 from functools import lru_cache
 from typing import cast
 
@@ -219,12 +220,9 @@ def _flags(header: Header) -> int:
 def _imdecode(data: bytes | bytearray, flags: int) -> tuple[Srgb | None, bytes]:
     """Return the decoded array, None if the codec fails, and what the codec wrote to standard error."""
     decoded: Srgb | None = None
-    with captured() as messages:
-        try:
-            decoded = cast("Srgb | None", cv2.imdecode(np.frombuffer(data, np.uint8), flags))
-        except cv2.error:
-            decoded = None
-    return decoded, messages.text
+    with captured() as messages, suppress(cv2.error):
+        decoded = cast("Srgb | None", cv2.imdecode(np.frombuffer(data, np.uint8), flags))
+    return decoded, bytes(messages)
 
 
 def _check_array(decoded: Srgb, header: Header) -> None:
