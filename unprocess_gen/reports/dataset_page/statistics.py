@@ -86,10 +86,8 @@ class ManifestStatistics:
         self.first_pair: Row | None = None
         self.failed: list[Row] = []
         self.sizes, self.effects, self.omitted = Counter[str](), Counter[str](), Counter[str]()
-        self.texts, self.reasons = (
-            {name: Counter[str]() for name in TEXT_COLUMNS},
-            defaultdict[str, Counter[str]](Counter),
-        )
+        self.texts = {name: Counter[str]() for name in TEXT_COLUMNS}
+        self.reasons: dict[str, Counter[str]] = defaultdict(Counter)
         self._step, self._image, columns = max(1, -(-pairs // PAIRS_DRAWN)), "", len(ALL_NUMBERS)
         self._range, self._total = np.full((2, columns), np.nan), np.zeros((2, columns))
         self._drawn, self._added = [np.empty((0, columns))], 0
@@ -97,14 +95,12 @@ class ManifestStatistics:
     @property
     def numbers(self) -> dict[str, NumberSummary]:
         """The columns that are not empty."""
-        (total, count), drawn = self._total, np.concatenate(self._drawn).T
-        mean = total / np.maximum(count, 1)
+        (total, count), drawn, (least, greatest) = self._total, np.concatenate(self._drawn).T, self._range.tolist()
+        mean = (total / np.maximum(count, 1)).tolist()
         return {
-            name: NumberSummary(name, least, average, greatest, values[~np.isnan(values)])
-            for name, least, average, greatest, values, number in zip(
-                ALL_NUMBERS, self._range[0].tolist(), mean.tolist(), self._range[1].tolist(), drawn, count, strict=True
-            )
-            if number
+            name: NumberSummary(name, least[i], mean[i], greatest[i], drawn[i][~np.isnan(drawn[i])])
+            for i, name in enumerate(ALL_NUMBERS)
+            if count[i]
         }
 
     def add(self, rows: Sequence[Row]) -> None:
