@@ -34,7 +34,7 @@ CONTENTS = {
 }
 """Complete contents."""
 
-VALUES: tuple[Any, ...] = (None, -1, 1e308, 2**62, 10**400, "x", [], {}, True)
+VALUES: tuple[Any, ...] = (None, 1e308, 2**62, "x")
 """Values in place of each number, text or list of a JSON file."""
 
 
@@ -96,7 +96,8 @@ def test_edited_record_of_a_run_is_reported_in_one_line(name: str, folder: Path,
     shutil.copytree(folder / "ds", folder / "original")
     problems = []
     for variant, write in variants(folder / "original" / name):
-        for verb in (("status", "ds"), ("part", "ds", 1), ("merge", "ds"), PREPARED):
+        verbs = (("status", "ds"), ("merge", "ds"), ("part", "ds", 1), PREPARED)
+        for verb in verbs[:2] if "=" in variant else verbs:  # these two read every record
             restore(folder / "ds", folder / "original")
             write(folder / "ds" / name)
             problems.append(problem(run_main(*verb), f"{verb[0]}: {variant}"))
@@ -108,11 +109,11 @@ def test_edited_record_of_a_run_is_reported_in_one_line(name: str, folder: Path,
 def test_edited_file_of_a_dataset_is_reported_in_one_line(name: str, folder: Path, run_main: RunMain) -> None:
     assert run_main(*PREPARED).code == 0
     shutil.copytree(folder / "ds", folder / "original")
-    verbs = (("verify", "ds"), ("replay", "ds/manifest.csv"), ("report", "ds"), ("verify", "ds", "--repair"), PREPARED)
-    again = ("again", "ds", "out=new", "n_jobs=1")
+    verbs = (("verify", "ds"), ("report", "ds"), ("verify", "ds", "--repair"), ("replay", "ds/manifest.csv"))
+    others = (("again", "ds", "out=new", "n_jobs=1"), PREPARED)
     problems = []
     for variant, write in variants(folder / "original" / name):
-        for verb in (*verbs, again):
+        for verb in verbs[1:2] if "=" in variant else (*verbs, *others):
             restore(folder / "ds", folder / "original")
             shutil.rmtree(folder / "new", ignore_errors=True)
             write(folder / "ds" / name)
