@@ -106,8 +106,10 @@ def _truncated_cdf(mean: float, std: float, low: float, high: float) -> tuple[in
         return fixed_point.fixed(bottom), fixed_point.fixed(top - bottom)
 
 
-def _nearest_truncated(u: float, mean: float, std: float, low: float, high: float) -> tuple[int, int] | None:
-    """Draw from a truncated normal distribution and return the value and its error, fixed-point.
+def _nearest_truncated(
+    finish: Callable[[int, int], float | None], u: float, a: float, mean: float, std: float, low: float, high: float
+) -> float | None:
+    """Draw from a truncated normal distribution, fixed-point; ``finish`` rounds the value, given its error.
 
     Roundings to 40 digits, to units, and of the product with ``u`` move the probability by less than 4 units. Returns
     None next to a limit, where `_truncated` clips.
@@ -120,23 +122,13 @@ def _nearest_truncated(u: float, mean: float, std: float, low: float, high: floa
     value = fixed_point.times(one, mean) + fixed_point.times(normal[0], std)
     error = fixed_point.times(normal[1], std) + 3
     within = fixed_point.times(one, low) < value - 2 * error and value + 2 * error < fixed_point.times(one, high)
-    return (value, error) if within else None
-
-
-def _nearest_truncated_normal(u: float, a: float, mean: float, std: float, low: float, high: float) -> float | None:
-    drawn = _nearest_truncated(u, mean, std, low, high)
-    return None if drawn is None else fixed_point.nearest(*drawn)
-
-
-def _nearest_inverse(u: float, a: float, mean: float, std: float, low: float, high: float) -> float | None:
-    drawn = _nearest_truncated(u, mean, std, low, high)
-    return None if drawn is None else fixed_point.nearest_inverse(*drawn)
+    return finish(value, error) if within else None
 
 
 FIXED_POINT: dict[str, Callable[..., float | None]] = {
     "log_uniform": _nearest_log_uniform,
-    "truncated_normal": _nearest_truncated_normal,
-    "inverse_truncated_normal": _nearest_inverse,
+    "truncated_normal": functools.partial(_nearest_truncated, fixed_point.nearest),
+    "inverse_truncated_normal": functools.partial(_nearest_truncated, fixed_point.nearest_inverse),
     "log_linear_in_a": fixed_point.nearest_log_linear,
 }
 """The functions of `DISTRIBUTIONS` that need an exponential, logarithm or quantile; None where they are undecided."""

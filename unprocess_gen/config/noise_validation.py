@@ -235,22 +235,16 @@ def _check_shape(key: str, branch: BranchConfig) -> None:
         raise refusal(key, value, f"{lacking}; expected shapes of {HEAVIEST_TAILS:g} or more")
 
 
-BLACK_ERROR_WORDS: tuple[list[str], ...] = (
-    *([], ["by_log_iso"], ["by_stop"]),
-    *(["by_colour"], ["by_colour", "by_stop"], ["by_colour", "by_log_iso"]),
-)
-"""Words that may precede the black-level errors of a branch."""
-
-
 def _check_black_error(key: str, branch: BranchConfig) -> None:
     value = branch.black_error_dn
     if value is None or _is_branch_number(value):
         return
     words, rest = table_words(value)
-    rows = rest if words[-1:] in (["by_log_iso"], ["by_stop"]) else [rest]
-    if words not in BLACK_ERROR_WORDS or not rows or not all(map(_is_four, rows)):
+    table = words[1:] if words[:1] == ["by_colour"] else words
+    rows = rest if table else [rest]
+    if table not in ([], ["by_stop"], ["by_log_iso"]) or not rows or not all(map(_is_four, rows)):
         raise refusal(key, value, f"expected {limits.BLACK_ERROR}")
-    if words[-1:] == ["by_stop"]:
+    if table == ["by_stop"]:
         _check_stops(key, value, rows, branch)
 
 
